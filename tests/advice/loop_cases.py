@@ -8,7 +8,8 @@ from functools import lru_cache
 import numpy as np
 from tests.control.frozen_flow import frozen_slopes
 
-from faintspot.advice.recorded_loop import ARCSEC, RecordedLoop
+from faintspot.advice.recorded_loop import RecordedLoop
+from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.control.reconstructor import make_reconstructor
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 

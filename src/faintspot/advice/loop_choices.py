@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from faintspot.advice.measured import Measured
 from faintspot.advice.open_loop import OpenLoop
-from faintspot.advice.recorded_loop import ARCSEC, RecordedLoop
+from faintspot.advice.recorded_loop import RecordedLoop
+from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
 from faintspot.control.learning import GAINS, KALMAN, learn
 from faintspot.control.learnt import SETTLE_FRAMES, Make, Plant
@@ -176,11 +177,11 @@ def _root(name: str, unit: str, square: float, error: float, remark: str = "") -
 
 
 def _whole(telemetry: OpenLoopTelemetry) -> NDArray[np.bool_]:
-    """Return the frames with all slopes, or with at least half of the largest number."""
+    """Return the frames with the largest share of measured slopes."""
     share = telemetry.trust.mean(axis=1)
     return np.asarray(share >= max(0.999 * float(share.max()), 1e-9))
 
 
 def _at_gain(choice: Choice, gain: float) -> Choice:
     """Return a choice whose integrator's gain is that of slopes as measured."""
-    return Choice(**{**vars(choice), "gain": choice.gain / gain})
+    return replace(choice, gain=choice.gain / gain)

@@ -14,10 +14,12 @@ from faintspot.advice.loop_choices import Choice, compared_choices
 from faintspot.advice.loop_spectra import ModalSpectra, modal_spectra
 from faintspot.advice.measured import Measured, outer_scale_and_r0
 from faintspot.advice.open_loop import OpenLoop, open_loop_of, runs_of, site_of_loop
-from faintspot.advice.recorded_loop import ARCSEC, RecordedLoop
+from faintspot.advice.recorded_loop import RecordedLoop
+from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
 from faintspot.control.identification import Identification, Identified
 from faintspot.control.loop_delay import LoopDelay, loop_delay
+from faintspot.control.recording import subapertures_across
 
 Floats = NDArray[np.float64]
 
@@ -96,18 +98,15 @@ def report_of_loop(loop: RecordedLoop, progress: Callable[[str], None] = lambda 
     }
     report = LoopReport(loop, {name: Part(title) for name, title in titles.items()})
     _frames(report)
-    steps: dict[str, Callable[[LoopReport, Any], Any]] = {
-        "delay": _loop,
-        "noise": _noise,
-        "turbulence": _turbulence,
-        "other choices": _choices,
-    }
-    found: Any = None
-    for name, step in steps.items():
-        progress(name)
-        found = step(report, found)
-        if found is None:
-            break
+    progress("delay")
+    delay = _loop(report)
+    progress("noise")
+    seen = _noise(report, delay)
+    if seen is not None:
+        progress("turbulence")
+        _turbulence(report, seen, delay)
+        progress("other choices")
+        _choices(report, seen, delay)
     return report
 
 
@@ -125,8 +124,8 @@ def _frames(report: LoopReport) -> None:
     part.missing = "; ".join(loop.remarks)
 
 
-def _loop(report: LoopReport, _: None) -> LoopDelay | None:
-    """Return delay and gain; None without open-loop slopes."""
+def _loop(report: LoopReport) -> LoopDelay:
+    """Return delay and gain; without commands those of an open loop."""
     loop, part = report.loop, report.parts["loop"]
     part.known.append(_saturated(loop))
     is_still = loop.commands is None or not np.ptp(loop.commands, axis=0).any()
@@ -184,7 +183,8 @@ def _saturated(loop: RecordedLoop) -> Measured:
     return Measured(name, unit, float(number), 0.0, f"of {commands.shape[1]}; {remark}{most}")
 
 
-def _noise(report: LoopReport, delay: LoopDelay) -> tuple[OpenLoop, LoopDelay] | None:
+def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
+    """Return the open-loop slopes; None if they are unknown."""
     loop, part = report.loop, report.parts["noise"]
     try:
         found = open_loop_of(loop, delay)
@@ -205,37 +205,34 @@ def _noise(report: LoopReport, delay: LoopDelay) -> tuple[OpenLoop, LoopDelay] |
     else:
         to_nm = scale * ARCSEC * loop.subaperture_m * 1e9
         part.known.append(Measured("tilt over a sub-aperture", "nm", rms * to_nm, spread * to_nm, over))
-    if report.parts["turbulence"].missing:
-        return None
-    return found, delay
+    return None if report.parts["turbulence"].missing else found
 
 
-def _turbulence(report: LoopReport, found: tuple[OpenLoop, LoopDelay]) -> tuple[OpenLoop, LoopDelay] | None:
-    loop, seen = report.loop, found[0]
+def _turbulence(report: LoopReport, seen: OpenLoop, delay: LoopDelay) -> None:
+    loop = report.loop
     part, site = report.parts["turbulence"], site_of_loop(loop)
     try:
         identified = Identification(seen.telemetry, site, loop.frame_rate_hz).layers()
     except InputError as error:
         part.missing = report.parts["vibrations"].missing = report.parts["spectra"].missing = str(error)
-        return found
+        return
     report.turbulence = identified
     report.spectra = modal_spectra(seen.telemetry, identified)
     _vibrations(report, identified)
     if loop.subaperture_m is None:
         part.missing = "Without subaperture_m (or diameter_m) neither r0 nor winds are known."
-        return found
+        return
     r0 = Measured("r0 at 500 nm", "m", remark="pixel_scale_arcsec is unknown")
     if loop.pixel_scale_arcsec is not None:
         shaking = sum(each.rms_px**2 for each in identified.vibrations)
         part.known += outer_scale_and_r0(
             seen.telemetry.open_loop_px, seen.run, site, shaking, loop.outer_scale_m
         )
-        of_gain = _GAIN_IN_R0 * abs(1 - found[1].gain)
+        of_gain = _GAIN_IN_R0 * abs(1 - delay.gain)
         r0 = part.known[-1] = part.known[-1].with_relative_error(of_gain)
     else:
         part.known.append(r0)
     part.known += _winds(identified, r0)
-    return found
 
 
 def _winds(identified: Identified, r0: Measured) -> list[Measured]:
@@ -254,13 +251,13 @@ def _winds(identified: Identified, r0: Measured) -> list[Measured]:
         time_ms = 314 * r0.value / speed
         error = time_ms * math.hypot(r0.error / r0.value, float(mean.std()) / speed)
         known.append(Measured("coherence time at 500 nm", "ms", time_ms, error))
-    for number in np.argsort(-share):
+    for rank, number in enumerate(np.argsort(-share), 1):
         x, y = winds[number]
         speed = math.hypot(x, y)
         along = float(np.hypot(*(errors[number] * winds[number]))) / max(speed, 1e-9)
         across = float(np.hypot(*(errors[number] * winds[number][::-1]))) / max(speed, 1e-9)
         degrees = math.degrees(across / max(speed, 1e-9))
-        name = f"layer {1 + list(np.argsort(-share)).index(number)}"
+        name = f"layer {rank}"
         direction = math.degrees(math.atan2(y, x)) % 360
         known += [
             Measured(f"{name}: speed", "m/s", speed, along),
@@ -272,8 +269,8 @@ def _winds(identified: Identified, r0: Measured) -> list[Measured]:
 
 def _vibrations(report: LoopReport, identified: Identified) -> None:
     loop, part = report.loop, report.parts["vibrations"]
-    across = (int(np.ptp(loop.cells, axis=0).max()) + 1) * (loop.subaperture_m or math.nan)
-    to_nm = math.sqrt(2) * (loop.pixel_scale_arcsec or math.nan) * ARCSEC * across / 4 * 1e9
+    diameter_m = subapertures_across(loop.cells) * (loop.subaperture_m or math.nan)
+    to_nm = math.sqrt(2) * (loop.pixel_scale_arcsec or math.nan) * ARCSEC * diameter_m / 4 * 1e9
     for each in identified.vibrations:
         rms = each.rms_px, each.rms_error_px
         shown = Measured(f"rms of {each.mode}", loop.slope_unit, *rms, "over all slopes")
@@ -285,14 +282,13 @@ def _vibrations(report: LoopReport, identified: Identified) -> None:
         part.missing = "No narrow line stands out of the spectra of tip, tilt and focus."
 
 
-def _choices(report: LoopReport, found: tuple[OpenLoop, LoopDelay]) -> None:
+def _choices(report: LoopReport, seen: OpenLoop, delay: LoopDelay) -> None:
     loop, part = report.loop, report.parts["choices"]
     if loop.interaction is None:
         part.missing = "The recording has no interaction or control matrix: no mirror can be replayed."
         return
     turbulence = report.parts["turbulence"].known
     r0 = next((each for each in turbulence if each.name.startswith("r0")), Measured("r0", "m"))
-    seen, delay = found
     try:
         report.choices = compared_choices(loop, seen, delay, site_of_loop(loop), r0)
     except InputError as error:

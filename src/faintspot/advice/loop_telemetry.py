@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.control.configuration import NONE, STREAM, Control
 from faintspot.control.learnt import INTEGRATOR, MODAL
-from faintspot.control.recording import check_commands, recorded_slopes
+from faintspot.control.recording import CLOSED, check_commands, recorded_slopes
 from faintspot.control.telemetry import without_prior
 from faintspot.io.telemetry import Telemetry
 
 Floats = NDArray[np.float64]
 
-_CLOSED = 2
 _EVEN_TRUST = 0.2  # trust above which weights are equal, to avoid selecting the best moments
 FEWEST_FRAMES = 200
 
@@ -100,7 +99,7 @@ def seen_in_telemetry(
 
 def _usable(telemetry: Telemetry, delay: int) -> NDArray[np.int64]:
     """Return the frames of a closed loop with known mirror commands."""
-    frame, closed = np.asarray(telemetry.frame), np.asarray(telemetry.loop) == _CLOSED
+    frame, closed = np.asarray(telemetry.frame), np.asarray(telemetry.loop) == CLOSED
     if len(frame) <= delay:
         return np.empty(0, np.int64)
     whole = (frame[delay:] - frame[:-delay] == delay) & closed[delay:] & closed[:-delay]

@@ -15,6 +15,7 @@ from faintspot.algorithms.noise import pixel_noise
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
+from faintspot.control.recording import OUTER_SCALE_M, side_m
 from faintspot.sensor.layout import Layout
 from faintspot.training.psf_learning import learn_psf_from_images
 from faintspot.turbulence.seeing import estimate_r0, slope_variance
@@ -22,8 +23,6 @@ from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 
-OUTER_SCALE_M = 25.0
-"""Outer scale assumed for r0 and wind [m]."""
 _SCALE_SPREAD = 0.7  # of the logarithm of the outer scale, where it is assumed
 _THEORY_ERROR = 0.03  # of r0: centroids are not quite mean gradients over squares
 _STRETCHES = 5  # parts of the telemetry whose scatter gives an error
@@ -119,9 +118,7 @@ def of_atmosphere(seen: LoopTelemetry, layout: Layout, gain: float = 1.0) -> lis
     """Return r0, the wind and vibrations, from slopes without the mirror's contribution."""
     _, atmosphere = seen.weighted(gain)
     r0, wind = ("r0 at 500 nm", "m"), ("wind", "m/s")
-    side = layout.subaperture_m
-    if side is None and layout.diameter_m is not None:
-        side = layout.diameter_m / (int(np.ptp(layout.cells, axis=0).max()) + 1)
+    side = side_m(layout.cells, layout.subaperture_m, layout.diameter_m)
     if side is None or layout.pixel_scale_arcsec is None:
         why = "the layout lacks subaperture_m or pixel_scale_arcsec"
         found = [Measured(*r0, remark=why), Measured(*wind, remark=why)]

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.advice.recorded_loop import ARCSEC, RecordedLoop
+from faintspot.advice.recorded_loop import RecordedLoop
+from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
 from faintspot.control.loop_delay import LoopDelay
 from faintspot.control.recording import OUTER_SCALE_M
@@ -35,7 +36,7 @@ class OpenLoop:
 
     @property
     def variance(self) -> Floats:
-        """(2 n,): standard deviation of the noise."""
+        """(2 n,): variance of the noise."""
         return np.asarray(np.min(self.telemetry.variance_px2, axis=0))
 
 
@@ -63,9 +64,9 @@ def open_loop_of(loop: RecordedLoop, delay: LoopDelay) -> OpenLoop:
     held, usable = _held(loop, delay)
     usable &= np.isfinite(loop.slopes).any(axis=1)
     rows = np.flatnonzero(usable)
-    if not len(rows) or np.ptp(loop.frame[rows]) + 1 > (1 + _MOST_LOST) * len(rows):
-        runs = runs_of(loop.frame[rows]) if len(rows) else rows
-        rows = rows[runs == np.bincount(runs).argmax()] if len(rows) else rows
+    if len(rows) and np.ptp(loop.frame[rows]) + 1 > (1 + _MOST_LOST) * len(rows):
+        runs = runs_of(loop.frame[rows])
+        rows = rows[runs == np.bincount(runs).argmax()]
     if len(rows) < FEWEST_FRAMES:
         raise InputError(f"{len(rows)} frames with known commands, expected {FEWEST_FRAMES}")
     place = loop.frame[rows] - loop.frame[rows[0]]

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.checks import finite_array, number_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays
 from faintspot.base.toml_files import check_keys, parse_file
 from faintspot.control.configuration import load_control
+from faintspot.control.recording import CLOSED, side_m
 from faintspot.io.frames import read_array
 from faintspot.io.telemetry import read_telemetry
 from faintspot.io.zarr_store import holds_telemetry
@@ -21,7 +23,6 @@ from faintspot.io.zarr_store import holds_telemetry
 Floats = NDArray[np.float64]
 
 SCIENCE_WAVELENGTH_M = 1.65e-6
-ARCSEC = np.pi / 180 / 3600
 UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
 """Units of slopes, in arcsec."""
 _OF_AOT = {"pix": "px", "pixel": "px", "px": "px", "arcsec": "arcsec", "rad": "rad"}
@@ -38,7 +39,6 @@ _NUMBERS = (
 )
 _WORDS = ("slope_unit", "slope_order", "loop")
 _PAIRS, _AXES = "pairs", "axes"
-_CLOSED = 2
 _TABLES = (".npz", ".npy", ".csv", ".txt")
 
 
@@ -156,7 +156,7 @@ def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
     """Return the values of a recording of our own engine."""
     recording = read_telemetry(path, images=False)
     layout = recording.attributes["layout"]
-    closed = np.asarray(recording.loop) == _CLOSED
+    closed = np.asarray(recording.loop) == CLOSED
     rows = closed if closed.any() else np.ones(len(recording.frame), np.bool_)
     slopes = recording.slopes[rows].astype(np.float64)
     slopes[~np.tile(recording.valid[rows], 2)] = np.nan
@@ -236,9 +236,6 @@ def _loop(name: str, values: dict[str, Any]) -> RecordedLoop:
         remarks.append("interaction matrix: pseudo-inverse of the control matrix")
     if interaction is not None:
         interaction = finite_array("interaction_matrix", interaction).astype(np.float64)
-    side, across = numbers.get("subaperture_m"), int(np.ptp(cells, axis=0).max()) + 1
-    if side is None and "diameter_m" in numbers:
-        side = numbers["diameter_m"] / across
     loop = RecordedLoop(
         name,
         slopes,
@@ -248,7 +245,7 @@ def _loop(name: str, values: dict[str, Any]) -> RecordedLoop:
         cells,
         commands,
         interaction,
-        side,
+        side_m(cells, numbers.get("subaperture_m"), numbers.get("diameter_m")),
         scale,
         numbers.get("delay_frames"),
         numbers.get("largest_command"),

@@ -42,9 +42,9 @@ class Matrices(NamedTuple):
     uncertainty: Any
     """(m, m): covariance of the slopes' error."""
     usual_inverse: Any
-    """(m, m): factor of the slopes' covariance with their usual noise."""
+    """(m, m): inverse of the slopes' covariance with their usual noise."""
     usual_variance: Any
-    """(m,): its diagonal before inversion."""
+    """(m,): diagonal of that covariance."""
     onward: Any
     """(layers, 2 m, m)"""
     command: Any

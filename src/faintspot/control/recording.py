@@ -25,7 +25,8 @@ Floats = NDArray[np.float64]
 FEWEST_FRAMES = 200
 OUTER_SCALE_M = 25.0
 _ARCSEC = math.pi / 180 / 3600
-_CLOSED = 2
+CLOSED = 2
+"""State of a closed loop in telemetry."""
 
 
 def telemetry_of_recording(
@@ -63,7 +64,7 @@ def telemetry_of_recording(
             "recording: expected a loop closed with an integrator, as what another controller or program has "
             "told the estimator to expect was not recorded"
         )
-    start, stop = _longest(np.asarray(recording.frame), np.asarray(recording.loop) == _CLOSED)
+    start, stop = _longest(np.asarray(recording.frame), np.asarray(recording.loop) == CLOSED)
     delay = control.options.delay_frames
     if stop - start < FEWEST_FRAMES + delay:
         raise InputError(
@@ -127,6 +128,18 @@ def recorded_slopes(
     return slopes, error / gain, held, expected
 
 
+def subapertures_across(cells: NDArray[np.int64]) -> int:
+    """Return the number of sub-apertures across an array, from their rows and columns (n, 2)."""
+    return int(np.ptp(cells, axis=0).max()) + 1
+
+
+def side_m(cells: NDArray[np.int64], subaperture_m: float | None, diameter_m: float | None) -> float | None:
+    """Return the side of a sub-aperture, given or from the diameter of the pupil; None without either."""
+    if subaperture_m is None and diameter_m is not None:
+        return diameter_m / subapertures_across(cells)
+    return subaperture_m
+
+
 def site_of(layout: Layout, layers: Sequence[tuple[float, float, float]] = ()) -> SlopeTurbulence:
     """Return prior knowledge of slopes in turbulence: geometry, outer scale, winds.
 
@@ -142,10 +155,7 @@ def site_of(layout: Layout, layers: Sequence[tuple[float, float, float]] = ()) -
     InputError
         When the layout does not know the size of a sub-aperture, or a value is out of range.
     """
-    across = int(np.ptp(layout.cells, axis=0).max()) + 1
-    side = layout.subaperture_m
-    if side is None and layout.diameter_m is not None:
-        side = layout.diameter_m / across
+    side = side_m(layout.cells, layout.subaperture_m, layout.diameter_m)
     if side is None:
         raise InputError(
             "layout: expected subaperture_m or diameter_m, which say how fast the wind crosses a sub-aperture"
