@@ -9,6 +9,7 @@ import numpy as np
 from faintspot.camera.calibration import Calibration
 from faintspot.camera.dark_frames import FEWEST_FRAMES, DarkPixels
 from faintspot.camera.photon_transfer import measure_detector
+from faintspot.cli.layout_options import is_number
 from faintspot.io.frames import open_frames
 
 _MOST_NUMBERS = 1 << 27  # read at a time
@@ -16,7 +17,7 @@ _MOST_NUMBERS = 1 << 27  # read at a time
 
 def measured_darks(location: str | None) -> DarkPixels | None:
     """Return the pixels of a file of dark frames; None for a number, few frames, or frames with NaN."""
-    if location is None or _is_number(location):
+    if location is None or is_number(location):
         return None
     with open_frames([location]) as frames:
         most = _MOST_NUMBERS // (frames.shape[0] * frames.shape[1])
@@ -42,11 +43,3 @@ def with_measured_pixels(
         calibration = calibration.with_bad_pixels(found)
         notes.append(f"  {len(pixels.blinking)} pixels that blink and {len(pixels.hot)} hot ones masked")
     return calibration, notes
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

@@ -98,10 +98,16 @@ def largest_window_note(layout: Layout) -> list[str]:
 
 def number_or_map(name: str, text: str) -> Any:
     """Return a value of the calibration: a number, or the map in a file."""
+    return float(text) if is_number(text) else read_map(name, text)
+
+
+def is_number(text: str) -> bool:
+    """Return whether a value is a number; otherwise it names a file."""
     try:
-        return float(text)
+        float(text)
     except ValueError:
-        return read_map(name, text)
+        return False
+    return True
 
 
 def flat_field(text: str) -> NDArray[np.float64]:
