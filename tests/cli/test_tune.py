@@ -163,16 +163,18 @@ def test_for_a_loop(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     result = run.ok(
         *("loop", "tune", "diffraction_limit", "--magnitudes", "9,13", "--magnitude", "12"),
         *("--methods", "tv, map+kalman", "--strehl", 0.3, "--radius-arcsec", 20),
-        *("--minutes", 2, "--workers", 1),
+        *("--seed", 7, "--workers", 1),
     )
     question = asked["question"]
     assert isinstance(question, LoopQuestion)
     assert (question.magnitudes, question.arms) == ((9.0, 13.0), ["tv", "map+kalman"])
-    assert (question.strehl, question.radius_arcsec, question.minutes) == (0.3, 20.0, 2.0)
+    assert (question.strehl, question.radius_arcsec) == (0.3, 20.0)
+    assert question.configuration.run.seed == 7
     assert question.configuration.camera.magnitude == 12.0
     assert asked["folder"] == "diffraction_limit-tune"
     for text in ("Recommended: window+kalman", "against window", "galactic pole", "This rests on"):
         assert text in result.out
+    assert "--methods brightest,window,window+kalman " in result.out
     assert max(len(line) for line in result.out.splitlines()[:-4]) <= 80
     assert "…" not in result.out
     assert (tmp_path / "faintspot-tune.png").read_bytes().startswith(b"\x89PNG")

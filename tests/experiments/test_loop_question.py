@@ -60,7 +60,6 @@ def test_radius() -> None:
         ({"strehl": 0.0}, "strehl = 0: expected a number above 0"),
         ({"strehl": 1.5}, "strehl = 1.5"),
         ({"radius_arcsec": -1}, "radius_arcsec = -1"),
-        ({"minutes": 0}, "minutes = 0"),
         ({"arms": ["kog"]}, "arm = 'kog'"),
         ({"arms": ["window+kalmann"]}, "control of the arm = 'kalmann'"),
     ],

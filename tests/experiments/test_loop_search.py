@@ -9,7 +9,14 @@ from tests.experiments.experiment_cases import SEARCH, small
 from faintspot.base.errors import InputError
 from faintspot.experiments import search as tuning
 from faintspot.experiments.loop_arms import LOOP_GAIN, arm_kind
-from faintspot.experiments.search import FIRST_TUNING_REALISATION, Search, stored_choice, tune, tuning_unit
+from faintspot.experiments.search import (
+    FIRST_TUNING_REALISATION,
+    Search,
+    smoothed,
+    stored_choice,
+    tune,
+    tuning_unit,
+)
 
 BRIGHTEST = arm_kind("brightest")
 KEPT = BRIGHTEST.tuned(small())["keep_brightest"]
@@ -99,7 +106,31 @@ def test_search_is_checked() -> None:
 
 def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[int]) -> None:
     kind = arm_kind("brightest+modal")
-    found = tune(kind, small(), Search(rounds=9), slopes={LOOP_GAIN: 0.9, "keep_brightest": BEST + 0.1})
+    found = tune(kind, small(), Search(rounds=9), slopes={LOOP_GAIN: 0.9, "keep_brightest": BEST + 1})
     highest = max(kind.tuned(small())[LOOP_GAIN].values)
-    assert found.choice == {LOOP_GAIN: highest, "keep_brightest": BEST}
+    assert found.choice == {LOOP_GAIN: highest, "keep_brightest": BEST + 1}
     assert found.tried == 1
+
+
+def test_of_known_slopes_only_the_gain_is_tuned(hill: list[int]) -> None:
+    slopes = {LOOP_GAIN: GAINS.values[-3], "keep_brightest": BEST + 1}
+    assert tune(BRIGHTEST, small(), slopes=slopes).choice == {**slopes, LOOP_GAIN: TOP}
+
+
+def test_options_follow_a_power_of_the_flux() -> None:
+    """One wrong value among five does not change the line."""
+    kind, fluxes = arm_kind("window"), (20.0, 40.0, 80.0, 160.0, 320.0)
+    stars = [small().replace("camera", photons_per_subaperture=flux) for flux in fluxes]
+    power = [2.0 * (flux / 20) ** 0.2 for flux in fluxes]
+    choices = [{LOOP_GAIN: 0.1 * k, "window_fwhm_px": width} for k, width in enumerate(power)]
+    choices[1]["window_fwhm_px"] = 3.5
+    found = smoothed(kind, stars, choices)
+    np.testing.assert_allclose([each["window_fwhm_px"] for each in found], power, rtol=5e-3)
+    assert [each[LOOP_GAIN] for each in found] == [each[LOOP_GAIN] for each in choices]
+    assert smoothed(kind, stars[:2], choices[:2]) == choices[:2]
+
+
+def test_whole_numbers_are_not_smoothed() -> None:
+    stars = [small().replace("camera", photons_per_subaperture=flux) for flux in (20.0, 40.0, 80.0)]
+    choices = [{LOOP_GAIN: 0.1, "keep_brightest": kept} for kept in KEPT.values[:3]]
+    assert smoothed(BRIGHTEST, stars, choices) == choices

@@ -29,11 +29,22 @@ def run(folder: Path, place: WorkerPool, arms: tuple[str, ...] = ARMS) -> Magnit
     return run_magnitude(small(), folder, arms, PHOTONS, search=SEARCH, place=place)
 
 
+TOLD: list[tuple[int, int]] = []
+"""Progress of the whole experiment."""
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("magnitude")
-    run(folder, HERE)
+    run(folder, WorkerPool(0, progress=lambda done, total: TOLD.append((done, total))))
     return folder
+
+
+def test_one_progress_of_all_stages(whole: Path) -> None:
+    done, total = np.transpose(TOLD)
+    assert (np.diff(done) >= 0).all()
+    assert done[-1] == total[-1]
+    assert (total == total[0]).all()
 
 
 def test_result(whole: Path) -> None:

@@ -59,9 +59,7 @@ if TYPE_CHECKING:
     help="Distance up to which a star serves, for the sky coverage.",
     show_default="the isoplanatic angle",
 )
-@option(
-    "--minutes", type=float, metavar="M", help="Begin no further candidate after this time.", show_default="5"
-)
+@option("--seed", type=click.IntRange(0), help="Seed of turbulence and noise.", show_default="CONFIG")
 @WORKERS
 @option(
     "--results", metavar="FOLDER", help="Folder of finished work, to continue from.", show_default="NAME-tune"
@@ -102,10 +100,11 @@ def tune(
         from faintspot.experiments.answer_figures import loop_figure
 
         write_picture(loop_figure(answer), drawing)
-    best, photons = answer.best.name, f"{answer.photons[answer.at_star]:g}"
-    command = shlex.join(
-        ["faintspot", "loop", "magnitude", str(loop), "--methods", f"brightest,window,{best}"]
+    names, photons = (
+        ",".join(dict.fromkeys(["brightest", "window", answer.best.name])),
+        f"{answer.photons[answer.at_star]:g}",
     )
+    command = shlex.join(["faintspot", "loop", "magnitude", str(loop), "--methods", names])
     click.echo(f"Next, a long search and long runs: {command} --flux-e {photons}")
     if target.name == ENGINE_FILE:
         folder, control = str(target.parent), answer.best.control
@@ -191,14 +190,15 @@ def _question(config: str, options: dict[str, Any]) -> LoopQuestion:
         loop = loop.replace("camera", magnitude=options["magnitude"], photons_per_subaperture=None)
     if options["flux_e"] is not None:
         loop = loop.replace("camera", photons_per_subaperture=options["flux_e"], magnitude=None)
-    methods, minutes = options["methods"], options["minutes"]
+    if options["seed"] is not None:
+        loop = loop.replace("run", seed=options["seed"])
+    methods = options["methods"]
     return LoopQuestion(
         loop,
         magnitudes=_range(options["magnitudes"]),
         arms=None if methods is None else [name.strip() for name in methods.split(",") if name.strip()],
         strehl=options["strehl"],
         radius_arcsec=options["radius_arcsec"],
-        **({} if minutes is None else {"minutes": minutes}),
     )
 
 

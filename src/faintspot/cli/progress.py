@@ -19,6 +19,8 @@ from rich.text import Text
 
 from faintspot.base.extras import present
 
+_SPEED_OVER_S = 120.0  # work of several kinds is done in turns
+
 
 class _Rate(ProgressColumn):
     """Units per second."""
@@ -52,7 +54,7 @@ def progress_bar(what: str, unit: str = "frames") -> Iterator[Callable[[int, int
     console = Console(stderr=True)
     if console.is_jupyter and not present("ipywidgets"):
         console = Console(stderr=True, force_jupyter=False)
-    progress = Progress(*columns, console=console, transient=True)
+    progress = Progress(*columns, console=console, transient=True, speed_estimate_period=_SPEED_OVER_S)
     task = progress.add_task(what, total=None)
 
     def advance(finished: int, total: int) -> None:

@@ -87,12 +87,12 @@ def run_budget(
     experiment = Experiment.begun(configuration, folder, KIND, quick, search, place, overwrite)
     configuration, flux = experiment.configuration, configuration.photons
     kinds = checked_arms(DEFAULT_ARMS if arms is None else arms)
-    choices = experiment.choices(kinds, [flux])
-    of = experiment.scored(
-        budget_run,
+    _, of = experiment.measured(
         kinds,
+        [flux],
+        budget_run,
         {term: term for term in TERMS},
-        lambda kind, term: (configuration, choices[kind.name, flux], term),
+        lambda kind, term, choices: (configuration, choices[flux], term),
     )
     names, labels = (tuple(getattr(kind, what) for kind in kinds) for what in ("name", "label"))
     result = BudgetResult(names, tuple(TERMS), labels, of("strehl"), of("residual_nm"))

@@ -171,15 +171,12 @@ class LoopQuestion:
         times fainter than the faintest; without any, from four times the star's flux to an eighth.
     arms : sequence of str, optional
         Names of candidates as for `arm_kind`; "window" and "brightest" always take part. Default: those,
-        "map_predicted", and with the predictive Kalman filter "window+kalman" and "map+kalman" as far as the
-        time goes.
+        "map_predicted", and with the predictive Kalman filter "window+kalman" and "map+kalman".
     strehl : float, optional
         Strehl ratio that limiting magnitudes are for. Default: half of what the baseline has with the
         brightest star.
     radius_arcsec : float, optional
         How far from the target a star still serves. Default: the isoplanatic angle of the layers.
-    minutes : float
-        Time after which no further candidate of the default ones is begun.
 
     Raises
     ------
@@ -200,7 +197,6 @@ class LoopQuestion:
     arms: Sequence[str] | None = None
     strehl: float | None = None
     radius_arcsec: float | None = None
-    minutes: float = 5.0
 
     def __post_init__(self) -> None:
         loop: Any = self.configuration
@@ -215,7 +211,6 @@ class LoopQuestion:
             number_between("strehl", self.strehl, 0.0, 1.0, low_open=True)
         if self.radius_arcsec is not None:
             number_between("radius_arcsec", self.radius_arcsec, 0.0, 3600.0, low_open=True)
-        number_between("minutes", self.minutes, 0.0, low_open=True)
         for kind in self.kinds:
             if kind.control != INTEGRATOR and self.configuration.control.mode != CLOSED:
                 raise InputError(f"arms: {kind.name!r} learns from a closed loop, this one is open")

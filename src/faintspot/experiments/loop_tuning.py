@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.control.learning import INTEGRATOR
 from faintspot.experiments.loop_answer import LoopAnswer
 from faintspot.experiments.loop_question import LoopQuestion
-from faintspot.experiments.loop_results import MagnitudeResult
 from faintspot.experiments.magnitude import run_magnitude, with_flux
 from faintspot.experiments.running import WorkerPool
 from faintspot.experiments.search import Search
@@ -65,8 +62,8 @@ def tune_loop(
 ) -> LoopAnswer:
     """Find out which estimator and control suit a closed loop, and with which settings.
 
-    Candidates are tuned and scored as by `run_magnitude`, with short runs and a short search.
-    Of the default candidates those whose control learns are measured only while there is time.
+    Candidates are tuned and scored as by `run_magnitude`, with short runs and a short search. The answer
+    depends on question, plan and the configuration's seed alone, not on the speed of the machine.
 
     Parameters
     ----------
@@ -97,29 +94,6 @@ def tune_loop(
         raise InputError(f"question: expected a LoopQuestion, got {type(question).__name__}")
     plan = LoopPlan() if plan is None else plan
     base, fluxes = plan.configuration(question.configuration), question.photons(plan.fluxes)
-    started, left_out = time.monotonic(), dict(question.left_out)
-
-    def measured(names: list[str], *, overwrite: bool = False) -> MagnitudeResult:
-        return run_magnitude(
-            base, folder, names, fluxes, search=plan.search, place=place, overwrite=overwrite
-        )
-
-    names = [kind.name for kind in question.kinds if kind.control == INTEGRATOR]
-    try:
-        result = measured(names)
-    except InputError:
-        if not overwrite:
-            raise
-        result = measured(names, overwrite=True)
-    for kind in question.kinds:
-        if kind.control == INTEGRATOR:
-            continue
-        minutes = (time.monotonic() - started) / 60
-        if question.arms is None and minutes > question.minutes:
-            left_out[kind.name] = (
-                f"{minutes:.1f} of the {question.minutes:g} minutes were over; the same command goes on"
-            )
-        else:
-            names.append(kind.name)
-            result = measured(names)
-    return LoopAnswer(question, result, plan.frames - plan.settle_frames, left_out)
+    names = [kind.name for kind in question.kinds]
+    result = run_magnitude(base, folder, names, fluxes, search=plan.search, place=place, overwrite=overwrite)
+    return LoopAnswer(question, result, plan.frames - plan.settle_frames, dict(question.left_out))

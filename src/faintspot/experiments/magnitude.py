@@ -23,10 +23,12 @@ from faintspot.estimators.trained import Trained
 from faintspot.estimators.window import Window
 from faintspot.experiments.loop_arms import ArmKind, Choice, arm_kind, default_arms
 from faintspot.experiments.loop_results import MagnitudeResult
-from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
+from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
 from faintspot.experiments.search import (
     QUICK,
     Search,
+    learning_frames,
+    smoothed,
     stored_choice,
     tuning_frames,
     tuning_unit,
@@ -54,7 +56,8 @@ def run_magnitude(
     """Measure the Strehl ratio of arms against the star's flux, or what is left of it.
 
     Each method is tuned at each flux in separate turbulence, then scored on the configuration's number of
-    realisations, which are the same for all. The result is also written to the folder.
+    realisations, which are the same for all. Numbers among the options follow a power of the flux, see
+    `smoothed`. The result is also written to the folder.
 
     Parameters
     ----------
@@ -93,12 +96,12 @@ def run_magnitude(
     fluxes = _checked_fluxes(
         photons if photons is not None else configuration.run.photons_per_subaperture, quick
     )
-    choices = experiment.choices(kinds, fluxes)
-    of = experiment.scored(
-        scored_run,
+    choices, of = experiment.measured(
         kinds,
+        fluxes,
+        scored_run,
         {f"{flux:g}": flux for flux in fluxes},
-        lambda kind, flux: (with_flux(configuration, flux), choices[kind.name, flux]),
+        lambda kind, flux, choice: (with_flux(configuration, flux), choice[flux]),
     )
     result = MagnitudeResult(
         tuple(kind.name for kind in kinds),
@@ -161,69 +164,159 @@ class Experiment:
             overwrite=self.overwrite,
         )
 
-    def choices(
-        self, kinds: Sequence[ArmKind], fluxes: Sequence[float]
-    ) -> dict[tuple[str, float], dict[str, Any]]:
-        """Return the tuned values of every arm at every flux, tuned now where they are not stored.
-
-        Slopes first, with the integrator, also of arms whose control learns; then what is that control's own.
-        """
-        plain = {kind.name: kind for kind in map(with_integrator, kinds)}
-        learning = {kind.name: kind for kind in kinds if kind.name not in plain}
-        choices: dict[tuple[str, float], dict[str, Any]] = {}
-
-        def units(kinds: Mapping[str, ArmKind]) -> dict[tuple[str, float], Unit]:
-            return {
-                (name, flux): _tuning_unit(
-                    kind,
-                    with_flux(self.configuration, flux),
-                    self.plan,
-                    choices.get((with_integrator(kind).name, flux)),
-                )
-                for name, kind in kinds.items()
-                for flux in fluxes
-            }
-
-        store = self.store([*units(plain).values(), *units(learning).values()], "-tuning")
-        for stage, kinds_now in (("tuning", plain), ("tuning of control", learning)):
-            if now := units(kinds_now):
-                self.place.say(stage)
-                results = run_units(tuning_unit, list(now.values()), store, self.place)
-                choices.update({key: stored_choice(results[unit.key]) for key, unit in now.items()})
-        return choices
-
-    def scored(
+    def measured(
         self,
-        function: Callable[..., Arrays],
         kinds: Sequence[ArmKind],
+        fluxes: Sequence[float],
+        function: Callable[..., Arrays],
         columns: Mapping[str, Any],
-        arguments: Callable[[ArmKind, Any], tuple[Any, ...]],
-    ) -> Callable[[str], NDArray[Any]]:
-        """Run every arm, column and realisation; return what gathers a variable, (arms, columns, runs).
+        arguments: Callable[[ArmKind, Any, Mapping[float, Choice]], tuple[Any, ...]],
+    ) -> tuple[dict[tuple[str, float], Choice], Callable[[str], NDArray[Any]]]:
+        """Tune every arm at every flux, then run every arm, column and realisation.
 
-        `arguments` are those of the function between the arm and the realisation, by arm and column.
+        Parameters
+        ----------
+        kinds, fluxes : sequence
+        function : callable
+            Makes one run, given the arm, `arguments`, the realisation and `advance`.
+        columns : mapping
+            Names and values of what the runs differ by.
+        arguments : callable
+            Takes the arm, the column's value and the arm's choices by flux.
+
+        Returns
+        -------
+        dict, callable
+            Tuned values by name and flux; and what gathers a variable of the runs, (arms, columns, runs).
         """
-        run_length = self.configuration.run
-        runs = range(run_length.realisations)
+        stages = self._stages(kinds, fluxes, len(columns))
+        choices = self._choices(kinds, fluxes, stages)
+        run = self.configuration.run
         units = [
-            Unit(f"{kind.name}-{name}-{run}", (kind, *arguments(kind, value), run), run_length.frames)
+            self._scoring_unit(kind, name, function, arguments(kind, value, choice))
             for kind in kinds
+            for choice in [{flux: choices[kind.name, flux] for flux in fluxes}]
             for name, value in columns.items()
-            for run in runs
         ]
-        self.place.say("scoring")
-        results = run_units(function, units, self.store(units), self.place)
+        stages[-1].say("scoring")
+        results = run_units(all_realisations, units, self.store(units), stages[-1])
 
         def gathered(variable: str) -> NDArray[Any]:
             values = np.array([results[unit.key][variable] for unit in units])
-            return values.reshape(len(kinds), len(columns), len(runs), *values.shape[1:])
+            return values.reshape(len(kinds), len(columns), run.realisations, *values.shape[2:])
 
-        return gathered
+        return choices, gathered
+
+    def _choices(
+        self, kinds: Sequence[ArmKind], fluxes: Sequence[float], stages: Sequence[WorkerPool]
+    ) -> dict[tuple[str, float], Choice]:
+        """Return the tuned values of every arm at every flux, tuned now where they are not stored.
+
+        Slopes first, with the integrator, also of arms whose control learns: all their options at each flux
+        alone, then the loop gain with smoothed options. Then what is the control's own.
+        """
+        stars = {flux: with_flux(self.configuration, flux) for flux in fluxes}
+        plain, learning = _plain_and_learning(kinds)
+        first = self._tuned("tuning", plain, stars, {}, stages[0])
+        slopes: dict[tuple[str, float], Choice] = {
+            (kind.name, flux): choice
+            for kind in plain
+            for found in [[first[kind.name, flux] for flux in fluxes]]
+            for flux, choice in zip(fluxes, smoothed(kind, list(stars.values()), found), strict=True)
+        }
+        if slopes != first:
+            slopes = self._tuned("tuning of the loop gain", plain, stars, slopes, stages[1])
+        own = self._tuned("tuning of control", learning, stars, slopes, stages[2])
+        return {**slopes, **own}
+
+    def _tuned(
+        self,
+        stage: str,
+        kinds: Sequence[ArmKind],
+        stars: Mapping[float, LoopConfiguration],
+        slopes: Mapping[tuple[str, float], Choice],
+        place: WorkerPool,
+    ) -> dict[tuple[str, float], Choice]:
+        """Return the tuned values of every arm with every star, given those of its slopes."""
+        units = {
+            (kind.name, flux): _tuning_unit(
+                kind, star, self.plan, slopes.get((with_integrator(kind).name, flux))
+            )
+            for kind in kinds
+            for flux, star in stars.items()
+        }
+        if not units:
+            return {}
+        place.say(stage)
+        store = self.store(list(units.values()), "-tuning")
+        results = run_units(tuning_unit, list(units.values()), store, place)
+        return {key: stored_choice(results[unit.key]) for key, unit in units.items()}
+
+    def _stages(self, kinds: Sequence[ArmKind], fluxes: Sequence[float], columns: int) -> list[WorkerPool]:
+        """Return where each stage runs, with a progress that is the whole experiment's."""
+        star, (plain, learning) = with_flux(self.configuration, fluxes[0]), _plain_and_learning(kinds)
+        known = {
+            kind.name: {name: each.first[0] for name, each in kind.tuned(star).items()} for kind in plain
+        }
+
+        def tuning(kinds: Sequence[ArmKind], slopes: Mapping[str, Choice]) -> int:
+            return len(fluxes) * sum(
+                tuning_frames(kind, star, self.plan, slopes.get(with_integrator(kind).name)) for kind in kinds
+            )
+
+        run = self.configuration.run
+        scoring = sum(learning_frames(kind, star) + run.realisations * run.frames for kind in kinds)
+        sizes = tuning(plain, {}), tuning(plain, known), tuning(learning, known), columns * scoring
+        return in_stages(self.place, sizes)
+
+    def _scoring_unit(
+        self, kind: ArmKind, name: str, function: Callable[..., Arrays], arguments: tuple[Any, ...]
+    ) -> Unit:
+        run = self.configuration.run
+        key = f"{kind.name}-{name}-{_digest(arguments)}"
+        every = run.realisations, run.frames
+        size = run.realisations * run.frames + learning_frames(kind, self.configuration)
+        return Unit(key, (function, every, kind, *arguments), size)
+
+
+def _plain_and_learning(kinds: Sequence[ArmKind]) -> tuple[list[ArmKind], list[ArmKind]]:
+    """Return all arms with the integrator in place of their control, and those whose control learns."""
+    plain = {kind.name: kind for kind in map(with_integrator, kinds)}
+    return list(plain.values()), [kind for kind in kinds if kind.name not in plain]
 
 
 def _tuning_unit(kind: ArmKind, star: LoopConfiguration, search: Search, slopes: Choice | None) -> Unit:
     key = f"{kind.name}-{star.camera.photons_per_subaperture:g}"
-    return Unit(key, (kind, star, search, slopes), tuning_frames(kind, star, search))
+    if slopes is not None:
+        key = f"{key}-{_digest(slopes)}"
+    return Unit(key, (kind, star, search, slopes), tuning_frames(kind, star, search, slopes))
+
+
+def _digest(of: object) -> str:
+    """Return a short text that differs between choices."""
+    return fingerprint_of(repr(of))[:8]
+
+
+def all_realisations(
+    function: Callable[..., Arrays], runs: tuple[int, int], *arguments: Any
+) -> dict[str, NDArray[Any]]:
+    """Make several runs in one process, where control learns only once; return their arrays, stacked.
+
+    Parameters
+    ----------
+    function : callable
+        Makes one run, given the arguments, the realisation and `advance`.
+    runs : (int, int)
+        Number of realisations, and frames of each run.
+    *arguments
+        The last one is `advance`.
+    """
+    count, frames = runs
+    *others, advance = arguments
+    every = [
+        function(*others, run, lambda done, run=run: advance(run * frames + done)) for run in range(count)
+    ]
+    return {name: np.array([each[name] for each in every]) for name in every[0]}
 
 
 def scored_run(

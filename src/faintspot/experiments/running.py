@@ -13,11 +13,11 @@ import signal
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from queue import SimpleQueue
 from typing import Any
 
@@ -69,7 +69,7 @@ class WorkerPool:
         version of faintspot. Anyone who can reach it can run anything as the user of its workers: see
         docs/study.md for one that only you reach.
     progress : callable, optional
-        Called with how much is done in this run and how much is to be done.
+        Called with how much is done and how much there is in all.
     announce : callable, optional
         Called with a line of text that says what is done.
 
@@ -93,6 +93,26 @@ class WorkerPool:
         """Announce a line of text."""
         if self.announce is not None:
             self.announce(text)
+
+
+def in_stages(place: WorkerPool, sizes: Sequence[int]) -> list[WorkerPool]:
+    """Return a place for each of several calls of `run_units`, with the progress of all of them together.
+
+    Parameters
+    ----------
+    place : WorkerPool
+    sizes : sequence of int
+        Expected amount of work of each call.
+    """
+
+    def part(before: int, size: int) -> WorkerPool:
+        def progress(done: int, total: int) -> None:
+            if place.progress is not None:
+                place.progress(before + round(size * done / max(1, total)), sum(sizes))
+
+        return replace(place, progress=progress)
+
+    return [part(sum(sizes[:number]), size) for number, size in enumerate(sizes)]
 
 
 def run_units(
@@ -121,7 +141,7 @@ def run_units(
     """
     missing = sorted((unit for unit in units if not store.done(unit.key)), key=lambda unit: -unit.size)
     if missing:
-        count = _Count(missing, place.progress)
+        count = _Count(units, missing, place.progress)
         for unit, result in _finished(function, missing, place, count):
             store.write(unit.key, result)
             count.at(unit.key, unit.size)
@@ -150,9 +170,9 @@ Finished = Iterator[tuple[Unit, Arrays]]
 class _Count:
     """Amount of finished work, in finished and unfinished units."""
 
-    def __init__(self, units: list[Unit], progress: Progress | None) -> None:
+    def __init__(self, units: list[Unit], missing: list[Unit], progress: Progress | None) -> None:
         self._whole = {unit.key: unit.size for unit in units}
-        self._done = dict.fromkeys(self._whole, 0)
+        self._done = {**self._whole, **{unit.key: 0 for unit in missing}}
         self._progress = progress
         self._show()
 

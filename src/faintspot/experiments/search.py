@@ -11,16 +11,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import theilslopes
 
 from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.simulation import simulate_loop
 from faintspot.base.checks import number_between
 from faintspot.control.learning import INTEGRATOR
-from faintspot.experiments.loop_arms import ArmKind, Choice, Tunable
+from faintspot.experiments.loop_arms import LOOP_GAIN, ArmKind, Choice, Tunable
 from faintspot.experiments.running import Advance
 from faintspot.experiments.statistics import slope_statistics
 
 _ROUNDS = 2  # of looking along each axis in turn
+_LEARNING_FRAMES = 3000  # that take as long as learning from telemetry
+_FEWEST_FLUXES = 3  # for a line
 
 Axes = Mapping[str, Sequence[Any]]
 """Values of each option; the usual one first."""
@@ -143,18 +146,32 @@ def tune(
     advance : callable, optional
         Told the number of frames simulated, after every run.
     slopes : mapping, optional
-        For control that learns: settings of its slopes with the integrator. Default: searched first.
+        Settings of the slopes with the integrator, of which only the loop gain is searched again, from the
+        given one. Default: searched; for control that learns, first.
     """
     search = Search() if search is None else search
-    tuned = kind.tuned(configuration)
-    if kind.control == INTEGRATOR:
-        return _sought(kind, configuration, search, tuned, advance)
-    if slopes is None:
+    if slopes is None and kind.control != INTEGRATOR:
         slopes = tune(with_integrator(kind), configuration, search, advance).choice
-    for name, each in tuned.items():
-        if name in slopes:
-            tuned[name] = each.nearest(slopes[name])
-    return _sought(kind, configuration, replace(search, finalists=1), tuned, advance)
+    search, tuned = _searched(kind, configuration, search, slopes)
+    return _sought(kind, configuration, search, tuned, advance)
+
+
+def _searched(
+    kind: ArmKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None
+) -> tuple[Search, dict[str, Tunable]]:
+    """Return the search and what it tunes where the settings of the slopes are known, or None."""
+    tuned = kind.tuned(configuration)
+    if slopes is None:
+        return search, tuned
+    for name in tuned.keys() & slopes.keys():
+        value = slopes[name]
+        if name != LOOP_GAIN:
+            tuned[name] = Tunable((value,), (value,))
+        elif kind.control == INTEGRATOR:
+            tuned[name] = replace(tuned[name], first=tuned[name].nearest(value).first)
+        else:
+            tuned[name] = tuned[name].nearest(value)
+    return replace(search, finalists=1), tuned
 
 
 def with_integrator(kind: ArmKind) -> ArmKind:
@@ -209,22 +226,57 @@ def tuning_unit(
     }
 
 
+def smoothed(
+    kind: ArmKind, stars: Sequence[LoopConfiguration], choices: Sequence[Choice]
+) -> list[dict[str, Any]]:
+    """Return the choices at several fluxes, with numbers among the options that are a power of the flux.
+
+    The Strehl ratio hardly depends on an option near its best value, so that the best one of a few short runs
+    scatters from flux to flux. The power law is the median line (Theil 1950) through all fluxes, within the
+    values on offer. Loop gain, whole numbers and options that may be 0 stay as they are, and with fewer than
+    three fluxes everything.
+    """
+    if len(stars) < _FEWEST_FLUXES:
+        return [dict(choice) for choice in choices]
+    tuned, declared = [kind.tuned(star) for star in stars], kind.estimator.declared()
+    flux = np.log([star.photons for star in stars])
+    found = [dict(choice) for choice in choices]
+    for name in tuned[0].keys() & declared.keys():
+        offered = [each[name].values for each in tuned]
+        values = {value for each in offered for value in each}
+        if declared[name].whole or not all(isinstance(value, float) and value > 0 for value in values):
+            continue
+        line = theilslopes(np.log([choice[name] for choice in choices]), flux, method="joint")
+        for choice, log_flux, each in zip(found, flux, offered, strict=True):
+            value = float(np.clip(math.exp(line.intercept + line.slope * log_flux), min(each), max(each)))
+            choice[name] = float(f"{value:.3g}")
+    return found
+
+
 def stored_choice(result: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     """Return the choice that `tuning_unit` stored."""
     choice: dict[str, Any] = json.loads(str(result["choice"]))
     return choice
 
 
-def tuning_frames(kind: ArmKind, configuration: LoopConfiguration, search: Search) -> int:
-    """Return about how many frames tuning an arm simulates, where its slopes are tuned already."""
-    tuned = kind.tuned(configuration)
-    if kind.control != INTEGRATOR:
-        options = with_integrator(kind).tuned(configuration)
-        tuned = {name: each for name, each in tuned.items() if name not in options}
+def tuning_frames(
+    kind: ArmKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None = None
+) -> int:
+    """Return about how many frames `tune` simulates, with `slopes` for control that learns."""
+    search, tuned = _searched(kind, configuration, search, slopes)
     combinations = math.prod(len(each.first) for each in tuned.values())
-    climbs = min(search.climbs, search.finalists if kind.control == INTEGRATOR else 1)
-    looks = search.finalists + 2 * len(tuned) * climbs * min(2, search.rounds) if search.rounds else 0
-    return combinations * search.coarse_frames + looks * search.frames * search.realisations
+    several = sum(len(each.values) > 1 for each in tuned.values())
+    climbs = min(search.climbs, search.finalists)
+    looks = search.finalists + 2 * several * climbs * min(2, search.rounds) if search.rounds else 0
+    simulated = combinations * search.coarse_frames + looks * search.frames * search.realisations
+    return simulated + learning_frames(kind, configuration)
+
+
+def learning_frames(kind: ArmKind, configuration: LoopConfiguration) -> int:
+    """Return about how many frames could be simulated while an arm's control learns."""
+    if kind.control == INTEGRATOR:
+        return 0
+    return configuration.control.telemetry_frames + _LEARNING_FRAMES
 
 
 class _Trials:
