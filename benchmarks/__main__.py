@@ -37,7 +37,7 @@ _ORDER = (
     "pyrtc_loop",
     "loop",
     "control",
-    "study",
+    "prediction",
     "startup",
     "gpu",
 )

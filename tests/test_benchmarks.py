@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 
 import pytest
-from benchmarks import rivals, study, sweeps
+from benchmarks import rivals, sweeps
 
 
 @pytest.fixture(scope="module")
@@ -40,10 +40,3 @@ def test_cpp_gives_the_same_fields(width: int) -> None:
     library = sweeps.cpp_library()
     assert library is not None
     assert sweeps.largest_difference(library, width) <= rivals.SAME_FIELD
-
-
-def test_the_straightforward_study_gives_the_same_slope_errors() -> None:
-    pytest.importorskip("skimage")
-    plain, tv = study.differences(10)
-    assert plain <= study.SAME_PLAIN_PX
-    assert tv <= 2 * study.SAME_TV_PX  # of fewer images than the benchmark's 30

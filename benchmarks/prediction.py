@@ -1,0 +1,217 @@
+"""Prediction in closed loop: ours against pyRTC's, on the same slopes.
+
+Slopes by a fixed window near the diffraction limit, with and without a vibration of the telescope. Winds and
+vibration are learnt from the telemetry of an integrator. The rivals (`pip install pyrtcao`, GPL-3) learn from
+the same telemetry; their options and gain are those that leave the least phase on other telemetry, as the
+integrator's gain is. All are scored on other turbulence; the rivals with brighter stars as well, so that the
+gain in magnitudes shows.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.measuring import Row, Table
+from faintspot.ao_loop import Arm, LoopConfiguration, load_loop
+from faintspot.ao_loop.atmosphere import MovingLayers
+from faintspot.ao_loop.calibration import make_pipeline
+from faintspot.ao_loop.control import slope_turbulence
+from faintspot.ao_loop.simulation import measure_gains
+from faintspot.ao_loop.telescope_model import TelescopeModel, prepare
+from faintspot.control.base import Controller, Expected
+from faintspot.control.commands import CommandDelayLine
+from faintspot.control.learning import GAINS, KALMAN, Plant, learn
+from faintspot.control.phase import residual_phase
+from faintspot.control.telemetry import OpenLoopTelemetry, make_telemetry
+from faintspot.control.vibrations import Vibration
+from faintspot.experiments.statistics import paired_mean
+from faintspot.pipeline.settings import Settings
+
+Floats = NDArray[np.float64]
+Make = Callable[[CommandDelayLine], Controller]
+
+FLUXES = 20.0, 27.0, 36.0
+"""Of the rivals; ours and the integrator have the first."""
+REALISATIONS, FRAMES, SETTLE = 3, 900, 100
+LEARNING, TUNING = (2000, 2000), (2001, 1000)
+"""Realisation and number of frames."""
+VIBRATION_NM, WIDTH_PX, TELEMETRY_GAIN = 120.0, 2.2, 0.2
+OURS, TARGET = "learnt", 0.3
+VIBRATION = Vibration("tip", 45.0, 0.005, 1.0, 0.0, 0.0)
+_GRIDS: dict[str, dict[str, tuple[Any, ...]]] = {
+    "least_squares": {"order": (4, 8, 16, 32), "regularization": (1e-3, 1e-2, 1e-1, 1.0)},
+    "ar_kalman": {"noise_band": (0.05, 0.1, 0.2, 0.4)},
+}
+_GAINS = (0.3, 0.5, 0.7, 1.0)
+
+
+class Shaken:
+    """Turbulence and a vibration of the telescope in tip."""
+
+    def __init__(self, layers: MovingLayers, amplitude_nm: float, rate_hz: float, realisation: int) -> None:
+        self.layers, self._rate_hz = layers, rate_hz
+        one, two = VIBRATION.recursion(rate_hz)
+        driving = np.sqrt(VIBRATION.driving_variance(rate_hz))
+        rng = np.random.default_rng([realisation, 45])
+        values = [0.0, 0.0]
+        for noise in rng.standard_normal(LEARNING[1] + 2000):
+            values.append(one * values[-1] + two * values[-2] + driving * noise)
+        self._values = amplitude_nm * np.array(values[2000:], np.float32)
+        tip = np.broadcast_to(np.linspace(-1, 1, layers.points, dtype=np.float32), (layers.points,) * 2)
+        self._tip: NDArray[np.float32] = tip / np.sqrt(np.mean(tip**2))
+
+    def r0_m(self, time_s: float) -> float:
+        """See `MovingLayers`."""
+        return self.layers.r0_m(time_s)
+
+    def wavefront_nm(self, time_s: float) -> NDArray[np.float32]:
+        """See `MovingLayers`."""
+        value = np.float32(self._values[int(time_s * self._rate_hz)])
+        return self.layers.wavefront_nm(time_s) + value * self._tip
+
+
+class Rival:
+    """A modal predictor of pyRTC as a controller: the command goes part of the way to the prediction."""
+
+    undoes_prior = True
+
+    def __init__(self, line: CommandDelayLine, plant: Plant, to_modes: Floats, predictor: Any, gain: float):
+        self._line, self._plant, self._to_modes, self._gain = line, plant, to_modes, gain
+        self._predictor = predictor
+        self.begin()
+
+    def expected(self) -> Expected:
+        """See `Controller`."""
+        return Expected(self._plant.interaction @ self._line.acting, None)
+
+    def begin(self) -> None:
+        """See `Controller`."""
+        self._predictor.reset()
+
+    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+        """See `Controller`."""
+        line, modes = self._line, self._plant.reconstructor.modes
+        open_loop = slopes_px - self._plant.interaction @ line.acting
+        self._predictor.update(self._to_modes @ np.where(np.isfinite(standard_error_px), open_loop, 0.0))
+        wanted = modes @ np.asarray(self._predictor.predict(), np.float64)
+        line.put((1 - self._gain) * line.latest - self._gain * wanted)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A star, with or without the vibration."""
+
+    photons: float
+    vibration_nm: float
+
+    @property
+    def configuration(self) -> LoopConfiguration:
+        """The loop."""
+        return load_loop("diffraction_limit").replace("camera", photons_per_subaperture=self.photons)
+
+    @property
+    def plant(self) -> Plant:
+        """What a controller needs to know of the loop."""
+        optics, control = prepare(self.configuration), self.configuration.control
+        return Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
+
+    def observed(self, make: Make, realisation: int, frames: int) -> tuple[float, OpenLoopTelemetry]:
+        """Run the loop; return its mean Strehl ratio and its telemetry."""
+        configuration, rate = self.configuration, self.configuration.control.frame_rate_hz
+        model = TelescopeModel(configuration, 1, realisation)
+        sensor, plant = model.optics.sensor, self.plant
+        if self.vibration_nm:
+            shaken: Any = Shaken(model.atmosphere, self.vibration_nm, rate, realisation)
+            model.atmosphere = shaken
+        flux_e = self.photons * sensor.illumination
+        settings = Settings("window", window_fwhm_px=WIDTH_PX, flux_e=flux_e)
+        pipeline = make_pipeline(configuration, sensor, Arm("window", settings))
+        centroid_gain = measure_gains(configuration, [pipeline], seed=1)[0]
+        line = CommandDelayLine(model.optics.mirror.commands, plant.delay_frames)
+        controller, strehl = make(line), np.zeros(frames)
+        slopes, errors, held = np.zeros((3, frames, len(plant.interaction)))
+        for frame in range(frames):
+            time_s, held[frame] = (frame + 0.5) / rate, plant.interaction @ line.acting
+            after, seen = model.wavefronts(time_s, line.acting)
+            strehl[frame] = model.truth(time_s, after).strehl
+            found = pipeline(model.frame(frame, seen))
+            slopes[frame] = found.vector / centroid_gain
+            errors[frame] = np.r_[found.standard_error_x, found.standard_error_y] / centroid_gain
+            controller.update(slopes[frame], errors[frame])
+        telemetry = make_telemetry(slopes, errors, held, np.zeros_like(held), None)
+        return float(strehl[SETTLE:].mean()), telemetry.part(SETTLE, frames)
+
+    def controllers(self, *, ours: bool) -> dict[str, Make]:
+        """Return controllers that have learnt: the rivals, tuned, and the integrator and ours."""
+        plant, cells = self.plant, prepare(self.configuration).sensor.layout.cells
+        integrator = partial(plant.integrator, TELEMETRY_GAIN)
+        learning, tuning = (self.observed(integrator, *each)[1] for each in (LEARNING, TUNING))
+        phase = residual_phase(plant.reconstructor.matrix, plant.interaction, cells)
+        found: dict[str, Make] = {
+            name: min(rivals(name, plant, learning), key=lambda make: plant.left(make, tuning, phase))
+            for name in _GRIDS
+        }
+        if ours:
+            rate_hz = self.configuration.control.frame_rate_hz
+            learnt = learn(KALMAN, plant, learning, slope_turbulence(self.configuration, cells), rate_hz)
+            gain = min(GAINS, key=lambda each: plant.left(partial(plant.integrator, each), tuning, phase))
+            found |= {"integrator": partial(plant.integrator, gain), OURS: learnt.controller}
+        return found
+
+
+def rivals(name: str, plant: Plant, telemetry: OpenLoopTelemetry) -> Iterator[Make]:
+    """Return a rival with all options and gains, fitted to telemetry."""
+    from pyrtc.predictive import make_predictor  # type: ignore[import-untyped, unused-ignore]
+
+    modes, options = plant.reconstructor.modes, _GRIDS[name]
+    for matrix in (plant.reconstructor.matrix, plant.reconstructor.clean):
+        to_modes = modes.T @ matrix
+        history = (np.sign(telemetry.trust) * telemetry.open_loop_px) @ to_modes.T
+        for values in itertools.product(*options.values()):
+            chosen = {"type": name, "horizon": plant.delay_frames, **dict(zip(options, values, strict=True))}
+            predictor = make_predictor(chosen, modes.shape[1]).fit(history)
+            for gain in _GAINS:
+                yield partial(Rival, plant=plant, to_modes=to_modes, predictor=predictor, gain=gain)
+
+
+def run() -> list[Table]:
+    """Compare them with and without a vibration."""
+    if importlib.util.find_spec("pyrtc") is None:
+        return [Table("prediction", "Prediction", [], ["pyrtcao is not installed: nothing to compare with"])]
+    return [table for vibration_nm in (0.0, VIBRATION_NM) for table in _tables(vibration_nm)]
+
+
+def _tables(vibration_nm: float) -> tuple[Table, Table]:
+    strehl: dict[tuple[str, float], Floats] = {}
+    for photons in FLUXES:
+        case = Case(photons, vibration_nm)
+        for name, make in case.controllers(ours=photons == FLUXES[0]).items():
+            each = (case.observed(make, realisation, FRAMES)[0] for realisation in range(REALISATIONS))
+            strehl[name, photons] = np.array(list(each))
+    own, rows = strehl[OURS, FLUXES[0]], []
+    for (name, photons), runs in strehl.items():
+        mean, ahead = paired_mean(runs), paired_mean(own - runs)
+        values = {"Strehl": mean.value, "error": mean.standard_error}
+        values |= {"learnt - it": ahead.value, "error of that": ahead.standard_error}
+        rows.append(Row(f"{name}, {photons:g} photons", values))
+    gains = []
+    for name in _GRIDS:
+        rising = np.maximum.accumulate([strehl[name, photons].mean() for photons in FLUXES])
+        equal = np.interp(own.mean(), rising, np.log10(FLUXES))
+        gain = 2.5 * float(equal - np.log10(FLUXES[0]))
+        gains.append(Row(name, {"magnitudes": gain}, f">= {TARGET:g}", gain >= TARGET))
+    about = f"vibration of {VIBRATION_NM:g} nm rms, 45 Hz" if vibration_nm else "no vibration"
+    label, runs_note = f"prediction-{vibration_nm:g}", f"{REALISATIONS} realisations of {FRAMES} frames"
+    note = f"at most {2.5 * np.log10(FLUXES[-1] / FLUXES[0]):.2f}, the range of the stars"
+    return (
+        Table(label, f"Strehl ratios, {about}", rows, [runs_note]),
+        Table(f"{label}-gain", f"Gain over the rivals, {about}", gains, [note]),
+    )
