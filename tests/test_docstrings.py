@@ -19,6 +19,7 @@ WITHOUT_EXAMPLE = {
     "faintspot.Wavefront": "in that of fit_wavefront",
     "faintspot.io.StoredSlopes": "in that of read_slopes",
     "faintspot.training.CentroidGain": "in that of measure_centroid_gain",
+    "faintspot.training.SodiumFit": "in that of fit_sodium_profile",
     "faintspot.training.LearntPSF": "in that of learn_psf_from_images",
     "faintspot.wavefront.Discrepancy": "in that of slope_discrepancy",
     "faintspot.estimators.Sensor": "made by a pipeline, in that of Estimator",

@@ -39,10 +39,13 @@ if TYPE_CHECKING:
     from faintspot.pipeline.slopes import Stages as Stages
     from faintspot.sensor.layout import Layout as Layout
     from faintspot.spots.bounds import cramer_rao as cramer_rao
+    from faintspot.spots.bounds import cramer_rao_covariance as cramer_rao_covariance
     from faintspot.spots.bounds import photon_efficiency as photon_efficiency
     from faintspot.spots.fixed_weights import FixedWeights as FixedWeights
+    from faintspot.spots.laser import LaserGuideStar as LaserGuideStar
     from faintspot.spots.psf import PSF as PSF
     from faintspot.spots.score import TrainedScore as TrainedScore
+    from faintspot.spots.sodium import SodiumProfile as SodiumProfile
     from faintspot.training import learn_psf as learn_psf
     from faintspot.training import train_estimator as train_estimator
     from faintspot.wavefront import Wavefront as Wavefront
@@ -69,6 +72,7 @@ _HOMES = {
     "Denoised": "faintspot.algorithms.total_variation",
     "FixedWeights": "faintspot.spots.fixed_weights",
     "InputError": "faintspot.base.errors",
+    "LaserGuideStar": "faintspot.spots.laser",
     "Layout": "faintspot.sensor.layout",
     "MeanFlux": "faintspot.pipeline.mean_flux",
     "MissingExtraError": "faintspot.base.errors",
@@ -76,6 +80,7 @@ _HOMES = {
     "Settings": "faintspot.pipeline.settings",
     "SlopePipeline": "faintspot.pipeline.slope_pipeline",
     "Slopes": "faintspot.pipeline.slopes",
+    "SodiumProfile": "faintspot.spots.sodium",
     "Stages": "faintspot.pipeline.slopes",
     "SubapertureFlag": "faintspot.base.flags",
     "TrainedScore": "faintspot.spots.score",
@@ -83,6 +88,7 @@ _HOMES = {
     "brightest_pixels": "faintspot.algorithms.brightest",
     "centre_of_gravity": "faintspot.algorithms.centroid",
     "cramer_rao": "faintspot.spots.bounds",
+    "cramer_rao_covariance": "faintspot.spots.bounds",
     "fit_wavefront": "faintspot.wavefront",
     "learn_psf": "faintspot.training",
     "measure_images": "faintspot.pipeline.images",

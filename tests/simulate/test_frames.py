@@ -12,6 +12,7 @@ from tests.shared_data import shared_file
 
 from faintspot.base.errors import InputError
 from faintspot.simulate import Detector, sensor_frames, spots, subapertures
+from faintspot.spots.psf import PSF
 
 QUIET = Detector(0.0)
 CORNERS = np.array([[0, 0], [2, 10], [12, 1]])
@@ -241,3 +242,30 @@ def test_bad_sensors_are_named_in_one_line(changed: dict[str, Any], named: str) 
     with pytest.raises(InputError, match=named) as caught:
         sensor_frames(**{**arguments, **changed})
     assert "\n" not in str(caught.value)
+
+
+def test_frames_of_psfs_hold_their_images() -> None:
+    psf = PSF.analytic("gaussian", elongation=[1.0, 2.0, 3.0], angle_deg=[0.0, 20.0, 70.0], index=[2, 0, 1])
+    frames, truth = sensor_frames(
+        CORNERS, (8, 6), (20, 24), 300, flux_e=100.0, psf=psf, detector=QUIET, rng=np.random.default_rng(6)
+    )
+    for corner, plane, positions in zip(CORNERS, (2, 0, 1), truth.swapaxes(0, 1), strict=True):
+        seen = frames[:, corner[0] : corner[0] + 8, corner[1] : corner[1] + 6].mean(axis=0)
+        centred = psf.images([[0.0, 0.0]], (8, 6), which=plane).sum()
+        expected = psf.images(positions, (8, 6), 100.0 / centred, which=plane).mean(axis=0)
+        # 48 pixels of 300 frames: 5 standard errors.
+        assert np.all(np.abs(seen - expected) <= 5 * np.sqrt(expected / 300) + 1e-3)
+
+
+def test_jitter_moves_all_spots_together() -> None:
+    options: dict[str, Any] = {"position_range_px": 0.0, "detector": QUIET}
+    _, truth = sensor_frames(
+        CORNERS, (8, 6), (20, 24), 4000, jitter_px=0.3, rng=np.random.default_rng(7), **options
+    )
+    np.testing.assert_array_equal(truth, np.broadcast_to(truth[:, :1], truth.shape))
+    # 4.9 standard errors of a standard deviation.
+    assert np.all(np.abs(truth[:, 0].std(axis=0) - 0.3) <= 4.9 * 0.3 / np.sqrt(8000))
+    still = sensor_frames(CORNERS, (8, 6), (20, 24), 3, rng=np.random.default_rng(8))
+    moved = sensor_frames(CORNERS, (8, 6), (20, 24), 3, jitter_px=0.3, rng=np.random.default_rng(8))
+    assert not np.array_equal(still[1], moved[1])
+    np.testing.assert_allclose(np.ptp(moved[1] - still[1], axis=1), 0.0, atol=1e-12)

@@ -12,10 +12,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.stats import norm, poisson
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.simulate import Detector, spots, subapertures
-from faintspot.spots.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency, poisson_gaussian_information
+from faintspot.spots.bounds import (
+    MEAN_ABSOLUTE,
+    cramer_rao,
+    cramer_rao_covariance,
+    photon_efficiency,
+    poisson_gaussian_information,
+)
+from faintspot.spots.psf import PSF
 
 PIXEL_VARIANCE = 1 / 12  # of a position within a pixel: widens a well-sampled spot
 GAUSSIAN_STD = 3 / math.sqrt(2 * math.log(2))  # of a "gaussian" spot of size 3
@@ -291,3 +299,19 @@ def test_impossible_efficiencies_are_refused() -> None:
         photon_efficiency([0.1, 0.2], [1.0, 2.0, 3.0])
     with pytest.raises(InputError, match="1e-20"):
         photon_efficiency(1e-20, 10.0)
+
+
+def test_the_covariance_of_elongated_spots_is_that_of_their_axes() -> None:
+    turned = [0.0, 30.0, 90.0]
+    psf = PSF.analytic("gaussian", elongation=[3.0] * 3, angle_deg=turned, radius_px=14, index=[0, 1, 2])
+    detector = Detector(read_noise_e=1.0)
+    found = cramer_rao_covariance([300.0, 300.0, 300.0], psf, (20, 20), detector=detector)
+    expected = cramer_rao(300.0, shape=(20, 20), elongation=3.0, profile="gaussian", detector=detector)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found[0])), expected, rtol=5e-3)
+    cosine, sine = np.cos(np.deg2rad(30.0)), np.sin(np.deg2rad(30.0))
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    # The pixels hardly matter at this width.
+    np.testing.assert_allclose(found[1], turn @ found[0] @ turn.T, rtol=0.02)
+    np.testing.assert_allclose(found[2], found[0][::-1, ::-1], rtol=1e-3, atol=1e-9)
+    with refused():
+        cramer_rao_covariance([1.0, 0.0, 1.0], psf)

@@ -181,3 +181,68 @@ def test_what_is_refused(values: dict[str, Any], message: str) -> None:
 def test_weights_of_another_window_are_refused(learnt: fs.FixedWeights) -> None:
     with pytest.raises(fs.InputError, match="expected windows of 8 x 8 px as in the layout, got 12 x 12"):
         fs.SlopePipeline(fs.Layout.grid((2, 2), pixels=8), fs.Settings("window"), score=learnt)
+
+
+ELONGATED = fs.PSF.analytic(
+    "gaussian", size=[1.0, 1.2], elongation=[2.0, 2.5], angle_deg=[30.0, 100.0], index=[0, 1]
+)
+
+
+def response(weights: fs.FixedWeights, kind: int, move: tuple[float, float]) -> Any:
+    """Slopes in x and y, and flux, of a spot of 1 e- that moved."""
+    image = ELONGATED.images([move], (SIDE, SIDE), which=kind)[0]
+    away = image - weights.mean_spot[kind]
+    return np.array(
+        [(weights.x[kind] * away).sum(), (weights.y[kind] * away).sum(), (weights.flux[kind] * image).sum()]
+    )
+
+
+@pytest.mark.parametrize(
+    "weights",
+    [
+        fs.FixedWeights.matched(ELONGATED, (SIDE, SIDE), flux_e=FLUX_E, read_noise_e=NOISE_E),
+        fs.FixedWeights.shaped(ELONGATED, (SIDE, SIDE), power=0.7),
+    ],
+)
+def test_weights_of_rotated_spots_are_unbiased_on_both_axes(weights: fs.FixedWeights) -> None:
+    for kind in (0, 1):
+        found = response(weights, kind, (0.02, -0.03))
+        # The image is linear in small moves.
+        np.testing.assert_allclose(found, [0.02, -0.03, 1.0], atol=1e-3)
+
+
+def test_the_matched_filter_reaches_the_bound_and_shaped_weights_do_not() -> None:
+    noise = fs.simulate.Detector(NOISE_E)
+    flux = FLUX_E / ELONGATED.images(np.zeros((2, 2)), (SIDE, SIDE), which=[0, 1]).sum(axis=(1, 2))
+    bound = fs.cramer_rao_covariance(FLUX_E, ELONGATED, (SIDE, SIDE), detector=noise, noise="gaussian")
+    variances = []
+    for weights in (
+        fs.FixedWeights.matched(ELONGATED, (SIDE, SIDE), flux_e=flux, read_noise_e=NOISE_E),
+        fs.FixedWeights.shaped(ELONGATED, (SIDE, SIDE)),
+    ):
+        pixels = NOISE_E**2 + flux[:, None, None] * weights.mean_spot
+        maps = np.stack([weights.x, weights.y], axis=1)
+        variances.append(np.einsum("kaij,kbij,kij->kab", maps, maps, pixels) / flux[:, None, None] ** 2)
+    np.testing.assert_allclose(variances[0], bound, rtol=2e-3, atol=1e-5)
+    assert np.all(np.diagonal(variances[1], axis1=1, axis2=2) > np.diagonal(bound, axis1=1, axis2=2))
+
+
+def test_weights_of_psfs_work_in_a_pipeline_per_subaperture() -> None:
+    weights = fs.FixedWeights.matched(ELONGATED, (SIDE, SIDE), flux_e=1e4, read_noise_e=NOISE_E)
+    truth = np.array([[0.05, -0.1], [-0.08, 0.02]])
+    frame = np.concatenate(list(ELONGATED.images(truth, (SIDE, SIDE), 1e4, which=[0, 1])), axis=1)
+    layout = fs.Layout.grid((1, 2), pixels=SIDE)
+    slopes = fs.SlopePipeline(layout, fs.Settings("window", flux_e=1e4), score=weights)(frame)
+    # Moves of a tenth of a pixel are linear to 1 %.
+    np.testing.assert_allclose(np.stack([slopes.x, slopes.y], axis=1), truth, atol=2e-3)
+
+
+def test_weights_of_impossible_spots_are_refused() -> None:
+    for options in ({"flux_e": 0.0}, {"flux_e": [1.0] * 3}, {"read_noise_e": -1.0}):
+        known: dict[str, Any] = {"flux_e": 10.0, "read_noise_e": 1.0, **options}
+        with refused():
+            fs.FixedWeights.matched(ELONGATED, (SIDE, SIDE), **known)
+    with refused():
+        fs.FixedWeights.shaped(ELONGATED, (SIDE, SIDE), power=-1.0)
+    with refused():
+        fs.FixedWeights.shaped(ELONGATED, (1, 1))

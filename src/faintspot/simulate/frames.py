@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,11 @@ from faintspot.base.checks import finite_array, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
 from faintspot.camera.detector import Detector
+from faintspot.spots.psf import PSF
 from faintspot.spots.shapes import image_shape, per_spot, spots
 from faintspot.spots.speckled import LARGEST_D_OVER_R0, speckled_images
+
+_Images = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 _BLOCK_PIXELS = 1 << 21  # pixels simulated at a time, to limit the memory of the double-precision means
 
@@ -131,6 +135,8 @@ def sensor_frames(
     angle_deg: ArrayLike = 0.0,
     position_range_px: float = 1.0,
     positions: ArrayLike | None = None,
+    psf: PSF | None = None,
+    jitter_px: float = 0.0,
     detector: Detector | None = None,
     rng: np.random.Generator | None = None,
 ) -> tuple[NDArray[Any], NDArray[np.float64]]:
@@ -157,6 +163,11 @@ def sensor_frames(
         True positions are uniform within plus and minus this on each axis [px], independently in each frame.
     positions : array_like, shape (n, 2) or (n_frames, n, 2), optional
         True x and y in px from the centre of each window, constant or for each frame, instead of random ones.
+    psf : PSF, optional
+        PSF of each sub-aperture instead of profile, size, elongation and angle_deg: elongated spots of
+        `faintspot.LaserGuideStar.psf`, for example.
+    jitter_px : float
+        Standard deviation of a motion common to all spots of a frame, such as the jitter of a beam [px].
     detector : Detector, optional
         Default: 0.1 e- read noise and no other noise. Maps have the shape of the frame.
     rng : numpy.random.Generator, optional
@@ -189,19 +200,48 @@ def sensor_frames(
     n = len(pixels)
     position_rng, noise_rng = spawn(rng, 2)
     truth = _true_positions(positions, position_range_px, (n_frames, n, 2), position_rng)
+    jitter = number_between("jitter_px", jitter_px, 0.0)
+    if jitter:  # spawned only if needed, as above
+        truth += spawn(rng, 1)[0].normal(0.0, jitter, (n_frames, 1, 2))
     camera = _camera(detector)
-    spot = _values_of_spots(
-        n, window_shape, profile, flux_e, size=size, elongation=elongation, angle_deg=angle_deg
-    )
+    form = {"profile": profile, "size": size, "elongation": elongation, "angle_deg": angle_deg}
+    images_of = _spots_of_psf(psf, n, window_shape, flux_e) if psf else _spots(n, window_shape, flux_e, form)
     blocks = []
     block = max(1, _BLOCK_PIXELS // max(rows * columns, pixels.size))
     for start in range(0, n_frames, block):
         part = truth[start : start + block]
-        repeated = {name: np.tile(value, len(part)) for name, value in spot.items()}
-        images = spots(part.reshape(-1, 2), shape=window_shape, profile=profile, **repeated)
+        images = images_of(part)
         mean_e = _place_windows(images.reshape(len(part), -1), pixels, (rows, columns))
         blocks.append(camera.expose(mean_e, spawn(noise_rng, 1)[0]))
     return np.concatenate(blocks), truth
+
+
+def _spots(n: int, shape: tuple[int, int], flux_e: ArrayLike, form: dict[str, Any]) -> _Images:
+    """Return a function that makes the images of the spots of several frames at positions (frames, n, 2)."""
+    profile = form.pop("profile")
+    values = _values_of_spots(n, shape, profile, flux_e, **form)
+
+    def images(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        repeated = {name: np.tile(value, len(positions)) for name, value in values.items()}
+        return spots(positions.reshape(-1, 2), shape=shape, profile=profile, **repeated)
+
+    return images
+
+
+def _spots_of_psf(psf: PSF, n: int, shape: tuple[int, int], flux_e: ArrayLike) -> _Images:
+    """Return a function as `_spots`, for PSFs."""
+    which = psf.index_of(n)
+    centred = psf.images(np.zeros((n, 2)), shape, which=which).sum(axis=(1, 2))
+    if not np.all(centred > 0):
+        raise InputError("psf: expected spots with flux in their windows, got none")
+    flux = per_spot("flux_e", flux_e, n, 0.0) / centred
+
+    def images(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        repeated = np.tile(which, len(positions))
+        made = psf.images(positions.reshape(-1, 2), shape, np.tile(flux, len(positions)), which=repeated)
+        return np.maximum(made, 0.0)
+
+    return images
 
 
 def _values_of_spots(

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between, numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.camera.detector import Detector
-from faintspot.spots.shapes import image_shape, position_array, spots
+from faintspot.spots.psf import PSF
+from faintspot.spots.shapes import image_shape, per_spot, position_array, spots
 
 Floats = NDArray[np.float64]
 
@@ -148,8 +149,63 @@ def cramer_rao(
     blur = _noise(detector, (ny, nx), exact)
     bound = np.empty((*flux.shape, 2))
     for index in np.ndindex(flux.shape):
-        errors = _standard_errors(float(flux[index]), spot, blur, unknown_flux, unknown_background, prior)
-        bound[index] = errors.mean(axis=0)
+        found = _covariances(float(flux[index]), spot, blur, unknown_flux, unknown_background, prior)
+        bound[index] = np.sqrt(np.diagonal(found, axis1=1, axis2=2)).mean(axis=0)
+    return bound
+
+
+def cramer_rao_covariance(
+    flux_e: ArrayLike,
+    psf: PSF,
+    shape: tuple[int, int] = (16, 16),
+    *,
+    detector: Detector | None = None,
+    noise: str = "exact",
+) -> NDArray[np.float64]:
+    """Return the bound on the covariance of x and y of each PSF's spot at the window centre, of unknown flux.
+
+    Elongated spots, such as those of `faintspot.LaserGuideStar`, have errors that are larger along one
+    direction: x and y are then correlated.
+
+    Parameters
+    ----------
+    flux_e : float or (n_psfs,) array
+        Electrons within the image of a centred spot; above 0.
+    psf : PSF
+    shape : (int, int)
+        Rows and columns of the image.
+    detector, noise
+        As for `cramer_rao`.
+
+    Returns
+    -------
+    (n_psfs, 2, 2) array
+        Covariance [px^2]; infinite variances and no covariance if an image has no information.
+
+    Raises
+    ------
+    InputError
+        As for `cramer_rao`.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> psf = fs.PSF.analytic("gaussian", elongation=3.0, angle_deg=45.0)
+    >>> bound = fs.cramer_rao_covariance(200.0, psf)[0]
+    >>> print(f"correlation of x and y: {bound[0, 1] / bound[0, 0]:.1f}")
+    correlation of x and y: 0.8
+    """
+    count = len(psf.samples)
+    flux = per_spot("flux_e", flux_e, count)
+    if not np.all(flux > 0):
+        raise InputError(f"flux_e = {flux.min():g}: expected numbers above 0")
+    size = image_shape("shape", shape)
+    blur = _noise(detector, size, one_of("noise", noise, _NOISES) == "exact")
+    bound = np.empty((count, 2, 2))
+    for plane in range(count):
+        render = functools.partial(psf.images, shape=size, which=plane)
+        spot = _with_derivatives(render, np.zeros((1, 2)), 0.01)
+        bound[plane] = _covariances(float(flux[plane]), spot, blur, True, False, math.inf)[0]
     return bound
 
 
@@ -269,10 +325,10 @@ def _noise(detector: Any, shape: tuple[int, int], exact: bool) -> _Noise:
     return _Noise(read_noise.ravel(), background.ravel(), excess, exact and excess == 1)
 
 
-def _standard_errors(
+def _covariances(
     flux: float, spot: _Spot, noise: _Noise, unknown_flux: bool, unknown_background: bool, prior: float
 ) -> Floats:
-    """Return the bound on x and y at each position, (m, 2)."""
+    """Return the bound on the covariance of x and y at each position, (m, 2, 2)."""
     weight = _pixel_information(flux * spot.image + noise.background_e, noise)
     derivatives = [flux * spot.along_x, flux * spot.along_y]
     if unknown_flux:
@@ -285,12 +341,12 @@ def _standard_errors(
     # In units of the error of each unknown, the matrix is well conditioned at any flux.
     scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
     illuminated = np.all(scale > 0, axis=1)
-    errors = np.full((len(scale), 2), prior)
+    covariances = np.full((len(scale), 2, 2), np.diag([prior**2, prior**2]))
     if illuminated.any():
         scale = scale[illuminated]
         inverse = np.linalg.inv(information[illuminated] / (scale[:, :, None] * scale[:, None, :]))
-        errors[illuminated] = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2)[:, :2]) / scale[:, :2]
-    return errors
+        covariances[illuminated] = (inverse / (scale[:, :, None] * scale[:, None, :]))[:, :2, :2]
+    return covariances
 
 
 def _pixel_information(mean_e: Floats, noise: _Noise) -> Floats:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import finite_array, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.npz import NpzFile
+from faintspot.spots.psf import PSF
 
 Floats = NDArray[np.float64]
 
@@ -20,6 +21,8 @@ _LEAST_WEIGHT = 1e-4  # of the largest: less counts nothing, and need not be rea
 _SAME = 1e-6  # relative to the largest weight; smaller weights are ignored and not read
 _RIDGE = 1e-6  # relative to the largest weight: indistinguishable in float32 sums
 # relative to the mean variance of a pixel: keeps the solution finite without noise
+
+_STEP_PX = 0.05  # for derivatives of spots
 
 
 class WeightedCentre(NamedTuple):
@@ -232,6 +235,111 @@ class FixedWeights(NpzFile):
         weights[np.abs(weights) < _LEAST_WEIGHT * np.abs(weights).max()] = 0.0
         along, across = weights.T.reshape(2, *shape)
         return cls(along, across, mean.reshape(shape), _best_flux(mean, variance).reshape(shape))
+
+    @classmethod
+    def matched(
+        cls,
+        psf: PSF,
+        shape: tuple[int, int],
+        *,
+        flux_e: ArrayLike,
+        read_noise_e: ArrayLike,
+        excess_noise: float = 1.0,
+        background_e: float = 0.0,
+    ) -> FixedWeights:
+        """Return the noise-weighted matched filter of each PSF of a sensor, linear in the pixels.
+
+        The least-squares fit of position and flux near a position of 0 with the variance of each pixel as
+        weight (Gilles & Ellerbroek 2006, Appl. Opt. 45, 6568). Its error is the Cramer-Rao bound as long as
+        spots move by less than about half their width.
+
+        Parameters
+        ----------
+        psf : PSF
+            One PSF, or those of the sub-apertures: see `LaserGuideStar.psf`.
+        shape : (int, int)
+            Rows and columns of the windows.
+        flux_e : float or (n_psfs,) array
+            Flux of a spot for which the weights are optimised [photo-electrons].
+        read_noise_e : float or (n_psfs, ny, nx) array
+            Read noise [photo-electrons].
+        excess_noise : float
+            Factor on the variance of the photon noise.
+        background_e : float
+            Background per pixel [photo-electrons], whose mean is subtracted and whose noise remains.
+
+        Raises
+        ------
+        InputError
+            If a value is out of range, shapes differ, or a spot has no flux in its window.
+        """
+        spot, along_x, along_y = _spot_and_gradients(psf, shape)
+        flux = numbers_between("flux_e", flux_e, 0.0, low_open=True)
+        noise = numbers_between("read_noise_e", read_noise_e, 0.0)
+        if flux.shape not in ((), (len(spot),)) or noise.shape not in ((), spot.shape):
+            raise InputError(
+                f"flux_e, read_noise_e: expected numbers or shapes ({len(spot)},) and {spot.shape}, "
+                f"got {flux.shape} and {noise.shape}"
+            )
+        dark = noise**2 + excess_noise * number_between("background_e", background_e, 0.0)
+        variance = dark + excess_noise * flux[..., None, None] * np.maximum(spot, 0.0)
+        variance = np.maximum(variance, _RIDGE * variance.max(axis=(1, 2), keepdims=True))
+        maps = np.stack([along_x, along_y, spot]) / variance
+        return cls._unbiased(maps, spot, along_x, along_y, psf.index)
+
+    @classmethod
+    def shaped(cls, psf: PSF, shape: tuple[int, int], *, power: float = 1.0) -> FixedWeights:
+        """Return a centre of gravity weighted with the shape of each PSF, elongated and rotated.
+
+        Parameters
+        ----------
+        psf : PSF
+            One PSF, or those of the sub-apertures.
+        shape : (int, int)
+            Rows and columns of the windows.
+        power : float
+            The weight is this power of the spot's image: below 1 wider, above 1 narrower than the spot.
+
+        Raises
+        ------
+        InputError
+            If a value is out of range, or a spot has no flux in its window.
+        """
+        spot, along_x, along_y = _spot_and_gradients(psf, shape)
+        peak = spot.max(axis=(1, 2), keepdims=True)
+        weight = (np.maximum(spot, 0.0) / peak) ** number_between("power", power, 0.0, 10.0)
+        rows, columns = (np.arange(side) - 0.5 * (side - 1) for side in shape)
+        maps = np.stack([weight * columns, weight * rows[:, None], weight])
+        return cls._unbiased(maps, spot, along_x, along_y, psf.index)
+
+    @classmethod
+    def _unbiased(
+        cls, maps: Floats, spot: Floats, along_x: Floats, along_y: Floats, index: Any
+    ) -> FixedWeights:
+        """Combine three maps per kind so that x, y and flux of a spot that moves little are right."""
+        n, ny, nx = spot.shape
+        rows = np.moveaxis(maps, 0, 1).reshape(n, 3, -1)
+        seen = np.stack([along_x, along_y, spot], axis=1).reshape(n, 3, -1)
+        response = rows @ seen.swapaxes(1, 2)
+        if not np.all(np.linalg.cond(response) < 1 / np.finfo(np.float32).eps):
+            raise InputError("psf: expected spots whose motion shows in their windows, got others")
+        x, y, flux = (np.linalg.inv(response) @ rows).reshape(n, 3, ny, nx).swapaxes(0, 1)
+        return cls(x, y, spot, flux, index)
+
+
+def _spot_and_gradients(psf: PSF, shape: tuple[int, int]) -> tuple[Floats, Floats, Floats]:
+    """Return images (n_psfs, ny, nx) of spots at 0 and their derivatives in the position."""
+    which = np.arange(len(psf.samples))
+
+    def images(x: float, y: float) -> Floats:
+        return psf.images(np.tile([x, y], (len(which), 1)), shape, which=which)
+
+    along_x = (images(_STEP_PX, 0.0) - images(-_STEP_PX, 0.0)) / (2 * _STEP_PX)
+    along_y = (images(0.0, _STEP_PX) - images(0.0, -_STEP_PX)) / (2 * _STEP_PX)
+    spot = images(0.0, 0.0)
+    if not np.all(spot.max(axis=(1, 2)) > 0):
+        raise InputError("psf: expected spots with flux in their windows, got none")
+    return spot, along_x, along_y
 
 
 def _pairs(first: Floats, second: Floats) -> tuple[tuple[Floats, Floats], ...]:

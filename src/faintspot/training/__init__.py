@@ -1,13 +1,18 @@
-"""Learning from spots: the trained linear score, the point-spread function, the centroid gain."""
+"""Learning from spots: the trained linear score, the PSF, the sodium profile, the centroid gain."""
 
 from faintspot.training.centroid_gain import CentroidGain, measure_centroid_gain
 from faintspot.training.psf_learning import LearntPSF, learn_psf, learn_psf_from_images
 from faintspot.training.recorded import train_from_frames
 from faintspot.training.simulation import train_estimator
+from faintspot.training.sodium import MeanImages, SodiumFit, fit_sodium_profile, fit_spot
 
 __all__ = [
     "CentroidGain",
     "LearntPSF",
+    "MeanImages",
+    "SodiumFit",
+    "fit_sodium_profile",
+    "fit_spot",
     "learn_psf",
     "learn_psf_from_images",
     "measure_centroid_gain",
