@@ -1,9 +1,9 @@
 """Does the loop's own figure of merit see what the science camera would?
 
-Two arms take turns in the simulated loop, which knows the truth. The difference of their residual wavefronts'
-mean squares without the noise, as `faintspot realtime advise` measures them, is set beside the true
-difference, over all that the mirror, its modes and the sensor leave. The plain rms of the slopes is there for
-comparison: it rewards the arm that sees least.
+Two methods take turns in the simulated loop, which knows the truth. The difference of their residual
+wavefronts' mean squares without the noise, as `faintspot realtime advise` measures them, is set beside the
+true difference, over all that the mirror, its modes and the sensor leave. The plain rms of the slopes is
+there for comparison: it rewards the method that sees least.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from benchmarks.measuring import Row, Table
 from faintspot.advice.centroid_gain import calibration_of_electrons, electrons_of, shifted_gain
 from faintspot.advice.loop_telemetry import LoopTelemetry
 from faintspot.advice.residual import residual_wavefront, wavefront_modes
-from faintspot.ao_loop import Arm, LoopConfiguration, LoopRecord, load_loop, simulate_loop
+from faintspot.ao_loop import LoopConfiguration, LoopRecord, Method, load_loop, simulate_loop
 from faintspot.ao_loop.calibration import flat_psf, reference_slopes
 from faintspot.ao_loop.camera import camera_calibration
 from faintspot.ao_loop.configuration import ARCSEC
@@ -32,32 +32,34 @@ REALISATIONS, FRAMES, TURN, IMAGES_EVERY = 4, 1600, 100, 20
 PHOTONS = 100.0, 300.0
 
 
-def _arms(photons: float, width_px: float) -> dict[str, Arm]:
+def _methods(photons: float, width_px: float) -> dict[str, Method]:
     window = Settings("window", flux_e=photons, window_fwhm_px=2.8 * width_px, centroid_gain=0.3)
     predicted: dict[str, Any] = {"correct_gain": False, "predict_prior": True}
     probable = Settings("map", flux_e=photons, prior_std_px=0.6)
     return {
-        "window, gain 0.4": Arm("-", window, 0.4, correct_gain=False),
-        "window, gain 0.2": Arm("-", window, 0.2, correct_gain=False),
-        "brightest, gain 0.4": Arm("-", Settings("brightest"), 0.4, correct_gain=False),
-        "map, gain 0.4": Arm("-", probable, 0.4, **predicted),
-        "narrow window, gain 0.4": Arm("-", Settings("window", flux_e=photons), 0.4, correct_gain=False),
+        "window, gain 0.4": Method("-", window, 0.4, correct_gain=False),
+        "window, gain 0.2": Method("-", window, 0.2, correct_gain=False),
+        "brightest, gain 0.4": Method("-", Settings("brightest"), 0.4, correct_gain=False),
+        "map, gain 0.4": Method("-", probable, 0.4, **predicted),
+        "narrow window, gain 0.4": Method("-", Settings("window", flux_e=photons), 0.4, correct_gain=False),
     }
 
 
-def seen_in_record(record: LoopRecord, arms: list[Arm], number: int) -> tuple[LoopTelemetry, np.ndarray]:
-    """Return what the slopes of an arm's scored frames show, and the numbers of these frames."""
+def seen_in_record(
+    record: LoopRecord, methods: list[Method], number: int
+) -> tuple[LoopTelemetry, np.ndarray]:
+    """Return what the slopes of a method's scored frames show, and the numbers of these frames."""
     held = record.commands.astype(np.float64) @ record.interaction_matrix.T
-    later, arm = record.delay_frames - 1, arms[number]
+    later, method = record.delay_frames - 1, methods[number]
     expected = np.zeros_like(held)
-    if arm.predict_prior:
+    if method.predict_prior:
         expected[: len(held) - later] = held[: len(held) - later] - held[later:]
     rows = np.flatnonzero(
-        record.scored & (record.arm == number) & (np.arange(record.frames) < record.frames - later)
+        record.scored & (record.method == number) & (np.arange(record.frames) < record.frames - later)
     )
     divisor = record.centroid_gain[number] if record.corrected[number] else 1.0
     slopes, error = (each[rows] / divisor for each in (record.slopes_px, record.standard_error_px))
-    prior = prior_std_px(arm, held.shape[1])
+    prior = prior_std_px(method, held.shape[1])
     alone, _, trust = without_prior(
         slopes.astype(np.float64), error.astype(np.float64), expected[rows], prior
     )
@@ -77,8 +79,8 @@ def frames_of_record(record: LoopRecord, numbers: list[int]) -> np.ndarray:
     return electrons_of(np.stack(frames), camera_calibration(configuration))
 
 
-def merits(configuration: LoopConfiguration, pair: list[Arm], realisation: int) -> np.ndarray:
-    """Return by how much the second arm has more: the loop's figure, the truth, both nm^2, slopes' px^2."""
+def merits(configuration: LoopConfiguration, pair: list[Method], realisation: int) -> np.ndarray:
+    """Return the second method's excess: the loop's figure, the truth, both nm^2, and slopes' px^2."""
     schedule = np.arange(FRAMES) // TURN % 2
     run = configuration.replace("run", frames=FRAMES, settle_frames=TURN)
     record = simulate_loop(run, pair, schedule, realisation=realisation)
@@ -89,17 +91,17 @@ def merits(configuration: LoopConfiguration, pair: list[Arm], realisation: int) 
     }
     modes, _ = wavefront_modes(replace(sensor.layout, **sizes))
     means = []
-    for number, arm in enumerate(pair):
+    for number, method in enumerate(pair):
         own = [k for k in range(TURN, FRAMES, IMAGES_EVERY) if schedule[k] == number]
         pipeline = SlopePipeline(
             sensor.layout,
-            arm.settings,
+            method.settings,
             calibration_of_electrons(camera_calibration(configuration)),
-            reference_slopes(configuration, sensor, arm),
+            reference_slopes(configuration, sensor, method),
             psf=flat_psf(configuration.spot_width_px, 1.0),
             threads=1,
         )
-        prior = prior_std_px(arm, 2 * len(sensor.layout))
+        prior = prior_std_px(method, 2 * len(sensor.layout))
         found = shifted_gain(pipeline, frames_of_record(record, own), prior)
         assert found is not None
         seen, frames = seen_in_record(record, pair, number)
@@ -111,14 +113,14 @@ def merits(configuration: LoopConfiguration, pair: list[Arm], realisation: int) 
 
 
 def run() -> list[Table]:
-    """Compare pairs of arms."""
+    """Compare pairs of methods."""
     rows = []
     for photons in PHOTONS:
         configuration = load_loop("camera_3e").replace("camera", photons_per_subaperture=photons)
-        arms = _arms(photons, configuration.scene.seen_fwhm_px)
-        first, *others = arms
+        methods = _methods(photons, configuration.scene.seen_fwhm_px)
+        first, *others = methods
         for name in others:
-            pair = [arms[first], arms[name]]
+            pair = [methods[first], methods[name]]
             found = np.array([merits(configuration, pair, 1500 + r) for r in range(REALISATIONS)])
             columns: dict[str, float] = {}
             for title, values in zip(("told", "true"), found.T[:2], strict=True):

@@ -45,11 +45,11 @@ def run() -> list[Table]:
     rows = []
     for name, percent in PERCENTILES.items():
         times: Times = {
-            arm: np.array([np.percentile(each, percent) for each in found])
-            for arm, found in latencies.items()
+            method: np.array([np.percentile(each, percent) for each in found])
+            for method, found in latencies.items()
         }
         ratio = median_ratio(times, "watched", "alone")
-        values = {arm: float(np.median(each)) for arm, each in times.items()} | {"ratio": ratio}
+        values = {method: float(np.median(each)) for method, each in times.items()} | {"ratio": ratio}
         known = {"ratio": spread(times, lambda each: median_ratio(each, "watched", "alone"))}
         rows.append(Row(name, values, spread=known))
     updates = Row(
@@ -71,7 +71,7 @@ def run() -> list[Table]:
 async def _turns(
     name: str, server: subprocess.Popen[str], url: str
 ) -> tuple[dict[str, list[NDArray[np.float64]]], float]:
-    """Return latencies (us) of every turn by arm, and how often a client was told of new frames."""
+    """Return latencies (us) of every turn by method, and how often a client was told of new frames."""
     reader = TelemetryReader.attach(name)
     clients = [await client(url) for _ in range(READING + SLOW)]
     counts = [0] * READING
@@ -79,14 +79,14 @@ async def _turns(
     found: dict[str, list[NDArray[np.float64]]] = {"alone": [], "watched": []}
     watched_s, updates = 0.0, 0
     for turn in range(2 * TURNS):
-        arm = "watched" if turn % 2 else "alone"
-        os.kill(server.pid, signal.SIGCONT if arm == "watched" else signal.SIGSTOP)
+        method = "watched" if turn % 2 else "alone"
+        os.kill(server.pid, signal.SIGCONT if method == "watched" else signal.SIGSTOP)
         await asyncio.sleep(0.5)  # the page takes up what it missed
         before, cursor = sum(counts), reader.records.written
         await asyncio.sleep(TURN_S)
         records, _, _ = reader.records.since(cursor)
-        found[arm].append((records["published_time_ns"] - records["last_row_time_ns"]) / 1e3)
-        if arm == "watched":
+        found[method].append((records["published_time_ns"] - records["last_row_time_ns"]) / 1e3)
+        if method == "watched":
             watched_s += TURN_S
             updates += sum(counts) - before
     for task in reading:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from benchmarks.measuring import Row, Table, absolute_spread, best, interleaved, pinned
-from faintspot.ao_loop import Arm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.ao_loop import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.ao_loop.atmosphere import MovingLayers, make_atmosphere
 from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.camera import make_detector
@@ -142,7 +142,7 @@ def parts_table(configuration: LoopConfiguration) -> Table:
     flux = optics.sensor.frame(optics.sensor.spots(wavefront)) * configuration.photons
     frame = detector.expose(flux, np.random.default_rng(1))
     pipelines = {
-        name: make_pipeline(configuration, optics.sensor, Arm(name, settings))
+        name: make_pipeline(configuration, optics.sensor, Method(name, settings))
         for name, settings in (("brightest", BRIGHTEST), ("TV", TV))
     }
     field = optics.pupil.field(wavefront, configuration.science.wavelength_m)
@@ -169,16 +169,16 @@ def run() -> list[Table]:
     """Time the loop."""
     configuration = load_loop("emccd")
     short = replace(configuration, run=replace(configuration.run, frames=FRAMES))
-    simulate_loop(short, [Arm("brightest", BRIGHTEST)])  # makes screens and calibration, compiles
-    arms = {"brightest": Arm("brightest", BRIGHTEST), "TV": Arm("TV", TV)}
+    simulate_loop(short, [Method("brightest", BRIGHTEST)])  # makes screens and calibration, compiles
+    methods = {"brightest": Method("brightest", BRIGHTEST), "TV": Method("TV", TV)}
 
-    def runs(arm: Arm) -> Any:
-        return lambda: simulate_loop(short, [arm])
+    def runs(method: Method) -> Any:
+        return lambda: simulate_loop(short, [method])
 
     with pinned():
-        times = interleaved({name: runs(arm) for name, arm in arms.items()}, fewest=3)
+        times = interleaved({name: runs(method) for name, method in methods.items()}, fewest=3)
     rows = []
-    for name in arms:
+    for name in methods:
         rate = FRAMES / best(times, name)
         target = f"at least {TARGET_FRAMES_PER_S:g}"
         known = {"frames/s": absolute_spread(times, name)}

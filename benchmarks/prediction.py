@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measuring import Row, Table
-from faintspot.ao_loop import Arm, LoopConfiguration, load_loop
+from faintspot.ao_loop import LoopConfiguration, Method, load_loop
 from faintspot.ao_loop.atmosphere import MovingLayers
 from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.control import slope_turbulence
@@ -133,7 +133,7 @@ class Case:
             model.atmosphere = shaken
         flux_e = self.photons * sensor.illumination
         settings = Settings("window", window_fwhm_px=WIDTH_PX, flux_e=flux_e)
-        pipeline = make_pipeline(configuration, sensor, Arm("window", settings))
+        pipeline = make_pipeline(configuration, sensor, Method("window", settings))
         centroid_gain = measure_gains(configuration, [pipeline], seed=1)[0]
         line = CommandDelayLine(model.optics.mirror.commands, plant.delay_frames)
         controller, strehl = make(line), np.zeros(frames)

@@ -58,7 +58,7 @@ SIDE, PIXELS, LEVEL_ADU, RATE_HZ = 6, 16, 100, 300.0
 ROUNDS, FRAMES_A_ROUND, BATCH = 8, 300, 64
 SAME_POSITION_PX = 1e-4
 """Same algorithm: only float32 rounding may differ."""
-ARMS: dict[str, tuple[dict[str, Any], float | None]] = {
+METHODS: dict[str, tuple[dict[str, Any], float | None]] = {
     "plain": ({"estimator": "thresholded", "threshold_e": 0.0}, 1.0),
     "12 brightest": ({"estimator": "brightest", "keep_brightest": 12}, None),
     "TV, 10 iterations": (
@@ -189,7 +189,7 @@ def path_of(pipeline: fs.SlopePipeline, raw: NDArray[np.uint16]) -> FramePath:
 def difference_px(component: Any, layout: fs.Layout, raw: NDArray[np.uint16]) -> float:
     """Return by how much pyRTC's and faintspot's plain positions differ at most."""
     theirs = pyrtc_kernel(component, raw.astype(np.int32) - LEVEL_ADU)().reshape(2, -1)
-    ours = pipeline_of(layout, ARMS["plain"][0])(raw)
+    ours = pipeline_of(layout, METHODS["plain"][0])(raw)
     return float(np.abs(theirs - np.stack([ours.x, ours.y])).max())
 
 
@@ -206,17 +206,17 @@ def _alone() -> Table:
             "pyRTC": pyrtc_kernel(component, image),
             "pyRTC, with map": partial(component._process_image, image),
         }
-        for arm, (settings, _) in ARMS.items():
+        for method, (settings, _) in METHODS.items():
             pipeline = pipeline_of(layout, settings)
-            candidates[f"compiled code, {arm}"] = partial(pipeline, batch)
-            candidates[f"offline call, {arm}"] = partial(pipeline, raw)
-            candidates[f"real-time call, {arm}"] = partial(path_of(pipeline, raw).measure, 0)
+            candidates[f"compiled code, {method}"] = partial(pipeline, batch)
+            candidates[f"offline call, {method}"] = partial(pipeline, raw)
+            candidates[f"real-time call, {method}"] = partial(path_of(pipeline, raw).measure, 0)
         with pinned():
             times = interleaved(candidates, seconds=10.0)
         component.close()
-    for arm in ARMS:
-        times[f"compiled code, {arm}"] /= BATCH
-    targets = {f"compiled code, {arm}": limit for arm, (_, limit) in ARMS.items()}
+    for method in METHODS:
+        times[f"compiled code, {method}"] /= BATCH
+    targets = {f"compiled code, {method}": limit for method, (_, limit) in METHODS.items()}
     rows = []
     for candidate in candidates:
         found = ratio(times, candidate, "pyRTC", ("ratio", "median ratio"))
@@ -303,37 +303,37 @@ class _Systems:
         end_processes(self._started)
 
 
-def _spread_of_rounds(rounds: Times, arm: str) -> float:
-    return spread(rounds, lambda part: median_ratio(part, arm, "pyRTC"))
+def _spread_of_rounds(rounds: Times, method: str) -> float:
+    return spread(rounds, lambda part: median_ratio(part, method, "pyRTC"))
 
 
 def _streams() -> Table:
     """Compare both systems, from stream to stream."""
     layout, stack = frames()
     name = f"faintspot_benchmark_{uuid4().hex[:8]}"
-    arms = ["pyRTC", *ARMS]
-    collected: dict[str, list[list[float]]] = {arm: [] for arm in arms}
+    methods = ["pyRTC", *METHODS]
+    collected: dict[str, list[list[float]]] = {method: [] for method in methods}
     with tempfile.TemporaryDirectory() as folder, streams_in(name, layout.frame_shape) as (theirs, ours):
         systems = _Systems(name, folder, theirs, ours, stack)
         try:
             systems.wait()
             for _ in range(ROUNDS):
-                for arm in arms:
-                    own = arm != "pyRTC"
+                for method in methods:
+                    own = method != "pyRTC"
                     systems.halt(not own)
                     if own:
-                        systems.set(ARMS[arm][0])
+                        systems.set(METHODS[method][0])
                     system = "faintspot" if own else "pyRTC"
                     systems.latencies_us(system, 10)  # settle
-                    collected[arm].append(systems.latencies_us(system, FRAMES_A_ROUND))
+                    collected[method].append(systems.latencies_us(system, FRAMES_A_ROUND))
         finally:
             systems.end()
     rows = []
-    rounds = {arm: np.array([np.median(part) for part in parts]) for arm, parts in collected.items()}
-    for arm, parts in collected.items():
+    rounds = {method: np.array([np.median(part) for part in parts]) for method, parts in collected.items()}
+    for method, parts in collected.items():
         whole = np.concatenate(parts)
         p50, p99, p99_9 = np.percentile(whole, [50, 99, 99.9])
-        middle = median_ratio(rounds, arm, "pyRTC")
+        middle = median_ratio(rounds, method, "pyRTC")
         missing = ROUNDS * FRAMES_A_ROUND - len(whole)
         values = {
             "p50": p50,
@@ -342,9 +342,9 @@ def _streams() -> Table:
             "ratio of p50": middle,
             "not in time": float(missing),
         }
-        limit = ARMS[arm][1] if arm in ARMS else None
-        name = arm if arm == "pyRTC" else f"faintspot, {arm}"
-        known = {} if arm == "pyRTC" else {"ratio of p50": _spread_of_rounds(rounds, arm)}
+        limit = METHODS[method][1] if method in METHODS else None
+        name = method if method == "pyRTC" else f"faintspot, {method}"
+        known = {} if method == "pyRTC" else {"ratio of p50": _spread_of_rounds(rounds, method)}
         rows.append(_row(name, values, limit, middle, known))
     note = f"{ROUNDS} rounds of {FRAMES_A_ROUND} frames at {RATE_HZ:g}/s; {os.cpu_count()} processors"
     return Table("pyrtc_streams", "From the frame's stream to the slopes' stream, us", rows, [note])

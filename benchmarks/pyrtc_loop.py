@@ -51,8 +51,8 @@ from faintspot.realtime.private_socket import socket_path
 COMMANDS, GAIN, LEAK = 54, 0.4, 0.1
 ROUNDS, FRAMES_A_ROUND, SETTLE, READOUT_S = 8, 250, 10, 1e-3
 SOFT, HARD, STREAM, ROWS = "pyRTC, soft-rtc", "pyRTC, hard-rtc", "stream", "rows"
-ARMS: dict[str, dict[str, Any]] = {
-    **{arm: settings for arm, (settings, _) in pyrtc.ARMS.items()},
+METHODS: dict[str, dict[str, Any]] = {
+    **{method: settings for method, (settings, _) in pyrtc.METHODS.items()},
     "window": {"estimator": "window", "window_fwhm_px": 4.0, "normalisation": "frame"},
 }
 PLAIN = "plain"
@@ -122,9 +122,9 @@ class System:
         if self.engine is not None:
             self.engine.send_signal(signal.SIGSTOP if halted else signal.SIGCONT)
 
-    def choose(self, arm: str) -> None:
-        """Set its engine to one of ARMS."""
-        request(socket_path(self.control), "set", timeout_s=LENGTHY_TIMEOUT_S, changes=ARMS[arm])
+    def choose(self, method: str) -> None:
+        """Set its engine to one of METHODS."""
+        request(socket_path(self.control), "set", timeout_s=LENGTHY_TIMEOUT_S, changes=METHODS[method])
 
     def latencies_us(self, count: int) -> NDArray[np.float64]:
         """Publish frames at the rate; return times to slopes and commands, (count, 2), NaN if not in time."""
@@ -206,8 +206,8 @@ class _Bench:
         """Wait for one after the other, until all have compiled; then give them priority."""
         for system in self.systems.values():
             system.wait()
-            for arm in ARMS if system.control else ():
-                system.choose(arm)
+            for method in METHODS if system.control else ():
+                system.choose(method)
             system.halt(True)
         for process in self.processes if first() else ():
             subprocess.run([*_FIRST, "--all-tasks", "--pid", _PRIORITY, str(process.pid)], check=True)
@@ -256,7 +256,7 @@ def bench() -> Iterator[_Bench]:
 
 
 def measured() -> tuple[dict[str, NDArray[np.float64]], float]:
-    """Return latencies, (rounds, frames, 2), by arm, and how far plain commands differ, of the largest.
+    """Return latencies, (rounds, frames, 2), by method, and how far plain commands differ, of the largest.
 
     After the best round: a frame that was lost moves them.
     """
@@ -267,11 +267,11 @@ def measured() -> tuple[dict[str, NDArray[np.float64]], float]:
             last = {}
             for label, system in running.systems.items():
                 system.halt(False)
-                for arm in ARMS if system.control else ("",):
-                    if arm:
-                        system.choose(arm)
+                for method in METHODS if system.control else ("",):
+                    if method:
+                        system.choose(method)
                     system.latencies_us(SETTLE)
-                    name = f"faintspot, {arm}, {label}" if arm else label
+                    name = f"faintspot, {method}, {label}" if method else label
                     found.setdefault(name, []).append(system.latencies_us(FRAMES_A_ROUND))
                     last[name] = system.last_commands()
                 system.halt(True)

@@ -91,11 +91,11 @@ def _streaming() -> Table:
             rounds["streamed"].append(_latency(values, 4))
             rounds["whole"].append(_latency(values, ROWS))
         columns = {
-            f"{arm} {name}": float(np.median([each[name] for each in found]))
-            for arm, found in rounds.items()
+            f"{method} {name}": float(np.median([each[name] for each in found]))
+            for method, found in rounds.items()
             for name in _NAMES
         }
-        p50 = {arm: np.array([each["p50"] for each in found]) for arm, found in rounds.items()}
+        p50 = {method: np.array([each["p50"] for each in found]) for method, found in rounds.items()}
         ratio = columns["ratio of p50"] = _streamed_to_whole(p50)
         known = {"ratio of p50": spread(p50, _streamed_to_whole)}
         rows.append(Row(f"TV, {iterations} iterations", columns, f"<= {LIMIT}", ratio <= LIMIT, known))

@@ -27,7 +27,7 @@ import numpy as np
 
 from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
 from faintspot import Calibration, Layout, Settings, SlopePipeline
-from faintspot.ao_loop import Arm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.ao_loop import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.ao_loop.control import slope_turbulence
 from faintspot.ao_loop.engine_files import write_engine_files
 from faintspot.ao_loop.telescope_model import prepare
@@ -199,7 +199,7 @@ def _observed(name: str, telescope: subprocess.Popen[bytes]) -> np.ndarray[Any, 
 
 
 def compared(
-    configuration: LoopConfiguration, arm: Arm, realisations: int = REALISATIONS
+    configuration: LoopConfiguration, method: Method, realisations: int = REALISATIONS
 ) -> dict[str, float]:
     """Return mean Strehl ratios of the engine's loop and of the simulated one, and their difference."""
     strehl = np.zeros((2, realisations))
@@ -207,8 +207,8 @@ def compared(
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         (folder / "loop.toml").write_text(configuration.to_text(), encoding="utf-8")
-        configuration_file.save(folder / "faintspot.toml", arm.settings)
-        path = write_engine_files(configuration.replace("control", gain=arm.gain), folder, arm.control)
+        configuration_file.save(folder / "faintspot.toml", method.settings)
+        path = write_engine_files(configuration.replace("control", gain=method.gain), folder, method.control)
         known = load_control(path)
         assert known is not None
         run = configuration.replace("run", frames=LOOP_FRAMES, settle_frames=SETTLED)
@@ -220,7 +220,7 @@ def compared(
             late = settled[:, _TRUTH_FRAME] - settled[:, _TRUTH_COMMANDS]
             on_time += np.count_nonzero(late == configuration.control.delay_frames)
             frames += len(settled)
-            record = simulate_loop(run, [arm], realisation=number)
+            record = simulate_loop(run, [method], realisation=number)
             places = settled[:, _TRUTH_FRAME].astype(int)
             strehl[:, number] = settled[:, _TRUTH_STREHL].mean(), record.strehl[places].mean()
     difference = strehl[0] - strehl[1]
@@ -238,10 +238,10 @@ def _loop() -> Table:
     configuration = load_loop("camera_3e").replace("camera", photons_per_subaperture=300.0).slowed_to(RATE_HZ)
     flux_e = configuration.photons
     predicting = Settings("map", flux_e=flux_e, prior_std_px=1.0)  # the filter says how wide
-    arms = [
-        Arm("30 brightest pixels, integrator", Settings("brightest", keep_brightest=30), 0.4),
-        Arm("fixed window, integrator", Settings("window", flux_e=flux_e), 0.4),
-        Arm(
+    methods = [
+        Method("30 brightest pixels, integrator", Settings("brightest", keep_brightest=30), 0.4),
+        Method("fixed window, integrator", Settings("window", flux_e=flux_e), 0.4),
+        Method(
             "maximum a posteriori, Kalman filter",
             predicting,
             0.3,
@@ -251,10 +251,10 @@ def _loop() -> Table:
         ),
     ]
     rows = []
-    for arm in arms:
-        columns = compared(configuration, arm)
+    for method in methods:
+        columns = compared(configuration, method)
         within = abs(columns["difference"]) <= max(3 * columns["its error"], 0.01)
-        rows.append(Row(arm.label, columns, "3 errors, or 0.01", within))
+        rows.append(Row(method.label, columns, "3 errors, or 0.01", within))
     note = (
         f"{REALISATIONS} realisations, frames {SETTLED} to {LOOP_FRAMES}, {RATE_HZ:g} frames/s, 300 photons"
     )

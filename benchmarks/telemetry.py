@@ -16,7 +16,7 @@ from faintspot.advice.loop_choices import AS_RUN, FILTER, Choice
 from faintspot.advice.loop_report import LoopReport, report_of_loop
 from faintspot.advice.measured import Measured
 from faintspot.advice.recorded_loop import RecordedLoop
-from faintspot.ao_loop import Arm, LoopConfiguration, LoopRecord, load_loop, simulate_loop
+from faintspot.ao_loop import LoopConfiguration, LoopRecord, Method, load_loop, simulate_loop
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.control.learning import KALMAN
 from faintspot.pipeline.settings import Settings
@@ -60,10 +60,10 @@ def _row(photons: float, realisation: int) -> Row:
     configuration = load_loop("diffraction_limit").replace("camera", photons_per_subaperture=photons)
     configuration = configuration.replace("run", frames=FRAMES, settle_frames=100)
     gain, other = _GAINS[photons]
-    own, second = (Arm("window", Settings("window"), gain=each) for each in (gain, other))
+    own, second = (Method("window", Settings("window"), gain=each) for each in (gain, other))
     first, *rest = (
-        simulate_loop(configuration, [arm], realisation=realisation)
-        for arm in (own, second, replace(own, control=KALMAN))
+        simulate_loop(configuration, [method], realisation=realisation)
+        for method in (own, second, replace(own, control=KALMAN))
     )
     report = report_of_loop(recording(first))
     error = first.standard_error_px[first.scored] / first.centroid_gain[0]

@@ -56,19 +56,19 @@ def main(motion_px: float, n: int) -> None:
         learnt, tuned, scored = (residual_spots(n, d_over_r0, motion_px, seed) for seed in (1, 2, 3))
         for flux_e in FLUX_E:
             best = fs.FixedWeights.best_linear(*learnt, flux_e=flux_e, read_noise_e=READ_NOISE_E)
-            arms: list[tuple[dict[str, Any], Any]] = [
+            methods: list[tuple[dict[str, Any], Any]] = [
                 ({"window_fwhm_px": width * FWHM_PX}, None) for width in WIDTHS
             ]
-            arms.append(({}, best))
+            methods.append(({}, best))
             gains, errors = [], []
-            for options, weights in arms:
+            for options, weights in methods:
                 slopes = slopes_of(tuned[0], flux_e, 4, options, weights)
                 gains.append(float((slopes * tuned[1]).sum() / (tuned[1] ** 2).sum()))
                 errors.append(np.mean((slopes / gains[-1] - tuned[1]) ** 2))
             chosen = int(np.argmin(errors[:-1]))
             squares = []
             for i in (chosen, -1):
-                slopes = slopes_of(scored[0], flux_e, 5, *arms[i]) / gains[i]
+                slopes = slopes_of(scored[0], flux_e, 5, *methods[i]) / gains[i]
                 squares.append(((slopes - scored[1]) ** 2).mean(axis=1).reshape(BLOCKS, -1).mean(axis=1))
             rms, ratio = np.sqrt([s.mean() for s in squares]), np.sqrt(squares[1].mean() / squares[0].mean())
             scatter = [s.std() / 2 / s.mean() / np.sqrt(BLOCKS) for s in squares]

@@ -101,7 +101,7 @@ def ours(**settings: Any) -> SlopeEstimator:
     return SlopeEstimator(sensor.mla_grid, sensor.mla_index, illuminated, settings=fs.Settings(**settings))
 
 
-ARMS = {
+METHODS = {
     "HCIPy, centre of gravity": [
         hcipy.ShackHartmannWavefrontSensorEstimator(sensor.mla_grid, sensor.mla_index, illuminated)
     ],
@@ -113,9 +113,9 @@ ARMS = {
 
 
 def main() -> None:
-    """Tune every arm on two pieces of air, then judge it on three others."""
+    """Tune every method on two pieces of air, then judge it on three others."""
     print(f"{FLUX_E:g} photons a lenslet, {READ_NOISE_E:g} e- read noise; Strehl ratio at 1.65 um")
-    for name, estimators in ARMS.items():
+    for name, estimators in METHODS.items():
         tried = []
         for estimator in estimators:
             control = calibrate(estimator)

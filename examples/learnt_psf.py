@@ -92,7 +92,7 @@ def learnt_from(images: NDArray[Any], read_noise: float, index: Any = None) -> t
 def compare(
     bench: Bench, flux: float, read_noise: float, bright: Any, one: Any, rng: np.random.Generator
 ) -> str:
-    """Return a line: errors of all arms, the bound, photon efficiencies."""
+    """Return a line: errors of all methods, the bound, photon efficiencies."""
     share = flux / bench.flux
     thin = [
         rng.binomial(np.rint(bench.images(half)).astype(np.int64), share)
@@ -103,14 +103,14 @@ def compare(
     ml = fs.Settings(estimator="ml", search_range_px=SEARCH_PX)
     ratios: list[float] = []  # actual over stated standard error, of errors below 1 px
 
-    def error(settings: fs.Settings, arm: Any = None) -> float:
+    def error(settings: fs.Settings, method: Any = None) -> float:
         at_full_flux = ml if settings.estimator.takes_prior else settings
-        truth = bench.truth(1, place(positions(full, at_full_flux, BRIGHT_READ_NOISE_E, arm, 1 / share)))
-        slopes = positions(thin[1], settings, read_noise, arm)
+        truth = bench.truth(1, place(positions(full, at_full_flux, BRIGHT_READ_NOISE_E, method, 1 / share)))
+        slopes = positions(thin[1], settings, read_noise, method)
         found = place(slopes) - truth
         stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1)
         near = np.all((np.abs(found) < 1.0) & np.isfinite(stated), axis=-1)
-        if arm is not None:
+        if method is not None:
             ratios.append(float(np.sqrt(np.mean(found[near] ** 2) / np.mean(stated[near] ** 2))))
         return float(np.abs(found).mean())
 
@@ -124,7 +124,7 @@ def compare(
     }
     for name, automatic in found_by_themselves.items():  # with the learnt PSF's width
         errors.append(error(ml.replace(estimator=name, flux_e=flux, **automatic), learnt[1]))
-    errors += [error(ml, arm) for arm in (analytic, *learnt, (bright[0], bright[1] * share))]
+    errors += [error(ml, method) for method in (analytic, *learnt, (bright[0], bright[1] * share))]
     errors += [error(ml.replace(estimator="map", prior_std_px=PRIOR_PX, flux_e=flux), learnt[1])]
     background = float(one[1][0])
     net_flux = flux - background * share * np.prod(bench.window)

@@ -1,4 +1,4 @@
-"""What the examples with other tools share: every arm is tuned on other air than it is judged by."""
+"""What the examples with other tools share: every method is tuned on other air than it is judged by."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def compare(
-    arms: Mapping[str, Sequence[Any]],
+    methods: Mapping[str, Sequence[Any]],
     strehl: Callable[[Any, float, int], float],
     gains: Sequence[float],
     *,
@@ -18,12 +18,12 @@ def compare(
     every_k: Sequence[int] = (11, 12, 13, 14),
     score: str = "Strehl ratio",
 ) -> None:
-    """Print a table: the score of every arm, its standard error over pieces of air, and against the first.
+    """Print a table: the score of every method, its standard error over pieces of air, and against the first.
 
     Parameters
     ----------
-    arms : mapping
-        By name, the setups to choose from; the first arm is what all are compared with.
+    methods : mapping
+        By name, the setups to choose from; the first method is what all are compared with.
     strehl : callable
         Closes the loop with a setup, a gain and the air of a seed.
     gains : sequence of float
@@ -34,7 +34,7 @@ def compare(
     """
     first: np.ndarray | None = None
     print(f"{'':34s} {score:16s} against the first  chosen, loop gain")
-    for name, setups in arms.items():
+    for name, setups in methods.items():
         begun = time.perf_counter()
         tried = [
             (np.mean([strehl(setup, gain, seed) for seed in tuning]), number, gain)

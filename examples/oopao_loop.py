@@ -2,7 +2,7 @@
 
 A 3.6 m telescope, 6x6 lenslets of 10x10 pixels, 22 electrons per lenslet and frame, 250 frames/s, 1 electron
 of read noise. One line makes a sensor measure with faintspot (`attach`); OOPAO's references, slopes units and
-interaction matrix are then made through it. Every arm is tuned on other air than it is judged by.
+interaction matrix are then made through it. Every method is tuned on other air than it is judged by.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def strehl(setup: Setup, gain: float, seed: int) -> float:
     return float(np.mean(ratios[SETTLE:]))
 
 
-ARMS = {
+METHODS = {
     "OOPAO, weighted": [Setup(f"{w:g} px", threshold=0.0, fwhm_px=w) for w in (3.0, 4.0, 5.0)],
     "OOPAO, threshold": [Setup(f"{t:g} of the peak", threshold=t) for t in (0.05, 0.1, 0.2)],
     "faintspot, brightest pixels": [
@@ -157,4 +157,4 @@ ARMS = {
 
 if __name__ == "__main__":
     print(f"{FLUX_E:g} e- a lenslet, {READ_NOISE_E:g} e- read noise; Strehl ratio at 1.65 um")
-    compare(ARMS, strehl, GAINS, tuning=(1,))
+    compare(METHODS, strehl, GAINS, tuning=(1,))

@@ -2,9 +2,9 @@
 
 pyRTC's slopes process and pyRTC's loop, frame by frame; camera, air and mirror are simulated: 6x6 lenslets of
 10x10 pixels, 40 electrons per lenslet and frame, 1 electron of read noise. The mirror makes the 14 modes that
-the air is made of. In the configuration `class_name` changes, and `faintspot` says how to measure. Every arm
-has an interaction matrix of its own and is tuned on other air than it is judged by. What is scored: the part
-of the air's displacements of the spots that is taken off.
+the air is made of. In the configuration `class_name` changes, and `faintspot` says how to measure. Every
+method has an interaction matrix of its own and is tuned on other air than it is judged by. What is scored:
+the part of the air's displacements of the spots that is taken off.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def table(name: str, **options: Any) -> dict[str, Any]:
     return {"estimator": {"name": name, **options}, "settings": {"flux_e": FLUX_E}}
 
 
-ARMS = {
+METHODS = {
     "pyRTC, weighted": [Setup(f"{w:g} px", {"centroider": "wcog", "wcog_fwhm": w}) for w in (2.0, 3.0, 4.0)],
     "pyRTC, threshold": [Setup(f"{c:g} e-", {"contrast": c}) for c in (1.0, 2.0, 3.0)],
     "faintspot, brightest pixels": [
@@ -170,4 +170,4 @@ ARMS = {
 
 if __name__ == "__main__":
     print(f"{FLUX_E:g} e- a lenslet, {READ_NOISE_E:g} e- read noise; part of the variance that is taken off")
-    compare(ARMS, part_taken_off, GAINS, score="part taken off")
+    compare(METHODS, part_taken_off, GAINS, score="part taken off")

@@ -1,8 +1,8 @@
 """faintspot in a soapy closed loop: its slopes beside soapy's own, for a faint star.
 
 A 3 m telescope, 5x5 lenslets of 12x12 pixels, 38 electrons per lenslet and frame, 250 frames/s, 1 electron of
-read noise. One line between `aoinit` and `makeIMat` makes a sensor measure with faintspot. Every arm has an
-interaction matrix of its own and is tuned on other air than it is judged by.
+read noise. One line between `aoinit` and `makeIMat` makes a sensor measure with faintspot. Every method has
+an interaction matrix of its own and is tuned on other air than it is judged by.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def strehl(setup: Setup, gain: float, seed: int) -> float:
     return float(np.mean(simulation.instStrehl[0, SETTLE:]))
 
 
-ARMS = {
+METHODS = {
     "soapy, brightest pixels": [
         Setup(f"{100 * f:g} %", own="brightest_pixel", threshold=f) for f in (0.1, 0.15)
     ],
@@ -113,4 +113,4 @@ ARMS = {
 
 if __name__ == "__main__":
     print(f"{FLUX_E:g} e- a lenslet, {READ_NOISE_E:g} e- read noise; Strehl ratio at 1.65 um")
-    compare(ARMS, strehl, GAINS, tuning=(1, 2, 3))
+    compare(METHODS, strehl, GAINS, tuning=(1, 2, 3))

@@ -2,8 +2,8 @@
 
 A 3.6 m telescope, 6x6 lenslets of 10x10 pixels, about 40 electrons per lenslet and frame, 250 frames/s, 1
 electron of read noise. In the parameter file the class of the slope computer changes (and `add_modules` says
-where it is); in the file that calibrates, it says `calibrating`. Every arm has a reconstructor of its own and
-is tuned on other air than it is judged by.
+where it is); in the file that calibrates, it says `calibrating`. Every method has a reconstructor of its own
+and is tuned on other air than it is judged by.
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ def table(name: str, **options: Any) -> dict[str, Any]:
     return {"estimator": {"name": name, **options}, "settings": {"flux_e": FLUX_E}}
 
 
-ARMS = {
+METHODS = {
     "SPECULA, weighted": [Setup(f"{2 * r:g} px", {"weightedPixRad": r}) for r in (2.0, 3.0)],
     "SPECULA, threshold": [Setup(f"{t:g} e-", {"thr_value": t}) for t in (1.0, 2.0)],
     "faintspot, brightest pixels": [
@@ -256,4 +256,4 @@ ARMS = {
 if __name__ == "__main__":
     run(SYSTEM, SUBAPERTURES)
     print(f"about {FLUX_E:g} e- a lenslet, 1 e- read noise; Strehl ratio at 1.65 um")
-    compare(ARMS, strehl, GAINS, tuning=(1,), every_k=(11, 12, 13))
+    compare(METHODS, strehl, GAINS, tuning=(1,), every_k=(11, 12, 13))

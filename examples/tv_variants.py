@@ -24,7 +24,7 @@ from scipy.ndimage import gaussian_filter
 import faintspot as fs
 from faintspot.algorithms.automatic import automatic_kept_pixels, automatic_strength
 from faintspot.estimators.brightest import BrightestPixels
-from faintspot.experiments.cell_arms import position_table
+from faintspot.experiments.cell_methods import position_table
 from faintspot.experiments.statistics import slope_statistics
 from faintspot.experiments.sweep import Cell
 from faintspot.simulate import Detector, subapertures
@@ -127,7 +127,7 @@ def zero_border_tv(images: Images, strength: float) -> Images:
     return np.ascontiguousarray(fs.tv_denoise(framed, strength * SIDE / (SIDE + 2))[:, 1:-1, 1:-1])
 
 
-class Arm(NamedTuple):
+class Method(NamedTuple):
     """A way to prepare images before the brightest pixels, and the parameters to choose from."""
 
     name: str
@@ -135,13 +135,13 @@ class Arm(NamedTuple):
     prepare: Callable[[Images, float, Cell], Images]
 
 
-ARMS = (
-    Arm("no TV", (0.0,), lambda g, _, __: g),
-    Arm("TV, searched", STRENGTHS, lambda g, s, cell: fs.tv_denoise(g, s * cell.pixel_noise_e)),
-    Arm("penalised", MULTIPLIERS, lambda g, m, cell: penalised_tv(g, m * cell.pixel_noise_e)),
-    Arm("whole frame", STRENGTHS, lambda g, s, cell: whole_frame_tv(g, s * cell.pixel_noise_e)),
-    Arm("zero border", STRENGTHS, lambda g, s, cell: zero_border_tv(g, s * cell.pixel_noise_e)),
-    Arm("Gaussian", WIDTHS_PX, lambda g, w, _: gaussian_filter(g, w, mode="constant", axes=(-2, -1))),
+METHODS = (
+    Method("no TV", (0.0,), lambda g, _, __: g),
+    Method("TV, searched", STRENGTHS, lambda g, s, cell: fs.tv_denoise(g, s * cell.pixel_noise_e)),
+    Method("penalised", MULTIPLIERS, lambda g, m, cell: penalised_tv(g, m * cell.pixel_noise_e)),
+    Method("whole frame", STRENGTHS, lambda g, s, cell: whole_frame_tv(g, s * cell.pixel_noise_e)),
+    Method("zero border", STRENGTHS, lambda g, s, cell: zero_border_tv(g, s * cell.pixel_noise_e)),
+    Method("Gaussian", WIDTHS_PX, lambda g, w, _: gaussian_filter(g, w, mode="constant", axes=(-2, -1))),
 )
 
 
@@ -228,15 +228,15 @@ def compare_single_frames(cell: Cell, uneven: float, count: int, rng: np.random.
     n_frames = count // LENSLETS**2
     for which, row in enumerate(rows):
         row.append(ratio(bordered, reference, truth, n_frames, which))
-    for arm in ARMS:
-        tables = (positions_of(arm.prepare(tuning, c, cell), cell) for c in arm.candidates)
+    for method in METHODS:
+        tables = (positions_of(method.prepare(tuning, c, cell), cell) for c in method.candidates)
         costs = np.stack([costs_of(table, tuning_truth) for table in tables], axis=1)
         for which, row in enumerate(rows):
             candidate, k = np.unravel_index(np.argmin(costs[which]), costs[which].shape)
-            prepared = arm.prepare(images, arm.candidates[candidate], cell)
+            prepared = method.prepare(images, method.candidates[candidate], cell)
             measured = positions_of(prepared, cell, KEPT[k])[:, 0]
             row.append(ratio(measured, reference, truth, n_frames, which))
-            row[-1] += f" ({arm.candidates[candidate]:g}, {KEPT[k]})"
+            row[-1] += f" ({method.candidates[candidate]:g}, {KEPT[k]})"
     return rows
 
 
@@ -293,20 +293,20 @@ def compare_moving_frames(cell: Cell, rho: float, count: int, rng: np.random.Gen
     images, motion = moving_frames(cell, rho, count, rng)
     tuning_truth, truth = (m[:, -SCORED:].reshape(-1, 2) for m in (tuning_motion, motion))
     rows, references = [[label(cell), f"{rho:g}"] for _ in QUANTITIES], [truth, truth]
-    for arm in TEMPORAL:
-        candidates = list(product(arm.frames, arm.strengths))
-        filtered = len(arm.gains) > 1
+    for method in TEMPORAL:
+        candidates = list(product(method.frames, method.strengths))
+        filtered = len(method.gains) > 1
         tables = (moving_positions(tuning, cell, *c, filtered) for c in candidates)
         costs = np.stack(
-            [[costs_of(smoothed(table, g), tuning_truth) for g in arm.gains] for table in tables], axis=2
+            [[costs_of(smoothed(table, g), tuning_truth) for g in method.gains] for table in tables], axis=2
         )  # (gain, quantity, candidate, k)
         for which, row in enumerate(rows):
             cost = costs[:, which]
             best, candidate, k = np.unravel_index(np.argmin(cost), cost.shape)
-            gain, (frames, strength) = arm.gains[best], candidates[candidate]
+            gain, (frames, strength) = method.gains[best], candidates[candidate]
             table = moving_positions(images, cell, frames, strength, filtered)
             measured = smoothed(table[:, :, k], gain)
-            if arm is TEMPORAL[0]:
+            if method is TEMPORAL[0]:
                 references[which] = measured
                 row.append(value(measured, truth, which))
             else:
@@ -331,10 +331,10 @@ def main() -> None:
     arguments = parser.parse_args()
     count = max(2, arguments.realisations // LENSLETS**2) * LENSLETS**2
     rng = np.random.default_rng(arguments.seed)
-    head = ["case", "TV, automatic", "zero border, automatic", *(arm.name for arm in ARMS)]
+    head = ["case", "TV, automatic", "zero border, automatic", *(method.name for method in METHODS)]
     frames = [(cell, 0.0) for cell in [*cases(), *far_cases()]] + [(cell, UNEVEN) for cell in cases()[4:9]]
     print_tables("Single frames", head, [compare_single_frames(*case, count, rng) for case in frames])
-    head = ["case", "correlation", *(arm.name for arm in TEMPORAL)]
+    head = ["case", "correlation", *(method.name for method in TEMPORAL)]
     moving = [compare_moving_frames(cell, rho, count, rng) for cell in cases() for rho in CORRELATIONS]
     print_tables("Moving spots", head, moving)
 

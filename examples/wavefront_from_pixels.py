@@ -30,7 +30,7 @@ from faintspot.ao_loop.control import learnt_control
 from faintspot.ao_loop.simulation import DisabledErrors, _Loop
 from faintspot.ao_loop.telescope_model import LoopOptics, TelescopeModel, prepare
 from faintspot.control.kalman import SlopePredictor
-from faintspot.experiments.loop_arms import arm_kind
+from faintspot.experiments.loop_methods import method_kind
 from faintspot.turbulence.slope_covariance import phase_covariance_rad2
 
 Floats = NDArray[np.float64]
@@ -254,10 +254,10 @@ class PixelLoop(_Loop):
 
 def closed_loop(configuration: LoopConfiguration, realisations: int) -> None:
     """Print Strehl ratios of the filter that slopes correct, and of the one that pixels correct."""
-    kind = arm_kind("window+kalman")
+    kind = method_kind("window+kalman")
     width = WINDOW_FWHM * configuration.spot_width_px
     choice = {"loop_gain": LOOP_GAIN, "noise_scale": NOISE_SCALE, "window_fwhm_px": width}
-    arm, learnt = learnt_control(configuration, kind.arm(configuration, choice), configuration.run.seed)
+    method, learnt = learnt_control(configuration, kind.method(configuration, choice), configuration.run.seed)
     assert learnt is not None
     model, settle = Model.of(configuration), configuration.run.settle_frames
     print(
@@ -266,7 +266,7 @@ def closed_loop(configuration: LoopConfiguration, realisations: int) -> None:
     found = []
     for realisation in range(realisations):
         which = np.zeros(configuration.run.frames, np.int64)
-        what = configuration, [(arm, learnt)], which, configuration.run.seed, realisation, DisabledErrors()
+        what = configuration, [(method, learnt)], which, configuration.run.seed, realisation, DisabledErrors()
         by_slopes, by_pixels = _Loop(*what), PixelLoop(*what)
         by_pixels.begin(model, learnt.model.predictor())
         found.append([each.run(None).truth[0, settle:].mean() for each in (by_slopes, by_pixels)])

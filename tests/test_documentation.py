@@ -122,16 +122,16 @@ def write_slopes(path: Path, frames: Any, layout: fs.Layout, calibration: fs.Cal
 
 
 def write_night(path: Path, layout: fs.Layout) -> None:
-    """Write telemetry of 20 frames with two arms in turn, in both formats."""
+    """Write telemetry of 20 frames with two methods in turn, in both formats."""
     records = np.zeros(20, record_type(len(layout)))
     records["frame"] = np.arange(20)
-    records["arm"] = records["frame"] % 2
+    records["method"] = records["frame"] % 2
     kinds = record_type(len(layout)), image_type(layout.frame_shape, len(layout), layout.window)
     told = {
         "name": "night",
         "layout": layout_values(layout),
         "settings": "",
-        "arms": ["none", "tv"],
+        "methods": ["none", "tv"],
         "dropped_records": 0,
     }
     store = TelemetryStore(path.with_suffix(".zarr"), *kinds, told)

@@ -26,7 +26,7 @@ question = Question(
     magnitude=10.0,
 )
 answer = fs.tune(question, rng=np.random.default_rng(1), realisations=1000)
-print(f"{answer.best.arm.label}: R = {answer.best.error_px[answer.at_star]:.3f} px")
+print(f"{answer.best.method.label}: R = {answer.best.error_px[answer.at_star]:.3f} px")
 print(answer.best.settings)
 
 # %%

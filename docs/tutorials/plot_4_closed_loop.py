@@ -14,7 +14,7 @@ the same turbulence and photons, other slopes and other control.
 from matplotlib.figure import Figure
 
 import faintspot as fs
-from faintspot.ao_loop import Arm, load_loop, simulate_loop
+from faintspot.ao_loop import Method, load_loop, simulate_loop
 
 loop = load_loop("diffraction_limit").replace("camera", photons_per_subaperture=20.0)
 loop = loop.replace("run", frames=400, settle_frames=80).replace("control", telemetry_frames=1000)
@@ -22,11 +22,11 @@ psf = fs.PSF.analytic(size=loop.spot_width_px / 2)
 window = fs.Settings("window", window_fwhm_px=1.3 * loop.spot_width_px, flux_e=20.0)
 posterior = fs.Settings("map", prior_std_px=0.7, flux_e=20.0)
 
-arms = [
-    Arm("brightest pixels", fs.Settings("brightest", keep_brightest=20), gain=0.1),
-    Arm("fixed window", window, gain=0.4),
-    Arm("maximum a posteriori", posterior, gain=0.4, predict_prior=True, correct_gain=False, psf=psf),
-    Arm(
+methods = [
+    Method("brightest pixels", fs.Settings("brightest", keep_brightest=20), gain=0.1),
+    Method("fixed window", window, gain=0.4),
+    Method("maximum a posteriori", posterior, gain=0.4, predict_prior=True, correct_gain=False, psf=psf),
+    Method(
         "the same, Kalman filter",
         posterior,
         gain=0.3,
@@ -36,7 +36,7 @@ arms = [
         control="kalman",
     ),
 ]
-records = {arm.label: simulate_loop(loop, [arm]) for arm in arms}
+records = {method.label: simulate_loop(loop, [method]) for method in methods}
 
 # %%
 # One short realisation each: enough to see, not enough to judge by. :doc:`/results/closed_loop` has five

@@ -54,7 +54,7 @@ def recording(
     when = (np.arange(frames) / RATE_HZ * 1e9).astype(np.int64)
     values: dict[str, Any] = {
         "frame": np.arange(frames),
-        "arm": np.zeros(frames, np.int64),
+        "method": np.zeros(frames, np.int64),
         "change": np.zeros(frames, np.int64),
         "last_row_time_ns": when,
         "published_time_ns": when + 1000,
@@ -72,6 +72,6 @@ def recording(
         "raw": np.zeros((0, *LAYOUT.frame_shape), np.float32),
         "denoised": np.zeros((0, n, *LAYOUT.window), np.float32),
         "changes": [],
-        "attributes": {"settings": "", "arms": ["set"]},
+        "attributes": {"settings": "", "methods": ["set"]},
     }
     return Telemetry(**{**values, **changes})

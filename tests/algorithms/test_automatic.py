@@ -21,7 +21,7 @@ from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.experiments.cell import realisations
-from faintspot.experiments.cell_arms import error_sums
+from faintspot.experiments.cell_methods import error_sums
 from faintspot.experiments.sweep import Cell
 
 FWHM_OF_SIZE = {"diffraction": 1.772, "gaussian": 2.0}
@@ -68,7 +68,7 @@ def test_near_the_best_of_a_search(cell: Cell) -> None:
     strength = float(automatic_strength(**about))
     width = float(automatic_smoothing(**about))
     strengths = [*(factor * cell.pixel_noise_e for factor in STRENGTHS), strength]
-    arms: dict[str, list[Any]] = {
+    methods: dict[str, list[Any]] = {
         "none": [BrightestPixels()],
         "tv": [TotalVariation(noise_std=value) for value in strengths if value],
         "smoothed": [Smoothed(smoothing_px=value) for value in (*WIDTHS, width) if value],
@@ -76,7 +76,7 @@ def test_near_the_best_of_a_search(cell: Cell) -> None:
     blocks = list(realisations(cell, REALISATIONS, np.random.default_rng(3)))
     errors: dict[str, Any] = {
         method: sum(error_sums(each, *block) for block in blocks) / REALISATIONS
-        for method, each in arms.items()
+        for method, each in methods.items()
     }
     plain = errors["none"][0]
     for method, value in (("none", 1.0), ("tv", strength), ("smoothed", width)):

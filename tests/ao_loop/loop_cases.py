@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import faintspot as fs
-from faintspot.ao_loop import Arm, LoopConfiguration
+from faintspot.ao_loop import LoopConfiguration, Method
 from faintspot.ao_loop.configuration import Camera
 
 PLAIN = fs.Settings("brightest", keep_brightest=80)
@@ -23,9 +23,9 @@ def faint() -> LoopConfiguration:
     return quiet().replace("camera", photons_per_subaperture=200.0, read_noise_e=1.0)
 
 
-def plain(label: str = "plain") -> Arm:
+def plain(label: str = "plain") -> Method:
     """Brightest pixels and centre of gravity."""
-    return Arm(label, PLAIN)
+    return Method(label, PLAIN)
 
 
 def expected_variance(amplitude: np.ndarray, spacing_m: float, r0_m: float, outer_scale_m: float) -> float:

@@ -9,7 +9,7 @@ import pytest
 from tests.ao_loop.loop_cases import faint, plain
 
 import faintspot as fs
-from faintspot.ao_loop import Arm, LoopRecord, simulate_loop
+from faintspot.ao_loop import LoopRecord, Method, simulate_loop
 from faintspot.base.errors import InputError
 
 pytest.importorskip("hcipy")
@@ -37,7 +37,7 @@ def test_a_record_comes_back_as_it_was(record: LoopRecord, tmp_path: Path) -> No
 
 def test_mean_strehl_is_of_scored_frames(record: LoopRecord) -> None:
     assert record.mean_strehl(1) == pytest.approx(record.strehl[5::2].mean())
-    with pytest.raises(InputError, match="arm = 2"):
+    with pytest.raises(InputError, match="method = 2"):
         record.mean_strehl(2)
 
 
@@ -63,6 +63,6 @@ def test_a_place_that_cannot_be_written_is_named(record: LoopRecord, tmp_path: P
     "values",
     [{"label": ""}, {"settings": None}, {"gain": -1.0}, {"gain": float("nan")}, {"window_pixels": 1}],
 )
-def test_bad_arms_are_refused(values: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=r"arm\."):
-        Arm(**{"label": "a", "settings": fs.Settings("brightest"), **values})
+def test_bad_methods_are_refused(values: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=r"method\."):
+        Method(**{"label": "a", "settings": fs.Settings("brightest"), **values})

@@ -5,7 +5,7 @@ import pytest
 from tests.ao_loop.loop_cases import PLAIN, expected_variance, faint, plain, quiet
 
 import faintspot as fs
-from faintspot.ao_loop import Arm, LoopRecord, load_loop, simulate_loop
+from faintspot.ao_loop import LoopRecord, Method, load_loop, simulate_loop
 from faintspot.ao_loop.atmosphere import make_atmosphere
 from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.mirror import BestFit
@@ -54,8 +54,8 @@ def test_runs_repeat_bit_for_bit(record: LoopRecord) -> None:
     np.testing.assert_array_equal(again.psf, record.psf)
 
 
-def test_arms_see_the_same_atmosphere_and_photons(record: LoopRecord) -> None:
-    both = [plain(), Arm("tv", fs.Settings(noise_std=1.0, keep_brightest=80))]
+def test_methods_see_the_same_atmosphere_and_photons(record: LoopRecord) -> None:
+    both = [plain(), Method("tv", fs.Settings(noise_std=1.0, keep_brightest=80))]
     schedule = np.repeat([0, 1], 100)
     mixed = simulate_loop(faint(), both, schedule)
     np.testing.assert_array_equal(mixed.slopes_px[:100], record.slopes_px[:100])
@@ -77,7 +77,7 @@ def test_slopes_follow_the_interaction_matrix() -> None:
     per cent from the mean gradient in partly lit sub-apertures.
     """
     loop = quiet().replace("run", frames=60)
-    record = simulate_loop(loop, [Arm("true", PLAIN, true_slopes=True)], seed=4)
+    record = simulate_loop(loop, [Method("true", PLAIN, true_slopes=True)], seed=4)
     atmosphere, sensor = make_atmosphere(loop, 4), prepare(loop).sensor
     frames = np.arange(20, 60)
     expected = np.array([sensor.mean_slopes_px(atmosphere.wavefront_nm((k + 0.5) / 250)) for k in frames])
@@ -93,7 +93,7 @@ def test_noise_free_loop_lies_between_fitting_error_and_its_budget() -> None:
     Aliasing adds up to 0.4 of the fitting variance (Rigaut, Veran & Lai 1998, SPIE 3353, 1038).
     """
     loop = quiet()
-    record = simulate_loop(loop, [Arm("true", PLAIN, true_slopes=True, gain=0.5)])
+    record = simulate_loop(loop, [Method("true", PLAIN, true_slopes=True, gain=0.5)])
     optics, atmosphere = prepare(loop), make_atmosphere(loop, loop.run.seed)
     fit = BestFit.of(optics.mirror, optics.pupil)
     fitting, lag = [], []
@@ -119,8 +119,8 @@ def test_without_correction_the_strehl_is_that_of_theory() -> None:
     loop = quiet().replace("atmosphere", r0_m=1.2).replace("control", gain=0.0, frame_rate_hz=5.0)
     loop = loop.replace("run", frames=150, settle_frames=0)
     optics = prepare(loop)
-    arm = Arm("none", PLAIN, true_slopes=True)
-    records = [simulate_loop(loop, [arm], realisation=number) for number in range(3)]
+    method = Method("none", PLAIN, true_slopes=True)
+    records = [simulate_loop(loop, [method], realisation=number) for number in range(3)]
     variance = np.mean([record.residual_nm**2 for record in records]) * (2 * np.pi / 500) ** 2
     expected = expected_variance(optics.pupil.amplitude, optics.pupil.spacing_m, 1.2, 25.0)
     assert variance == pytest.approx(expected, rel=0.2)
@@ -132,8 +132,8 @@ def test_open_loop_control() -> None:
     loop = load_loop("open_loop").replace("run", frames=160, settle_frames=40)
     settings = fs.Settings("brightest", keep_brightest=150)
     bright = loop.replace("camera", photons_per_subaperture=2000.0)
-    corrected = simulate_loop(bright, [Arm("corrected", settings)])
-    not_corrected = simulate_loop(bright, [Arm("not", settings, correct_gain=False)])
+    corrected = simulate_loop(bright, [Method("corrected", settings)])
+    not_corrected = simulate_loop(bright, [Method("not", settings, correct_gain=False)])
     assert corrected.mean_strehl() > 0.5
     assert corrected.mean_strehl() > not_corrected.mean_strehl()
     assert not corrected.closed
@@ -146,8 +146,8 @@ def test_centroid_gain_falls_with_noise_and_brightest_pixels() -> None:
     for photons, noise, kept in ((1e5, 0.0, 255), (200.0, 1.0, 80), (200.0, 3.0, 20)):
         camera = {"photons_per_subaperture": photons, "read_noise_e": noise}
         case = loop.replace("camera", **camera)
-        arm = Arm("k", fs.Settings("brightest", keep_brightest=kept))
-        pipeline = make_pipeline(case, prepare(case).sensor, arm)
+        method = Method("k", fs.Settings("brightest", keep_brightest=kept))
+        pipeline = make_pipeline(case, prepare(case).sensor, method)
         gains.append(measure_gains(case, [pipeline], seed=1)[0])
     assert gains[0] == pytest.approx(0.93, abs=0.06)  # wings beyond the window
     assert gains[0] > gains[1] > gains[2] > 0.05
@@ -157,53 +157,53 @@ def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
     loop = faint().replace("camera", read_noise_e=3.0, photons_per_subaperture=400.0)
     settings = fs.Settings("brightest", keep_brightest=80)
     corrected, not_corrected = (
-        simulate_loop(loop, [Arm("k", settings, gain=0.3, correct_gain=flag)]) for flag in (True, False)
+        simulate_loop(loop, [Method("k", settings, gain=0.3, correct_gain=flag)]) for flag in (True, False)
     )
     assert corrected.centroid_gain[0] < 0.8
     assert corrected.mean_strehl() > not_corrected.mean_strehl()
 
 
 @pytest.mark.parametrize(
-    "arm",
+    "method",
     [
-        Arm(
+        Method(
             "ml", fs.Settings(estimator="ml", search_range_px=4, model_error=0.3), weighted_reconstructor=True
         ),
-        Arm("map", fs.Settings(estimator="map", prior_std_px=1.0, model_error=0.3), predict_prior=True),
-        Arm("weighted", fs.Settings(estimator="weighted", search_range_px=4)),
-        Arm("smoothed", fs.Settings(estimator="smoothed", keep_brightest=80)),
-        Arm("window", fs.Settings("brightest", keep_brightest=50), window_pixels=10),
-        Arm("auto", fs.Settings(noise_std="auto", keep_brightest="auto")),
+        Method("map", fs.Settings(estimator="map", prior_std_px=1.0, model_error=0.3), predict_prior=True),
+        Method("weighted", fs.Settings(estimator="weighted", search_range_px=4)),
+        Method("smoothed", fs.Settings(estimator="smoothed", keep_brightest=80)),
+        Method("window", fs.Settings("brightest", keep_brightest=50), window_pixels=10),
+        Method("auto", fs.Settings(noise_std="auto", keep_brightest="auto")),
     ],
-    ids=lambda arm: arm.label,
+    ids=lambda method: method.label,
 )
-def test_every_kind_of_arm_closes_the_loop(arm: Arm) -> None:
+def test_every_kind_of_method_closes_the_loop(method: Method) -> None:
     loop = load_loop("diffraction_limit").replace("run", frames=100, settle_frames=40)
-    record = simulate_loop(loop.replace("camera", photons_per_subaperture=400.0), [arm])
+    record = simulate_loop(loop.replace("camera", photons_per_subaperture=400.0), [method])
     assert record.mean_strehl() > 0.3
 
 
 def test_invalid_sub_apertures_do_no_harm() -> None:
     loop = faint().replace("run", frames=60)
-    arm = Arm("nothing", fs.Settings(estimator="thresholded", threshold_e=1e6))
-    record = simulate_loop(loop, [arm])
+    method = Method("nothing", fs.Settings(estimator="thresholded", threshold_e=1e6))
+    record = simulate_loop(loop, [method])
     assert not record.valid.any()
     np.testing.assert_array_equal(record.commands, 0)
 
 
 @pytest.mark.parametrize(
-    ("arms", "schedule", "message"),
+    ("methods", "schedule", "message"),
     [
-        ([], None, "arms"),
+        ([], None, "methods"),
         ([plain()], [0, 1], "schedule = 1"),
         ([plain()], [[0]], "schedule"),
         ([plain()] * 2, [0.5], "whole number"),
-        ([Arm("wide", PLAIN, window_pixels=20)], [0], "window_pixels = 20"),
+        ([Method("wide", PLAIN, window_pixels=20)], [0], "window_pixels = 20"),
     ],
 )
-def test_impossible_runs_are_refused(arms: list[Arm], schedule: object, message: str) -> None:
+def test_impossible_runs_are_refused(methods: list[Method], schedule: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        simulate_loop(faint(), arms, schedule)  # type: ignore[arg-type]
+        simulate_loop(faint(), methods, schedule)  # type: ignore[arg-type]
 
 
 def test_more_actuators_than_slopes_can_control_are_refused() -> None:

@@ -31,9 +31,9 @@ def test_demo_twice(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
     frames, truth = np.load(made / "frames.npy"), np.load(made / "truth.npy")
     assert frames.shape == (40, 112, 112)
     assert truth.shape == (40, 36, 2)
-    for arm in ("tv", "no-tv"):
-        stored = read_slopes(made / f"{arm}.npz").variables
-        np.testing.assert_array_equal(stored["x"], SlopePipeline.from_file(made / f"{arm}.toml")(frames).x)
+    for method in ("tv", "no-tv"):
+        stored = read_slopes(made / f"{method}.npz").variables
+        np.testing.assert_array_equal(stored["x"], SlopePipeline.from_file(made / f"{method}.toml")(frames).x)
     assert (made / "report.html").stat().st_size > 100_000
     # The page was made once, and takes longest: the second one only has to replace it.
     monkeypatch.setattr("faintspot.recorded.page.slopes_report", lambda *arguments, **options: "second")
@@ -52,9 +52,9 @@ def test_bad_options(folder: Path, run: Commands) -> None:
 
 
 def test_a_gain_that_is_not_reached_is_said_in_words() -> None:
-    def arms(error: float) -> list[Scored]:
+    def methods(error: float) -> list[Scored]:
         return [Scored(Settings("tv", noise_std=1.0), np.full(20, error / flux)) for flux in FLUXES_E]
 
-    table = comparison_table(Comparison("best k", arms(1.0), arms(1e3)), np.random.default_rng(1))
+    table = comparison_table(Comparison("best k", methods(1.0), methods(1e3)), np.random.default_rng(1))
     assert "nan" not in str(table.caption)
     assert "no flux" in str(table.caption)

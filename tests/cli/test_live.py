@@ -41,7 +41,7 @@ def test_what_cannot_be_shown_is_one_line(tmp_path: Path) -> None:
 def test_page_is_served_until_it_is_ended(tmp_path: Path, end: signal.Signals) -> None:
     images = image_type(LAYOUT.frame_shape, N, LAYOUT.window)
     made = records(0, 100)
-    attributes = {"layout": layout_values(LAYOUT), "settings": "", "arms": []}
+    attributes = {"layout": layout_values(LAYOUT), "settings": "", "methods": []}
     store = TelemetryStore(tmp_path / "night.zarr", made.dtype, images, attributes)
     store.append(made, np.empty(0, images), {})
     command = [*COMMAND, "night.zarr", "--port", "0"]

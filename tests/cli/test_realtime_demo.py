@@ -95,7 +95,7 @@ def shown(turns: int) -> Shown:
 
 def test_table() -> None:
     seen = shown(13)
-    methods = {method.strehl.arm: method for method in seen.by_method()}
+    methods = {method.strehl.method: method for method in seen.by_method()}
     assert [method.strehl.mean.value for method in methods.values()] == pytest.approx([0.3, 0.5, 0.4])
     assert methods["brightest"].strehl.difference is None
     difference = methods["window"].strehl.difference

@@ -26,7 +26,7 @@ def is_page(path: Path) -> bool:
     return text.lstrip().lower().startswith("<!doctype html>") and text.rstrip().endswith("</html>")
 
 
-def test_one_and_two_arms(measured: Path, run: Commands) -> None:
+def test_one_and_two_methods(measured: Path, run: Commands) -> None:
     result = run.ok("report", "slopes.zarr/")  # as a shell completes it
     assert result.out == "slopes.html: open it in a browser\n"
     assert result.err == ""

@@ -53,7 +53,7 @@ def test_key(folder: Path, run: Commands) -> None:
         assert_equal(folder / name, expected(frames))
 
 
-def test_no_denoise_is_the_other_arm(folder: Path, run: Commands) -> None:
+def test_no_denoise_is_the_other_method(folder: Path, run: Commands) -> None:
     frames = simulated()
     np.save("a.npy", frames)
     run.ok("slopes", "a.npy", "-o", "s.npz", "--no-denoise")

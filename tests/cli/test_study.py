@@ -27,7 +27,7 @@ flux_e = [30, 100]
 SLOW = """
 name = "slow"
 realisations = 1500
-arms = ["brightest", "tv"]
+estimators = ["brightest", "tv"]
 
 [sweeps.flux]
 flux_e = { from = 10, to = 1000, points = 30, spacing = "log" }
@@ -36,7 +36,9 @@ flux_e = { from = 10, to = 1000, points = 30, spacing = "log" }
 
 def test_estimators(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     sweep = Sweep("a", flux_e=[50, 200], pixels=8)
-    small = StudySpecification("estimators", [sweep], realisations=100, arms=["brightest", "ml"], fixed_k=[])
+    small = StudySpecification(
+        "estimators", [sweep], realisations=100, estimators=["brightest", "ml"], fixed_k=[]
+    )
     monkeypatch.setattr(estimators, "estimators_study", lambda quick: small)
     out = run.ok("study", "estimators", "--quick", "--workers", 0).out
     assert "estimators-quick.html: open it in a browser" in out

@@ -167,7 +167,7 @@ def test_for_a_loop(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     )
     question = asked["question"]
     assert isinstance(question, LoopQuestion)
-    assert (question.magnitudes, question.arms) == ((9.0, 13.0), ["tv", "map+kalman"])
+    assert (question.magnitudes, question.methods) == ((9.0, 13.0), ["tv", "map+kalman"])
     assert (question.strehl, question.radius_arcsec) == (0.3, 20.0)
     assert question.configuration.run.seed == 7
     assert question.configuration.camera.magnitude == 12.0

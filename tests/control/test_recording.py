@@ -45,7 +45,7 @@ def recording(frames: int = 700) -> Any:
     slopes_px = np.array(slopes, np.float32)[kept]
     error = np.full((len(kept), 9), 0.3 * GAIN, np.float32)
     return SimpleNamespace(
-        attributes={"arms": ["set"]},
+        attributes={"methods": ["set"]},
         frame=kept,
         loop=np.where(kept < 40, 1, 2),
         commands=np.array(sent, np.float32)[kept],
@@ -94,7 +94,7 @@ def test_what_is_refused() -> None:
     with pytest.raises(InputError, match="expected a loop closed with an integrator"):
         telemetry_of_recording(recording(), told, np.full(18, 0.3))
     night = recording()
-    night.attributes["arms"] = ["window+integrator", "map+kalman"]
+    night.attributes["methods"] = ["window+integrator", "map+kalman"]
     with pytest.raises(InputError, match="expected a loop closed with an integrator"):
         telemetry_of_recording(night, CONTROL, np.full(18, 0.3))
     for changes, message in (

@@ -10,7 +10,7 @@ import numpy as np
 
 from faintspot.ao_loop.configuration import LoopConfiguration, load_loop
 from faintspot.experiments.loop_answer import LoopAnswer
-from faintspot.experiments.loop_arms import LOOP_GAIN, NOISE_SCALE, ArmKind, Tunable, arm_kind
+from faintspot.experiments.loop_methods import LOOP_GAIN, NOISE_SCALE, MethodKind, Tunable, method_kind
 from faintspot.experiments.loop_question import LoopQuestion
 from faintspot.experiments.loop_results import MagnitudeResult
 
@@ -37,11 +37,11 @@ def made_up(
     shifts: Mapping[str, float] = SHIFTS, realisations: int = 4, scatter: float = 1e-3, **asked: Any
 ) -> LoopAnswer:
     """Curves of one shape on air that is the same for all, with a scatter of their own."""
-    question = LoopQuestion(configuration(), arms=tuple(shifts), **asked)
+    question = LoopQuestion(configuration(), methods=tuple(shifts), **asked)
     rng = np.random.default_rng(5)
     magnitudes = question.configuration.photometry.magnitude(PHOTONS)
     atmosphere = rng.normal(0.0, 0.02, (len(PHOTONS), realisations))
-    kinds = [arm_kind(name) for name in shifts]
+    kinds = [method_kind(name) for name in shifts]
     strehl = np.array(
         [
             strehl_of(magnitudes, shift)[:, None] + atmosphere + rng.normal(0.0, scatter, atmosphere.shape)
@@ -68,7 +68,7 @@ def made_up(
     return LoopAnswer(question, measured, 300, {"map+kalman": "no time"})
 
 
-def _value(kind: ArmKind, name: str, tunable: Tunable) -> Any:
+def _value(kind: MethodKind, name: str, tunable: Tunable) -> Any:
     """Return a value that is not the last on offer, but for the window's width."""
     if (kind.name, name) == ("window", "window_fwhm_px"):
         return tunable.values[-1]

@@ -8,7 +8,7 @@ import functools
 import numpy as np
 
 import faintspot as fs
-from faintspot.ao_loop import Arm, LoopConfiguration, simulate_loop
+from faintspot.ao_loop import LoopConfiguration, Method, simulate_loop
 from faintspot.ao_loop.configuration import Camera
 from faintspot.experiments.loop_results import BudgetResult, InterleavedResult, MagnitudeResult
 from faintspot.pipeline.configuration import to_text
@@ -33,13 +33,15 @@ def small_interleaved() -> InterleavedResult:
     configuration = configuration.replace("telescope", diameter_m=2.4).replace("sensor", subapertures=4)
     schedule = np.tile(np.repeat(np.arange(len(STRENGTHS)), BLOCK), CYCLES)
     configuration = configuration.replace("run", frames=len(schedule), settle_frames=20)
-    arms = [
-        Arm("no TV", fs.Settings("brightest", keep_brightest=80))
+    methods = [
+        Method("no TV", fs.Settings("brightest", keep_brightest=80))
         if np.isnan(strength)
-        else Arm(f"TV {strength:g}", fs.Settings(noise_std=strength, keep_brightest=80))
+        else Method(f"TV {strength:g}", fs.Settings(noise_std=strength, keep_brightest=80))
         for strength in STRENGTHS
     ]
-    records = tuple(simulate_loop(configuration, arms, schedule, realisation=number) for number in range(2))
+    records = tuple(
+        simulate_loop(configuration, methods, schedule, realisation=number) for number in range(2)
+    )
     block = np.repeat(np.arange(CYCLES * len(STRENGTHS)), BLOCK)
     names = ("full gain, 2 strengths", "75 % gain, 2 strengths")
     return InterleavedResult(records, (block,) * 2, (np.array(STRENGTHS),) * 2, names, 20)
@@ -50,7 +52,7 @@ def made_up_interleaved(gain: float) -> InterleavedResult:
     result = small_interleaved()
     frames = np.arange(result.records[0].frames)
     records = tuple(
-        dataclasses.replace(record, strehl=0.3 + 1e-4 * frames + gain * (record.arm == 2))
+        dataclasses.replace(record, strehl=0.3 + 1e-4 * frames + gain * (record.method == 2))
         for record in result.records
     )
     return dataclasses.replace(result, records=records)
@@ -89,6 +91,6 @@ def made_up_magnitude(gain_mag: float = 0.3, realisations: int = 6) -> Magnitude
 
 
 def made_up_budget() -> BudgetResult:
-    """Two arms, three terms, five realisations."""
+    """Two methods, three terms, five realisations."""
     strehl = np.array([0.4, 0.5, 0.6])[None, :, None] + np.random.default_rng(1).normal(0, 0.01, (2, 3, 5))
     return BudgetResult(NAMES[:2], TERMS, LABELS[:2], strehl, 100 / strehl)

@@ -100,12 +100,12 @@ def test_the_limit_is_sought_beyond_the_plot() -> None:
     assert answer.flux_e[-1] > 10 ** (0.4 * 0.75) * 200 * 1.01
     assert answer.flux_e[answer.at_star] == pytest.approx(200.0)
     assert "all that was tried" not in " ".join(answer_text.recommendation(answer))
-    # R of the recommended arm at its limit is the budget: straight line in log-log between the points.
+    # R of the recommended method at its limit is the budget: straight line in log-log between the points.
     found = np.exp(np.interp(np.log(limit.value), np.log(answer.flux_e), np.log(answer.best.error_px)))
     assert found == pytest.approx(0.02, rel=0.05)
 
 
-def test_the_figure_shows_every_arm_and_the_limit() -> None:
+def test_the_figure_shows_every_method_and_the_limit() -> None:
     answer = answered(budget="0.1")
     axes = tune_figure(answer).axes[0]
     labels = axes.get_legend_handles_labels()[1]
@@ -118,6 +118,6 @@ def test_a_notebook_shows_the_recommendation_and_every_estimator() -> None:
     answer = answered()
     rows = ElementTree.fromstring(answer._repr_html_()).findall("tr")
     assert len(rows) == 1 + len(answer.results)
-    assert str(rows[0].findtext("td")).startswith(answer.best.arm.label)
+    assert str(rows[0].findtext("td")).startswith(answer.best.method.label)
     rms = [float(str(row.findtext("td")).split()[1]) for row in rows[1:]]
     assert rms == sorted(rms)  # the best first

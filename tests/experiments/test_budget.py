@@ -11,12 +11,12 @@ from faintspot.ao_loop.files import BUDGET_FILE
 from faintspot.ao_loop.simulation import simulate_loop
 from faintspot.base.errors import InputError
 from faintspot.experiments.budget import TERMS, budget_run, run_budget
-from faintspot.experiments.loop_arms import LOOP_GAIN, arm_kind
+from faintspot.experiments.loop_methods import LOOP_GAIN, method_kind
 from faintspot.experiments.loop_results import BudgetResult
 from faintspot.experiments.running import WorkerPool
 
 pytest.importorskip("hcipy")
-KIND = arm_kind("brightest")
+KIND = method_kind("brightest")
 CHOICE = {LOOP_GAIN: 0.5, "keep_brightest": 16}
 
 FAINT = small().replace("camera", photons_per_subaperture=40.0).replace("run", frames=300, settle_frames=40)
@@ -28,7 +28,7 @@ def strehl(term: str) -> float:
 
 
 def test_without_nothing_it_is_the_loop_itself() -> None:
-    record = simulate_loop(FAINT, [KIND.arm(FAINT, CHOICE)])
+    record = simulate_loop(FAINT, [KIND.method(FAINT, CHOICE)])
     assert strehl("nothing") == pytest.approx(record.mean_strehl(), abs=1e-12)
 
 
@@ -69,7 +69,7 @@ def test_experiment_and_resume(tmp_path: Path) -> None:
 
 
 def test_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="arms: expected at least one"):
+    with pytest.raises(InputError, match="methods: expected at least one"):
         run_budget(small(), tmp_path, [], place=HERE)
     with pytest.raises(InputError, match=r"control.mode = 'open'"):
         run_budget(small().replace("control", mode="open"), tmp_path, place=HERE)

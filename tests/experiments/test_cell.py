@@ -11,7 +11,7 @@ from tests.shared_data import shared_file
 
 from faintspot.experiments import Cell, StudySpecification, Sweep, measure_cell
 from faintspot.experiments.cell import realisations
-from faintspot.experiments.cell_arms import CellArms, error_sums, errors_of
+from faintspot.experiments.cell_methods import CellMethods, error_sums, errors_of
 
 SMALL = StudySpecification("small", [Sweep("a", flux_e=60, pixels=8)], realisations=400, fixed_k=(10, 40))
 
@@ -22,16 +22,16 @@ def measured() -> dict[str, Any]:
 
 
 def test_shapes_and_consistency(measured: dict[str, Any]) -> None:
-    arms, modes = len(SMALL.arms), len(SMALL.modes)
+    methods, modes = len(SMALL.estimators), len(SMALL.modes)
     for name in ("error", "error_se", "chosen_k", "chosen_candidate", "invalid_fraction"):
-        assert measured[name].shape == (arms, modes), name
-    assert measured["error_covariance"].shape == (modes, arms, arms)
-    assert measured["error_at_k"].shape == measured["error_at_k_se"].shape == (arms, 63)
+        assert measured[name].shape == (methods, modes), name
+    assert measured["error_covariance"].shape == (modes, methods, methods)
+    assert measured["error_at_k"].shape == measured["error_at_k_se"].shape == (methods, 63)
     variances = np.diagonal(measured["error_covariance"], axis1=1, axis2=2).T
     np.testing.assert_allclose(measured["error_se"] ** 2, variances)
-    thresholded = SMALL.arms.index("thresholded")
-    for i, arm in enumerate(SMALL.arms):
-        if arm == "thresholded":
+    thresholded = SMALL.estimators.index("thresholded")
+    for i, method in enumerate(SMALL.estimators):
+        if method == "thresholded":
             assert np.isnan(measured["chosen_k"][i]).all()
             assert np.ptp(measured["error"][i]) == 0.0
             assert np.isnan(measured["error_at_k"][i]).all()
@@ -41,7 +41,7 @@ def test_shapes_and_consistency(measured: dict[str, Any]) -> None:
         # The same numbers, added up in another order.
         assert measured["error_at_k"][i, best - 1] == pytest.approx(measured["error"][i, 0], rel=1e-9)
         assert measured["error_at_k_se"][i, best - 1] == pytest.approx(measured["error_se"][i, 0], rel=1e-6)
-        assert np.isnan(measured["chosen_candidate"][i]).all() == (arm not in ("tv", "smoothed"))
+        assert np.isnan(measured["chosen_candidate"][i]).all() == (method not in ("tv", "smoothed"))
     assert measured["chosen_candidate"][thresholded, 0] in SMALL.thresholds
 
 
@@ -50,28 +50,28 @@ def test_chosen_on_one_half_and_scored_on_the_other(measured: dict[str, Any]) ->
     rng = np.random.default_rng(cell.seed(SMALL.seed))
     ((first, first_truth),) = realisations(cell, 200, rng)
     ((second, second_truth),) = realisations(cell, 200, rng)
-    arms = CellArms(cell, SMALL)
+    methods = CellMethods(cell, SMALL)
 
     def errors(strength: float, images: Any, truth: Any) -> Any:
-        positions, _, _ = arms.positions("tv", (("noise_std", strength),), images)
+        positions, _, _ = methods.positions("tv", (("noise_std", strength),), images)
         return errors_of(positions, truth[:, None])
 
     tables = [errors(f, first, first_truth).mean(axis=0) for f in SMALL.strengths]
     row, column = map(int, np.unravel_index(np.argmin(tables), np.shape(tables)))
-    arm = SMALL.arms.index("tv")
-    assert measured["chosen_candidate"][arm, 0] == SMALL.strengths[row]
-    assert measured["chosen_k"][arm, 0] == column + 1
+    method = SMALL.estimators.index("tv")
+    assert measured["chosen_candidate"][method, 0] == SMALL.strengths[row]
+    assert measured["chosen_k"][method, 0] == column + 1
     scored = errors(SMALL.strengths[row], second, second_truth)[:, column]
-    assert measured["error"][arm, 0] == pytest.approx(scored.mean(dtype=np.float64))
-    assert measured["error_se"][arm, 0] == pytest.approx(scored.std(ddof=1) / np.sqrt(200), rel=1e-5)
+    assert measured["error"][method, 0] == pytest.approx(scored.mean(dtype=np.float64))
+    assert measured["error_se"][method, 0] == pytest.approx(scored.std(ddof=1) / np.sqrt(200), rel=1e-5)
     fixed = [errors(f, first, first_truth)[:, 39].mean() for f in SMALL.strengths]
-    assert measured["chosen_candidate"][arm, 2] == SMALL.strengths[int(np.argmin(fixed))]
+    assert measured["chosen_candidate"][method, 2] == SMALL.strengths[int(np.argmin(fixed))]
 
 
-def test_arms_share_images_and_do_not_disturb_each_other(measured: dict[str, Any]) -> None:
-    alone = StudySpecification("alone", SMALL.sweeps, realisations=400, arms=["tv"], fixed_k=(10, 40))
+def test_methods_share_images_and_do_not_disturb_each_other(measured: dict[str, Any]) -> None:
+    alone = StudySpecification("alone", SMALL.sweeps, realisations=400, estimators=["tv"], fixed_k=(10, 40))
     tv = measure_cell(alone.cells()[0], alone)
-    np.testing.assert_array_equal(tv["error"][0], measured["error"][SMALL.arms.index("tv")])
+    np.testing.assert_array_equal(tv["error"][0], measured["error"][SMALL.estimators.index("tv")])
 
 
 def test_windows_too_small_for_a_fixed_k() -> None:
@@ -98,7 +98,7 @@ def test_standard_errors_are_right() -> None:
     errors, variances = [], []
     for seed in range(40):
         specification = StudySpecification(
-            "s", [Sweep("a", pixels=8)], seed=seed, realisations=400, arms=["brightest"], fixed_k=(12,)
+            "s", [Sweep("a", pixels=8)], seed=seed, realisations=400, estimators=["brightest"], fixed_k=(12,)
         )
         result = measure_cell(specification.cells()[0], specification)
         errors.append(result["error"][0, 1])
@@ -141,23 +141,24 @@ def test_reference_cases(name: str) -> None:
         background_e=0.0,
         em_gain=1.0,
     )
-    specification = StudySpecification("r", [Sweep("a")], arms=["brightest", "tv"], fixed_k=[])
-    arms = CellArms(cell, specification)
+    specification = StudySpecification("r", [Sweep("a")], estimators=["brightest", "tv"], fixed_k=[])
+    methods = CellMethods(cell, specification)
     estimators: dict[str, list[Any]] = {
-        arm: [arms.estimator(arm, candidate) for candidate in arms.candidates(arm)] for arm in arms.kinds
+        method: [methods.estimator(method, candidate) for candidate in methods.candidates(method)]
+        for method in methods.kinds
     }
     blocks = list(realisations(cell, 10_000, np.random.default_rng(cell.seed(1))))
     of_all = {
-        arm: np.sum([error_sums(each, *block) for block in blocks], axis=0) / 10_000
-        for arm, each in estimators.items()
+        method: np.sum([error_sums(each, *block) for block in blocks], axis=0) / 10_000
+        for method, each in estimators.items()
     }
     found = {}
-    for arm, key in (("brightest", "without"), ("tv", "with_tv")):
-        expected, means = case[key], of_all[arm]
+    for method, key in (("brightest", "without"), ("tv", "with_tv")):
+        expected, means = case[key], of_all[method]
         row, column = np.unravel_index(np.argmin(means), means.shape)
-        found[arm] = means[row, column]
+        found[method] = means[row, column]
         tolerance = 4 * np.sqrt(2) * expected["se"] + 0.01 * expected["R"]
-        assert found[arm] == pytest.approx(expected["R"], abs=tolerance)
+        assert found[method] == pytest.approx(expected["R"], abs=tolerance)
         low, high = expected["k_within_1pct"]
         assert low - 3 <= column + 1 <= high + 3
     assert found["brightest"] / found["tv"] == pytest.approx(case["ratio"], rel=0.03)

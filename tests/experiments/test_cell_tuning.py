@@ -1,4 +1,4 @@
-"""What arms choose: for R, and for the gain-corrected rms."""
+"""What methods choose: for R, and for the gain-corrected rms."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 
 from faintspot.experiments import StudySpecification, Sweep
 from faintspot.experiments.cell import Tuning, realisations
-from faintspot.experiments.cell_arms import CellArms, position_table
+from faintspot.experiments.cell_methods import CellMethods, position_table
 from faintspot.experiments.statistics import slope_statistics
 
 SPECIFICATION = StudySpecification(
     "s",
     [Sweep("a", flux_e=30, pixels=8, d_over_r0=2)],
     realisations=400,
-    arms=["brightest", "smoothed", "ml"],
+    estimators=["brightest", "smoothed", "ml"],
     widths=[0.4, 1.0],
     blurs=[0.0, 1.5],
     model_errors=[0.3],
@@ -21,11 +21,11 @@ SPECIFICATION = StudySpecification(
     corrected=True,
 )
 CELL = SPECIFICATION.cells()[0]
-ARMS = CellArms(CELL, SPECIFICATION, 30.0)
+METHODS = CellMethods(CELL, SPECIFICATION, 30.0)
 
 
 def tuning() -> Tuning:
-    return Tuning(ARMS, SPECIFICATION)
+    return Tuning(METHODS, SPECIFICATION)
 
 
 def test_choices_are_those_of_the_smallest_error() -> None:
@@ -34,9 +34,9 @@ def test_choices_are_those_of_the_smallest_error() -> None:
     search = tuning()
     search.add(blocks)
     choices = search.choices()
-    for arm in ("brightest", "smoothed"):
-        candidates = ARMS.candidates(arm)
-        tables = [position_table(ARMS.estimator(arm, c), images, 1.0)[0] for c in candidates]  # type: ignore[arg-type]
+    for method in ("brightest", "smoothed"):
+        candidates = METHODS.candidates(method)
+        tables = [position_table(METHODS.estimator(method, c), images, 1.0)[0] for c in candidates]  # type: ignore[arg-type]
         corrected = [
             [slope_statistics(table[:, k, 0], table[:, k, 1], truth).corrected_rms.value for k in range(63)]
             for table in tables
@@ -44,11 +44,11 @@ def test_choices_are_those_of_the_smallest_error() -> None:
         errors = [np.abs(table - truth[:, None]).mean(axis=(0, 2)) for table in tables]
         for mode, values in (("best", errors), ("corrected", corrected)):
             row, column = np.unravel_index(np.argmin(values), np.shape(values))
-            assert choices[arm, mode].column == column, (arm, mode)
-            assert choices[arm, mode].candidate == candidates[int(row)]
-        assert choices[arm, "fixed20"].column == 19
-    robust = ARMS.candidates("ml")
-    slopes = [ARMS.measure("ml", candidate, images) for candidate in robust]
+            assert choices[method, mode].column == column, (method, mode)
+            assert choices[method, mode].candidate == candidates[int(row)]
+        assert choices[method, "fixed20"].column == 19
+    robust = METHODS.candidates("ml")
+    slopes = [METHODS.measure("ml", candidate, images) for candidate in robust]
     found = [slope_statistics(s.x, s.y, truth) for s in slopes]
     best = int(np.argmin([s.error.value for s in found]))
     assert choices["ml", "best"].candidate == robust[best]
@@ -66,8 +66,8 @@ def test_images_may_come_in_parts() -> None:
 
 
 def test_nothing_to_choose_needs_no_images() -> None:
-    specification = StudySpecification("s", [Sweep("a")], arms=["ml", "trained"], fixed_k=[])
-    arms = CellArms(specification.cells()[0], specification)
-    choices = Tuning(arms, specification).choices()
+    specification = StudySpecification("s", [Sweep("a")], estimators=["ml", "trained"], fixed_k=[])
+    methods = CellMethods(specification.cells()[0], specification)
+    choices = Tuning(methods, specification).choices()
     assert choices["ml", "best"].candidate == (("blur_px", 0.0), ("model_error", 0.0))
     assert choices["trained", "best"].candidate == ()

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.experiments.study_cases import ARMS, Cell, cells, dataset, power_law
+from tests.experiments.study_cases import METHODS, Cell, cells, dataset, power_law
 
 from faintspot.experiments import built_in_studies as paper
 from faintspot.experiments.claims import fixed_mode, guidance, verdicts
@@ -25,10 +25,10 @@ def quick_cells() -> list[Cell]:
 def study(gain: Callable[[Cell], float], every: list[Cell] | None = None, **options: Any) -> Any:
     """A study in which TV has `gain` times the flux."""
 
-    def of_arm(cell: Cell, arm: str, mode: str) -> float:
-        return gain(cell) if arm == "tv" else 1.0
+    def of_method(cell: Cell, method: str, mode: str) -> float:
+        return gain(cell) if method == "tv" else 1.0
 
-    return dataset(quick_cells() if every is None else every, power_law(of_arm), **options)
+    return dataset(quick_cells() if every is None else every, power_law(of_method), **options)
 
 
 def outcome(number: int, data: Any) -> Outcome:
@@ -61,18 +61,18 @@ def test_a_smaller_gain_than_claimed_holds_in_part(number: int) -> None:
 
 def test_dependence_on_k_is_measured_in_best_k_and_over_the_fixed_ones() -> None:
     flat, steep = (
-        (lambda arm: 0.5 if arm == "brightest" else 0.1),
-        (lambda arm: 0.1 if arm == "brightest" else 0.5),
+        (lambda method: 0.5 if method == "brightest" else 0.1),
+        (lambda method: 0.1 if method == "brightest" else 0.5),
     )
     good, bad = (verdicts(study(lambda cell: 1.0, rise_with_k=rise))[4] for rise in (flat, steep))
     assert good.best.outcome is HOLDS
     assert bad.best.outcome is FAILS
-    assert good.fixed.outcome is IN_PART  # the same at every fixed k in both arms: not decided
+    assert good.fixed.outcome is IN_PART  # the same at every fixed k in both methods: not decided
 
 
 def test_fixed_k_decides_over_the_fixed_modes() -> None:
-    def gain(cell: Cell, arm: str, mode: str) -> float:
-        return {"fixed40": 0.8, "fixed60": 0.6}.get(mode, 1.0) if arm == "brightest" else 1.0
+    def gain(cell: Cell, method: str, mode: str) -> float:
+        return {"fixed40": 0.8, "fixed60": 0.6}.get(mode, 1.0) if method == "brightest" else 1.0
 
     assert verdicts(dataset(quick_cells(), power_law(gain)))[4].fixed.outcome is HOLDS
 
@@ -94,7 +94,7 @@ def test_no_difference_is_called_worse_in_five_per_cent_of_studies() -> None:
         mean, covariance = exact["error"].values, exact["error_covariance"].values
         for i, m in np.ndindex(mean.shape[0], mean.shape[2]):
             noisy["error"].values[i, :, m] = rng.multivariate_normal(mean[i, :, m], covariance[i, m])
-        rows = [row for row in against_tv(noisy, "best") if row.arm == "brightest"]
+        rows = [row for row in against_tv(noisy, "best") if row.method == "brightest"]
         alarms += any(row.larger > 0 for row in rows)
     assert alarms <= 12
 
@@ -109,7 +109,9 @@ def test_what_is_missing_is_said() -> None:
     found = verdicts(partial)
     assert found[0].outcome is Outcome.NOT_MEASURED
     assert found[0].best.in_words() == "no finished cells for it"
-    assert verdicts(partial.sel(arm=["brightest", "smoothed"], arm2=["brightest", "smoothed"])) == []
+    assert (
+        verdicts(partial.sel(estimator=["brightest", "smoothed"], estimator2=["brightest", "smoothed"])) == []
+    )
 
 
 def test_without_fixed_modes_only_best_k_decides() -> None:
@@ -137,9 +139,9 @@ def test_outcomes_are_combined(outcomes: list[Outcome], together: Outcome) -> No
 
 def test_guidance_follows_the_numbers() -> None:
     def with_gains(tv: float, gaussian: float) -> str:
-        def gain(cell: Cell, arm: str, mode: str) -> float:
+        def gain(cell: Cell, method: str, mode: str) -> float:
             return {"tv": tv, "smoothed": gaussian}.get(
-                arm, 0.6 if mode != "best" and arm == "brightest" else 1.0
+                method, 0.6 if mode != "best" and method == "brightest" else 1.0
             )
 
         return " ".join(guidance(dataset(quick_cells(), power_law(gain))))
@@ -153,8 +155,8 @@ def test_guidance_follows_the_numbers() -> None:
 
 
 def test_against_tv_counts_cells() -> None:
-    rows = {row.arm: row for row in against_tv(study(lambda cell: 1.2, cells()), "best")}
-    assert set(rows) == set(ARMS) - {"tv"}
+    rows = {row.method: row for row in against_tv(study(lambda cell: 1.2, cells()), "best")}
+    assert set(rows) == set(METHODS) - {"tv"}
     assert (rows["brightest"].smaller, rows["brightest"].larger, rows["brightest"].cells) == (0, 5, 5)
     assert rows["brightest"].mean_ratio > 1.08
     assert rows["brightest"].smallest == 0

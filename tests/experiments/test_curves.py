@@ -166,11 +166,11 @@ def test_bad_input_is_refused() -> None:
         with pytest.raises(InputError, match=words):
             Curve.of_errors(flux, {"a": errors})
     curve, rng = exact(1 / FLUX, 1 / FLUX), np.random.default_rng(1)
-    with pytest.raises(InputError, match="arms 'reference' and 'magic'"):
+    with pytest.raises(InputError, match="methods 'reference' and 'magic'"):
         gain_at_flux(curve, 80.0, rng, method="magic", reference="reference")
     with pytest.raises(InputError, match="flux_e"):
         gain_at_flux(curve, 0.0, rng, method="method", reference="reference")
     with pytest.raises(InputError, match="error_px"):
         gain_at_error(curve, 0.0, rng, method="method", reference="reference")
-    with pytest.raises(InputError, match="arm 'magic'"):
+    with pytest.raises(InputError, match="method 'magic'"):
         curve.of("magic")

@@ -23,11 +23,11 @@ def test_never_scored_on_the_frames_that_were_chosen_with() -> None:
     slopes = [SlopePipeline(LAYOUT, settings, CALIBRATION)(frames) for settings in CANDIDATES]
     positions = [np.stack([s.x, s.y], axis=-1).astype(np.float64) for s in slopes]
     truth = np.concatenate([positions[0][:15], positions[2][15:]])
-    arm = choose(LAYOUT, CANDIDATES, frames, truth)
-    assert arm.settings == CANDIDATES[0]
+    method = choose(LAYOUT, CANDIDATES, frames, truth)
+    assert method.settings == CANDIDATES[0]
     expected = np.abs(positions[0][15:] - positions[2][15:]).mean(axis=-1).ravel()
-    np.testing.assert_allclose(arm.errors, expected, rtol=1e-12)
-    assert arm.slope_error.value == pytest.approx(expected.mean())
+    np.testing.assert_allclose(method.errors, expected, rtol=1e-12)
+    assert method.slope_error.value == pytest.approx(expected.mean())
     assert expected.mean() > 0
     # Chosen on the second half it would have been candidate 2, with no error at all.
     assert choose(LAYOUT, CANDIDATES, frames[::-1], truth[::-1]).settings == CANDIDATES[2]
@@ -69,7 +69,7 @@ def test_compare_reports_both_modes_and_its_progress() -> None:
             assert without.errors.shape == denoised.errors.shape == (10 * 36,)
             assert without.settings.estimator.name == "brightest"
             assert denoised.settings.estimator.name == "tv"
-    assert all(arm.settings.keep_brightest == 40 for arm in fixed.without + fixed.denoised)
+    assert all(method.settings.keep_brightest == 40 for method in fixed.without + fixed.denoised)
     difference = best.difference(2)
     assert difference.value == pytest.approx(
         best.without[2].slope_error.value - best.denoised[2].slope_error.value

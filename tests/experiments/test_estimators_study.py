@@ -19,12 +19,12 @@ from faintspot.experiments.study_page import write_study_report
 from faintspot.experiments.sweep import Cell
 from faintspot.report import drawing
 
-ARMS = ("brightest", "tv", "ml", "map", "weighted")
+METHODS = ("brightest", "tv", "ml", "map", "weighted")
 KINDS = ("error", "photon-efficiency", "gain", "outlier-fraction")
 
 
-def error(cell: dict[str, Any], arm: str, mode: str) -> float:
-    return power_law(lambda c, a, m: 1.5 if a in ("ml", "map") else 1.0)(cell, arm, mode)
+def error(cell: dict[str, Any], method: str, mode: str) -> float:
+    return power_law(lambda c, a, m: 1.5 if a in ("ml", "map") else 1.0)(cell, method, mode)
 
 
 def study(**options: Any) -> Any:
@@ -34,7 +34,7 @@ def study(**options: Any) -> Any:
         *cells(elongation=3.0),
         *(row for d in (0.5, 1.0, 3.0) for row in cells(d_over_r0=d, fluxes=(50.0, 200.0))),
     ]
-    return dataset(every, error, arms=ARMS, **options)
+    return dataset(every, error, methods=METHODS, **options)
 
 
 def test_full_study_has_the_reference_cases() -> None:
@@ -63,7 +63,7 @@ def test_figures() -> None:
     assert set(made) == {f"{kind}-{spot}" for kind in KINDS for spot in spots} | {"corrected-rms-diffraction"}
     first = made["error-diffraction"].figure
     assert [axes.get_title() for axes in first.axes] == ["0.1 e- read noise", "3 e- read noise"]
-    assert len(first.axes[0].containers) == len(ARMS)
+    assert len(first.axes[0].containers) == len(METHODS)
     turbulence = made["corrected-rms-diffraction"].figure
     assert [axes.get_title() for axes in turbulence.axes] == [
         "0.1 e- read noise, 50 e- signal",
@@ -107,7 +107,7 @@ def test_findings_count_cells() -> None:
 def test_tables() -> None:
     efficiency, calibration, speckled = (each.tables[0] for each in result_sections(study()))
     assert [len(table.rows) for table in (efficiency, calibration, speckled)] == [15, 15, 6]
-    assert efficiency.header[2:] == speckled.header[3:] == list(ARMS)
+    assert efficiency.header[2:] == speckled.header[3:] == list(METHODS)
     assert calibration.header[1:] == ["ml", "map", "weighted"]
     assert set(calibration.rows[0][1:]) == {"1.00 (1.10)"}
     assert "d/r0 3" in str(speckled.rows[-1][0])
@@ -127,7 +127,7 @@ def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     specification = estimators.estimators_study(quick=True)
     quick = [asdict(cell) for cell in specification.cells()]
     few = [row for row in quick if row["d_over_r0"] > 0 or row["read_noise_e"] == 3]
-    data = dataset(few, error, arms=ARMS)
+    data = dataset(few, error, methods=METHODS)
     data.attrs["specification"] = specification.to_text()
     written = write_study_report(data, tmp_path / "study.html")
     assert (tmp_path / "study-figures" / "corrected-rms-diffraction.csv") in written

@@ -40,7 +40,7 @@ def test_sets(whole: Path) -> None:
     for record, block, number in zip(result.records, result.block, (6, 4), strict=True):
         assert record.frames == len(block) == 60 * number
         np.testing.assert_array_equal(np.bincount(block), [60] * number)
-    np.testing.assert_array_equal(result.records[0].arm[::60], [0, 1, 2, 0, 1, 2])
+    np.testing.assert_array_equal(result.records[0].method[::60], [0, 1, 2, 0, 1, 2])
     assert result.records[0].labels == ("no TV", "TV 0 e-", "TV 2 e-")
 
 

@@ -36,7 +36,7 @@ def test_every_measurement_is_a_row() -> None:
     table = measurements(result)
     assert len(table.strehl) == 2 * CYCLES * len(STRENGTHS)
     assert table.frames.tolist() == [40] * len(table.frames)
-    np.testing.assert_array_equal(table.arm[:3], [0, 1, 2])
+    np.testing.assert_array_equal(table.method[:3], [0, 1, 2])
     record = result.records[0]
     assert table.strehl[1] == pytest.approx(record.strehl[BLOCK + 20 : 2 * BLOCK].mean())
     assert table.time_s[0] == pytest.approx(40 / record.frame_rate_hz)

@@ -46,8 +46,8 @@ def test_the_level_is_half_of_what_the_baseline_has_with_the_brightest_star() ->
     assert made_up(strehl=0.3).level == 0.3
 
 
-def test_differences_are_paired_and_wider_for_more_arms() -> None:
-    """Air that is the same scatters by 0.02, the arms themselves by 0.001."""
+def test_differences_are_paired_and_wider_for_more_methods() -> None:
+    """Air that is the same scatters by 0.02, the methods themselves by 0.001."""
     answer = made_up()
     expected = strehl_of(magnitudes()[3], 0.5) - strehl_of(magnitudes()[3], 0.0)
     found = answer.difference("window+kalman", "window", 3)
@@ -82,7 +82,7 @@ def test_a_winner_is_named_against_the_baseline_first_and_brightest_pixels_secon
     assert all("±" in line for line in against)
 
 
-def test_of_equal_arms_without_the_baseline_the_simplest_is_taken() -> None:
+def test_of_equal_methods_without_the_baseline_the_simplest_is_taken() -> None:
     shifts = {"brightest": -2.0, "window": 0.0, "map+kalman": 1.0, "window+kalman": 1.0, "map_predicted": 1.0}
     answer = made_up(shifts, scatter=0.01)
     assert answer.equal(answer.at_star) == ("map_predicted", "window+kalman", "map+kalman")
@@ -168,7 +168,7 @@ def test_saved_settings_and_loop_can_be_loaded(tmp_path: Path) -> None:
     assert (settings.estimator.name, settings.window_fwhm_px, settings.flux_e) == ("window", 3.0, 100.0)
     assert configuration_file.load(target, "calibration").read_noise_e == 3.0
     table = tomllib.loads(target.read_text())["loop"]
-    assert (table["arm"], table["control"], table["gain"]) == ("window+kalman", "kalman", 0.4)
+    assert (table["method"], table["control"], table["gain"]) == ("window+kalman", "kalman", 0.4)
     assert table["centroid_gain"] == 0.9
     again = load_loop(loop)
     assert (again.photons, again.control.gain) == (100.0, 0.4)
@@ -182,7 +182,7 @@ def test_figure() -> None:
     assert len(right.patches) == 3 * len(SHIFTS)
 
 
-def test_unknown_arms_are_refused() -> None:
+def test_unknown_methods_are_refused() -> None:
     answer: LoopAnswer = made_up()
     with pytest.raises(InputError, match="expected one that was tried: brightest, window"):
         answer.runs("tv")

@@ -24,7 +24,7 @@ def test_default_candidates() -> None:
 
 
 def test_references_and_what_others_start_from_always_take_part() -> None:
-    question = LoopQuestion(configuration(), arms=["tv", "map+kalman"])
+    question = LoopQuestion(configuration(), methods=["tv", "map+kalman"])
     assert names(question) == ["brightest", "window", "tv", "map_predicted", "map+kalman"]
 
 
@@ -60,8 +60,8 @@ def test_radius() -> None:
         ({"strehl": 0.0}, "strehl = 0: expected a number above 0"),
         ({"strehl": 1.5}, "strehl = 1.5"),
         ({"radius_arcsec": -1}, "radius_arcsec = -1"),
-        ({"arms": ["kog"]}, "arm = 'kog'"),
-        ({"arms": ["window+kalmann"]}, "control of the arm = 'kalmann'"),
+        ({"methods": ["kog"]}, "method = 'kog'"),
+        ({"methods": ["window+kalmann"]}, "control of the method = 'kalmann'"),
     ],
 )
 def test_bad_values_are_named(values: dict[str, Any], message: str) -> None:
@@ -74,6 +74,6 @@ def test_other_mistakes() -> None:
     with pytest.raises(InputError, match=r"expected a faintspot\.ao_loop\.LoopConfiguration, got str"):
         LoopQuestion("canary")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="learns from a closed loop"):
-        LoopQuestion(load_loop("open_loop"), arms=["window+kalman"])
+        LoopQuestion(load_loop("open_loop"), methods=["window+kalman"])
     with pytest.raises(InputError, match="the brightest leaves"):
         LoopQuestion(configuration(), magnitudes=(30.0, 35.0)).photons(3)

@@ -8,7 +8,7 @@ from tests.experiments.experiment_cases import SEARCH, small
 
 from faintspot.base.errors import InputError
 from faintspot.experiments import search as tuning
-from faintspot.experiments.loop_arms import LOOP_GAIN, arm_kind
+from faintspot.experiments.loop_methods import LOOP_GAIN, method_kind
 from faintspot.experiments.search import (
     FIRST_TUNING_REALISATION,
     Search,
@@ -18,7 +18,7 @@ from faintspot.experiments.search import (
     tuning_unit,
 )
 
-BRIGHTEST = arm_kind("brightest")
+BRIGHTEST = method_kind("brightest")
 KEPT = BRIGHTEST.tuned(small())["keep_brightest"]
 BEST = KEPT.values[2]
 GAINS = BRIGHTEST.tuned(small())[LOOP_GAIN]
@@ -38,10 +38,10 @@ def hill(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """A loop whose Strehl ratio is highest at TOP and the best number of pixels; realisations used."""
     used: list[int] = []
 
-    def simulate(configuration: Any, arms: Any, *, realisation: int) -> _Record:
+    def simulate(configuration: Any, methods: Any, *, realisation: int) -> _Record:
         used.append(realisation)
-        kept = arms[0].settings.keep_brightest
-        return _Record(1 - (arms[0].gain - TOP) ** 2 - 0.1 * np.log(kept / BEST) ** 2)
+        kept = methods[0].settings.keep_brightest
+        return _Record(1 - (methods[0].gain - TOP) ** 2 - 0.1 * np.log(kept / BEST) ** 2)
 
     monkeypatch.setattr(tuning, "simulate_loop", simulate)
     return used
@@ -64,9 +64,9 @@ def test_climbs_the_second_hill_too(monkeypatch: pytest.MonkeyPatch) -> None:
     heights[low - 1 : low + 2] = 0.6, 0.45, 0.3
     heights[middle], heights[high] = 0.4, 0.5
 
-    def simulate(configuration: Any, arms: Any, *, realisation: int) -> _Record:
-        kept = arms[0].settings.keep_brightest
-        return _Record(heights[GAINS.values.index(arms[0].gain)] - (kept != KEPT.first[0]))
+    def simulate(configuration: Any, methods: Any, *, realisation: int) -> _Record:
+        kept = methods[0].settings.keep_brightest
+        return _Record(heights[GAINS.values.index(methods[0].gain)] - (kept != KEPT.first[0]))
 
     monkeypatch.setattr(tuning, "simulate_loop", simulate)
     assert (
@@ -90,7 +90,7 @@ def test_without_rounds_the_best_coarse_choice(hill: list[int]) -> None:
 
 
 def test_is_repeatable_and_stored() -> None:
-    centroid = arm_kind("centroid")
+    centroid = method_kind("centroid")
     one, other = (tuning_unit(centroid, small(), SEARCH, None, lambda frames: None) for _ in range(2))
     assert stored_choice(one) == stored_choice(other)
     np.testing.assert_array_equal(one["strehl"], other["strehl"])
@@ -105,7 +105,7 @@ def test_search_is_checked() -> None:
 
 
 def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[int]) -> None:
-    kind = arm_kind("brightest+modal")
+    kind = method_kind("brightest+modal")
     found = tune(kind, small(), Search(rounds=9), slopes={LOOP_GAIN: 0.9, "keep_brightest": BEST + 1})
     highest = max(kind.tuned(small())[LOOP_GAIN].values)
     assert found.choice == {LOOP_GAIN: highest, "keep_brightest": BEST + 1}
@@ -119,7 +119,7 @@ def test_of_known_slopes_only_the_gain_is_tuned(hill: list[int]) -> None:
 
 def test_options_follow_a_power_of_the_flux() -> None:
     """One wrong value among five does not change the line."""
-    kind, fluxes = arm_kind("window"), (20.0, 40.0, 80.0, 160.0, 320.0)
+    kind, fluxes = method_kind("window"), (20.0, 40.0, 80.0, 160.0, 320.0)
     stars = [small().replace("camera", photons_per_subaperture=flux) for flux in fluxes]
     power = [2.0 * (flux / 20) ** 0.2 for flux in fluxes]
     choices = [{LOOP_GAIN: 0.1 * k, "window_fwhm_px": width} for k, width in enumerate(power)]

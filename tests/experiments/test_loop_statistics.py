@@ -23,7 +23,7 @@ numbers = arrays(np.float64, st.integers(1, 12), elements=st.floats(-1, 1))
 
 
 def curves(shift: float, realisations: int = 6, scatter: float = 0.02) -> np.ndarray:
-    atmosphere = np.random.default_rng(2).normal(0, scatter, realisations)  # the same for every arm
+    atmosphere = np.random.default_rng(2).normal(0, scatter, realisations)  # the same for every method
     return 0.7 - 0.1 * (MAGNITUDES[:, None] - shift - 8) + atmosphere
 
 

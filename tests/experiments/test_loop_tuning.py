@@ -12,7 +12,7 @@ from tests.experiments.loop_answer_cases import configuration, made_up
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.loop_answer import LoopAnswer
-from faintspot.experiments.loop_arms import LOOP_GAIN, arm_kind
+from faintspot.experiments.loop_methods import LOOP_GAIN, method_kind
 from faintspot.experiments.loop_question import LoopQuestion
 from faintspot.experiments.loop_tuning import LoopPlan, tune_loop
 from faintspot.experiments.running import WorkerPool
@@ -27,7 +27,7 @@ PLAN = LoopPlan(fluxes=3, frames=30, settle_frames=10, realisations=2, search=SE
 
 def question(**asked: Any) -> LoopQuestion:
     loop = small().replace("control", telemetry_frames=200)
-    return LoopQuestion(loop, magnitudes=(9.0, 11.0), **{"arms": ("window+kalman",), **asked})
+    return LoopQuestion(loop, magnitudes=(9.0, 11.0), **{"methods": ("window+kalman",), **asked})
 
 
 def tuned(folder: Path, place: WorkerPool = HERE, **asked: Any) -> LoopAnswer:
@@ -66,8 +66,8 @@ def test_interrupted_it_goes_on_to_the_same_answer(tmp_path: Path, whole: tuple[
 
 
 def test_another_loop_in_the_folder_is_refused_or_replaced(tmp_path: Path) -> None:
-    tuned(tmp_path, arms=())
-    other = LoopQuestion(small().replace("camera", read_noise_e=5.0), magnitudes=(9.0, 11.0), arms=())
+    tuned(tmp_path, methods=())
+    other = LoopQuestion(small().replace("camera", read_noise_e=5.0), magnitudes=(9.0, 11.0), methods=())
     with pytest.raises(InputError, match=r"magnitude-tuning\.zarr"):
         tune_loop(other, tmp_path, plan=PLAN, place=HERE)
     answer = tune_loop(other, tmp_path, plan=PLAN, place=HERE, overwrite=True)
@@ -85,7 +85,9 @@ def test_another_loop_in_the_folder_is_refused_or_replaced(tmp_path: Path) -> No
 )
 def test_values_at_the_end_of_what_was_on_offer(name: str, option: str, place: int, at_end: bool) -> None:
     answer = made_up({"brightest": -2.0, name: 0.0})
-    tuned_values = {each: tunable.values for each, tunable in arm_kind(name).tuned(configuration()).items()}
+    tuned_values = {
+        each: tunable.values for each, tunable in method_kind(name).tuned(configuration()).items()
+    }
     choice = {each: values[len(values) // 2] for each, values in tuned_values.items()}
     text = json.dumps({**choice, option: tuned_values[option][place]})
     measured = replace(answer.measured, choices=np.full(answer.measured.choices.shape, text))

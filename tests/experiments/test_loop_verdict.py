@@ -14,8 +14,8 @@ from faintspot.experiments.loop_verdict import (
     better_and_worse,
     loop_verdict,
     options_that_may_pay,
-    reference_arms,
-    tv_arm,
+    reference_methods,
+    tv_method,
 )
 
 pytest.importorskip("hcipy")
@@ -33,12 +33,12 @@ def test_a_gain_is_said() -> None:
     assert "beyond its error in" in lines[0]
 
 
-def test_arms_are_found_by_their_names() -> None:
+def test_methods_are_found_by_their_names() -> None:
     result = dataclasses.replace(made_up_magnitude(), labels=tuple("abcd"))
-    assert LABELS[reference_arms(result)[0]] == "brightest pixels"
-    arm = tv_arm(result)
-    assert arm is not None
-    assert LABELS[arm] == "TV denoising"
+    assert LABELS[reference_methods(result)[0]] == "brightest pixels"
+    method = tv_method(result)
+    assert method is not None
+    assert LABELS[method] == "TV denoising"
     assert options_that_may_pay(result) == [("weighted reconstructor", 3, 2)]
     above, below = better_and_worse(result, 2, 0)
     assert above
@@ -59,7 +59,7 @@ def test_results_are_read_from_a_folder(tmp_path: Path) -> None:
 
 def test_gains_are_said_against_the_strongest_baseline_first() -> None:
     result = dataclasses.replace(made_up_magnitude(), names=("brightest", "tv", "window", "ml"))
-    assert reference_arms(result) == [2, 0]
+    assert reference_methods(result) == [2, 0]
     lines = [line for line in loop_verdict(LoopResults(magnitude=result)) if line.startswith("Magnitudes")]
     against = [line.split(" against ")[1].split(":")[0] for line in lines]
     window, brightest = result.labels[2], result.labels[0]

@@ -21,12 +21,12 @@ from faintspot.experiments.magnitude import quick_run, run_magnitude
 from faintspot.experiments.running import WorkerPool
 
 pytest.importorskip("hcipy")
-ARMS = ("centroid", "brightest")
+METHODS = ("centroid", "brightest")
 PHOTONS = (400.0, 40.0)
 
 
-def run(folder: Path, place: WorkerPool, arms: tuple[str, ...] = ARMS) -> MagnitudeResult:
-    return run_magnitude(small(), folder, arms, PHOTONS, search=SEARCH, place=place)
+def run(folder: Path, place: WorkerPool, methods: tuple[str, ...] = METHODS) -> MagnitudeResult:
+    return run_magnitude(small(), folder, methods, PHOTONS, search=SEARCH, place=place)
 
 
 TOLD: list[tuple[int, int]] = []
@@ -71,26 +71,26 @@ def test_interrupted_and_started_again(tmp_path: Path, whole: Path, calls: int) 
     assert_same_units(tmp_path, whole)
 
 
-def test_arms_can_be_added(tmp_path: Path, whole: Path) -> None:
+def test_methods_can_be_added(tmp_path: Path, whole: Path) -> None:
     folder = shutil.copytree(whole, tmp_path / "copy")
     one = run(folder, WorkerPool(0, progress=StopsAfter(0)), ("centroid",))  # nothing is left to do
     assert one.labels == ("centre of gravity",)
     both = run(folder, HERE)
     np.testing.assert_array_equal(both.strehl, MagnitudeResult.load(whole / MAGNITUDE_FILE).strehl)
-    three = run(folder, HERE, (*ARMS, "ml"))
+    three = run(folder, HERE, (*METHODS, "ml"))
     assert three.names == ("centroid", "brightest", "ml")
     np.testing.assert_array_equal(three.strehl[:2], both.strehl)
 
 
 def test_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^arm = 'kog': expected one of 'brightest'"):
+    with pytest.raises(InputError, match=r"^method = 'kog': expected one of 'brightest'"):
         run_magnitude(small(), tmp_path, ("kog",), PHOTONS, place=HERE)
-    with pytest.raises(InputError, match="arms: expected at least one"):
+    with pytest.raises(InputError, match="methods: expected at least one"):
         run_magnitude(small(), tmp_path, (), PHOTONS, place=HERE)
     with pytest.raises(InputError, match="photons: expected at least one"):
-        run_magnitude(small(), tmp_path, ARMS, place=HERE)
+        run_magnitude(small(), tmp_path, METHODS, place=HERE)
     with pytest.raises(InputError, match="photons"):
-        run_magnitude(small(), tmp_path, ARMS, (0.0,), place=HERE)
+        run_magnitude(small(), tmp_path, METHODS, (0.0,), place=HERE)
 
 
 def test_quick_is_never_longer() -> None:

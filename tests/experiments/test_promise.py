@@ -105,7 +105,7 @@ def test_scatter_between_frames_that_one_method_alone_has_is_its_error() -> None
 
 def test_methods_are_chosen_by_the_recording() -> None:
     answer = answered(0.0, 0.5)
-    assert set(answer.promises) == {result.arm.name for result in answer.results}
+    assert set(answer.promises) == {result.method.name for result in answer.results}
     assert all(promise.unshared_px == 0 for promise in answer.promises.values())
     ratios = [promise.ratio.value for promise in answer.promises.values()]
     np.testing.assert_allclose(ratios, 1.0, atol=0.15)
@@ -133,9 +133,9 @@ def test_spots_in_the_middle_of_the_search_range_have_larger_errors_than_spread_
     }
     question = question_from_frames(frames[:40], layout=LAYOUT, **known)
     answer = tune(question, **QUICK)
-    promise, arm = answer.promises["ml"], answer["ml"].arm
+    promise, method = answer.promises["ml"], answer["ml"].method
     assert promise.placed_px > 1.05 * promise.promised_px
-    slopes = SlopePipeline(LAYOUT, arm.settings, question.calibration, **arm.parts)(frames[40:])
+    slopes = SlopePipeline(LAYOUT, method.settings, question.calibration, **method.parts)(frames[40:])
     reached = np.abs(np.stack([slopes.x, slopes.y], axis=-1) - truth[40:]).mean()
     assert promise.expected_px == pytest.approx(reached, rel=0.08)
 

@@ -46,12 +46,12 @@ def test_camera_flux_and_spot_are_measured() -> None:
     assert any("PSF learnt" in fact for fact in question.facts)
 
 
-def test_a_learnt_psf_is_used_and_the_trained_arm_left_out() -> None:
+def test_a_learnt_psf_is_used_and_the_trained_method_left_out() -> None:
     frames, darks = recorded()
     question = question_from_frames(frames, darks, layout=LAYOUT, flux_e=100.0)
     answer = tune(question, **QUICK)
     assert "trained" in answer.left_out
-    assert answer["ml"].arm.psf is question.psf
+    assert answer["ml"].method.psf is question.psf
     assert answer["ml"].settings.weight_floor == 1e-3
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from faintspot.experiments.loop_arms import Choice
+from faintspot.experiments.loop_methods import Choice
 from faintspot.experiments.search import coordinate_search, corrected_badness
 
 

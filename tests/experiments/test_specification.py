@@ -16,7 +16,7 @@ TEXT = """
 name = "mine"
 seed = 7
 realisations = 400
-arms = ["brightest", "tv"]
+estimators = ["brightest", "tv"]
 strengths = [0.5, 1.0]
 fixed_k = [10]
 
@@ -64,7 +64,7 @@ def test_fingerprint_changes_with_everything() -> None:
     changes: dict[str, Any] = {
         "seed": 2,
         "realisations": 100,
-        "arms": ["brightest", "tv"],
+        "estimators": ["brightest", "tv"],
         "strengths": [0.5],
         "widths": [0.5],
         "thresholds": [1],
@@ -97,12 +97,12 @@ def test_seeds_of_cells_without_turbulence_never_change() -> None:
     assert speckled.seed(1).generate_state(2).tolist() != SEED_OF_DEFAULT_CELL
 
 
-def test_search_range_is_the_same_for_all_arms() -> None:
+def test_search_range_is_the_same_for_all_methods() -> None:
     sweep = Sweep("a", position_range_px=[1, 4])
     near, far = sweep.cells()
     old = StudySpecification("x", [sweep])
     assert old.search_range_of(far) == np.inf
-    new = replace(old, arms=["brightest", "ml"])
+    new = replace(old, estimators=["brightest", "ml"])
     assert (new.search_range_of(near), new.search_range_of(far)) == (1.0, 4.0)
     assert replace(new, search_range_px=2).search_range_of(far) == 2.0
 
@@ -133,8 +133,8 @@ BAD = {
     'name = "x"\nrealizations = 3' + SWEEP: ("realizations", "did you mean realisations"),
     'name = "x"\nrealisations = 3' + SWEEP: ("realisations = 3", "20"),
     'name = "x"\nseed = -1' + SWEEP: ("seed = -1",),
-    'name = "x"\narms = ["brightest", "tvs"]' + SWEEP: ("arms = 'tvs'", "'tv'"),
-    'name = "x"\narms = []' + SWEEP: ("arms", "empty"),
+    'name = "x"\nestimators = ["brightest", "tvs"]' + SWEEP: ("estimators = 'tvs'", "'tv'"),
+    'name = "x"\nestimators = []' + SWEEP: ("estimators", "empty"),
     'name = "x"\nstrengths = [0]' + SWEEP: ("strengths = 0", "above 0"),
     'name = "x"\nstrengths = 1.0' + SWEEP: ("strengths", "list"),
     'name = "x"\nfixed_k = [20, 256]' + SWEEP: ("fixed_k = 256", "256 pixels"),

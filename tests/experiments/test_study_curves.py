@@ -7,15 +7,15 @@ import pytest
 from tests.experiments.study_cases import cells, dataset, power_law
 
 from faintspot.base.errors import InputError
-from faintspot.experiments.arms import TV_OVER_NO_TV
 from faintspot.experiments.curves import Curve, gain_at_error, gain_at_flux
+from faintspot.experiments.methods import TV_OVER_NO_TV
 from faintspot.experiments.study_curves import Configuration, study_curves
 
 CONFIGURATION = Configuration("diffraction", 1.0, 0.1, 1.0, 1.0, 16)
 
 
-def gain_of(cell: object, arm: str, mode: str) -> float:
-    return 2.0 if arm == "tv" else 1.0
+def gain_of(cell: object, method: str, mode: str) -> float:
+    return 2.0 if method == "tv" else 1.0
 
 
 def curve(**options: object):  # type: ignore[no-untyped-def]
@@ -54,7 +54,7 @@ def test_interval_covers_the_truth_as_often_as_it_says() -> None:
     """300 noisy studies: 95 % +- 3 standard deviations of the binomial count, 1.3 %."""
     rng = np.random.default_rng(3)
     exact = curve()
-    pair = [exact.arms.index("brightest"), exact.arms.index("tv")]
+    pair = [exact.methods.index("brightest"), exact.methods.index("tv")]
     # Twice the flux, where log R is a straight line: as the interpolated curve says.
     known = gain_at_flux(exact, 80.0, rng, **TV_OVER_NO_TV)
     assert known is not None
@@ -64,7 +64,7 @@ def test_interval_covers_the_truth_as_often_as_it_says() -> None:
         for i in range(len(noisy)):
             part = exact.covariance[i][np.ix_(pair, pair)]
             noisy[i, pair] = rng.multivariate_normal(exact.error[i, pair], part)
-        item = Curve(exact.flux_e, exact.arms, noisy, exact.covariance)
+        item = Curve(exact.flux_e, exact.methods, noisy, exact.covariance)
         gain = gain_at_flux(item, 80.0, rng, **TV_OVER_NO_TV)
         assert gain is not None
         hits += gain.low <= known.factor <= gain.high

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.experiments.study_cases import ARMS, MODES, cells, dataset, power_law
+from tests.experiments.study_cases import METHODS, MODES, cells, dataset, power_law
 
 from faintspot.experiments.study_curves import kept_panels, spread
 from faintspot.experiments.study_figures import (
@@ -20,8 +20,8 @@ from faintspot.experiments.study_figures import (
 )
 
 
-def equal(cell: Any, arm: str, mode: str) -> float:
-    return 1.5 if arm == "tv" else 1.0
+def equal(cell: Any, method: str, mode: str) -> float:
+    return 1.5 if method == "tv" else 1.0
 
 
 def study(**options: Any) -> Any:
@@ -54,8 +54,8 @@ def test_solid_is_tv_and_dashed_is_not() -> None:
     figure = sweep_figure(data, list(range(5)), "fig9", "A title").figure
     lines = [line for line in figure.axes[0].lines if np.size(line.get_xdata()) == 5]
     assert [line.get_linestyle() for line in lines] == ["-", "--"]
-    for line, arm in zip(lines, ("tv", "brightest"), strict=True):
-        wanted = data["error"].sel(arm=arm, mode="best").values[:5]
+    for line, method in zip(lines, ("tv", "brightest"), strict=True):
+        wanted = data["error"].sel(estimator=method, mode="best").values[:5]
         np.testing.assert_allclose(np.asarray(line.get_ydata(), dtype=float), wanted)
 
 
@@ -63,9 +63,11 @@ def test_numbers_of_a_sweep_are_in_its_data() -> None:
     data = study()
     made = sweep_figure(data, [0, 1], "fig9", "A title")
     rows = list(csv.DictReader(io.StringIO(made.csv())))
-    assert len(rows) == 2 * len(ARMS) * len(MODES)
-    row = next(row for row in rows if (row["flux_e"], row["mode"], row["arm"]) == ("30.0", "fixed40", "tv"))
-    wanted = float(data["error"].isel(cell=1).sel(mode="fixed40", arm="tv"))
+    assert len(rows) == 2 * len(METHODS) * len(MODES)
+    row = next(
+        row for row in rows if (row["flux_e"], row["mode"], row["method"]) == ("30.0", "fixed40", "tv")
+    )
+    wanted = float(data["error"].isel(cell=1).sel(mode="fixed40", estimator="tv"))
     assert float(row["R_px"]) == pytest.approx(wanted, rel=1e-5)
 
 
@@ -82,8 +84,8 @@ def test_kept_pixels_are_drawn_for_signals_sizes_and_noises() -> None:
     assert first.startswith("signals")
     assert second.startswith("spot sizes")
     assert third.startswith("read noises")
-    assert made.header[:3] == ["panel", "arm", "k"]
-    assert kept_pixels_figure(study().sel(arm=["brightest"], arm2=["brightest"])) is None
+    assert made.header[:3] == ["panel", "method", "k"]
+    assert kept_pixels_figure(study().sel(estimator=["brightest"], estimator2=["brightest"])) is None
 
 
 def test_kept_panels_take_the_nearest_flux_and_the_largest_window() -> None:
@@ -113,7 +115,7 @@ def test_baselines_are_drawn_for_the_main_read_noises() -> None:
         "best k: 3 e- read noise",
         "fixed k = 40: 3 e- read noise",
     ]
-    assert len(made.figure.axes[0].containers) == len(ARMS)
+    assert len(made.figure.axes[0].containers) == len(METHODS)
     assert baselines_figure(study(), "nothing") is None
 
 

@@ -15,7 +15,9 @@ def test_gains_of_every_mode_and_none_where_there_is_no_crossing() -> None:
         Sweep("dark", flux_e=(10, 12), read_noise_e=(16,)),  # never reaches 0.15 px
     ]
     dataset = run(
-        StudySpecification("gains", sweeps, realisations=600, arms=("brightest", "tv"), fixed_k=(20, 40)),
+        StudySpecification(
+            "gains", sweeps, realisations=600, estimators=("brightest", "tv"), fixed_k=(20, 40)
+        ),
         workers=0,
     )
     table = gains_by_mode(dataset)

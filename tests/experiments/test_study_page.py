@@ -20,8 +20,8 @@ pytestmark = pytest.mark.usefixtures("undrawn_pictures")
 
 
 def of(specification: StudySpecification, **options: Any) -> Any:
-    def gain(cell: Any, arm: str, mode: str) -> float:
-        return 1.4 if arm == "tv" else 1.0
+    def gain(cell: Any, method: str, mode: str) -> float:
+        return 1.4 if method == "tv" else 1.0
 
     data = dataset([asdict(cell) for cell in specification.cells()], power_law(gain), **options)
     data.attrs["specification"] = specification.to_text()
@@ -62,9 +62,11 @@ class TestPage:
         assert 'id="fig1"' not in html
         assert "my &lt;study&gt;" in html
 
-    def test_of_arms_without_tv_has_no_verdict(self) -> None:
+    def test_of_methods_without_tv_has_no_verdict(self) -> None:
         data = of(paper.paper_study(quick=True, figures=["fig3"]))
-        html = study_report(data.sel(arm=["brightest", "smoothed"], arm2=["brightest", "smoothed"]))
+        html = study_report(
+            data.sel(estimator=["brightest", "smoothed"], estimator2=["brightest", "smoothed"])
+        )
         assert "No verdicts" in html
 
 

@@ -24,13 +24,13 @@ OTHER = replace(SPECIFICATION, seed=2)
 
 def test_schema() -> None:
     dataset = new_dataset(SPECIFICATION)
-    assert dict(dataset.sizes) == {"cell": N_CELLS, "arm": 4, "arm2": 4, "mode": 3, "k": 63}
+    assert dict(dataset.sizes) == {"cell": N_CELLS, "estimator": 4, "estimator2": 4, "mode": 3, "k": 63}
     assert set(dataset.data_vars) == {*VARIABLES, "done"}
-    assert dataset["gain"].dims == ("cell", "arm", "mode")
-    assert dataset["stated_over_actual"].dims == ("cell", "arm")
+    assert dataset["gain"].dims == ("cell", "estimator", "mode")
+    assert dataset["stated_over_actual"].dims == ("cell", "estimator")
     assert dataset["bound"].dims == ("cell",)
-    assert dataset["error_covariance"].dims == ("cell", "mode", "arm", "arm2")
-    assert dataset["error_at_k"].dims == ("cell", "arm", "k")
+    assert dataset["error_covariance"].dims == ("cell", "mode", "estimator", "estimator2")
+    assert dataset["error_at_k"].dims == ("cell", "estimator", "k")
     for name in VARIABLES:
         assert dataset[name].attrs["units"]
         assert np.isnan(dataset[name]).all()
@@ -57,7 +57,7 @@ def test_store_is_memory(tmp_path: Path) -> None:
     # A window of 6 x 6 pixels has no more than 35 k.
     small = dataset_of(SPECIFICATION, memory).isel(cell=0)
     assert int(small["pixels"]) == 6
-    assert np.isfinite(small["error_at_k"].sel(arm="brightest", k=slice(1, 35))).all()
+    assert np.isfinite(small["error_at_k"].sel(estimator="brightest", k=slice(1, 35))).all()
     assert np.isnan(small["error_at_k"].sel(k=slice(36, None))).all()
     opened = xarray.open_zarr(path, consolidated=False)
     np.testing.assert_array_equal(opened["error"], dataset_of(SPECIFICATION, memory)["error"])

@@ -17,10 +17,10 @@ from faintspot.experiments.tuning import _ranked
 
 
 @pytest.mark.portable
-def test_every_arm_is_scored_on_the_same_spots() -> None:
+def test_every_method_is_scored_on_the_same_spots() -> None:
     answer = answered()
-    assert [result.arm.name for result in answer.results] == list(estimators())
-    assert answer.curve.arms == tuple(estimators())
+    assert [result.method.name for result in answer.results] == list(estimators())
+    assert answer.curve.methods == tuple(estimators())
     assert (len(answer.flux_e), answer.realisations) == (3, 512)
     assert all(result.settings.search_range_px == 1.0 for result in answer.results)
 
@@ -30,7 +30,7 @@ def test_errors_are_near_the_bound_where_the_spot_is_known() -> None:
     """The bound is for unbiased estimators; 512 spots tell R to 3 %."""
     answer = answered()
     assert answer["ml"].statistics.error.value == pytest.approx(answer.bound_px[1], rel=0.15)
-    assert answer.best.arm.name in ("ml", "weighted", "matched", "smoothed", "map", "trained")
+    assert answer.best.method.name in ("ml", "weighted", "matched", "smoothed", "map", "trained")
     assert answer.best.over_brightest.value > 0.1
 
 
@@ -41,8 +41,8 @@ def test_more_flux_means_smaller_errors() -> None:
 
 def test_tv_is_not_recommended_for_gaussian_spots_without_read_noise() -> None:
     answer = answered(read_noise_e=0.1, profile="gaussian", fwhm_px=2.0, flux_e=100.0)
-    assert answer.best.arm.name != "tv"
-    # Every arm has chosen its settings on 256 spots only.
+    assert answer.best.method.name != "tv"
+    # Every method has chosen its settings on 256 spots only.
     assert abs(answer["tv"].over_brightest.value) < 0.1
 
 
@@ -77,11 +77,11 @@ def test_progress_is_reported_to_the_end() -> None:
     assert all(a[0] < b[0] for a, b in itertools.pairwise(seen))
 
 
-def test_of_equal_arms_the_one_that_knows_least_then_the_cheapest_is_taken() -> None:
+def test_of_equal_methods_the_one_that_knows_least_then_the_cheapest_is_taken() -> None:
     results = list(answered().results)
     rng = np.random.default_rng(2)
     common = rng.normal(-2.0, 0.1, 16)
-    blocks = {result.arm.name: common + 1.0 for result in results}
+    blocks = {result.method.name: common + 1.0 for result in results}
     for name in ("map", "ml", "tv", "smoothed"):
         blocks[name] = common + rng.normal(0.0, 0.01, 16)
     rms = {name: math.exp(float(values.mean())) for name, values in blocks.items()}
@@ -91,7 +91,7 @@ def test_of_equal_arms_the_one_that_knows_least_then_the_cheapest_is_taken() -> 
             statistics=dataclasses.replace(
                 result.statistics,
                 corrected_rms=dataclasses.replace(
-                    result.statistics.corrected_rms, value=rms[result.arm.name]
+                    result.statistics.corrected_rms, value=rms[result.method.name]
                 ),
             ),
         )
@@ -125,7 +125,7 @@ def test_an_estimator_of_somebody_else_takes_part(monkeypatch: pytest.MonkeyPatc
     answer = tune(Question(**{**CAMERA, "flux_e": 2000.0}), realisations=256, steps=1)
     assert answer["own"].settings.power == 2.0
     assert answer["own"].statistics.error.value < answer["centroid"].statistics.error.value
-    assert answer["own"].arm.label == "somebody's own"
+    assert answer["own"].method.label == "somebody's own"
 
 
 def test_only_a_question_is_answered() -> None:
@@ -148,4 +148,4 @@ def test_a_plugin_that_refuses_the_scene_is_left_out(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(registry, "_kinds", {**estimators(), "refusing": Refusing})
     answer = tune(Question(**CAMERA), rng=np.random.default_rng(1), **QUICK)
     assert "too bright for me" in answer.left_out["refusing"]
-    assert "refusing" not in [result.arm.name for result in answer.results]
+    assert "refusing" not in [result.method.name for result in answer.results]

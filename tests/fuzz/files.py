@@ -35,7 +35,7 @@ _WORDS = (b"1e300", b"-1", b"nan", b"-inf", b"0", b"0.5", b"9" * 30, b'"x"', b"[
 _STUDY = """name = "s"
 seed = 3
 realisations = 40
-arms = ["tv", "brightest"]
+methods = ["tv", "brightest"]
 fixed_k = [5]
 [sweeps.light]
 flux_e = { from = 10, to = 100, points = 3, spacing = "log" }

@@ -22,7 +22,7 @@ ATTRIBUTES: dict[str, Any] = {
         "cells": [[row, column] for row in range(3) for column in range(3) if (row, column) != (1, 1)],
     },
     "settings": '[estimator]\nname = "tv"\nnoise_std = 1.5\n[settings]\nflux_e = 30.0\n',
-    "arms": ["none", "tv"],
+    "methods": ["none", "tv"],
     "dropped_records": 2,
 }
 CHANGES = [
@@ -31,7 +31,7 @@ CHANGES = [
 ]
 RECORD = np.dtype(
     [
-        *[(name, np.int64) for name in ("sequence", "frame", "arm", "change")],
+        *[(name, np.int64) for name in ("sequence", "frame", "method", "change")],
         *[(name, np.int64) for name in ("last_row_time_ns", "published_time_ns", "clock_offset_ns")],
         *[(name, np.float32, (N,)) for name in ("x", "y", "flux", "standard_error_x", "standard_error_y")],
         ("iterations", np.int32, (N,)),
@@ -54,7 +54,7 @@ def records_of(first: int, count: int) -> np.ndarray:
     rng = np.random.default_rng(first)
     records = np.zeros(count, RECORD)
     records["frame"] = np.arange(first, first + count)
-    records["arm"], records["change"] = records["frame"] % 2, first
+    records["method"], records["change"] = records["frame"] % 2, first
     records["last_row_time_ns"] = 10**12 + records["frame"] * 10**6
     records["published_time_ns"] = records["last_row_time_ns"] + 50_000
     records["clock_offset_ns"] = START_NS - 10**12

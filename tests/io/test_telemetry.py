@@ -147,7 +147,7 @@ def test_aot_is_read_back_by_aotpy(store: TelemetryStore, tmp_path: Path) -> Non
     assert json.loads(system.config) == tables
     metadata = {each.key: each.value for each in system.metadata}
     assert [json.loads(metadata[key]) for key in ("CHG1", "CHG2")] == CHANGES
-    assert (metadata["DROPPED"], metadata["ARMS"]) == (2, "none, tv")
+    assert (metadata["DROPPED"], metadata["METHODS"]) == (2, "none, tv")
 
     (sensor,) = system.wavefront_sensors
     assert (sensor.n_valid_subapertures, sensor.subaperture_size) == (N, 8)

@@ -28,7 +28,7 @@ def records(first: int, count: int, *, method: int = 0, interval_s: float = 0.01
     """Records of `count` frames from number `first` on, valid, 100 e-, 50 us late."""
     made = np.zeros(count, record_type(N))
     made["frame"] = np.arange(first, first + count)
-    made["arm"] = method
+    made["method"] = method
     made["last_row_time_ns"] = 1e9 * interval_s * made["frame"]
     made["published_time_ns"] = made["last_row_time_ns"] + 50_000
     made["flux"] = 100.0

@@ -91,7 +91,11 @@ def test_methods_of_an_earlier_interleaving_are_not_compared() -> None:
     page_state = PageState(["none", "tv"])
     for turn in range(6):
         page_state.add(Batch(records(50 * turn, 50, method=turn % 2)))
-    change = {"frame": 300, "number": 1, "changes": {"arms": ["ml", "set"], "first_arm": 2, "every": 50}}
+    change = {
+        "frame": 300,
+        "number": 1,
+        "changes": {"methods": ["ml", "set"], "first_method": 2, "every": 50},
+    }
     for turn in range(6, 12):
         made = records(50 * turn, 50, method=2 + turn % 2)
         page_state.add(Batch(made, changes=[change] if turn == 6 else []))

@@ -47,7 +47,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     images["raw"] = images["image_frame"][:, None, None]
     path = tmp_path_factory.mktemp("night") / "night.zarr"
     change = {"frame": 5000, "number": 1, "changes": {"noise_std": 2.0}, "where": None}
-    attributes = {"layout": layout_values(LAYOUT), "settings": "[settings]", "arms": ["set"]}
+    attributes = {"layout": layout_values(LAYOUT), "settings": "[settings]", "methods": ["set"]}
     store = TelemetryStore(path, made.dtype, images.dtype, attributes)
     store.append(made, images, {"changes": [change]})
     return path
@@ -154,7 +154,7 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, night: Path) -> None:
     empty = tmp_path / "empty.zarr"
     made = records(0, 0)
     images = image_type(LAYOUT.frame_shape, N, LAYOUT.window)
-    TelemetryStore(empty, made.dtype, images, {"layout": layout_values(LAYOUT), "arms": []})
+    TelemetryStore(empty, made.dtype, images, {"layout": layout_values(LAYOUT), "methods": []})
     with pytest.raises(InputError, match="expected a recording with frames"):
         RecordingSource(empty)
 
@@ -162,7 +162,7 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, night: Path) -> None:
 def test_recording_of_another_sensor_than_it_says_is_refused(tmp_path: Path) -> None:
     made = records(0, 5)
     images = image_type((4, 4), N, LAYOUT.window)
-    attributes = {"layout": layout_values(LAYOUT), "arms": []}
+    attributes = {"layout": layout_values(LAYOUT), "methods": []}
     TelemetryStore(tmp_path / "night.zarr", made.dtype, images, attributes).append(
         made, np.zeros(1, images), {"changes": []}
     )
@@ -175,7 +175,7 @@ def test_recording_of_another_sensor_than_it_says_is_refused(tmp_path: Path) -> 
 )
 def test_attributes_that_make_no_sense_are_one_line(tmp_path: Path, wrong: dict[str, Any]) -> None:
     made, images = records(0, 5), image_type(LAYOUT.frame_shape, N, LAYOUT.window)
-    attributes = {"layout": layout_values(LAYOUT), "arms": []}
+    attributes = {"layout": layout_values(LAYOUT), "methods": []}
     store = TelemetryStore(tmp_path / "night.zarr", made.dtype, images, attributes)
     store.append(made, np.zeros(0, images), {"changes": []} | wrong)
     with pytest.raises(InputError, match="the store is damaged"):

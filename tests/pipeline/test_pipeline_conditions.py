@@ -214,12 +214,12 @@ class TestPhysics:
         layout = fs.Layout.grid((100, 100), pixels=16)
         frame = images.reshape(100, 100, 16, 16).swapaxes(1, 2).reshape(1600, 1600)
         strength = np.sqrt(9 + 200 / 256)
-        arms = {
+        methods = {
             "without": fs.Settings("brightest", keep_brightest=case["without"]["k"]),
             "with_tv": fs.Settings(noise_std=strength, keep_brightest=case["with_tv"]["k"]),
         }
         errors = {}
-        for name, settings in arms.items():
+        for name, settings in methods.items():
             slopes = fs.SlopePipeline(layout, settings)(frame)
             position = np.stack([slopes.x, slopes.y], axis=-1)
             errors[name] = float(np.mean(np.abs(position - truth)))

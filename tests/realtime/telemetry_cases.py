@@ -41,7 +41,7 @@ def write_images(ring: TelemetryRing, frame: int) -> None:
 def as_written(items: Any) -> bool:
     """Whether records (structured, or `Telemetry`) hold what `write` writes; none is torn."""
     frames = [int(frame) for frame in items["frame"]]
-    right = [items["arm"], items["change"], items["last_row_time_ns"], items["published_time_ns"]]
+    right = [items["method"], items["change"], items["last_row_time_ns"], items["published_time_ns"]]
     expected = [[f % 2, f // 10, 1000 * f + 7, 1000 * f + 507] for f in frames]
     scalars = np.array_equal(np.stack(right, axis=-1), np.array(expected).reshape(-1, 4))
     names = [name for name in FIELDS if name != "bad_pixels"]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from faintspot.ao_loop import Arm, simulate_loop
+from faintspot.ao_loop import Method, simulate_loop
 from faintspot.ao_loop.telescope_model import TelescopeModel
 from faintspot.base.errors import InputError
 from faintspot.control.compiled import CompiledIntegrator
@@ -41,7 +41,7 @@ def test_the_loop_is_the_simulated_one(sky: Sky, files: tuple[Path, Control]) ->
     path, control = files
     settings = configuration_file.load_all(path).settings
     run = CONFIGURATION.replace("run", frames=FRAMES, settle_frames=10)
-    record = simulate_loop(run, [Arm("-", settings, gain=control.options.gain)])
+    record = simulate_loop(run, [Method("-", settings, gain=control.options.gain)])
     sky.start(make_engine(sky.name, path, control))
     sky.loop.close()
     strehl = sky.frames(FRAMES)

@@ -40,7 +40,7 @@ def test_a_controller_goes_on_from_what_the_mirror_holds(sky: Sky, files: tuple[
     strehl = sky.frames(FRAMES)
     records, sent = sky.records, sky.records["commands"].astype(np.float64)
     place = np.arange(FRAMES) // EVERY % 2
-    assert records["arm"].tolist() == place.tolist()
+    assert records["method"].tolist() == place.tolist()
     assert engine.status()["methods"] == ["window+integrator", "map+kalman"]
     slopes, errors = (
         np.hstack([records[f"{name}{axis}"] for axis in "xy"]).astype(np.float64)
@@ -117,7 +117,7 @@ def test_methods_change_while_the_loop_is_closed(sky: Sky, files: tuple[Path, Co
     assert commands_of(engine)["loop"]({"action": "gain", "gain": 0.125})["loop"]["gain"] == 0.125
     interleave({"methods": "set"})
     sky.frames(4)
-    methods = sky.records["arm"]
+    methods = sky.records["method"]
     assert set(methods[:4]) == {0}
     assert set(methods[5:-4]) == {1, 2}
     assert set(methods[-3:]) == {3}

@@ -71,9 +71,9 @@ def test_methods_take_turns() -> None:
     with Bench(interleaving=Interleaving.parse("none,tv", 2)) as bench:
         bench.measure(data)
         records = bench.records
-    assert records["arm"].tolist() == [0, 0, 1, 1, 0, 0, 1, 1]
+    assert records["method"].tolist() == [0, 0, 1, 1, 0, 0, 1, 1]
     for record, frame in zip(records, data, strict=True):
-        settings = SETTINGS if record["arm"] else SETTINGS.replace(estimator="brightest")
+        settings = SETTINGS if record["method"] else SETTINGS.replace(estimator="brightest")
         assert np.array_equal(np.concatenate([record["x"], record["y"]]), make(settings)(frame).vector)
 
 

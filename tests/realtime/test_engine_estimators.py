@@ -163,7 +163,7 @@ def test_a_fault_in_an_method_ends_taking_turns(camera: Camera, tmp_path: Path) 
     assert camera.engine.status()["methods"] == ["set"]
     camera.assert_measured_with(SETTINGS, camera.shoot())
     # "set" has a number of its own again, after those of the methods that took turns.
-    assert camera.records["arm"][-1] == 3
+    assert camera.records["method"][-1] == 3
 
 
 @pytest.mark.usefixtures("tried_here")

@@ -76,16 +76,16 @@ def test_every() -> None:
 def test_methods_of_later_interleavings_have_numbers_of_their_own() -> None:
     changes: list[dict[str, Any]] = [
         {"changes": {"noise_std": 2.0}},
-        {"changes": {"arms": ["ml", "set"], "first_arm": 2, "every": 5}},
+        {"changes": {"methods": ["ml", "set"], "first_method": 2, "every": 5}},
         {"changes": {"loop": "open"}},
-        {"changes": {"arms": ["set"], "first_arm": 4, "every": 5}},
+        {"changes": {"methods": ["set"], "first_method": 4, "every": 5}},
     ]
     assert methods_after(["none", "tv"], changes[:1]) == (["none", "tv"], 0)
     assert methods_after(["none", "tv"], changes) == (["none", "tv", "ml", "set", "set"], 4)
     # Of a recording, whose methods are all of them already.
     assert methods_after(["a", "b", "c", "d", "e"], changes[:2]) == (["a", "b", "ml", "set", "e"], 2)
-    garbage: list[dict[str, Any]] = [{}, {"changes": {"arms": "x", "first_arm": 0}}]
-    garbage += [{"changes": {"arms": ["x"], "first_arm": number}} for number in (-1, 9, "0", None)]
+    garbage: list[dict[str, Any]] = [{}, {"changes": {"methods": "x", "first_method": 0}}]
+    garbage += [{"changes": {"methods": ["x"], "first_method": number}} for number in (-1, 9, "0", None)]
     assert methods_after(["none", "tv"], garbage) == (["none", "tv"], 0)
 
 
@@ -109,12 +109,12 @@ def test_methods_change_while_the_engine_runs(bench: Bench) -> None:
     assert (status["methods"], status["every"]) == (["none", "tv"], 2)
     bench.until(lambda: bench.telemetry.changes_since(0)[0])
     (change,), _, _ = bench.telemetry.changes_since(0)
-    assert change["changes"] == {"arms": ["none", "tv"], "first_arm": 1, "every": 2}
+    assert change["changes"] == {"methods": ["none", "tv"], "first_method": 1, "every": 2}
     at = change["frame"]
     assert at in (4, 5)  # was waited for already, or not
-    assert bench.records["arm"].tolist() == [0] * at + [1 + number // 2 % 2 for number in range(at, 12)]
+    assert bench.records["method"].tolist() == [0] * at + [1 + number // 2 % 2 for number in range(at, 12)]
     for record, frame in zip(bench.records[at:], frames[at:], strict=True):
-        settings = without_denoising(SETTINGS, "") if record["arm"] == 1 else SETTINGS
+        settings = without_denoising(SETTINGS, "") if record["method"] == 1 else SETTINGS
         assert np.array_equal(np.concatenate([record["x"], record["y"]]), make(settings)(frame).vector)
     handlers["set"]({"changes": {"noise_std": 2.0}})  # the methods stay
     bench.send(ring, 12, frames[0])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot.ao_loop import Arm, simulate_loop
+from faintspot.ao_loop import Method, simulate_loop
 from faintspot.ao_loop.control import learnt_control
 from faintspot.control.configuration import Control
 from faintspot.pipeline import configuration as configuration_file
@@ -40,11 +40,11 @@ def test_the_kalman_filter_s_loop_is_the_simulated_one(sky: Sky, tmp_path: Path)
     run = run.replace("run", frames=FRAMES, settle_frames=10)
     path, control = configured(tmp_path, SETTINGS, run, "kalman")
     assert (control.prediction, control.options.centroid_gain) == ("controller", 1.0)
-    arm = Arm("-", SETTINGS, predict_prior=True, correct_gain=False, control="kalman")
+    method = Method("-", SETTINGS, predict_prior=True, correct_gain=False, control="kalman")
     told, _ = learnt_control(
-        run, arm, run.run.seed, simulate_loop
+        run, method, run.run.seed, simulate_loop
     )  # the first frame's prior, too, is as wide
-    record = simulate_loop(run, [arm])
+    record = simulate_loop(run, [method])
     sky.start(make_engine(sky.name, path, control, settings=told.settings))
     sky.loop.close()
     strehl = sky.frames(FRAMES)

@@ -176,6 +176,6 @@ def test_methods_that_came_later_are_named(name: str, tmp_path: Path) -> None:
     with TelemetryRing.create(name, LAYOUT, methods=["none", "tv"]) as ring:
         recording = Recorder(name, tmp_path / "night.zarr")
         write(ring, 1)
-        ring.write_change(2, 1, {"arms": ["ml", "set"], "first_arm": 2, "every": 50}, None)
+        ring.write_change(2, 1, {"methods": ["ml", "set"], "first_method": 2, "every": 50}, None)
         recording.run(n_frames=1)
-    assert read_telemetry(tmp_path / "night.zarr").attributes["arms"] == ["none", "tv", "ml", "set"]
+    assert read_telemetry(tmp_path / "night.zarr").attributes["methods"] == ["none", "tv", "ml", "set"]

@@ -65,7 +65,7 @@ def test_what_is_written_is_read(name: str) -> None:
         reader = TelemetryReader.attach(name)
         assert reader.layout == LAYOUT
         assert reader.settings == SETTINGS
-        assert reader.description["arms"] == ["none", "tv"]
+        assert reader.description["methods"] == ["none", "tv"]
         records, cursor, dropped = reader.records.since(0)
         assert (len(records), cursor, dropped) == (0, 0, 0)
         for frame in range(5):

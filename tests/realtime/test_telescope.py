@@ -415,11 +415,11 @@ def test_files_keep_what_else_there_is(tmp_path: Path) -> None:
     assert (len(known.layout), known.calibration.read_noise_e) == (36, 1.0)
     reference = np.load(tmp_path / "reference_slopes.npy")
     assert reference.shape == (72,)
-    arm = faintspot.ao_loop.Arm("-", known.settings)
+    method = faintspot.ao_loop.Method("-", known.settings)
     sensor = TelescopeModel(CONFIGURATION, 1).optics.sensor
     frame = sensor.frame(sensor.spots(np.zeros((sensor.points,) * 2, np.float32))) * 1e6
     plain_slopes = fs.SlopePipeline(known.layout, known.settings, fs.Calibration(0.0), reference)(frame)
     np.testing.assert_allclose(plain_slopes.vector, 0, atol=1e-5)
-    assert make_pipeline(CONFIGURATION, sensor, arm).layout.frame_shape == known.layout.frame_shape
+    assert make_pipeline(CONFIGURATION, sensor, method).layout.frame_shape == known.layout.frame_shape
     with pytest.raises(InputError, match="cannot be written"):
         write_engine_files(CONFIGURATION, path / "inside_a_file")

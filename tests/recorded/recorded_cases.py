@@ -29,13 +29,13 @@ def simulated(layout: Layout, n_frames: int) -> tuple[NDArray[Any], NDArray[np.f
     return sensor_frames(layout.corners, layout.window, layout.frame_shape, n_frames, rng=rng)
 
 
-def two_arms(layout: Layout, frames: NDArray[Any]) -> tuple[list[MeasuredSlopes], dict[str, Stages]]:
-    arms, stages = [], {}
+def two_methods(layout: Layout, frames: NDArray[Any]) -> tuple[list[MeasuredSlopes], dict[str, Stages]]:
+    methods, stages = [], {}
     for name, settings in (("TV", SETTINGS), ("no TV", SETTINGS.replace(estimator="brightest"))):
         pipeline = SlopePipeline(layout, settings)
-        arms.append(MeasuredSlopes.of(name, pipeline(frames)))
+        methods.append(MeasuredSlopes.of(name, pipeline(frames)))
         stages[name] = pipeline.explain(frames[0])
-    return arms, stages
+    return methods, stages
 
 
 @dataclass

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.recorded.recorded_cases import sensor, simulated, two_arms
+from tests.recorded.recorded_cases import sensor, simulated, two_methods
 
 from faintspot.recorded import maps
 from faintspot.recorded.statistics import MeasuredSlopes, jitter, summarise, valid_in_all
@@ -38,8 +38,8 @@ def test_drawn_arrows_are_no_longer_than_the_limit() -> None:
 
 def test_outlines_are_left_out_of_big_sensors() -> None:
     def drawn(side: int) -> int:
-        arm = slopes(n=side**2)
-        figure = maps.slope_arrows([arm], [summarise(arm)], Layout.grid((side, side), pixels=8))
+        method = slopes(n=side**2)
+        figure = maps.slope_arrows([method], [summarise(method)], Layout.grid((side, side), pixels=8))
         return len(figure.axes[0].collections)
 
     assert drawn(30) == drawn(2) - 1
@@ -47,9 +47,9 @@ def test_outlines_are_left_out_of_big_sensors() -> None:
 
 def test_legend_of_the_jitter_lies_outside() -> None:
     layout = sensor()
-    arms, _ = two_arms(layout, simulated(layout, 6)[0])
-    valid = valid_in_all(arms)
-    figure = maps.jitter_plot(arms, [jitter(arm.x, arm.y, valid) for arm in arms])
+    methods, _ = two_methods(layout, simulated(layout, 6)[0])
+    valid = valid_in_all(methods)
+    figure = maps.jitter_plot(methods, [jitter(method.x, method.y, valid) for method in methods])
     assert all(panel.get_legend() is None for panel in figure.axes)
     figure.draw_without_rendering()
     legend = figure.legends[0].get_window_extent()
@@ -60,6 +60,6 @@ def test_one_frame_has_a_map_of_the_flux_alone() -> None:
     layout = sensor()
     frames = simulated(layout, 2)[0]
     for n_frames, titles in ((1, ["TV: flux"]), (2, ["TV: median flux", "TV: valid frames"])):
-        arm = two_arms(layout, frames[:n_frames])[0][0]
-        figure = maps.flux_and_validity([arm], [summarise(arm)], layout)
+        method = two_methods(layout, frames[:n_frames])[0][0]
+        figure = maps.flux_and_validity([method], [summarise(method)], layout)
         assert [title for panel in figure.axes if (title := panel.get_title())] == titles

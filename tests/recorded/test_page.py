@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.recorded.recorded_cases import SETTINGS, Page, sensor, simulated, two_arms
+from tests.recorded.recorded_cases import SETTINGS, Page, sensor, simulated, two_methods
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.pipeline.slope_pipeline import SlopePipeline
@@ -20,7 +20,7 @@ SECTIONS = ["numbers", "frame", "flux", "slopes", "iterations", "jitter", "confi
 
 
 def page_of(of: Layout, frames: Any, true: Any = None, **changes: Any) -> Page:
-    arms, stages = two_arms(of, frames)
+    methods, stages = two_methods(of, frames)
     arguments: dict[str, Any] = {
         "layout": of,
         "stages": stages,
@@ -29,14 +29,14 @@ def page_of(of: Layout, frames: Any, true: Any = None, **changes: Any) -> Page:
         "facts": {"Sources": "frames.fits"},
         "configurations": {"Configuration": "[settings]\nnoise_std = 0.3 # <b>"},
     }
-    return Page(slopes_report(arms, **(arguments | changes)))
+    return Page(slopes_report(methods, **(arguments | changes)))
 
 
-def plain_page(arms: list[MeasuredSlopes], layout: Layout | None) -> Page:
-    """The page of arms alone, without pictures of frames."""
+def plain_page(methods: list[MeasuredSlopes], layout: Layout | None) -> Page:
+    """The page of methods alone, without pictures of frames."""
     configurations = {"Configuration": ""}
     return Page(
-        slopes_report(arms, layout=layout, stages=None, title="t", facts={}, configurations=configurations)
+        slopes_report(methods, layout=layout, stages=None, title="t", facts={}, configurations=configurations)
     )
 
 
@@ -64,16 +64,16 @@ def test_page_has_all_sections_and_pictures_and_needs_nothing_else() -> None:
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
-def test_texts_are_escaped_and_numbers_are_those_of_the_arms() -> None:
+def test_texts_are_escaped_and_numbers_are_those_of_the_methods() -> None:
     layout = sensor()
     frames, truth = simulated(layout, 6)
     page = page_of(layout, frames, truth)
     assert "A <test> & more" in page.text
     assert "noise_std = 0.3 # <b>" in page.text
     assert "frames.fits" in page.text
-    arms = two_arms(layout, frames)[0]
-    assert f"{np.median(arms[0].flux[arms[0].valid]):#.3g}".rstrip(".") + " e-" in page.text
-    errors = (np.abs(arms[0].x - truth[..., 0]) + np.abs(arms[0].y - truth[..., 1])) / 2
+    methods = two_methods(layout, frames)[0]
+    assert f"{np.median(methods[0].flux[methods[0].valid]):#.3g}".rstrip(".") + " e-" in page.text
+    errors = (np.abs(methods[0].x - truth[..., 0]) + np.abs(methods[0].y - truth[..., 1])) / 2
     assert f"{errors.mean():#.4g} ±" in page.text
     assert "flux gain against 'no TV'" in page.text
 
@@ -110,12 +110,14 @@ def test_everything_invalid(value: float) -> None:
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
-def test_one_arm_and_hexagonal_layout() -> None:
+def test_one_method_and_hexagonal_layout() -> None:
     corners = np.array([[0, 2], [0, 12], [9, 7]])
     layout = Layout((20, 22), (8, 8), corners, geometry="hexagonal", pitch_px=10.0)
     frames, _ = simulated(layout, 3)
-    arm = MeasuredSlopes.of("no TV", SlopePipeline(layout, SETTINGS.replace(estimator="brightest"))(frames))
-    page = plain_page([arm], layout)
+    method = MeasuredSlopes.of(
+        "no TV", SlopePipeline(layout, SETTINGS.replace(estimator="brightest"))(frames)
+    )
+    page = plain_page([method], layout)
     text = page.text
     assert "hexagonal" in text
     assert "iterations" not in page.ids
@@ -138,8 +140,8 @@ def test_warnings_say_what_to_do_next() -> None:
     flags[:, 0] = 1  # NO_FLUX
     flags[:, 1] = 8  # SATURATED
     flags[:, 2] = 32  # NOT_CONVERGED
-    arm = MeasuredSlopes("TV", x, x, x + 5, flags, x.astype(int) + 7)
-    text = plain_page([arm], None).text
+    method = MeasuredSlopes("TV", x, x, x + 5, flags, x.astype(int) + 7)
+    text = plain_page([method], None).text
     assert "20.0 % of the measurements had no flux" in text
     assert "20.0 % of the measurements were saturated" in text
     assert "raise max_iterations" in text
@@ -159,9 +161,9 @@ def test_parts_that_do_not_fit_are_refused_in_one_line() -> None:
         with pytest.raises(InputError) as error:
             page_of(layout, frames, **changes)
         assert "\n" not in str(error.value)
-    arms = two_arms(layout, frames)[0]
-    for wrong in ([], [arms[0], arms[0]], [arms[0], two_arms(layout, frames[:1])[0][1]]):
-        with pytest.raises(InputError, match="arms: expected"):
+    methods = two_methods(layout, frames)[0]
+    for wrong in ([], [methods[0], methods[0]], [methods[0], two_methods(layout, frames[:1])[0][1]]):
+        with pytest.raises(InputError, match="methods: expected"):
             plain_page(wrong, layout)
 
 

@@ -72,7 +72,7 @@ def test_one_store_gives_the_whole_page(tmp_path: Path) -> None:
     assert "Not drawn" not in page.text
 
 
-def test_two_stores_are_two_arms(tmp_path: Path) -> None:
+def test_two_stores_are_two_methods(tmp_path: Path) -> None:
     first = store(tmp_path / "a.npz", sensor())
     second = store(tmp_path / "b.npz", sensor(), PLAIN)
     page = Page(report_of_stored([first, second]))

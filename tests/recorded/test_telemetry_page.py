@@ -13,7 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.io.telemetry import Telemetry, TelemetryStore, read_telemetry
 from faintspot.realtime.telemetry_segment import image_type, layout_values, record_type
 from faintspot.recorded.telemetry_figures import latency_figure
-from faintspot.recorded.telemetry_numbers import arms_in_turn, change_rows, gaps, quantities, timing
+from faintspot.recorded.telemetry_numbers import change_rows, gaps, methods_in_turn, quantities, timing
 from faintspot.recorded.telemetry_page import report_of_telemetry
 from faintspot.sensor.layout import Layout
 
@@ -26,24 +26,26 @@ RMS_PX, FLUX_E = {0: 0.20, 1: 0.16}, {0: 300.0, 1: 280.0}
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Make a store of 2000 frames at 1 kHz, twelve of them lost, with two arms, five frames each in turn."""
+    """Make a store of 2000 frames at 1 kHz, twelve of them lost, with two methods in turns of five frames."""
     rng = np.random.default_rng(3)
     records = np.zeros(FRAMES, record_type(N))
     number = np.arange(FRAMES)
-    arm = number // EVERY % 2
-    records["frame"], records["arm"] = number + 10, arm
+    method = number // EVERY % 2
+    records["frame"], records["method"] = number + 10, method
     records["last_row_time_ns"] = 1_000_000 * number
-    records["published_time_ns"] = records["last_row_time_ns"] + 50_000 + 10_000 * arm
-    wave = 0.3 + np.sin(number / 300)[:, None]  # of the air, the same in both arms; taken off over many turns
+    records["published_time_ns"] = records["last_row_time_ns"] + 50_000 + 10_000 * method
+    wave = (
+        0.3 + np.sin(number / 300)[:, None]
+    )  # of the air, the same in both methods; taken off over many turns
     for axis in "xy":
-        records[axis] = 0.5 + np.vectorize(RMS_PX.get)(arm)[:, None] * rng.normal(size=(FRAMES, N))
+        records[axis] = 0.5 + np.vectorize(RMS_PX.get)(method)[:, None] * rng.normal(size=(FRAMES, N))
         records[f"standard_error_{axis}"] = 0.1
-    records["flux"] = np.vectorize(FLUX_E.get)(arm)[:, None] + 50 * wave
+    records["flux"] = np.vectorize(FLUX_E.get)(method)[:, None] + 50 * wave
     attributes = {
         "name": "bench",
         "layout": layout_values(LAYOUT),
         "settings": '[estimator]\nname = "tv"\n',
-        "arms": ["none", "tv"],
+        "methods": ["none", "tv"],
         "dropped_records": 3,
     }
     kinds = record_type(N), image_type(LAYOUT.frame_shape, N, LAYOUT.window)
@@ -71,11 +73,11 @@ def test_rates_and_lost_frames(night: Telemetry) -> None:
     assert len(change_rows(night)) == 1
 
 
-def test_arms_in_turn_differ_as_they_were_made(night: Telemetry) -> None:
+def test_methods_in_turn_differ_as_they_were_made(night: Telemetry) -> None:
     values = quantities(night)
-    rms = arms_in_turn(night, values["rms of slopes about their mean (px)"])
-    flux = arms_in_turn(night, values["flux (e-)"])
-    assert [arm.arm for arm in rms] == ["none", "tv"]
+    rms = methods_in_turn(night, values["rms of slopes about their mean (px)"])
+    flux = methods_in_turn(night, values["flux (e-)"])
+    assert [method.method for method in rms] == ["none", "tv"]
     assert rms[0].difference is None
     for compared, true in ((rms, RMS_PX[1] - RMS_PX[0]), (flux, FLUX_E[1] - FLUX_E[0])):
         difference = compared[1].difference
@@ -83,13 +85,13 @@ def test_arms_in_turn_differ_as_they_were_made(night: Telemetry) -> None:
         assert difference.high < 0
         # 5 % of it: 200 turns of 5 frames of 32 slopes have 0.5 %, the wave of the air differs between turns.
         assert difference.value == pytest.approx(true, rel=0.05)
-    # The wave is common to both arms: in the difference it hardly counts, in the means it does.
+    # The wave is common to both methods: in the difference it hardly counts, in the means it does.
     assert flux[1].difference.standard_error < 0.2 * flux[1].mean.standard_error  # type: ignore[union-attr]
 
 
 def test_page(path: Path) -> None:
     page = Page(report_of_telemetry(path))
-    assert page.ids[:4] == ["timing", "lost", "arms", "changes"]
+    assert page.ids[:4] == ["timing", "lost", "methods", "changes"]
     assert {"numbers", "flux", "slopes", "jitter", "wavefront", "configuration"} <= set(page.ids)
     assert "frame" not in page.ids
     for words in (
@@ -102,7 +104,7 @@ def test_page(path: Path) -> None:
 
 
 def test_key_numbers_are_those_of_each_method(path: Path) -> None:
-    """The arms have 0.20 and 0.16 px of noise; together they would have 0.18."""
+    """The methods have 0.20 and 0.16 px of noise; together they would have 0.18."""
     text = Page(report_of_telemetry(path)).text
     numbers = text[text.index("method noise (px)") :]
     noise = [float(numbers.split(f" {name} ", 1)[1].split()[0]) for name in ("none", "tv")]

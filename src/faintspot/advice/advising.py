@@ -145,11 +145,11 @@ def advise(loop: Loop, telemetry: Telemetry, settings: Settings) -> Advice:
     InputError
         When the telemetry has no frames of a closed loop, or several interleaved methods.
     """
-    arms = np.unique(telemetry.arm)
-    if not len(arms):
+    methods = np.unique(telemetry.method)
+    if not len(methods):
         raise InputError(f"{loop.name}: expected frames of a closed loop, got none")
-    if len(arms) != 1:
-        raise InputError(f"telemetry: expected a single method, found {len(arms)} interleaved")
+    if len(methods) != 1:
+        raise InputError(f"telemetry: expected a single method, found {len(methods)} interleaved")
     layout = loop.layout
     seen = seen_in_telemetry(telemetry, loop.control, prior_std_px(settings, layout))
     frames = electrons_of(telemetry.raw, loop.calibration)

@@ -9,7 +9,7 @@ import numpy as np
 from faintspot.advice.loop_choices import AS_RUN, BEST, FILTER
 from faintspot.advice.loop_report import LoopReport, Part
 from faintspot.advice.measured import Measured
-from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, colour_bar, new_figure, styled
+from faintspot.report.drawing import GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.page import Page, Section, Table, html_of
 from faintspot.report.texts import Texts
@@ -111,7 +111,7 @@ def _wind_figure(report: LoopReport) -> FigureWithData | None:
         axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=GREY, lw=0.6, ls=":")
     x, y = winds.T
     axes.errorbar(x, y, 1.96 * errors[:, 1], 1.96 * errors[:, 0], fmt="none", color=GREY, capsize=2)
-    axes.scatter(x, y, 900 * share, color=ARM_COLOURS[1], alpha=0.7)
+    axes.scatter(x, y, 900 * share, color=METHOD_COLOURS[1], alpha=0.7)
     for place, part in zip(winds, share, strict=True):
         axes.annotate(f"{part:.0%}", place, textcoords="offset points", xytext=(12, 8))
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
@@ -134,10 +134,10 @@ def _spectra_figure(report: LoopReport) -> FigureWithData | None:
     for panel, name in zip(panels, spectra.measured, strict=False):
         measured, model = spectra.measured[name], spectra.model[name]
         panel.loglog(spectra.frequency_hz, measured, color=GREY, lw=1, label="measured")
-        panel.loglog(spectra.frequency_hz, model, color=ARM_COLOURS[0], lw=1.6, label="found")
+        panel.loglog(spectra.frequency_hz, model, color=METHOD_COLOURS[0], lw=1.6, label="found")
         spread = np.exp(1.96 / np.sqrt(0.55 * spectra.pieces))
         panel.fill_between(
-            spectra.frequency_hz, model / spread, model * spread, color=ARM_COLOURS[0], alpha=0.15, lw=0
+            spectra.frequency_hz, model / spread, model * spread, color=METHOD_COLOURS[0], alpha=0.15, lw=0
         )
         panel.set(title=name, xlabel="frequency (Hz)", ylabel=f"slope² ({report.loop.slope_unit}²/Hz)")
         rows += [(name, *each) for each in zip(spectra.frequency_hz, measured, model, strict=True)]
@@ -156,8 +156,10 @@ def _gain_figure(report: LoopReport) -> FigureWithData | None:
     axes = figure.subplots()
     values = [(each.gain, each.residual.value, each.residual.error) for each in curve]
     gain, residual, error = np.array(values).T
-    axes.errorbar(gain, residual, 1.96 * error, fmt="o-", color=ARM_COLOURS[1], capsize=3, label="integrator")
-    for name, colour in ((AS_RUN, "black"), (FILTER, ARM_COLOURS[0])):
+    axes.errorbar(
+        gain, residual, 1.96 * error, fmt="o-", color=METHOD_COLOURS[1], capsize=3, label="integrator"
+    )
+    for name, colour in ((AS_RUN, "black"), (FILTER, METHOD_COLOURS[0])):
         for each in (one for one in report.choices if one.name == name):
             axes.axhline(each.residual.value, color=colour, label=name)
             axes.axhspan(*each.residual.interval, color=colour, alpha=0.12, lw=0)

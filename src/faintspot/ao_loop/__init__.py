@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 from faintspot.base.lazy import lazy_attributes
 
 if TYPE_CHECKING:
-    from faintspot.ao_loop.arms import Arm as Arm
     from faintspot.ao_loop.configuration import LoopConfiguration as LoopConfiguration
     from faintspot.ao_loop.configuration import load_loop as load_loop
     from faintspot.ao_loop.configuration import shipped_loops as shipped_loops
+    from faintspot.ao_loop.methods import Method as Method
     from faintspot.ao_loop.record import LoopRecord as LoopRecord
     from faintspot.ao_loop.simulation import simulate_loop as simulate_loop
 
 _HOMES = {
-    "Arm": "faintspot.ao_loop.arms",
+    "Method": "faintspot.ao_loop.methods",
     "LoopConfiguration": "faintspot.ao_loop.configuration",
     "LoopRecord": "faintspot.ao_loop.record",
     "load_loop": "faintspot.ao_loop.configuration",

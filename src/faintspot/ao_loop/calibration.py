@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.ao_loop.arms import Arm
 from faintspot.ao_loop.atmosphere import MovingLayers
 from faintspot.ao_loop.camera import Exposing, camera_calibration
 from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
+from faintspot.ao_loop.methods import Method
 from faintspot.ao_loop.mirror import DeformableMirror
 from faintspot.ao_loop.wavefront_sensor import ShackHartmann
 from faintspot.base.errors import InputError
@@ -33,7 +33,7 @@ _SMALLEST_GAIN = 0.05  # less is noise, and dividing by it would make the loop u
 Floats = NDArray[np.float64]
 
 
-def arm_layout(layout: Layout, arm: Arm) -> Layout:
+def method_layout(layout: Layout, method: Method) -> Layout:
     """Return the windows of a method: the middle of the sensor's windows.
 
     Raises
@@ -42,28 +42,30 @@ def arm_layout(layout: Layout, arm: Arm) -> Layout:
         When they are larger than the sensor's.
     """
     side = layout.window[0]
-    pixels = side if arm.window_pixels is None else arm.window_pixels
+    pixels = side if method.window_pixels is None else method.window_pixels
     if pixels > side:
-        raise InputError(f"arm.window_pixels = {pixels}: expected at most the {side} of the sensor's windows")
+        raise InputError(
+            f"method.window_pixels = {pixels}: expected at most the {side} of the sensor's windows"
+        )
     corners = layout.corners + (side - pixels) // 2
     return Layout(layout.frame_shape, (pixels, pixels), corners, layout.centres, layout.cells)
 
 
-def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, arm: Arm) -> SlopePipeline:
+def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, method: Method) -> SlopePipeline:
     """Return the pipeline of a method, with the reference slopes of a flat wavefront."""
     return SlopePipeline(
-        arm_layout(sensor.layout, arm),
-        arm.settings,
+        method_layout(sensor.layout, method),
+        method.settings,
         camera_calibration(configuration),
-        reference_slopes(configuration, sensor, arm),
-        psf=_psf(configuration, arm),
-        score=arm.score,
+        reference_slopes(configuration, sensor, method),
+        psf=_psf(configuration, method),
+        score=method.score,
         threads=1,
     )
 
 
 def reference_slopes(
-    configuration: LoopConfiguration, sensor: ShackHartmann, arm: Arm
+    configuration: LoopConfiguration, sensor: ShackHartmann, method: Method
 ) -> NDArray[np.float32]:
     """Return the slopes that a method measures for a flat wavefront, all x, then all y, (2 n,) px.
 
@@ -71,20 +73,20 @@ def reference_slopes(
     at its strength of denoising they would be denoised to nothing.
     """
     bright = SlopePipeline(
-        arm_layout(sensor.layout, arm),
-        arm.settings.replace(estimator=arm.settings.estimator.for_bright_flux(), flux_e=None),
+        method_layout(sensor.layout, method),
+        method.settings.replace(estimator=method.settings.estimator.for_bright_flux(), flux_e=None),
         Calibration(dark=0.0, read_noise_e=1.0),
-        psf=_psf(configuration, arm),
-        score=arm.score,
+        psf=_psf(configuration, method),
+        score=method.score,
         threads=1,
     )
     flat = sensor.spots(np.zeros((sensor.points, sensor.points), np.float32))
     return bright(sensor.frame(flat) * _BRIGHT_E).vector
 
 
-def _psf(configuration: LoopConfiguration, arm: Arm) -> PSF:
-    if arm.psf is not None:
-        return arm.psf
+def _psf(configuration: LoopConfiguration, method: Method) -> PSF:
+    if method.psf is not None:
+        return method.psf
     return flat_psf(configuration.spot_width_px, configuration.sensor.spot_elongation)
 
 
@@ -97,12 +99,12 @@ def flat_psf(width_px: float, elongation: float) -> PSF:
 def interaction_matrix(sensor: ShackHartmann, mirror: DeformableMirror) -> Floats:
     """Return the displacements of the spots for a command of 1 nm of each actuator, (2 n, commands) px.
 
-    Measured by poking each actuator up and down, with bright frames without noise, centres of gravity of
-    all the flux in the windows, and divided by the slopes that a known displacement gives. All arms use it,
-    each with its own reference slopes and its own centroid gain at the run's flux. A matrix through an arm's
-    own estimator with such frames was no better: it changed the Strehl ratio by -0.035 to 0.000 for the 20
-    brightest pixels, -0.007 to 0.016 for weighted centres of gravity, and -0.037 to -0.014 for likelihood,
-    which sees bright spots with other weights than faint ones (80 to 1000 photons, 700 frames).
+    Measured by poking each actuator up and down, with bright frames without noise, centres of gravity of all
+    the flux in the windows, and divided by the slopes that a known displacement gives. All methods use it,
+    each with its own reference slopes and its own centroid gain at the run's flux. A matrix through a
+    method's own estimator with such frames was no better: it changed the Strehl ratio by -0.035 to 0.000 for
+    the 20 brightest pixels, -0.007 to 0.016 for weighted centres of gravity, and -0.037 to -0.014 for
+    likelihood, which sees bright spots with other weights than faint ones (80 to 1000 photons, 700 frames).
     """
     pixels = sensor.layout.pixels
     settings = Settings(BrightestPixels(keep_brightest=pixels - 1))

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.ao_loop.arms import PRIOR, Arm
 from faintspot.ao_loop.configuration import CLOSED, ControlParameters, LoopConfiguration, RunLength
+from faintspot.ao_loop.methods import PRIOR, Method
 from faintspot.ao_loop.record import LoopRecord
 from faintspot.base.errors import InputError
 from faintspot.control.base import Controller
@@ -37,32 +37,32 @@ _SETTLE_FRAMES = 50
 def make_controller(
     configuration: LoopConfiguration,
     optics: LoopOptics,
-    arm: Arm,
+    method: Method,
     learnt: Learnt | None,
     line: CommandDelayLine,
 ) -> Controller:
     """Return the controller of a method, which sends its commands to `line`."""
     if learnt is not None:
-        return learnt.controller(line, prior_std_px(arm, len(optics.interaction)))
+        return learnt.controller(line, prior_std_px(method, len(optics.interaction)))
     control = configuration.control
     return Integrator(
         line,
         optics.interaction,
         optics.reconstructor,
-        control.gain if arm.gain is None else arm.gain,
+        control.gain if method.gain is None else method.gain,
         control.leak,
-        weighted=arm.weighted_reconstructor and not arm.true_slopes,
+        weighted=method.weighted_reconstructor and not method.true_slopes,
         sees_mirror=control.mode == CLOSED,
     )
 
 
 def learnt_control(
     configuration: LoopConfiguration,
-    arm: Arm,
+    method: Method,
     seed: int,
     simulate: Simulate,
     learns_on: LoopConfiguration | None = None,
-) -> tuple[Arm, Learnt | None]:
+) -> tuple[Method, Learnt | None]:
     """Return the learnt controller of a method (None for the integrator), and the adapted method.
 
     The prior of an estimator that has one becomes as wide as the control is sure.
@@ -70,7 +70,7 @@ def learnt_control(
     Parameters
     ----------
     configuration : LoopConfiguration
-    arm : Arm
+    method : Method
     seed : int
     simulate : function
         `simulate_loop`, which makes the telemetry.
@@ -82,25 +82,30 @@ def learnt_control(
     InputError
         For control that learns, in open loop.
     """
-    if arm.control == INTEGRATOR:
-        return arm, None
+    if method.control == INTEGRATOR:
+        return method, None
     if configuration.control.mode != CLOSED:
-        raise InputError(f"arm.control = {arm.control!r}: expected {INTEGRATOR!r} in open loop")
+        raise InputError(f"method.control = {method.control!r}: expected {INTEGRATOR!r} in open loop")
     on = configuration if learns_on is None else learns_on
     learnt = _learnt(
-        replace(on, name="-", run=RunLength()), _Known.of(arm), arm.control, arm.noise_scale, seed, simulate
+        replace(on, name="-", run=RunLength()),
+        _Known.of(method),
+        method.control,
+        method.noise_scale,
+        seed,
+        simulate,
     )
-    if learnt.expected_std_px is not None and _has_prior(arm):
+    if learnt.expected_std_px is not None and _has_prior(method):
         std = np.sqrt(np.square(learnt.expected_std_px).reshape(2, -1).mean(axis=0))
-        arm = _with_prior(arm, std)
-    return arm, learnt
+        method = _with_prior(method, std)
+    return method, learnt
 
 
-def prior_std_px(arm: Arm, slopes: int) -> Floats | None:
+def prior_std_px(method: Method, slopes: int) -> Floats | None:
     """Return the standard deviations of the estimator's prior around the prediction, (2 n,), or None."""
-    if not _has_prior(arm):
+    if not _has_prior(method):
         return None
-    each = np.broadcast_to(getattr(arm.settings, PRIOR), (slopes // 2,))
+    each = np.broadcast_to(getattr(method.settings, PRIOR), (slopes // 2,))
     return np.tile(each, 2).astype(np.float64)
 
 
@@ -124,21 +129,21 @@ def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64])
 class _Known:
     """Method, equal to others that would leave the same telemetry."""
 
-    arm: Arm = field(compare=False)
+    method: Method = field(compare=False)
     same: tuple[Any, ...]
 
     @classmethod
-    def of(cls, arm: Arm) -> _Known:
+    def of(cls, method: Method) -> _Known:
         from faintspot.pipeline.configuration import to_text
 
-        plain = replace(arm, label="telemetry", control=INTEGRATOR, noise_scale=1.0)
-        if _has_prior(arm):
+        plain = replace(method, label="telemetry", control=INTEGRATOR, noise_scale=1.0)
+        if _has_prior(method):
             plain = _with_prior(plain, _TELEMETRY_PRIOR_PX)
         values = {
             **vars(plain),
             "settings": to_text(plain.settings),
-            "psf": id(arm.psf),
-            "score": id(arm.score),
+            "psf": id(method.psf),
+            "score": id(method.score),
         }
         return cls(plain, tuple(values.items()))
 
@@ -171,16 +176,16 @@ def _telemetry(
     """Run the loop with an integrator in turbulence that is never scored."""
     frames = configuration.control.telemetry_frames
     run = configuration.replace("run", frames=frames, settle_frames=0)
-    record = simulate(run, [known.arm], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)
-    return telemetry_of(record, known.arm)
+    record = simulate(run, [known.method], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)
+    return telemetry_of(record, known.method)
 
 
-def telemetry_of(record: LoopRecord, arm: Arm) -> OpenLoopTelemetry:
+def telemetry_of(record: LoopRecord, method: Method) -> OpenLoopTelemetry:
     """Return the telemetry of a run of one method with the integrator."""
     divisor = float(record.centroid_gain[0]) if record.corrected[0] else 1.0
     held = record.commands.astype(np.float64) @ record.interaction_matrix.T
     expected = np.zeros_like(held)
-    if arm.predict_prior:  # what acts less the latest command, which acts so many frames later
+    if method.predict_prior:  # what acts less the latest command, which acts so many frames later
         later = record.delay_frames - 1
         expected[: len(held) - later] = held[: len(held) - later] - held[later:]
     telemetry = make_telemetry(
@@ -188,20 +193,20 @@ def telemetry_of(record: LoopRecord, arm: Arm) -> OpenLoopTelemetry:
         record.standard_error_px.astype(np.float64) / divisor,
         held,
         expected,
-        prior_std_px(arm, held.shape[1]),
+        prior_std_px(method, held.shape[1]),
     )
     return telemetry.part(_SETTLE_FRAMES, record.frames - record.delay_frames)
 
 
-def _has_prior(arm: Arm) -> bool:
+def _has_prior(method: Method) -> bool:
     """Whether the estimator uses the controller's prediction as its prior."""
-    has = arm.predict_prior and PRIOR in arm.settings.declared() and not arm.true_slopes
-    return has and getattr(arm.settings, PRIOR) is not None
+    has = method.predict_prior and PRIOR in method.settings.declared() and not method.true_slopes
+    return has and getattr(method.settings, PRIOR) is not None
 
 
-def _with_prior(arm: Arm, std_px: float | Floats) -> Arm:
+def _with_prior(method: Method, std_px: float | Floats) -> Method:
     changes: dict[str, Any] = {PRIOR: std_px}
-    return replace(arm, settings=arm.settings.replace(**changes))
+    return replace(method, settings=method.settings.replace(**changes))
 
 
 def _without_assumed(configuration: LoopConfiguration) -> LoopConfiguration:

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.ao_loop.arms import PRIOR, Arm
 from faintspot.ao_loop.calibration import flat_psf, make_pipeline, reference_slopes
 from faintspot.ao_loop.camera import camera_calibration
 from faintspot.ao_loop.configuration import ARCSEC, LoopConfiguration
 from faintspot.ao_loop.control import learnt_control
+from faintspot.ao_loop.methods import PRIOR, Method
 from faintspot.ao_loop.simulation import measure_gains, simulate_loop
 from faintspot.ao_loop.telescope_model import prepare
 from faintspot.base.files import output_errors, write_atomically
@@ -80,18 +80,18 @@ def write_engine_files(
     if not configuration_file.has(path, "settings"):
         configuration_file.save(path, fixed_window(configuration))
     known = configuration_file.load_all(path)
-    arm = _arm(known.settings, psf, known.score, control)
-    reference = reference_slopes(configuration, optics.sensor, arm)
+    method = _method(known.settings, psf, known.score, control)
+    reference = reference_slopes(configuration, optics.sensor, method)
     write_atomically(folder / INTERACTION, lambda stream: np.save(stream, optics.interaction))
     write_atomically(folder / REFERENCE, lambda stream: np.save(stream, reference))
     loop, before = configuration.control, read_tables(path).get(control_file.TABLE, {})
     usual = {"gain": loop.gain, "leak": loop.leak, "delay_frames": loop.delay_frames}
     measured = {"interaction_matrix": INTERACTION, "reference_slopes": REFERENCE, "centroid_gain": 1.0}
     seed = configuration.run.seed
-    if arm.correct_gain:
-        pipeline = make_pipeline(configuration, optics.sensor, arm)
+    if method.correct_gain:
+        pipeline = make_pipeline(configuration, optics.sensor, method)
         measured["centroid_gain"] = float(measure_gains(configuration, [pipeline], seed=seed)[0])
-    _, learnt = learnt_control(configuration, arm, seed, simulate_loop)
+    _, learnt = learnt_control(configuration, method, seed, simulate_loop)
     if learnt is not None:
         learnt.model.save(folder / MODEL)
         measured |= {"controller": control, "model": MODEL}
@@ -105,13 +105,13 @@ def fixed_window(configuration: LoopConfiguration, **options: Any) -> Settings:
     return Settings("window", window_fwhm_px=width, flux_e=configuration.photons, **options)
 
 
-def _arm(settings: Settings, psf: PSF, score: Score | None, control: str) -> Arm:
+def _method(settings: Settings, psf: PSF, score: Score | None, control: str) -> Method:
     """Return the method of the simulated loop that equals the engine's."""
     predicts = control == KALMAN and settings.estimator.takes_prior
     if predicts and PRIOR in settings.declared() and getattr(settings, PRIOR) is None:
         anything: dict[str, Any] = {PRIOR: 1.0}  # it becomes what the filter is sure of
         settings = settings.replace(**anything)
-    return Arm(
+    return Method(
         "-",
         settings,
         psf=psf,

@@ -74,7 +74,7 @@ def open_loop_slopes(record: LoopRecord) -> Floats:
 
     A run in open loop has measured just them; only the centroid gain is taken out.
     """
-    gain = record.centroid_gain[record.arm]
+    gain = record.centroid_gain[record.method]
     if not record.closed:
         measured: Floats = record.slopes_px / gain[:, None]
         return measured

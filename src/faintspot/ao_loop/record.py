@@ -19,9 +19,9 @@ class LoopRecord(Stored):
     Examples
     --------
     >>> import faintspot as fs
-    >>> from faintspot.ao_loop import Arm, LoopConfiguration, simulate_loop
+    >>> from faintspot.ao_loop import Method, LoopConfiguration, simulate_loop
     >>> loop = LoopConfiguration().replace("run", frames=40, settle_frames=20)
-    >>> record = simulate_loop(loop, [Arm("brightest", fs.Settings("brightest"))])
+    >>> record = simulate_loop(loop, [Method("brightest", fs.Settings("brightest"))])
     >>> record.labels, record.frames, 0.0 < record.mean_strehl() < 1.0
     (('brightest',), 40, True)
     """
@@ -42,19 +42,19 @@ class LoopRecord(Stored):
     """(frames,): rms of the residual wavefront."""
     r0_m: NDArray[np.float64]
     """(frames,): true Fried parameter at 500 nm."""
-    arm: NDArray[np.int8]
+    method: NDArray[np.int8]
     """(frames,): number of the method that measured the frame."""
     interaction_matrix: NDArray[np.float64]
     """(2 n, m): displacements of the spots, true px, for a command of 1 nm."""
     centroid_gain: NDArray[np.float64]
-    """(arms,): centroid gain of each method at the run's flux."""
+    """(methods,): centroid gain of each method at the run's flux."""
     corrected: NDArray[np.bool_]
-    """(arms,): whether slopes were divided by the centroid gain."""
+    """(methods,): whether slopes were divided by the centroid gain."""
     psf: NDArray[np.float32]
-    """(arms, pixels, pixels): mean image of the frames after settling; a flat wavefront's peak is 1."""
+    """(methods, pixels, pixels): mean image of the frames after settling; a flat wavefront's peak is 1."""
     labels: tuple[str, ...]
     """Labels of the methods."""
-    arm_settings: tuple[str, ...]
+    method_settings: tuple[str, ...]
     """Settings of each method as TOML."""
     cells: NDArray[np.int64]
     """(n, 2): row and column of each sub-aperture in the lenslet array."""
@@ -86,15 +86,15 @@ class LoopRecord(Stored):
         """(frames,): whether a frame comes after settling."""
         return np.arange(self.frames) >= self.settle_frames
 
-    def mean_strehl(self, arm: int = 0) -> float:
+    def mean_strehl(self, method: int = 0) -> float:
         """Return the long-exposure Strehl ratio of a method: the mean of its frames after settling.
 
         Raises
         ------
         InputError
-            When the arm has no such frame.
+            When the method has no such frame.
         """
-        chosen = self.scored & (self.arm == arm)
+        chosen = self.scored & (self.method == method)
         if not chosen.any():
-            raise InputError(f"arm = {arm}: no frame after the {self.settle_frames} settling ones")
+            raise InputError(f"method = {method}: no frame after the {self.settle_frames} settling ones")
         return float(self.strehl[chosen].mean())

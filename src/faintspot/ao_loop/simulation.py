@@ -10,7 +10,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.ao_loop.arms import Arm
 from faintspot.ao_loop.calibration import (
     centroid_gain,
     make_pipeline,
@@ -20,6 +19,7 @@ from faintspot.ao_loop.calibration import (
 from faintspot.ao_loop.camera import Exposing, make_detector
 from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
 from faintspot.ao_loop.control import learnt_control, make_controller
+from faintspot.ao_loop.methods import Method
 from faintspot.ao_loop.record import LoopRecord
 from faintspot.ao_loop.telescope import PSF_SAMPLING
 from faintspot.ao_loop.telescope_model import TelescopeModel, atmosphere_of, prepare, without_flux
@@ -32,7 +32,7 @@ from faintspot.pipeline.mean_flux import MeanFlux
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.pipeline.slopes import Slopes
 
-_MOST_ARMS = 127
+_MOST_METHODS = 127
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ class DisabledErrors:
         camera = {"photons_per_subaperture": configuration.photons, "magnitude": None}
         return configuration.replace("camera", **camera).replace("control", frame_rate_hz=rate)
 
-    def arm(self, arm: Arm) -> Arm:
+    def method(self, method: Method) -> Method:
         """Return the method as used in such a run."""
-        return replace(arm, true_slopes=arm.true_slopes or self.true_slopes)
+        return replace(method, true_slopes=method.true_slopes or self.true_slopes)
 
     def time_s(self, frame: int, frame_rate_hz: float) -> float:
         """Return the middle of a frame."""
@@ -79,7 +79,7 @@ class DisabledErrors:
 
 def simulate_loop(
     configuration: LoopConfiguration,
-    arms: Sequence[Arm],
+    methods: Sequence[Method],
     schedule: ArrayLike | None = None,
     *,
     seed: int | None = None,
@@ -92,14 +92,14 @@ def simulate_loop(
 
     In every frame the sensor sees, for the whole exposure, the wavefront of its middle after the mirror; the
     command computed from frame k acts first during the exposure of frame k + delay_frames. Air and noise
-    depend on seed, realisation and frame alone: runs with other arms see the same.
+    depend on seed, realisation and frame alone: runs with other methods see the same.
 
     Parameters
     ----------
     configuration : LoopConfiguration
-    arms : sequence of Arm
+    methods : sequence of Method
     schedule : (frames,) array of int, optional
-        Which arm measures each frame. Default: the configuration's number of frames with the first arm.
+        Which method measures each frame. Default: the configuration's number of frames with the first method.
     seed : int, optional
         Default: the configuration's.
     realisation : int
@@ -118,26 +118,26 @@ def simulate_loop(
     Raises
     ------
     InputError
-        For a schedule that names arms that are not there, no arms, or parts that do not fit together.
+        For a schedule that names methods that are not there, no methods, or parts that do not fit together.
     MissingExtraError
         When HCIPy is not installed.
 
     Examples
     --------
     >>> import faintspot as fs
-    >>> from faintspot.ao_loop import Arm, LoopConfiguration, simulate_loop
+    >>> from faintspot.ao_loop import Method, LoopConfiguration, simulate_loop
     >>> loop = LoopConfiguration().replace("run", frames=40, settle_frames=20)
-    >>> record = simulate_loop(loop, [Arm("brightest", fs.Settings("brightest"))])
+    >>> record = simulate_loop(loop, [Method("brightest", fs.Settings("brightest"))])
     >>> record.strehl.shape, record.slopes_px.shape, bool(record.strehl[-1] > record.strehl[0])
     ((40,), (40, 72), True)
     """
-    which = _checked_schedule(configuration, arms, schedule)
+    which = _checked_schedule(configuration, methods, schedule)
     start = configuration.run.seed if seed is None else int(number_between("seed", seed, 0, integer=True))
     number = int(number_between("realisation", realisation, 0, integer=True))
     switches = DisabledErrors() if disabled_errors is None else disabled_errors
     ready = [
-        learnt_control(switches.configuration(configuration), arm, start, simulate_loop, learns_on)
-        for arm in map(switches.arm, arms)
+        learnt_control(switches.configuration(configuration), method, start, simulate_loop, learns_on)
+        for method in map(switches.method, methods)
     ]
     what = configuration, ready, which, start, number, switches
     gains = None
@@ -171,7 +171,7 @@ class _Loop:
     def __init__(
         self,
         configuration: LoopConfiguration,
-        ready: Sequence[tuple[Arm, Learnt | None]],
+        ready: Sequence[tuple[Method, Learnt | None]],
         which: NDArray[np.int64],
         seed: int,
         realisation: int,
@@ -179,7 +179,7 @@ class _Loop:
         gains: NDArray[np.float64] | None = None,
     ) -> None:
         self.configuration = configuration = disabled_errors.configuration(configuration)
-        self.arms = arms = tuple(arm for arm, _ in ready)
+        self.methods = methods = tuple(method for method, _ in ready)
         self.which, self.disabled_errors = which, disabled_errors
         self.seed, self.realisation = seed, realisation
         self.telescope_model = TelescopeModel(
@@ -190,9 +190,9 @@ class _Loop:
             noiseless=disabled_errors.noiseless,
         )
         self.optics = optics = self.telescope_model.optics
-        self.pipelines = [make_pipeline(configuration, optics.sensor, arm) for arm in arms]
+        self.pipelines = [make_pipeline(configuration, optics.sensor, method) for method in methods]
         self.fluxes = [self._first_flux(pipeline) for pipeline in self.pipelines]
-        for number in range(len(arms)):
+        for number in range(len(methods)):
             self._follow_flux(number)
         self.gains, self.divisors = self._gains_and_divisors(gains)
         self.line = CommandDelayLine(optics.mirror.commands, configuration.control.delay_frames)
@@ -203,9 +203,9 @@ class _Loop:
         self.errors = np.zeros((frames, 2 * n), np.float32)
         self.commands = np.zeros((frames, optics.mirror.commands), np.float32)
         self.truth = np.zeros((3, frames))
-        self.regression = np.zeros((2, len(arms)))
+        self.regression = np.zeros((2, len(methods)))
         pixels = len(optics.science.transform)
-        self.images = np.zeros((len(arms), pixels, pixels))
+        self.images = np.zeros((len(methods), pixels, pixels))
 
     def _first_flux(self, pipeline: SlopePipeline) -> MeanFlux | None:
         """Return the mean flux of every sub-aperture for an estimator that uses it, as before a run."""
@@ -234,8 +234,8 @@ class _Loop:
             realisation=self.realisation,
             detector=self.telescope_model.detector,
         )
-        gains = np.where([arm.true_slopes for arm in self.arms], 1.0, gains)
-        return gains, np.where([arm.correct_gain for arm in self.arms], gains, 1.0)
+        gains = np.where([method.true_slopes for method in self.methods], 1.0, gains)
+        return gains, np.where([method.correct_gain for method in self.methods], gains, 1.0)
 
     def run(self, progress: Callable[[int, int], None] | None) -> _Loop:
         """Simulate all frames."""
@@ -269,10 +269,10 @@ class _Loop:
     def _measure(self, frame: int, wavefront: NDArray[np.float32]) -> Slopes:
         """Measure the slopes of the camera's frame."""
         number, sensor = int(self.which[frame]), self.optics.sensor
-        if self.arms[number].true_slopes:
+        if self.methods[number].true_slopes:
             return _true_slopes(sensor.mean_slopes_px(wavefront))
         prior = None
-        if self.arms[number].predict_prior:
+        if self.methods[number].predict_prior:
             prior = self.controllers[number].expected().mean_px
         slopes = self.pipelines[number](self.telescope_model.frame(frame, wavefront), prior)
         known = self.fluxes[number]
@@ -292,7 +292,7 @@ class _Loop:
         """Return the record of the run."""
         configuration, sensor = self.configuration, self.optics.sensor
         scored = self.which[configuration.run.settle_frames :]
-        exposures = np.maximum(1, np.bincount(scored, minlength=len(self.arms)))
+        exposures = np.maximum(1, np.bincount(scored, minlength=len(self.methods)))
         strehl, residual, r0 = self.truth
         return LoopRecord(
             self.slopes,
@@ -305,10 +305,10 @@ class _Loop:
             self.which.astype(np.int8),
             self.optics.interaction,
             self.gains,
-            np.array([arm.correct_gain for arm in self.arms]),
+            np.array([method.correct_gain for method in self.methods]),
             (self.images / exposures[:, None, None]).astype(np.float32),
-            tuple(arm.label for arm in self.arms),
-            tuple(configuration_file.to_text(arm.settings) for arm in self.arms),
+            tuple(method.label for method in self.methods),
+            tuple(configuration_file.to_text(method.settings) for method in self.methods),
             sensor.layout.cells,
             sensor.illumination,
             configuration.control.frame_rate_hz,
@@ -334,17 +334,17 @@ def _true_slopes(vector: NDArray[np.float64]) -> Slopes:
 
 
 def _checked_schedule(
-    configuration: LoopConfiguration, arms: Sequence[Arm], schedule: ArrayLike | None
+    configuration: LoopConfiguration, methods: Sequence[Method], schedule: ArrayLike | None
 ) -> NDArray[np.int64]:
-    if not 1 <= len(arms) <= _MOST_ARMS:
-        raise InputError(f"arms: expected 1 to {_MOST_ARMS}, got {len(arms)}")
-    if len(arms) > 1 and any(arm.control != INTEGRATOR for arm in arms):
-        raise InputError("arms: expected one, or several with the integrator alone")
+    if not 1 <= len(methods) <= _MOST_METHODS:
+        raise InputError(f"methods: expected 1 to {_MOST_METHODS}, got {len(methods)}")
+    if len(methods) > 1 and any(method.control != INTEGRATOR for method in methods):
+        raise InputError("methods: expected one, or several with the integrator alone")
     if schedule is None:
         return np.zeros(configuration.run.frames, np.int64)
-    which = numbers_between("schedule", schedule, 0, len(arms) - 1, integer=True)
+    which = numbers_between("schedule", schedule, 0, len(methods) - 1, integer=True)
     if which.ndim != 1:
-        raise InputError(f"schedule: expected one arm for each frame, got shape {which.shape}")
+        raise InputError(f"schedule: expected one method for each frame, got shape {which.shape}")
     return which.astype(np.int64)
 
 

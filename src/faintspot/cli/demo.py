@@ -111,7 +111,7 @@ def write_files(
     frames, truth = demonstration.simulate(layout, demonstration.SHOWN_FLUX_E, n_frames, rng)
     for name, values in (("frames", frames), ("truth", truth)):
         write_atomically(folder / f"{name}.npy", partial(np.save, arr=values))
-    arms, stages = [], {}
+    methods, stages = [], {}
     for name, chosen in (("TV", comparison.denoised[shown]), ("no TV", comparison.without[shown])):
         stem = name.lower().replace(" ", "-")
         config = folder / f"{stem}.toml"
@@ -121,12 +121,14 @@ def write_files(
         with progress_bar(f"slopes, {name}") as advance:
             measure_recorded([folder / "frames.npy"], config, output, overwrite=True, progress=advance)
         stored = read_slopes(output).variables
-        arms.append(MeasuredSlopes(name, *(stored[key] for key in ("x", "y", "flux", "flags", "iterations"))))
+        methods.append(
+            MeasuredSlopes(name, *(stored[key] for key in ("x", "y", "flux", "flags", "iterations")))
+        )
         stages[name] = SlopePipeline.from_file(config).explain(frames[0])
-    return {"arms": arms, "layout": layout, "stages": stages, "truth": truth}
+    return {"methods": methods, "layout": layout, "stages": stages, "truth": truth}
 
 
-def write_page(folder: Path, arms: list[MeasuredSlopes], **shown: Any) -> None:
+def write_page(folder: Path, methods: list[MeasuredSlopes], **shown: Any) -> None:
     """Make the report."""
     from faintspot.base.files import write_atomically
     from faintspot.recorded.page import slopes_report
@@ -138,7 +140,7 @@ def write_page(folder: Path, arms: list[MeasuredSlopes], **shown: Any) -> None:
         "Camera": "EMCCD, gain 500, read noise 45 e- at the output (0.09 e- referred to photo-electrons)",
     }
     html = slopes_report(
-        arms,
+        methods,
         **shown,
         title="faintspot demonstration",
         facts=facts,

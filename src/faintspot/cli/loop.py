@@ -217,13 +217,13 @@ def _listed(text: str) -> list[str]:
 
 def _methods(text: str | None) -> list[str] | None:
     """Return the methods that are asked for; name those that could use the loop's prediction but do not."""
-    from faintspot.experiments.loop_arms import arm_kind
+    from faintspot.experiments.loop_methods import method_kind
 
     if text is None:
         return None
     names = _listed(text)
     for name in names:
-        kind = arm_kind(name)
+        kind = method_kind(name)
         if kind.estimator.takes_prior and not kind.is_predicted:
             own = kind.estimator.name
             rest = kind.name.removeprefix(own)

@@ -196,7 +196,7 @@ def _question(config: str, options: dict[str, Any]) -> LoopQuestion:
     return LoopQuestion(
         loop,
         magnitudes=_range(options["magnitudes"]),
-        arms=None if methods is None else [name.strip() for name in methods.split(",") if name.strip()],
+        methods=None if methods is None else [name.strip() for name in methods.split(",") if name.strip()],
         strehl=options["strehl"],
         radius_arcsec=options["radius_arcsec"],
     )

@@ -64,12 +64,12 @@ def demo(
 
 def methods_table(methods: list[MethodShown]) -> Table:
     """Return what every method has done as a table."""
-    columns = ("Strehl ratio", f"over {methods[0].strehl.arm}", "p50", "p99", "frames")
+    columns = ("Strehl ratio", f"over {methods[0].strehl.method}", "p50", "p99", "frames")
     table = results_table("method", *columns)
     for method in methods:
         difference = method.strehl.difference
         table.add_row(
-            method.strehl.arm,
+            method.strehl.method,
             _plus_minus(method.strehl.mean, ""),
             "" if difference is None else _plus_minus(difference, "+"),
             f"{method.p50_us:.0f}",

@@ -163,20 +163,20 @@ def command(
 
 
 def answer_table(answer: Answer) -> Table:
-    """Return the errors of all arms at the star's flux as a table."""
+    """Return the errors of all methods at the star's flux as a table."""
     recorded = ["recorded"] if answer.promises else []
     headings = ("R (px)", "gain", "rms/gain", *recorded, "outliers", "cost", "mag saved")
     table = results_table("estimator", *headings, wraps=True)
     for result in answer.results:
-        found, is_reference = result.statistics, result.arm.name == answer_text.BRIGHTEST
+        found, is_reference = result.statistics, result.method.name == answer_text.BRIGHTEST
         table.add_row(
-            result.arm.label,
+            result.method.label,
             f"{found.error.value:.4f}±{found.error.standard_error:.4f}",
             f"{found.gain.value:.2f}",
             f"{found.corrected_rms.value:.4f}",
-            *([f"x {answer.promises[result.arm.name].ratio.value:.2f}"] if recorded else []),
+            *([f"x {answer.promises[result.method.name].ratio.value:.2f}"] if recorded else []),
             f"{100 * found.outlier_fraction.value:.1f} %",
-            f"{result.arm.estimator.cost:.2f}",
+            f"{result.method.estimator.cost:.2f}",
             "" if is_reference else answer_text.short_gain(answer, result.over_brightest),
             style="bold" if result is answer.best else None,
         )

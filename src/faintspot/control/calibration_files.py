@@ -60,7 +60,7 @@ def save_picture(path: str | Path, found: MirrorCalibration, reference: Floats, 
     InputError
         When the file cannot be written.
     """
-    from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, new_figure, png, styled
+    from faintspot.report.drawing import GREY, METHOD_COLOURS, WIDTH, new_figure, png, styled
 
     @styled
     def drawn() -> bytes:
@@ -78,8 +78,8 @@ def save_picture(path: str | Path, found: MirrorCalibration, reference: Floats, 
             for each in (found.interaction, found.interaction_error)
         )
         places = np.arange(len(size))
-        answers.plot(places, size, "o", ms=4, color=ARM_COLOURS[1], label="slopes")
-        answers.plot(places, error, "_", ms=6, color=ARM_COLOURS[0], label="their standard error")
+        answers.plot(places, size, "o", ms=4, color=METHOD_COLOURS[1], label="slopes")
+        answers.plot(places, error, "_", ms=6, color=METHOD_COLOURS[0], label="their standard error")
         for place in places[~found.answers]:
             answers.axvline(place, color=GREY, lw=1, ls=":")
         answers.set(title="How far each actuator answers", xlabel="command", ylabel="rms slope of a poke, px")
@@ -87,7 +87,7 @@ def save_picture(path: str | Path, found: MirrorCalibration, reference: Floats, 
         answers.legend(loc="best")
         x, y = layout.corners[:, ::-1].T + (np.array(layout.window[::-1])[:, None] - 1) / 2 + layout.offsets.T
         spots.plot(x, y, "+", ms=4, color=GREY)
-        spots.quiver(x, y, *reference.reshape(2, -1), angles="xy", color=ARM_COLOURS[1])
+        spots.quiver(x, y, *reference.reshape(2, -1), angles="xy", color=METHOD_COLOURS[1])
         rms = float(np.sqrt(np.square(reference).mean()))
         spots.set(title=f"Reference slopes, {rms:.2g} px rms", xlabel="column, px", ylabel="row, px")
         spots.set_aspect("equal")

@@ -58,7 +58,7 @@ def telemetry_of_recording(
     check_commands(recording, control, "recording")
     predicted = prior_std_px is not None and control.prediction != NONE
     unknown = control.options.controller not in (INTEGRATOR, MODAL) or control.prediction == STREAM
-    in_turn = any(str(arm).endswith(f"+{KALMAN}") for arm in recording.attributes.get("arms", []))
+    in_turn = any(str(method).endswith(f"+{KALMAN}") for method in recording.attributes.get("methods", []))
     if (predicted and unknown) or (prior_std_px is not None and in_turn):
         raise InputError(
             "recording: expected a loop closed with an integrator, as what another controller or program has "

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.ao_loop.arms import Arm
+from faintspot.ao_loop.methods import Method
 from faintspot.base.errors import InputError
 from faintspot.base.notebook import table
 from faintspot.camera.calibration import Calibration
 from faintspot.config.tables import save_tables
-from faintspot.experiments.arms import Knowledge
 from faintspot.experiments.curves import Curve
+from faintspot.experiments.methods import Knowledge
 from faintspot.experiments.promise import Promise
 from faintspot.experiments.question import Question
 from faintspot.experiments.statistics import Estimate, SlopeStatistics
@@ -26,10 +26,10 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class ArmResult:
-    """One arm at the star's flux, with its best settings."""
+class MethodResult:
+    """One method at the star's flux, with its best settings."""
 
-    arm: Arm
+    method: Method
     statistics: SlopeStatistics
     error_px: Floats
     """(m,) R at every flux, the settings chosen anew at each."""
@@ -45,7 +45,7 @@ class ArmResult:
     @property
     def settings(self) -> Settings:
         """The best settings."""
-        return self.arm.settings
+        return self.method.settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,24 +59,24 @@ class Answer:
     >>> question = Question(read_noise_e=3.0, pixels=8, fwhm_px=1.8, flux_e=200.0)
     >>> answer = fs.tune(question, realisations=256, steps=1)
     >>> answer.save("faintspot.toml")
-    >>> fs.Settings.load("faintspot.toml").estimator.name == answer.best.arm.name
+    >>> fs.Settings.load("faintspot.toml").estimator.name == answer.best.method.name
     True
     """
 
     question: Question
     curve: Curve
-    """R of all arms at m fluxes."""
-    results: tuple[ArmResult, ...]
+    """R of all methods at m fluxes."""
+    results: tuple[MethodResult, ...]
     equal: tuple[str, ...]
-    """Names of the arms that are as good as the best within the errors; the first is recommended."""
+    """Names of the methods that are as good as the best within the errors; the first is recommended."""
     bound_px: Floats
     """(m,) R of an estimator at the Cramer-Rao bound, for spots without speckles."""
     realisations: int
     """Spots that were scored at each flux."""
     left_out: dict[str, str]
-    """Arms that were not tried, and why."""
+    """Methods that were not tried, and why."""
     promises: dict[str, Promise] = field(default_factory=dict)
-    """Slope error of every arm, checked on the recording; empty where there is none."""
+    """Slope error of every method, checked on the recording; empty where there is none."""
 
     @property
     def flux_e(self) -> Floats:
@@ -89,19 +89,19 @@ class Answer:
         return int(np.argmin(np.abs(np.log(self.flux_e / self.question.star_flux_e))))
 
     @property
-    def best(self) -> ArmResult:
-        """The recommended arm."""
+    def best(self) -> MethodResult:
+        """The recommended method."""
         return self[self.equal[0]]
 
     @property
     def promise(self) -> Promise | None:
-        """The recommended arm's slope error, checked on the recording."""
-        return self.promises.get(self.best.arm.name)
+        """The recommended method's slope error, checked on the recording."""
+        return self.promises.get(self.best.method.name)
 
     @property
-    def best_without_psf(self) -> ArmResult:
-        """The best arm of those that need not know the spot."""
-        free = [result for result in self.results if Knowledge.of(result.arm.estimator) < Knowledge.SPOT]
+    def best_without_psf(self) -> MethodResult:
+        """The best method of those that need not know the spot."""
+        free = [result for result in self.results if Knowledge.of(result.method.estimator) < Knowledge.SPOT]
         if self.best in free:
             return self.best
         return min(free, key=lambda result: result.statistics.ranking_rms)
@@ -113,7 +113,7 @@ class Answer:
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether even the recommended arm's corrected rms is not below the spots' own motion."""
+        """Whether even the recommended method's corrected rms is not below the spots' own motion."""
         return not self.best.statistics.corrected_rms.value < self.prior_rms_px
 
     @property
@@ -146,15 +146,15 @@ class Answer:
         )
 
     def _repr_html_(self) -> str:
-        rows = {"recommended": f"{self.best.arm.label} ({settings_in_words(self.best.settings)})"}
+        rows = {"recommended": f"{self.best.method.label} ({settings_in_words(self.best.settings)})"}
         for result in sorted(self.results, key=lambda each: each.statistics.ranking_rms):
-            rows[result.arm.label] = (
+            rows[result.method.label] = (
                 f"rms {result.statistics.corrected_rms.value:.3g} px, corrected for the gain; "
                 f"R {result.error_px[self.at_star]:.3g} px"
             )
         return table(f"Estimators for a star of {self.question.star_flux_e:.4g} e-", rows)
 
-    def __getitem__(self, name: str) -> ArmResult:
+    def __getitem__(self, name: str) -> MethodResult:
         """Return the result of an estimator.
 
         Raises
@@ -162,7 +162,7 @@ class Answer:
         InputError
             For one that was not tried.
         """
-        results = {result.arm.name: result for result in self.results}
+        results = {result.method.name: result for result in self.results}
         found = results.get(name)
         if found is None:
             raise InputError(f"estimator {name!r}: expected one that was tried: {', '.join(results)}")
@@ -180,7 +180,13 @@ class Answer:
             When the file cannot be written.
         """
         best = self.best
-        for item in (self.question.layout, best.settings, self.calibration, best.arm.psf, best.arm.score):
+        for item in (
+            self.question.layout,
+            best.settings,
+            self.calibration,
+            best.method.psf,
+            best.method.score,
+        ):
             if item is not None:
                 configuration.save(path, item)
         save_tables(path, {"promise": None if self.promise is None else self.promise.to_table()})

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.control.learning import INTEGRATOR
 from faintspot.experiments import answer_text
-from faintspot.experiments.loop_figures import arm_style
+from faintspot.experiments.loop_figures import method_style
 from faintspot.experiments.loop_question import MODEL_ERROR, PLACES
 from faintspot.report.drawing import FLUX_GREY, GREY, axis_above, new_figure, note, plain_ticks, styled
 
@@ -43,7 +43,7 @@ def tune_figure(answer: Answer) -> Figure:
     axes = figure.subplots()
     place = answer.magnitudes(answer.flux_e)
     for result in answer.results:
-        _draw_arm(axes, answer, result, place)
+        _draw_method(axes, answer, result, place)
     saturated = answer.question.search_range_px / 2
     bound = np.where(answer.bound_px < 1.5 * saturated, answer.bound_px, np.nan)
     axes.plot(place, bound, color="black", lw=1.3, label="Cramér-Rao bound", zorder=6)
@@ -64,8 +64,8 @@ def tune_figure(answer: Answer) -> Figure:
     return figure
 
 
-def _draw_arm(axes: Axes, answer: Any, result: Any, place: NDArray[np.float64]) -> None:
-    style = result.arm.estimator.style
+def _draw_method(axes: Axes, answer: Any, result: Any, place: NDArray[np.float64]) -> None:
+    style = result.method.estimator.style
     best = result is answer.best
     axes.errorbar(
         place,
@@ -78,7 +78,7 @@ def _draw_arm(axes: Axes, answer: Any, result: Any, place: NDArray[np.float64]) 
         lw=3 if best else 1.6,
         elinewidth=1,
         zorder=4 if best else 3,
-        label=f"{result.arm.label} (recommended)" if best else result.arm.label,
+        label=f"{result.method.label} (recommended)" if best else result.method.label,
     )
 
 
@@ -144,7 +144,7 @@ def loop_figure(answer: LoopAnswer) -> Figure:
 def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
     magnitudes = answer.magnitudes
     for name, kind in answer.kinds.items():
-        drawn = arm_style(name)
+        drawn = method_style(name)
         label = f"{name} (recommended)" if kind is answer.best else name
         axes.plot(magnitudes, answer.curve(name), **{**drawn, "marker": ""})
         axes.plot([], [], label=label, **drawn)
@@ -176,7 +176,7 @@ def _draw_sky(axes: Axes, answer: LoopAnswer) -> None:
     """Draw the fraction of the sky: thick error bars are the limits', thin ones with the star counts'."""
     width = 0.8 / len(answer.kinds)
     for number, (name, kind) in enumerate(answer.kinds.items()):
-        drawn = arm_style(name)
+        drawn = method_style(name)
         for group, place in enumerate(PLACES):
             found = answer.coverage(name, place)
             assert found is not None

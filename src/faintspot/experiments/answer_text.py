@@ -7,8 +7,8 @@ from typing import Any
 
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.experiments.answer import Answer, ArmResult, settings_in_words
-from faintspot.experiments.arms import Knowledge
+from faintspot.experiments.answer import Answer, MethodResult, settings_in_words
+from faintspot.experiments.methods import Knowledge
 from faintspot.experiments.statistics import Estimate
 from faintspot.experiments.words import plain_number, with_error
 from faintspot.report.texts import Texts
@@ -41,14 +41,14 @@ def situation(answer: Answer) -> str:
 def recommendation(answer: Answer) -> list[str]:
     """Return the recommendation in a few sentences, the first a heading."""
     best = answer.best
-    lines = [f"Recommended: {best.arm.label} ({settings_in_words(best.settings)})"]
+    lines = [f"Recommended: {best.method.label} ({settings_in_words(best.settings)})"]
     if answer.is_hopeless:
         rms = best.statistics.corrected_rms.value
         lines.append(_TEXT("answer.too_faint", rms=rms, prior=answer.prior_rms_px))
-    if best.arm.name != BRIGHTEST:
+    if best.method.name != BRIGHTEST:
         gains = (gain_in_words(answer, gain) for gain in (best.over_brightest, best.over_thresholded))
         lines.append(_TEXT("answer.saves", **dict(zip(("brightest", "thresholded"), gains, strict=True))))
-    others = [answer[name].arm.label for name in answer.equal[1:]]
+    others = [answer[name].method.label for name in answer.equal[1:]]
     if others:
         lines.append(_TEXT("answer.as_good", others=", ".join(others)))
     lines += _about_tv(answer)
@@ -56,8 +56,8 @@ def recommendation(answer: Answer) -> list[str]:
     if gain < _LOW_GAIN:
         lines.append(_TEXT("answer.low_gain", gain=gain))
     alternative = answer.best_without_psf
-    if Knowledge.of(best.arm.estimator) == Knowledge.SPOT:
-        words = {"label": alternative.arm.label, "settings": settings_in_words(alternative.settings)}
+    if Knowledge.of(best.method.estimator) == Knowledge.SPOT:
+        words = {"label": alternative.method.label, "settings": settings_in_words(alternative.settings)}
         gained = gain_in_words(answer, alternative.over_brightest)
         lines.append(_TEXT("answer.without_spot", **words, gain=gained))
     return lines + _limiting(answer) + promise_lines(answer)
@@ -82,9 +82,9 @@ def promise_lines(answer: Answer) -> list[str]:
         text += _TEXT("answer.placed", **errors)
     lines = [text]
     simulated = min(answer.results, key=lambda result: result.statistics.ranking_rms)
-    factor = answer.promises[simulated.arm.name].factor
+    factor = answer.promises[simulated.method.name].factor
     if factor > 1 and simulated is not answer.best:
-        lines.append(_TEXT("answer.contradicted_best", label=simulated.arm.label, factor=factor))
+        lines.append(_TEXT("answer.contradicted_best", label=simulated.method.label, factor=factor))
     if promise.contradicted:
         why = " (pixels have another noise than was taken)" if promise.noise_differs else ""
         expected = _TEXT("answer.expect", **errors)
@@ -139,7 +139,7 @@ def _about_tv(answer: Answer) -> list[str]:
     tv, best = answer[TV], answer.best
     if tv is best:
         return []
-    times = tv.arm.estimator.cost / best.arm.estimator.cost
+    times = tv.method.estimator.cost / best.method.estimator.cost
     gain = tv.over_brightest
     if not math.isfinite(gain.value):
         helps = gain.value > 0
@@ -148,11 +148,11 @@ def _about_tv(answer: Answer) -> list[str]:
     if not helps:
         return [_TEXT("answer.tv_does_not", gain=gain_in_words(answer, gain))]
     saved = gain_in_words(answer, gain)
-    return [_TEXT("answer.tv_saves", gain=saved, times=times, label=best.arm.label)]
+    return [_TEXT("answer.tv_saves", gain=saved, times=times, label=best.method.label)]
 
 
 def _limiting(answer: Answer) -> list[str]:
-    """Return the limiting magnitudes of the recommended arm and of brightest pixels."""
+    """Return the limiting magnitudes of the recommended method and of brightest pixels."""
     budget = answer.question.budget_px
     if budget is None:
         return []
@@ -163,7 +163,7 @@ def _limiting(answer: Answer) -> list[str]:
     return [f"limiting {'magnitude' if answer.question.photometry else 'flux'} {text}"]
 
 
-def _limit(answer: Answer, result: ArmResult) -> str:
+def _limit(answer: Answer, result: MethodResult) -> str:
     limit: Any = result.limiting_flux_e
     if limit.value == 0:
         return f"fainter than all that was tried ({_place(answer, answer.flux_e[0])})"

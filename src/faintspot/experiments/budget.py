@@ -17,14 +17,14 @@ from faintspot.base.errors import InputError
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.experiments.loop_arms import ArmKind, Choice
+from faintspot.experiments.loop_methods import Choice, MethodKind
 from faintspot.experiments.loop_results import BudgetResult
-from faintspot.experiments.magnitude import Experiment, checked_arms
+from faintspot.experiments.magnitude import Experiment, checked_methods
 from faintspot.experiments.running import Advance, WorkerPool
 from faintspot.experiments.search import Search
 
 KIND = "budget"
-DEFAULT_ARMS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation))
+DEFAULT_METHODS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation))
 _FASTER = 10.0
 
 
@@ -45,32 +45,33 @@ Floats = NDArray[np.float64]
 def run_budget(
     configuration: LoopConfiguration,
     folder: str | Path,
-    arms: Sequence[str] | None = None,
+    methods: Sequence[str] | None = None,
     *,
     quick: bool = False,
     search: Search | None = None,
     place: WorkerPool | None = None,
     overwrite: bool = False,
 ) -> BudgetResult:
-    """Measure the Strehl ratio of arms with each of `TERMS` switched off, or what is left of it.
+    """Measure the Strehl ratio of methods with each of `TERMS` switched off, or what is left of it.
 
-    Each arm is tuned as for `run_magnitude`, at the configuration's own light with everything on, and keeps
-    these settings and its loop gain throughout. The result is also written to the folder.
+    Each method is tuned as for `run_magnitude`, at the configuration's own flux with everything on, and
+    keeps these settings and its loop gain throughout. The result is also written to the folder.
 
     Parameters
     ----------
     configuration : LoopConfiguration
     folder : path
         Where finished units are remembered; made where it is not there.
-    arms : sequence of str, optional
-        See `faintspot.experiments.loop_arms.arm_kind`. Default: brightest pixels, Gaussian smoothing and TV.
+    methods : sequence of str, optional
+        See `faintspot.experiments.loop_methods.method_kind`. Default: brightest pixels, Gaussian smoothing
+        and TV.
     quick, search, place, overwrite
         As for `run_magnitude`.
 
     Raises
     ------
     InputError
-        For unknown arms, a folder that holds another experiment, or a loop that is open.
+        For unknown methods, a folder that holds another experiment, or a loop that is open.
     MissingExtraError
         When HCIPy, or Dask where it is needed, is not installed.
 
@@ -86,7 +87,7 @@ def run_budget(
         )
     experiment = Experiment.begun(configuration, folder, KIND, quick, search, place, overwrite)
     configuration, flux = experiment.configuration, configuration.photons
-    kinds = checked_arms(DEFAULT_ARMS if arms is None else arms)
+    kinds = checked_methods(DEFAULT_METHODS if methods is None else methods)
     _, of = experiment.measured(
         kinds,
         [flux],
@@ -101,14 +102,14 @@ def run_budget(
 
 
 def budget_run(
-    kind: ArmKind,
+    kind: MethodKind,
     configuration: LoopConfiguration,
     choice: Choice,
     term: str,
     realisation: int,
     advance: Advance,
 ) -> dict[str, NDArray[Any]]:
-    """Run a tuned arm once with a term switched off; Strehl ratio and rms wavefront as arrays.
+    """Run a tuned method once with a term switched off; Strehl ratio and rms wavefront as arrays.
 
     Raises
     ------
@@ -116,10 +117,10 @@ def budget_run(
         For an unknown term.
     """
     off = TERMS[one_of("term", term, list(TERMS))]
-    arm = kind.arm(configuration, choice)
+    method = kind.method(configuration, choice)
     record = simulate_loop(
         configuration,
-        [arm],
+        [method],
         realisation=realisation,
         progress=lambda done, total: advance(done),
         disabled_errors=off,

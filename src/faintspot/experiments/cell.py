@@ -1,6 +1,6 @@
-"""One cell of a study: simulate, choose each arm's settings on one half, score them on the other.
+"""One cell of a study: simulate, choose each method's settings on one half, score them on the other.
 
-All arms see the same images. They are simulated and measured block by block, so that memory does not grow
+All methods see the same images. They are simulated and measured block by block, so that memory does not grow
 with the number of realisations.
 """
 
@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.experiments.arms import keeps_every_k, knows_the_spot
-from faintspot.experiments.cell_arms import (
+from faintspot.experiments.cell_methods import (
     Block,
     Candidate,
-    CellArms,
+    CellMethods,
     Floats,
     Measured,
     detector_of,
@@ -25,6 +24,7 @@ from faintspot.experiments.cell_arms import (
     moments_of,
     shown,
 )
+from faintspot.experiments.methods import keeps_every_k, knows_the_spot
 from faintspot.experiments.specification import BEST, CORRECTED, StudySpecification
 from faintspot.experiments.statistics import OUTLIER_PX, slope_statistics
 from faintspot.experiments.sweep import Cell
@@ -44,34 +44,36 @@ class Choice:
 class Tuning:
     """Errors of all candidates on the first half of a cell's images, and what follows from them."""
 
-    def __init__(self, arms: CellArms, specification: StudySpecification) -> None:
-        self._arms = arms
-        self._modes = specification.kept_pixels(arms.cell)
-        self._candidates = {arm: arms.candidates(arm) for arm in specification.arms}
+    def __init__(self, methods: CellMethods, specification: StudySpecification) -> None:
+        self._methods = methods
+        self._modes = specification.kept_pixels(methods.cell)
+        self._candidates = {method: methods.candidates(method) for method in specification.estimators}
         self._errors: dict[str, Any] = dict.fromkeys(self._candidates, 0.0)  # sums over images
         self._moments: dict[str, Any] = dict.fromkeys(self._candidates, 0.0)
 
     def add(self, blocks: Sequence[Block]) -> None:
         """Add images and their true positions."""
-        for arm, candidates in self._candidates.items():
-            if len(candidates) == 1 and not keeps_every_k(self._arms.kinds[arm]):
+        for method, candidates in self._candidates.items():
+            if len(candidates) == 1 and not keeps_every_k(self._methods.kinds[method]):
                 continue  # there is nothing to choose
-            for images, truth in self._arms.parts(arm, blocks):
-                found = [self._arms.positions(arm, candidate, images)[0] for candidate in candidates]
-                self._errors[arm] += np.stack([errors_of(each, truth[:, None]).sum(axis=0) for each in found])
+            for images, truth in self._methods.parts(method, blocks):
+                found = [self._methods.positions(method, candidate, images)[0] for candidate in candidates]
+                self._errors[method] += np.stack(
+                    [errors_of(each, truth[:, None]).sum(axis=0) for each in found]
+                )
                 if CORRECTED in self._modes:
-                    self._moments[arm] += np.stack([moments_of(each, truth) for each in found], axis=1)
+                    self._moments[method] += np.stack([moments_of(each, truth) for each in found], axis=1)
 
     def choices(self) -> dict[tuple[str, str], Choice]:
-        """Return the choice of every arm and mode."""
+        """Return the choice of every method and mode."""
         chosen = {}
-        for arm, candidates in self._candidates.items():
+        for method, candidates in self._candidates.items():
             for mode, kept in self._modes.items():
-                if np.ndim(self._errors[arm]) == 0:
-                    chosen[arm, mode] = Choice(candidates[0], None)
+                if np.ndim(self._errors[method]) == 0:
+                    chosen[method, mode] = Choice(candidates[0], None)
                     continue
-                errors = _corrected_rms(self._moments[arm]) if mode == CORRECTED else self._errors[arm]
-                chosen[arm, mode] = _smallest(candidates, errors, kept)
+                errors = _corrected_rms(self._moments[method]) if mode == CORRECTED else self._errors[method]
+                chosen[method, mode] = _smallest(candidates, errors, kept)
         return chosen
 
 
@@ -155,22 +157,22 @@ def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDA
     --------
     >>> from faintspot.experiments import StudySpecification, Sweep, measure_cell
     >>> light = Sweep("light", flux_e=100, pixels=8)
-    >>> study = StudySpecification("mine", [light], realisations=400, arms=["brightest"], fixed_k=[])
+    >>> study = StudySpecification("mine", [light], realisations=400, estimators=["brightest"], fixed_k=[])
     >>> measured = measure_cell(study.cells()[0], study)
     >>> print(f"R = {measured['error'][0, 0]:.2f} px, {measured['chosen_k'][0, 0]:.0f} pixels kept")
     R = 0.07 px, 12 pixels kept
     """
     rng = np.random.default_rng(cell.seed(specification.seed))
     half = specification.realisations // 2
-    arms: CellArms | None = None
+    methods: CellMethods | None = None
     for stack in _stacks(realisations(cell, half, rng), cell.pixels):
-        if arms is None:
+        if methods is None:
             flux = np.concatenate([images.sum(axis=(1, 2), dtype=np.float64) for images, _ in stack])
-            arms = CellArms(cell, specification, float(flux.mean()))
-            tuning = Tuning(arms, specification)
+            methods = CellMethods(cell, specification, float(flux.mean()))
+            tuning = Tuning(methods, specification)
         tuning.add(stack)
-    assert arms is not None
-    scores = Scores(arms, tuning.choices())
+    assert methods is not None
+    scores = Scores(methods, tuning.choices())
     for stack in _stacks(realisations(cell, specification.realisations - half, rng), cell.pixels):
         scores.add(stack)
     return _results(cell, specification, scores)
@@ -179,8 +181,8 @@ def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDA
 class Scores:
     """Positions with the chosen settings, stack after stack."""
 
-    def __init__(self, arms: CellArms, choices: dict[tuple[str, str], Choice]) -> None:
-        self._arms, self.choices = arms, choices
+    def __init__(self, methods: CellMethods, choices: dict[tuple[str, str], Choice]) -> None:
+        self._methods, self.choices = methods, choices
         self._truth: list[Floats] = []
         self._positions: dict[tuple[str, str], list[Floats]] = {key: [] for key in choices}
         self._valid: dict[tuple[str, str], list[Any]] = {key: [] for key in choices}
@@ -195,79 +197,81 @@ class Scores:
     def add(self, blocks: Sequence[Block]) -> None:
         """Score images."""
         self._truth += [truth for _, truth in blocks]
-        for arm, candidate in dict.fromkeys((arm, c.candidate) for (arm, _), c in self.choices.items()):
-            same = (arm, candidate)
+        for method, candidate in dict.fromkeys(
+            (method, c.candidate) for (method, _), c in self.choices.items()
+        ):
+            same = (method, candidate)
             modes = [mode for (a, mode), choice in self.choices.items() if (a, choice.candidate) == same]
-            for images, truth in self._arms.parts(arm, blocks):
-                self._add(arm, modes, truth, self._arms.positions(arm, candidate, images))
+            for images, truth in self._methods.parts(method, blocks):
+                self._add(method, modes, truth, self._methods.positions(method, candidate, images))
 
-    def _add(self, arm: str, modes: list[str], truth: Floats, measured: Measured) -> None:
-        """Add positions that an arm measured for the modes that chose its candidate."""
+    def _add(self, method: str, modes: list[str], truth: Floats, measured: Measured) -> None:
+        """Add positions that a method measured for the modes that chose its candidate."""
         positions, valid, stated = measured
         for mode in modes:
-            column = self.choices[arm, mode].column or 0
-            self._positions[arm, mode].append(positions[:, column])
-            self._valid[arm, mode].append(valid[:, column])
+            column = self.choices[method, mode].column or 0
+            self._positions[method, mode].append(positions[:, column])
+            self._valid[method, mode].append(valid[:, column])
         if BEST not in modes:
             return
         if stated is None:
             errors = errors_of(positions, truth[:, None])
             sums = np.stack([errors.sum(axis=0), np.square(errors).sum(axis=0)])
-            self.sums[arm] = self.sums.get(arm, 0.0) + sums
-        elif knows_the_spot(arm):
-            self._stated.setdefault(arm, []).append(stated)
+            self.sums[method] = self.sums.get(method, 0.0) + sums
+        elif knows_the_spot(method):
+            self._stated.setdefault(method, []).append(stated)
 
-    def positions(self, arm: str, mode: str) -> Floats:
+    def positions(self, method: str, mode: str) -> Floats:
         """Return the positions of all realisations, (n, 2) px."""
-        return np.concatenate(self._positions[arm, mode])
+        return np.concatenate(self._positions[method, mode])
 
-    def valid(self, arm: str, mode: str) -> NDArray[np.bool_]:
+    def valid(self, method: str, mode: str) -> NDArray[np.bool_]:
         """Return which realisations have a valid position."""
-        return np.concatenate(self._valid[arm, mode])
+        return np.concatenate(self._valid[method, mode])
 
-    def stated(self, arm: str) -> Floats | None:
+    def stated(self, method: str) -> Floats | None:
         """Return the standard errors (n, 2) that an estimator states, px, in mode "best"."""
-        return np.concatenate(self._stated[arm]) if arm in self._stated else None
+        return np.concatenate(self._stated[method]) if method in self._stated else None
 
 
 def _results(cell: Cell, specification: StudySpecification, scores: Scores) -> dict[str, NDArray[Any]]:
     """Arrange choices and scores as the dataset has them."""
-    arms, modes, truth = specification.arms, specification.modes, scores.truth
+    methods, modes, truth = specification.estimators, specification.modes, scores.truth
     names = ["error", "error_se", "chosen_k", "chosen_candidate", "chosen_model_error", "invalid_fraction"]
     names += [name for statistic in STATISTICS for name in (statistic, f"{statistic}_se")]
-    results: dict[str, NDArray[Any]] = {name: np.full((len(arms), len(modes)), np.nan) for name in names}
-    results["error_covariance"] = np.full((len(modes), len(arms), len(arms)), np.nan)
+    results: dict[str, NDArray[Any]] = {name: np.full((len(methods), len(modes)), np.nan) for name in names}
+    results["error_covariance"] = np.full((len(modes), len(methods), len(methods)), np.nan)
     for j, mode in enumerate(modes):
-        if (arms[0], mode) not in scores.choices:
+        if (methods[0], mode) not in scores.choices:
             continue
-        positions = [scores.positions(arm, mode) for arm in arms]
+        positions = [scores.positions(method, mode) for method in methods]
         errors = np.stack([errors_of(part, truth) for part in positions])
         covariance = _covariance_of_means(errors)
         results["error"][:, j] = errors.mean(axis=1)
         results["error_se"][:, j] = np.sqrt(np.diag(covariance))
         results["error_covariance"][j] = covariance
-        for i, arm in enumerate(arms):
-            choice = scores.choices[arm, mode]
+        for i, method in enumerate(methods):
+            choice = scores.choices[method, mode]
             results["chosen_k"][i, j] = np.nan if choice.column is None else choice.column + 1
             results["chosen_candidate"][i, j] = shown(choice.candidate)
             results["chosen_model_error"][i, j] = shown(choice.candidate, "model_error")
-            results["invalid_fraction"][i, j] = 1.0 - scores.valid(arm, mode).mean()
+            results["invalid_fraction"][i, j] = 1.0 - scores.valid(method, mode).mean()
             statistics = slope_statistics(positions[i][:, 0], positions[i][:, 1], truth)
             for name in STATISTICS:
                 estimate = getattr(statistics, name)
                 results[name][i, j] = estimate.value
                 results[f"{name}_se"][i, j] = estimate.standard_error
-    results |= _stated_over_actual(arms, scores)
-    return results | _results_at_k(cell, arms, scores) | _against_the_bound(cell, results["error"])
+    results |= _stated_over_actual(methods, scores)
+    return results | _results_at_k(cell, methods, scores) | _against_the_bound(cell, results["error"])
 
 
-def _stated_over_actual(arms: Any, scores: Scores) -> dict[str, NDArray[Any]]:
+def _stated_over_actual(methods: Any, scores: Scores) -> dict[str, NDArray[Any]]:
     """Root mean squares of stated standard errors and of errors: their ratio, without outliers and with."""
-    without, whole = np.full((2, len(arms)), np.nan)
-    for i, arm in enumerate(arms):
-        stated = scores.stated(arm)
+    without, whole = np.full((2, len(methods)), np.nan)
+    for i, method in enumerate(methods):
+        stated = scores.stated(method)
         if stated is not None:
-            errors = scores.positions(arm, BEST) - scores.truth
+            errors = scores.positions(method, BEST) - scores.truth
             known = np.all(np.isfinite(stated), axis=1)
             near = known & np.all(np.abs(errors) <= OUTLIER_PX, axis=1)
             without[i], whole[i] = (
@@ -298,20 +302,20 @@ def _against_the_bound(cell: Cell, errors: Floats) -> dict[str, NDArray[Any]]:
     return {"bound": bounds[0], "bound_rms": bounds[1], "photon_efficiency": efficiency}
 
 
-def _results_at_k(cell: Cell, arms: Any, scores: Scores) -> dict[str, NDArray[Any]]:
+def _results_at_k(cell: Cell, methods: Any, scores: Scores) -> dict[str, NDArray[Any]]:
     """R and its standard error for every k, at the candidate of mode "best"."""
-    errors, standard_errors = np.full((2, len(arms), cell.pixels**2 - 1), np.nan)
+    errors, standard_errors = np.full((2, len(methods), cell.pixels**2 - 1), np.nan)
     count = len(scores.truth)
-    for i, arm in enumerate(arms):
-        if arm in scores.sums:
-            mean, mean_square = scores.sums[arm] / count
+    for i, method in enumerate(methods):
+        if method in scores.sums:
+            mean, mean_square = scores.sums[method] / count
             errors[i] = mean
             standard_errors[i] = np.sqrt(np.maximum(mean_square - mean**2, 0.0) / (count - 1))
     return {"error_at_k": errors, "error_at_k_se": standard_errors}
 
 
 def _covariance_of_means(errors: Floats) -> Floats:
-    """Covariance of the means of (arms, n) errors.
+    """Covariance of the means of (methods, n) errors.
 
     Products are summed without BLAS, whose results depend on its number of threads.
     """

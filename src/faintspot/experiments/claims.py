@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from faintspot.experiments import judges
-from faintspot.experiments.arms import NO_TV, SMOOTHING, TV, TV_OVER_NO_TV
 from faintspot.experiments.curves import Curve, Gain, gain_at_error
 from faintspot.experiments.judges import LEVEL_PX
+from faintspot.experiments.methods import NO_TV, SMOOTHING, TV, TV_OVER_NO_TV
 from faintspot.experiments.specification import BEST
 from faintspot.experiments.statistics import magnitudes
 from faintspot.experiments.study_curves import (
@@ -29,7 +29,7 @@ FIXED_MODE = "fixed40"
 
 
 def fixed_mode(dataset: xarray.Dataset) -> str:
-    """Return the mode of one k for all arms that is shown: k = 40, or else the largest of the study."""
+    """Return the mode of one k for all methods that is shown: k = 40, or else the largest of the study."""
     fixed = [str(name) for name in dataset["mode"].values if str(name).startswith("fixed")]
     return FIXED_MODE if FIXED_MODE in fixed or not fixed else fixed[-1]
 
@@ -45,7 +45,7 @@ def verdicts(dataset: xarray.Dataset, seed: int = 2015) -> list[Verdict]:
         Of the bootstraps, so that the same study always gets the same verdicts.
     """
     modes = [str(name) for name in dataset["mode"].values]
-    if not {NO_TV, TV} <= {str(name) for name in dataset["arm"].values}:
+    if not {NO_TV, TV} <= {str(name) for name in dataset["estimator"].values}:
         return []
     results = []
     for number, (text, judge) in enumerate(zip(_TEXT["claims"], judges.JUDGES, strict=True), start=1):
@@ -83,12 +83,12 @@ def guidance(dataset: xarray.Dataset, seed: int = 2015) -> list[str]:
     seed : int
         Of the bootstraps.
     """
-    arms = {str(arm) for arm in dataset["arm"].values}
-    if not {NO_TV, TV} <= arms:
+    methods = {str(method) for method in dataset["estimator"].values}
+    if not {NO_TV, TV} <= methods:
         return [_TEXT["guidance.no_tv"]]
     rng = np.random.default_rng(seed)
     curves = study_curves(dataset, BEST)
-    best = _compared(curves, rng, SMOOTHING in arms)
+    best = _compared(curves, rng, SMOOTHING in methods)
     if not best:
         return [_TEXT("guidance.no_gains", level=LEVEL_PX)]
     paragraphs = [_flux_gains("brightest pixels alone", [item.gain for item in best])]

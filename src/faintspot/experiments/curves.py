@@ -29,19 +29,19 @@ _SMALLEST_ERROR_PX = 1e-6  # of a resampled R
 
 @dataclass(frozen=True)
 class Curve:
-    """The slope error R of all arms at increasing flux, px; the arms have seen the same spots."""
+    """The slope error R of all methods at increasing flux, px; the methods have seen the same spots."""
 
     flux_e: Floats
     """(n_flux,)"""
-    arms: tuple[str, ...]
+    methods: tuple[str, ...]
     error: Floats
-    """(n_flux, n_arms)."""
+    """(n_flux, n_methods)."""
     covariance: Floats
-    """(n_flux, n_arms, n_arms) of the means, px^2."""
+    """(n_flux, n_methods, n_methods) of the means, px^2."""
 
     @classmethod
     def of_errors(cls, flux_e: ArrayLike, errors: Mapping[str, ArrayLike]) -> Curve:
-        """Return the curve of the errors (|dx| + |dy|) / 2 of each spot, (n_flux, n) px for every arm.
+        """Return the curve of the errors (|dx| + |dy|) / 2 of each spot, (n_flux, n) px for every method.
 
         Raises
         ------
@@ -53,44 +53,46 @@ class Curve:
             raise InputError(f"flux_e: expected at least two increasing numbers, got {flux.tolist()}")
         shapes = {np.shape(values) for values in errors.values()}
         if len(shapes) != 1 or len(shape := shapes.pop()) != 2 or shape[0] != len(flux):
-            raise InputError(f"errors: expected arrays of one shape ({len(flux)}, n) for all arms")
+            raise InputError(f"errors: expected arrays of one shape ({len(flux)}, n) for all methods")
         every = np.stack([np.asarray(values, np.float64) for values in errors.values()])
         mean = every.mean(axis=2)
         centred = every - mean[..., None]
         covariance = np.einsum("ifn,jfn->fij", centred, centred) / shape[1] ** 2
         return cls(flux, tuple(errors), mean.T, covariance)
 
-    def of(self, arm: str) -> Floats:
-        """Return R of an arm, (n_flux,)."""
-        return self.error[:, self._index(arm)]
+    def of(self, method: str) -> Floats:
+        """Return R of a method, (n_flux,)."""
+        return self.error[:, self._index(method)]
 
-    def se_of(self, arm: str) -> Floats:
-        """Return the standard error of R of an arm."""
-        index = self._index(arm)
+    def se_of(self, method: str) -> Floats:
+        """Return the standard error of R of a method."""
+        index = self._index(method)
         return np.sqrt(self.covariance[:, index, index])
 
-    def has(self, *arms: str) -> bool:
-        """Whether these arms are measured."""
-        return all(arm in self.arms for arm in arms)
+    def has(self, *methods: str) -> bool:
+        """Whether these methods are measured."""
+        return all(method in self.methods for method in methods)
 
-    def difference(self, arm: str, reference: str) -> tuple[Floats, Floats]:
-        """Return R of `reference` minus R of `arm` at each flux and its paired standard error."""
-        i, j = self._index(arm), self._index(reference)
+    def difference(self, method: str, reference: str) -> tuple[Floats, Floats]:
+        """Return R of `reference` minus R of `method` at each flux and its paired standard error."""
+        i, j = self._index(method), self._index(reference)
         covariance = self.covariance
         variance = covariance[:, i, i] + covariance[:, j, j] - 2 * covariance[:, i, j]
         return self.error[:, j] - self.error[:, i], np.sqrt(np.maximum(variance, 0.0))
 
-    def at(self, flux_e: float, arm: str) -> Estimate | None:
+    def at(self, flux_e: float, method: str) -> Estimate | None:
         """Return R at that flux; None when there is none."""
-        found = np.flatnonzero(np.isclose(self.flux_e, flux_e) & np.isfinite(self.of(arm)))
+        found = np.flatnonzero(np.isclose(self.flux_e, flux_e) & np.isfinite(self.of(method)))
         return (
-            Estimate(float(self.of(arm)[found[0]]), float(self.se_of(arm)[found[0]])) if found.size else None
+            Estimate(float(self.of(method)[found[0]]), float(self.se_of(method)[found[0]]))
+            if found.size
+            else None
         )
 
-    def _index(self, arm: str) -> int:
-        if arm not in self.arms:
-            raise InputError(f"arm {arm!r}: expected one of {', '.join(self.arms)}")
-        return self.arms.index(arm)
+    def _index(self, method: str) -> int:
+        if method not in self.methods:
+            raise InputError(f"method {method!r}: expected one of {', '.join(self.methods)}")
+        return self.methods.index(method)
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ def gain_at_flux(
     """Return by how much less flux `method` reaches the R that `reference` has at a flux.
 
     log R is interpolated monotonically (PCHIP) in log flux. The 95 % interval is a parametric bootstrap: R of
-    both arms is drawn from the normal distribution of their standard errors and covariance.
+    both methods is drawn from the normal distribution of their standard errors and covariance.
 
     Returns
     -------
@@ -146,7 +148,7 @@ def gain_at_flux(
     Raises
     ------
     InputError
-        For a flux that is not above 0 or an unknown arm.
+        For a flux that is not above 0 or an unknown method.
     """
     flux_e = number_between("flux_e", flux_e, 0.0, low_open=True)
     curves = _resampled(curve, reference, method, rng)
@@ -170,7 +172,7 @@ def gain_at_error(
     Raises
     ------
     InputError
-        For an error that is not above 0 or an unknown arm.
+        For an error that is not above 0 or an unknown method.
     """
     error_px = number_between("error_px", error_px, 0.0, low_open=True)
     curves = _resampled(curve, reference, method, rng)
@@ -201,8 +203,8 @@ def magnitude_gain(
     return Estimate(math.nan) if gain is None else gain.in_magnitudes
 
 
-def limiting_flux(curve: Curve, arm: str, budget_px: float, rng: np.random.Generator) -> Estimate:
-    """Return the flux at which R of an arm equals a budget.
+def limiting_flux(curve: Curve, method: str, budget_px: float, rng: np.random.Generator) -> Estimate:
+    """Return the flux at which R of a method equals a budget.
 
     Returns
     -------
@@ -213,10 +215,10 @@ def limiting_flux(curve: Curve, arm: str, budget_px: float, rng: np.random.Gener
     Raises
     ------
     InputError
-        For a budget that is not above 0 or an unknown arm.
+        For a budget that is not above 0 or an unknown method.
     """
     budget_px = number_between("budget_px", budget_px, 0.0, low_open=True)
-    curves = _resampled(curve, arm, arm, rng)
+    curves = _resampled(curve, method, method, rng)
     if curves is None:
         return Estimate(math.nan)
     flux = np.exp(_crossings(curves, curves.method, np.full(curves.method.shape[1], np.log(budget_px))))
@@ -237,9 +239,9 @@ class _Resampled:
 def _resampled(curve: Curve, reference: str, method: str, rng: np.random.Generator) -> _Resampled | None:
     from scipy.interpolate import PchipInterpolator
 
-    pair = [curve.arms.index(arm) for arm in (reference, method) if curve.has(arm)]
+    pair = [curve.methods.index(method) for method in (reference, method) if curve.has(method)]
     if len(pair) < 2:
-        raise InputError(f"arms {reference!r} and {method!r}: expected two of {', '.join(curve.arms)}")
+        raise InputError(f"methods {reference!r} and {method!r}: expected two of {', '.join(curve.methods)}")
     kept = np.all(np.isfinite(curve.error[:, pair]), axis=1)
     if np.count_nonzero(kept) < 2:
         return None

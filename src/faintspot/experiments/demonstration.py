@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from faintspot.algorithms.noise import suggested_strength
 from faintspot.base.checks import number_between
 from faintspot.camera.calibration import Calibration
-from faintspot.experiments.arms import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.experiments.curves import Curve, Gain, gain_at_flux
+from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.experiments.statistics import Estimate, absolute_errors
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
@@ -66,7 +66,8 @@ class Comparison:
         """Flux gain of denoising at SHOWN_FLUX_E."""
         errors = {TV: self.denoised, NO_TV: self.without}
         curve = Curve.of_errors(
-            FLUXES_E, {arm: np.stack([each.errors for each in scored]) for arm, scored in errors.items()}
+            FLUXES_E,
+            {method: np.stack([each.errors for each in scored]) for method, scored in errors.items()},
         )
         gain = gain_at_flux(curve, SHOWN_FLUX_E, rng, **TV_OVER_NO_TV)
         assert gain is not None  # the flux is one of the curve's

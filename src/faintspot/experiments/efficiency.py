@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.estimators.maximum_likelihood import MaximumLikelihood
 from faintspot.estimators.weighted import Weighted
-from faintspot.experiments.arms import knows_the_spot
+from faintspot.experiments.methods import knows_the_spot
 from faintspot.experiments.specification import BEST, CORRECTED
 from faintspot.experiments.study_curves import Configuration
 from faintspot.report.page import Section
@@ -26,16 +26,16 @@ ENOUGH_PHOTONS = {0.1: 30.0, 3.0: 120.0, 16.0: 500.0}
 """Fewest electrons, by read noise, at which an estimator that knows the spot is expected at the bound."""
 ML, MAP = MaximumLikelihood.name, MaximumAPosteriori.name
 EXPECTED_EFFICIENCY = {ML: 0.95, MAP: 0.95, Weighted.name: 0.75}
-"""Least photon efficiency, by arm, where there is flux enough."""
+"""Least photon efficiency, by method, where there is flux enough."""
 NEAR_BEST = 1.04
-"""Gain-corrected rms over the smallest of all arms up to which an arm counts as near the best."""
+"""Gain-corrected rms over the smallest of all methods up to which a method counts as near the best."""
 _TEXT = Texts("faintspot.experiments")
 _OUTLIERS = 0.01  # fraction of the likelihood's slopes, from which outliers dominate its error
 
 
 def compares_estimators(dataset: xarray.Dataset) -> bool:
-    """Whether a study has arms that know the spot."""
-    return any(knows_the_spot(str(arm)) for arm in dataset["arm"].values)
+    """Whether a study has methods that know the spot."""
+    return any(knows_the_spot(str(method)) for method in dataset["estimator"].values)
 
 
 def enough_photons(read_noise_e: float, flux_e: float) -> bool:
@@ -49,25 +49,25 @@ def enough_photons(read_noise_e: float, flux_e: float) -> bool:
 
 
 class _Cells:
-    """Finished cells of a study, with their values by arm."""
+    """Finished cells of a study, with their values by method."""
 
     def __init__(self, dataset: xarray.Dataset, speckled: bool) -> None:
         done = dataset["done"].values & ((dataset["d_over_r0"].values > 0) == speckled)
         self._dataset = dataset.isel(cell=np.flatnonzero(done))
-        self.arms = [str(arm) for arm in dataset["arm"].values]
+        self.methods = [str(method) for method in dataset["estimator"].values]
         self.count = int(done.sum())
 
     def coordinate(self, name: str) -> NDArray[Any]:
         return self._dataset[name].values
 
     def values(self, name: str, mode: str | None = None) -> Floats:
-        """Values of all arms, (cells, arms)."""
+        """Values of all methods, (cells, methods)."""
         variable = self._dataset[name] if mode is None else self._dataset[name].sel(mode=mode)
-        return np.asarray(variable.transpose("cell", "arm").values, dtype=np.float64)
+        return np.asarray(variable.transpose("cell", "estimator").values, dtype=np.float64)
 
-    def of(self, name: str, arm: str, mode: str | None = BEST) -> Floats:
-        """Values of one arm, (cells,)."""
-        return self.values(name, mode)[:, self.arms.index(arm)]
+    def of(self, name: str, method: str, mode: str | None = BEST) -> Floats:
+        """Values of one method, (cells,)."""
+        return self.values(name, mode)[:, self.methods.index(method)]
 
     def words(self, cell: int) -> str:
         """A cell in one line."""
@@ -99,19 +99,19 @@ def _efficient(cells: _Cells) -> list[str]:
     conditions = zip(cells.coordinate("read_noise_e"), cells.coordinate("flux_e"), strict=True)
     enough = np.array([enough_photons(float(noise), float(flux)) for noise, flux in conditions])
     found = []
-    for arm, target in EXPECTED_EFFICIENCY.items():
-        if arm in cells.arms and enough.any():
-            values = np.where(enough, cells.of("photon_efficiency", arm), np.inf)
+    for method, target in EXPECTED_EFFICIENCY.items():
+        if method in cells.methods and enough.any():
+            values = np.where(enough, cells.of("photon_efficiency", method), np.inf)
             lowest = int(np.argmin(values))
             reached = int(np.sum(values[enough] >= target))
-            words = {"arm": arm, "target": target, "reached": reached, "cells": enough.sum()}
+            words = {"method": method, "target": target, "reached": reached, "cells": enough.sum()}
             where = cells.words(lowest)
             found.append(_TEXT("findings.efficient", **words, lowest=values[lowest], where=where))
     return found
 
 
 def _outlier_dominated(cells: _Cells) -> list[str]:
-    if not {ML, MAP} <= set(cells.arms):
+    if not {ML, MAP} <= set(cells.methods):
         return []
     dominated = cells.of("outlier_fraction", ML) > _OUTLIERS
     if not dominated.any():
@@ -141,11 +141,13 @@ def _near_the_best(cells: _Cells, dataset: xarray.Dataset) -> list[str]:
     found = []
     for words, part in (("all", d_over_r0 > 0), ("d/r0 up to 1", d_over_r0 <= 1), ("above 1", d_over_r0 > 1)):
         if part.any():
-            near = {arm: int(np.sum(ratio[part, i] <= NEAR_BEST)) for i, arm in enumerate(cells.arms)}
-            worst = {arm: float(ratio[part, i].max()) for i, arm in enumerate(cells.arms)}
-            ranked = sorted(near, key=lambda arm: (-near[arm], worst[arm]))
+            near = {
+                method: int(np.sum(ratio[part, i] <= NEAR_BEST)) for i, method in enumerate(cells.methods)
+            }
+            worst = {method: float(ratio[part, i].max()) for i, method in enumerate(cells.methods)}
+            ranked = sorted(near, key=lambda method: (-near[method], worst[method]))
             listed = ", ".join(
-                f"{arm} {near[arm]} (worst {100 * (worst[arm] - 1):.0f} %)" for arm in ranked[:5]
+                f"{method} {near[method]} (worst {100 * (worst[method] - 1):.0f} %)" for method in ranked[:5]
             )
             near_percent = 100 * (NEAR_BEST - 1)
             counts = {"which": words, "cells": part.sum(), "near": near_percent}
@@ -165,26 +167,30 @@ def result_sections(dataset: xarray.Dataset) -> list[Section]:
     if cells.count:
         efficiency, bound = cells.values("photon_efficiency", BEST), cells.coordinate("bound")
         rows = [[f"{bound[i]:.4f}", *map(_number, efficiency[i])] for i in cells.order()]
-        sections.append(_section(cells, "efficiency", rows, cells.arms))
+        sections.append(_section(cells, "efficiency", rows, cells.methods))
         near, whole = (cells.values(f"stated_over_actual{part}") for part in ("", "_all"))
-        kept = [i for i, arm in enumerate(cells.arms) if knows_the_spot(arm)]
+        kept = [i for i, method in enumerate(cells.methods) if knows_the_spot(method)]
         rows = [[f"{_number(near[i, j])} ({_number(whole[i, j])})" for j in kept] for i in cells.order()]
-        sections.append(_section(cells, "calibration", rows, [cells.arms[j] for j in kept]))
+        sections.append(_section(cells, "calibration", rows, [cells.methods[j] for j in kept]))
     if speckled.count:
         values = speckled.values("corrected_rms", _corrected_mode(dataset))
         best, excess = np.nanargmin(values, axis=1), 100 * (_ratio_to_best(values) - 1)
         rows = [
-            [f"{values[i, best[i]]:.4f}", speckled.arms[best[i]], *(_number(each, 0) for each in excess[i])]
+            [
+                f"{values[i, best[i]]:.4f}",
+                speckled.methods[best[i]],
+                *(_number(each, 0) for each in excess[i]),
+            ]
             for i in speckled.order()
         ]
-        sections.append(_section(speckled, "speckled", rows, speckled.arms))
+        sections.append(_section(speckled, "speckled", rows, speckled.methods))
     return sections
 
 
-def _section(cells: _Cells, name: str, rows: list[list[str]], arms: list[str]) -> Section:
+def _section(cells: _Cells, name: str, rows: list[list[str]], methods: list[str]) -> Section:
     """Return the section of a table with a row for each cell."""
     named = [[cells.words(index), *row] for index, row in zip(cells.order(), rows, strict=True)]
-    table = _TEXT.table(f"estimator_tables.{name}", named, arms)
+    table = _TEXT.table(f"estimator_tables.{name}", named, methods)
     return Section(f"{name}-table", _TEXT[f"estimator_tables.{name}.title"], tables=[table])
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from faintspot.experiments.arms import knows_the_spot, label_of, style_of
+from faintspot.experiments.methods import knows_the_spot, label_of, style_of
 from faintspot.experiments.specification import BEST, CORRECTED
 from faintspot.experiments.study_figures import label_axes
 from faintspot.experiments.study_tables import parameter_in_words, parameters_of, table_of_cells
@@ -105,7 +105,7 @@ def _groups(dataset: xarray.Dataset, axis: str, by: Sequence[str], *, speckled: 
 
 @styled
 def _figure(dataset: xarray.Dataset, group: _Group, kind: str, axis: str) -> FigureWithData:
-    """Draw a variable of every arm along an axis, one panel for each camera, two in a row."""
+    """Draw a variable of every method along an axis, one panel for each camera, two in a row."""
     from matplotlib.lines import Line2D
 
     own_mode = kind == "corrected_rms" and CORRECTED in dataset["mode"].values
@@ -115,12 +115,12 @@ def _figure(dataset: xarray.Dataset, group: _Group, kind: str, axis: str) -> Fig
     figure = new_figure(WIDTH, _ROW_HEIGHT * rows + 0.9)
     panels = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
     for index, (panel, part) in enumerate(zip(panels, group.panels, strict=False)):
-        found = dataset.isel(cell=part.cells).sel(arm=_drawn_arms(dataset), mode=mode)
+        found = dataset.isel(cell=part.cells).sel(estimator=_drawn_methods(dataset), mode=mode)
         x = found[axis].values
-        for arm in found["arm"].values:
-            chosen = found.sel(arm=arm)
+        for method in found["estimator"].values:
+            chosen = found.sel(estimator=method)
             se = chosen[f"{kind}_se"].values if f"{kind}_se" in found else None
-            panel.errorbar(x, chosen[kind].values, se, elinewidth=1, zorder=3, **_line_of(str(arm)))
+            panel.errorbar(x, chosen[kind].values, se, elinewidth=1, zorder=3, **_line_of(str(method)))
         label_axes(panel, axis, log_y=False)
         _SCALES[kind](panel, found, x, found[kind].values)
         panel.set_title(part.title)
@@ -128,7 +128,7 @@ def _figure(dataset: xarray.Dataset, group: _Group, kind: str, axis: str) -> Fig
             panel.set_ylabel(_TEXT[f"estimators.{kind}.axis"])
     for unused in panels[len(group.panels) :]:
         unused.set_axis_off()
-    handles = [Line2D([], [], **_line_of(arm)) for arm in _drawn_arms(dataset)]
+    handles = [Line2D([], [], **_line_of(method)) for method in _drawn_methods(dataset)]
     if kind in ("error", "photon_efficiency"):
         handles.append(Line2D([], [], label="Cramer-Rao bound", **_BOUND))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
@@ -161,7 +161,7 @@ def _outlier_scale(panel: Axes, found: xarray.Dataset, x: Any, values: Any) -> N
 
 
 def _rms_scale(panel: Axes, found: xarray.Dataset, x: Any, values: Any) -> None:
-    best = found["corrected_rms"].min("arm").values
+    best = found["corrected_rms"].min("estimator").values
     panel.plot(x, best, "o", ms=15, mfc="none", mec="black", mew=1.4, zorder=4)
     panel.set(xscale="log", yscale="log")
     plain_ticks(panel.xaxis, (0.3, 0.5, 1, 2, 3, 5, 10))
@@ -178,12 +178,12 @@ _SCALES = {
 }
 
 
-def _drawn_arms(dataset: xarray.Dataset) -> list[str]:
-    return [str(arm) for arm in dataset["arm"].values]
+def _drawn_methods(dataset: xarray.Dataset) -> list[str]:
+    return [str(method) for method in dataset["estimator"].values]
 
 
-def _line_of(arm: str) -> dict[str, Any]:
+def _line_of(method: str) -> dict[str, Any]:
     """Return the style of a method: solid if it knows the spot, else dashed."""
-    style = style_of(arm)
-    line = {"label": label_of(arm), "color": style.colour, "marker": style.marker, "lw": 1.8}
-    return {**line, "ms": 8 if style.marker == "*" else 5.5, "ls": "-" if knows_the_spot(arm) else "--"}
+    style = style_of(method)
+    line = {"label": label_of(method), "color": style.colour, "marker": style.marker, "lw": 1.8}
+    return {**line, "ms": 8 if style.marker == "*" else 5.5, "ls": "-" if knows_the_spot(method) else "--"}

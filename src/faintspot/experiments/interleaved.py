@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.algorithms.noise import suggested_strength
-from faintspot.ao_loop.arms import Arm
 from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.files import make_folder
+from faintspot.ao_loop.methods import Method
 from faintspot.ao_loop.record import LoopRecord
 from faintspot.ao_loop.simulation import simulate_loop
 from faintspot.base.checks import number_between, numbers_between
@@ -110,7 +110,7 @@ def run_interleaved(
     """Observe in four sets, two at full and two at 75 % of the multiplication gain, or what is left of them.
 
     Each set consists of a measurement without denoising, then 8 or 20 with strengths rising from 0 to 2
-    electrons, and again, while the loop stays closed and the turbulence drifts. All arms of a set have the
+    electrons, and again, while the loop stays closed and the turbulence drifts. All methods of a set have the
     same number of kept pixels and the same loop gain: those that are best for denoising and none together,
     in turbulence that is not scored. Without multiplication all sets are the same but for the air.
 
@@ -173,7 +173,7 @@ def blocks_of(plan: ObservingPlan, number: int) -> NDArray[np.int64]:
 
 
 def strengths_of(plan: ObservingPlan, number: int) -> NDArray[np.float64]:
-    """Return the strength of each arm of a set, electrons; NaN for the first, which does not denoise."""
+    """Return the strength of each method of a set, electrons; NaN for the first, which does not denoise."""
     return np.concatenate([[np.nan], np.linspace(0, plan.strongest_e, plan.strengths[number])])
 
 
@@ -192,13 +192,13 @@ def _with_multiplication(configuration: LoopConfiguration, fraction: float) -> L
     return configuration.replace("camera", em_gain=max(1.0, fraction * configuration.camera.em_gain))
 
 
-def _arm(label: str, strength_e: float, kept: int, gain: float) -> Arm:
+def _method(label: str, strength_e: float, kept: int, gain: float) -> Method:
     estimator: Estimator = BrightestPixels(keep_brightest=kept)
     if not math.isnan(strength_e):
         estimator = TotalVariation(
             noise_std=strength_e, keep_brightest=kept, max_iterations=_MOST_ITERATIONS, tolerance=_TOLERANCE
         )
-    return Arm(label, Settings(estimator), gain)
+    return Method(label, Settings(estimator), gain)
 
 
 def _kept_pixels(configuration: LoopConfiguration, fraction: float) -> int:
@@ -243,14 +243,14 @@ def _trial(
     gain: float,
     advance: Advance,
 ) -> Arrays:
-    """Return the mean Strehl ratio of an arm with and one without denoising."""
+    """Return the mean Strehl ratio of a method with and one without denoising."""
     short = _with_multiplication(configuration, fraction).replace(
         "run", frames=plan.tuning_frames, settle_frames=plan.settle_in_block
     )
     pixels = _kept_pixels(configuration, kept)
     strehl = [
         simulate_loop(
-            short, [_arm("tuning", strength, pixels, gain)], realisation=FIRST_TUNING_REALISATION
+            short, [_method("tuning", strength, pixels, gain)], realisation=FIRST_TUNING_REALISATION
         ).mean_strehl()
         for strength in (np.nan, _mean_pixel_noise_e(short))
     ]
@@ -269,16 +269,16 @@ def _observe(
     """Observe one set; its number is that of the air's realisation."""
     strengths = strengths_of(plan, number)
     pixels = _kept_pixels(configuration, kept)
-    arms = [
-        _arm("no TV" if math.isnan(strength) else f"TV {strength:.3g} e-", float(strength), pixels, gain)
+    methods = [
+        _method("no TV" if math.isnan(strength) else f"TV {strength:.3g} e-", float(strength), pixels, gain)
         for strength in strengths
     ]
-    schedule = blocks_of(plan, number) % len(arms)
+    schedule = blocks_of(plan, number) % len(methods)
     whole = _with_multiplication(configuration, plan.em_fractions[number]).replace(
         "run", frames=len(schedule), settle_frames=plan.settle_in_block
     )
     record = simulate_loop(
-        whole, arms, schedule, realisation=number, progress=lambda done, total: advance(done)
+        whole, methods, schedule, realisation=number, progress=lambda done, total: advance(done)
     )
     return record.arrays()
 

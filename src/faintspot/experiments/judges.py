@@ -1,6 +1,6 @@
 """Verdicts on the claims of Basden et al. 2015 (arXiv:1503.06043) from the results of a study.
 
-All intervals are of 95 %. The two arms are brightest pixels without denoising and TV denoising. Where
+All intervals are of 95 %. The two methods are brightest pixels without denoising and TV denoising. Where
 nothing is left of a spot every estimator answers about the centre, so that flux gains mean nothing: they are
 taken only where R without TV is below INFORMATIVE times that of an estimator that always answers the centre.
 """
@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from faintspot.experiments.arms import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.experiments.curves import Curve, Gain, gain_at_error, gain_at_flux
+from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.experiments.study_curves import (
     KEPT_RANGE,
     Case,
@@ -132,7 +132,7 @@ def independent_of_pixels(dataset: xarray.Dataset, mode: str, rng: np.random.Gen
     for group in _grouped(curves, "pixels"):
         (small_key, small), (large_key, large) = group[0], group[-1]
         for flux in np.intersect1d(small.flux_e, large.flux_e):
-            changes = [_log_change(small, large, float(flux), arm) for arm in (TV, NO_TV)]
+            changes = [_log_change(small, large, float(flux), method) for method in (TV, NO_TV)]
             if any(change is None for change in changes):
                 continue
             (tv, tv_error), (plain, plain_error) = (change for change in changes if change is not None)
@@ -160,7 +160,7 @@ def less_dependence_on_k(dataset: xarray.Dataset, mode: str, rng: np.random.Gene
     cases = []
     for panel in (panel for profile in _profiles(dataset) for panel in kept_panels(dataset, profile)):
         for label, cell in panel.cells:
-            tv, plain = (spread(dataset, cell, arm, modes) for arm in (TV, NO_TV))
+            tv, plain = (spread(dataset, cell, method, modes) for method in (TV, NO_TV))
             if tv is not None and plain is not None:
                 finding = f"largest R / smallest R for k = {names}: {_in_both(tv, plain)}"
                 outcome = _less(plain[0] - tv[0], np.hypot(tv[1], plain[1]))
@@ -289,8 +289,8 @@ def _difference(first: Gain, second: Gain) -> tuple[float, float]:
     return float(np.log(first.factor / second.factor)), error
 
 
-def _log_change(small: Curve, large: Curve, flux_e: float, arm: str) -> tuple[float, float] | None:
-    first, second = small.at(flux_e, arm), large.at(flux_e, arm)
+def _log_change(small: Curve, large: Curve, flux_e: float, method: str) -> tuple[float, float] | None:
+    first, second = small.at(flux_e, method), large.at(flux_e, method)
     if first is None or second is None:
         return None
     errors = (each.standard_error / each.value for each in (first, second))

@@ -44,7 +44,7 @@ class Measurements:
     set_names: tuple[str, ...]
     set_number: NDArray[np.int64]
     """Index into set_names."""
-    arm: NDArray[np.int64]
+    method: NDArray[np.int64]
     strength_e: Floats
     """NaN: no TV."""
     time_s: Floats
@@ -139,10 +139,10 @@ def measurements(result: InterleavedResult) -> Measurements:
         raise InputError(
             f"interleaved observations: no measurement has {_FEWEST_FRAMES} frames after settling"
         )
-    number, arm, strength, time, strehl, r0, truth, frames = (
+    number, method, strength, time, strehl, r0, truth, frames = (
         np.array(column) for column in zip(*rows, strict=True)
     )
-    return Measurements(result.set_names, number, arm, strength, time, strehl, r0, truth, frames)
+    return Measurements(result.set_names, number, method, strength, time, strehl, r0, truth, frames)
 
 
 def group_rows(table: Measurements, set_number: int | None = None) -> list[GroupRow]:
@@ -244,21 +244,23 @@ def regression_lines(table: Measurements) -> dict[str, RegressionLine]:
     return lines
 
 
-def differences_by_flux(result: MagnitudeResult, arm: int, reference: int) -> list[Estimate]:
-    """Return an arm's Strehl less the reference's at each flux, over realisations.
+def differences_by_flux(result: MagnitudeResult, method: int, reference: int) -> list[Estimate]:
+    """Return a method's Strehl less the reference's at each flux, over realisations.
 
     The intervals hold together, for all fluxes, with 95 %.
     """
     fluxes = len(result.photons)
-    return [paired_mean(result.strehl[arm, f] - result.strehl[reference, f], fluxes) for f in range(fluxes)]
+    return [
+        paired_mean(result.strehl[method, f] - result.strehl[reference, f], fluxes) for f in range(fluxes)
+    ]
 
 
-def gains_in_magnitude(result: MagnitudeResult, arm: int, reference: int) -> dict[float, Estimate]:
+def gains_in_magnitude(result: MagnitudeResult, method: int, reference: int) -> dict[float, Estimate]:
     """Return the gain in limiting magnitude at each Strehl ratio that the reference's curve passes."""
     curve = np.array([paired_mean(values).value for values in result.strehl[reference]])
     known = curve[np.isfinite(curve)]
     return {
-        level: magnitude_gain(result.magnitudes, result.strehl[arm], result.strehl[reference], level)
+        level: magnitude_gain(result.magnitudes, result.strehl[method], result.strehl[reference], level)
         for level in _STREHL_LEVELS
         if len(known) and known.min() < level <= known.max()
     }
@@ -276,12 +278,12 @@ def _rows_of_set(
         frames = int(chosen.sum())
         if frames < _FEWEST_FRAMES:
             continue
-        arm = int(record.arm[start])
+        method = int(record.method[start])
         measured = float(record.valid[chosen].mean()) >= _LEAST_VALID
         rows.append(
             (
-                arm,
-                float(strengths[arm]),
+                method,
+                float(strengths[method]),
                 float(np.flatnonzero(chosen).mean() + 0.5) / record.frame_rate_hz,
                 float(record.strehl[chosen].mean()),
                 r0_of_record(record, chosen).r0_m if measured else np.nan,

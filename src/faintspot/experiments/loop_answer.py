@@ -12,16 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.ao_loop.arms import Arm
 from faintspot.ao_loop.camera import camera_calibration
 from faintspot.ao_loop.configuration import LoopConfiguration
+from faintspot.ao_loop.methods import Method
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived, write_atomically
 from faintspot.config.tables import save_tables
 from faintspot.control.learning import INTEGRATOR
 from faintspot.estimators.base import Need
-from faintspot.experiments.arms import Knowledge
-from faintspot.experiments.loop_arms import LOOP_GAIN, NOISE_SCALE, ArmKind, arm_kind
+from faintspot.experiments.loop_methods import LOOP_GAIN, NOISE_SCALE, MethodKind, method_kind
 from faintspot.experiments.loop_question import (
     BASELINE,
     MODEL_ERROR,
@@ -32,6 +31,7 @@ from faintspot.experiments.loop_question import (
 )
 from faintspot.experiments.loop_results import MagnitudeResult, falling, limiting_magnitudes, magnitude_gain
 from faintspot.experiments.magnitude import with_flux
+from faintspot.experiments.methods import Knowledge
 from faintspot.experiments.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
 from faintspot.experiments.words import with_error
 from faintspot.pipeline import configuration as configuration_file
@@ -98,9 +98,9 @@ class LoopAnswer:
     """Candidates that were not tried, and why."""
 
     @cached_property
-    def kinds(self) -> dict[str, ArmKind]:
+    def kinds(self) -> dict[str, MethodKind]:
         """Candidates that were tried, by name."""
-        return {name: arm_kind(name) for name in self.measured.names}
+        return {name: method_kind(name) for name in self.measured.names}
 
     @property
     def photons(self) -> Floats:
@@ -148,7 +148,7 @@ class LoopAnswer:
     def _place(self, name: str) -> int:
         names = self.measured.names
         if name not in names:
-            raise InputError(f"arm {name!r}: expected one that was tried: {', '.join(names)}")
+            raise InputError(f"method {name!r}: expected one that was tried: {', '.join(names)}")
         return names.index(name)
 
     def at_end(self, name: str, flux: int) -> list[str]:
@@ -165,19 +165,19 @@ class LoopAnswer:
         return found
 
     def strehl(self, name: str, flux: int) -> Estimate:
-        """Return an arm's Strehl ratio at a measured flux."""
+        """Return a method's Strehl ratio at a measured flux."""
         return paired_mean(self.runs(name)[flux])
 
     def difference(self, name: str, reference: str, flux: int) -> Estimate:
         """Return the difference of two methods' Strehl ratios in the same turbulence.
 
-        Its interval holds for all comparisons with one arm together.
+        Its interval holds for all comparisons with one method together.
         """
         differences = self.runs(name)[flux] - self.runs(reference)[flux]
         return paired_mean(differences, max(1, len(self.kinds) - 1))
 
     def equal(self, flux: int) -> tuple[str, ...]:
-        """Return the arms that are not below the best beyond the error; the first is recommended.
+        """Return the methods that are not below the best beyond the error; the first is recommended.
 
         That is the baseline where it is among them, else the one that need not learn, has to know least and
         costs least.
@@ -187,12 +187,12 @@ class LoopAnswer:
         return tuple(sorted(same, key=lambda name: _simplicity(self.kinds[name])))
 
     @property
-    def best(self) -> ArmKind:
+    def best(self) -> MethodKind:
         """Recommended method for the star."""
         return self.kinds[self.equal(self.at_star)[0]]
 
     def limit(self, name: str) -> Limit:
-        """Return an arm's limiting magnitude."""
+        """Return a method's limiting magnitude."""
         faint, strehl = self._from_bright(name)
         value = float(limiting_magnitudes(faint, strehl.mean(axis=1), self.level))
         if not math.isfinite(value):
@@ -206,7 +206,7 @@ class LoopAnswer:
         return Limit(of_draws(value, drawn, realisations), between)
 
     def gain(self, name: str, reference: str) -> Limit:
-        """Return the gain in limiting magnitude over another arm; NaN where one of them has no limit."""
+        """Return the gain in limiting magnitude over another method; NaN where one of them has no limit."""
         faint, strehl = self._from_bright(name)
         found = magnitude_gain(faint, strehl, self._from_bright(reference)[1], self.level)
         if not math.isfinite(found.value):
@@ -218,7 +218,7 @@ class LoopAnswer:
         return Limit(found, abs(mine - other))
 
     def coverage(self, name: str, place: str) -> Coverage | None:
-        """Return what part of a place of `PLACES` an arm can use; None: no radius."""
+        """Return what part of a place of `PLACES` a method can use; None: no radius."""
         limit, radius = self.limit(name), self.question.radius
         if radius is None:
             return None
@@ -239,16 +239,16 @@ class LoopAnswer:
         return Coverage(float(fraction), strehl_error, (many - few) / 2, bound)
 
     def curve(self, name: str) -> Floats:
-        """Return an arm's mean Strehl ratios (F,), made to fall with magnitude; straight lines join them."""
+        """Return a method's mean Strehl ratios (F,), made to fall with magnitude; to be joined by lines."""
         return falling(self._from_bright(name)[1].mean(axis=1))[::-1]
 
     def star(self, flux: int) -> LoopConfiguration:
         """Return the loop with the star of a measured flux."""
         return with_flux(self.question.configuration, float(self.photons[flux]))
 
-    def arm(self, name: str, flux: int) -> Arm:
+    def method(self, name: str, flux: int) -> Method:
         """Return a candidate with its settings for a measured flux, as `simulate_loop` takes it."""
-        return self.kinds[name].arm(self.star(flux), self.choice(name, flux))
+        return self.kinds[name].method(self.star(flux), self.choice(name, flux))
 
     def save(self, path: str | Path) -> Path:
         """Write what is recommended for the star as a configuration file; what else it holds stays.
@@ -267,21 +267,21 @@ class LoopAnswer:
             When a file cannot be written.
         """
         path, flux, best = Path(path), self.at_star, self.best
-        arm, star = self.arm(best.name, flux), self.star(flux)
-        settings = arm.settings
+        method, star = self.method(best.name, flux), self.star(flux)
+        settings = method.settings
         if settings.estimator.uses_flux:
             settings = settings.replace(flux_e=float(f"{star.photons:.4g}"))
-        psf = arm.psf
+        psf = method.psf
         if psf is None and settings.estimator.needs & {Need.PSF, Need.WIDTH}:  # what the loop gives it
             psf = PSF.analytic(size=star.spot_width_px / 2, elongation=star.sensor.spot_elongation)
-        for item in (settings, psf, arm.score):
+        for item in (settings, psf, method.score):
             if item is not None:
                 configuration_file.save(path, item)
         if not configuration_file.has(path, "calibration"):
             configuration_file.save(path, camera_calibration(star))
         save_tables(path, {"loop": self._loop_table(flux)})
         loop = derived(path, "-loop.toml")
-        gain = {} if arm.gain is None else {"gain": arm.gain}
+        gain = {} if method.gain is None else {"gain": method.gain}
         write_atomically(loop, star.replace("control", **gain).to_text())
         return loop
 
@@ -289,7 +289,7 @@ class LoopAnswer:
         best = self.best
         strehl, choice = self.strehl(best.name, flux), self.choice(best.name, flux)
         table = {
-            "arm": best.name,
+            "method": best.name,
             "control": best.control,
             "gain": float(choice[LOOP_GAIN]),
             "photons_per_subaperture": float(self.photons[flux]),
@@ -297,7 +297,7 @@ class LoopAnswer:
         }
         if NOISE_SCALE in choice:
             table["noise_scale"] = float(choice[NOISE_SCALE])
-        if self.arm(best.name, flux).correct_gain:
+        if self.method(best.name, flux).correct_gain:
             gains = self.measured.centroid_gain[self._place(best.name), flux]
             table["centroid_gain"] = round(float(gains.mean()), 3)
         if math.isfinite(strehl.standard_error):
@@ -323,6 +323,6 @@ def _interpolation_error(faint: Floats, strehl: Floats, value: float) -> float:
     return float(bend * (value - faint[end - 1]) * (faint[end] - value) / abs(slopes[end - 1]))
 
 
-def _simplicity(kind: ArmKind) -> tuple[Any, ...]:
+def _simplicity(kind: MethodKind) -> tuple[Any, ...]:
     own = kind.name != BASELINE, kind.control != INTEGRATOR
     return *own, int(Knowledge.of(kind.estimator)), kind.estimator.cost, kind.name

@@ -24,7 +24,7 @@ from faintspot.experiments.loop_analysis import (
     paired_differences,
     regression_lines,
 )
-from faintspot.experiments.loop_arms import CONTROL_SIGN
+from faintspot.experiments.loop_methods import CONTROL_SIGN
 from faintspot.experiments.loop_results import BudgetResult, MagnitudeResult
 from faintspot.experiments.statistics import paired_mean
 from faintspot.report.drawing import (
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 _TEXT = Texts("faintspot.experiments")
 _STREHL = "H-band Strehl ratio"
-_DODGE = 0.008  # of the axis, between arms at the same magnitude
+_DODGE = 0.008  # of the axis, between methods at the same magnitude
 _LEARNING_LINE = (0, (6, 1.5, 1, 1.5))
 _DECADES = 3  # of intensity in images
 
@@ -61,21 +61,21 @@ def strehl_axis(wavelength_m: float) -> str:
 
 @styled
 def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> FigureWithData:
-    """Draw Strehl against magnitude for every arm, and what each gains over the reference."""
+    """Draw Strehl against magnitude for every method, and what each gains over the reference."""
     figure = new_figure(WIDTH, 6.4)
     left, right = figure.subplots(1, 2)
     shift = _DODGE * float(np.ptp(result.magnitudes) or 1.0)
     rows = []
-    for arm, name in enumerate(result.labels):
-        runs = [paired_mean(values) for values in result.strehl[arm]]
+    for method, name in enumerate(result.labels):
+        runs = [paired_mean(values) for values in result.strehl[method]]
         value = np.array([run.value for run in runs])
         error = np.nan_to_num([run.standard_error for run in runs])
-        place = result.magnitudes + (arm - len(result.labels) / 2) * shift
-        style = arm_style(result.names[arm])
+        place = result.magnitudes + (method - len(result.labels) / 2) * shift
+        style = method_style(result.names[method])
         left.errorbar(result.magnitudes, value, error, label=name, capsize=2, **style)
-        differences = differences_by_flux(result, arm, reference)
+        differences = differences_by_flux(result, method, reference)
         low, middle, high = np.array([[d.low, d.value, d.high] for d in differences]).T
-        if arm != reference:
+        if method != reference:
             right.errorbar(place, middle, np.nan_to_num([middle - low, high - middle]), capsize=2, **style)
         count = np.full(len(value), result.strehl.shape[-1])
         columns = result.magnitudes, result.photons, value, error, count, low, middle, high
@@ -93,13 +93,13 @@ def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> Fig
 
 @styled
 def gain_figure(result: MagnitudeResult) -> FigureWithData:
-    """Draw the centroid gain of every arm against the star's flux."""
+    """Draw the centroid gain of every method against the star's flux."""
     figure = new_figure(WIDTH * 0.7, 5.2)
     panel = figure.subplots()
     rows = []
-    for arm, name in enumerate(result.labels):
-        value = np.array([paired_mean(values).value for values in result.centroid_gain[arm]])
-        panel.plot(result.photons, value, label=name, **arm_style(result.names[arm]))
+    for method, name in enumerate(result.labels):
+        value = np.array([paired_mean(values).value for values in result.centroid_gain[method]])
+        panel.plot(result.photons, value, label=name, **method_style(result.names[method]))
         rows += [[name, p, v] for p, v in zip(result.photons, value, strict=True)]
     panel.axhline(1, color=GREY, lw=1)
     panel.set_xscale("log")
@@ -151,24 +151,24 @@ def psf_figure(images: Sequence[NDArray[Any]], names: Sequence[str], where: str)
 
 @styled
 def budget_figure(result: BudgetResult, label: str) -> FigureWithData:
-    """Draw the Strehl ratio of every arm with each term of the error budget switched off."""
-    terms, arms = len(result.terms), len(result.labels)
-    figure = new_figure(WIDTH * 0.8, 1.6 + 0.2 * terms * (arms + 1))
+    """Draw the Strehl ratio of every method with each term of the error budget switched off."""
+    terms, methods = len(result.terms), len(result.labels)
+    figure = new_figure(WIDTH * 0.8, 1.6 + 0.2 * terms * (methods + 1))
     panel = figure.subplots()
     rows = []
-    for arm, name in enumerate(result.labels):
-        runs = [paired_mean(values) for values in result.strehl[arm]]
+    for method, name in enumerate(result.labels):
+        runs = [paired_mean(values) for values in result.strehl[method]]
         value = np.array([run.value for run in runs])
         error = np.nan_to_num([run.standard_error for run in runs])
-        place = np.arange(terms) + (arm - (arms - 1) / 2) * 0.8 / arms
-        colour = arm_style(result.names[arm])["color"]
-        panel.barh(place, value, 0.72 / arms, xerr=error, color=colour, label=name, capsize=2, ecolor=GREY)
+        place = np.arange(terms) + (method - (methods - 1) / 2) * 0.8 / methods
+        colour = method_style(result.names[method])["color"]
+        panel.barh(place, value, 0.72 / methods, xerr=error, color=colour, label=name, capsize=2, ecolor=GREY)
         panel.plot([value[0]] * 2, [-0.5, terms - 0.5], color=colour, lw=0.8, ls=":")
         rows += [[name, t, v, e] for t, v, e in zip(result.terms, value, error, strict=True)]
     panel.set_yticks(range(terms), [_switched(term) for term in result.terms])
     panel.invert_yaxis()
     panel.set(xlabel=label)
-    figure.legend(loc="outside lower center", ncols=min(3, arms), frameon=False)
+    figure.legend(loc="outside lower center", ncols=min(3, methods), frameon=False)
     return _TEXT.figure("budget", figure, rows)
 
 
@@ -176,8 +176,8 @@ def _switched(term: str) -> str:
     return "whole loop" if term == "nothing" else f"without {term}"
 
 
-def arm_style(name: str) -> dict[str, Any]:
-    """Return the style of an arm's estimator; markers are hollow where the loop does more than the usual.
+def method_style(name: str) -> dict[str, Any]:
+    """Return the style of a method's estimator; markers are hollow where the loop does more than the usual.
 
     Lines of control that learns are dash-dotted.
     """

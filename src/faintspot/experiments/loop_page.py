@@ -38,8 +38,8 @@ from faintspot.experiments.loop_verdict import (
     LoopResults,
     loop_verdict,
     options_that_may_pay,
-    reference_arms,
-    tv_arm,
+    reference_methods,
+    tv_method,
 )
 from faintspot.experiments.statistics import paired_mean
 from faintspot.experiments.words import with_interval
@@ -155,22 +155,22 @@ def _seeing_line(table: Measurements) -> list[str]:
 
 
 def _magnitude(result: MagnitudeResult) -> list[Section]:
-    references = reference_arms(result)
-    base = " and then with ".join(result.labels[arm] for arm in references)
+    references = reference_methods(result)
+    base = " and then with ".join(result.labels[method] for method in references)
     wavelength = LoopConfiguration.from_text(result.configuration).science.wavelength_m
     tables = [strehl_table(result)]
     for place, reference in enumerate(references):
-        others = [arm for arm in range(len(result.labels)) if arm not in references[: place + 1]]
+        others = [method for method in range(len(result.labels)) if method not in references[: place + 1]]
         tables += [
             gain_table(result, others, reference),
-            difference_table(result, [(arm, reference) for arm in others]),
+            difference_table(result, [(method, reference) for method in others]),
         ]
-    pairs = [(arm, without) for _, arm, without in options_that_may_pay(result)]
+    pairs = [(method, without) for _, method, without in options_that_may_pay(result)]
     if pairs:
         table = difference_table(result, pairs)
         tables.append(replace(table, caption=_TEXT["tables.difference.options"] + table.caption))
-    arms, fluxes, realisations = result.strehl.shape
-    counts = {"arms": arms, "fluxes": fluxes, "realisations": realisations}
+    methods, fluxes, realisations = result.strehl.shape
+    counts = {"methods": methods, "fluxes": fluxes, "realisations": realisations}
     text = [_TEXT("loop.magnitude", **counts, reference=base)]
     return [
         Section(
@@ -188,17 +188,17 @@ def _magnitude(result: MagnitudeResult) -> list[Section]:
 def _images(interleaved: InterleavedResult | None, magnitude: MagnitudeResult | None) -> Section:
     figure = None
     if magnitude is not None:
-        figure = _images_of_arms(magnitude)
+        figure = _images_of_methods(magnitude)
     if figure is None and interleaved is not None:
         figure = _images_of_set(interleaved)
     title = "Long-exposure image with and without TV"
     if figure is None:
-        return Section("psf", title, missing="Not drawn: arms with and without TV are not both there.")
+        return Section("psf", title, missing="Not drawn: methods with and without TV are not both there.")
     return Section("psf", title, figures=[figure])
 
 
-def _images_of_arms(result: MagnitudeResult) -> FigureWithData | None:
-    tv, reference = tv_arm(result), reference_arms(result)[-1]
+def _images_of_methods(result: MagnitudeResult) -> FigureWithData | None:
+    tv, reference = tv_method(result), reference_methods(result)[-1]
     if tv is None or tv == reference:
         return None
     curve = np.array([paired_mean(values).value for values in result.strehl[reference]])
@@ -206,9 +206,11 @@ def _images_of_arms(result: MagnitudeResult) -> FigureWithData | None:
         return None
     good = np.flatnonzero(curve >= _LEAST_STREHL)
     flux = int(good[0]) if len(good) else int(np.nanargmax(curve))
-    images = [result.psf[arm, flux] for arm in (reference, tv)]
-    where = _TEXT("loop.images_of_arms", realisations=result.strehl.shape[-1], photons=result.photons[flux])
-    return psf_figure(images, [result.labels[arm] for arm in (reference, tv)], where)
+    images = [result.psf[method, flux] for method in (reference, tv)]
+    where = _TEXT(
+        "loop.images_of_methods", realisations=result.strehl.shape[-1], photons=result.photons[flux]
+    )
+    return psf_figure(images, [result.labels[method] for method in (reference, tv)], where)
 
 
 def _images_of_set(result: InterleavedResult) -> FigureWithData | None:
@@ -233,8 +235,8 @@ def _budget_lines(result: BudgetResult) -> list[str]:
     """Describe which term costs each method most Strehl, and how differences between methods change."""
     lines = []
     changes = result.strehl - result.strehl[:, :1]
-    for arm, name in enumerate(result.labels):
-        gains = [paired_mean(runs) for runs in changes[arm]]
+    for method, name in enumerate(result.labels):
+        gains = [paired_mean(runs) for runs in changes[method]]
         order = sorted(range(1, len(gains)), key=lambda number: -np.nan_to_num(gains[number].value))
         parts = [f"{result.terms[n]} {with_interval(gains[n])}" for n in order[:3] if gains[n].decided > 0]
         if parts:
@@ -242,11 +244,11 @@ def _budget_lines(result: BudgetResult) -> list[str]:
         if _SLOPE_ERROR in result.terms:
             most = with_interval(gains[result.terms.index(_SLOPE_ERROR)])
             lines.append(_TEXT("loop.true_slopes", name=name, change=most))
-    for arm, name in enumerate(result.labels[1:], start=1):
+    for method, name in enumerate(result.labels[1:], start=1):
         parts = [
             f"{_without(number, term)} {with_interval(paired_mean(difference))}"
             for number, (term, difference) in enumerate(
-                zip(result.terms, result.strehl[arm] - result.strehl[0], strict=True)
+                zip(result.terms, result.strehl[method] - result.strehl[0], strict=True)
             )
         ]
         lines.append(f"{name} less {result.labels[0]}: {'; '.join(parts)}.")

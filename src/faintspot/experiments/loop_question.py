@@ -16,7 +16,7 @@ from faintspot.base.errors import InputError
 from faintspot.control.learning import INTEGRATOR, KALMAN
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.window import Window
-from faintspot.experiments.loop_arms import ArmKind, arm_kind
+from faintspot.experiments.loop_methods import MethodKind, method_kind
 
 Floats = NDArray[np.float64]
 
@@ -169,8 +169,8 @@ class LoopQuestion:
     magnitudes : (float, float), optional
         First and last magnitude. Default: from the brightest star of the configuration's `run` to one four
         times fainter than the faintest; without any, from four times the star's flux to an eighth.
-    arms : sequence of str, optional
-        Names of candidates as for `arm_kind`; "window" and "brightest" always take part. Default: those,
+    methods : sequence of str, optional
+        Names of candidates as for `method_kind`; "window" and "brightest" always take part. Default: those,
         "map_predicted", and with the predictive Kalman filter "window+kalman" and "map+kalman".
     strehl : float, optional
         Strehl ratio that limiting magnitudes are for. Default: half of what the baseline has with the
@@ -181,20 +181,20 @@ class LoopQuestion:
     Raises
     ------
     InputError
-        For values out of range, unknown arms, control that learns in open loop.
+        For values out of range, unknown methods, control that learns in open loop.
 
     Examples
     --------
     >>> from faintspot.ao_loop import load_loop
     >>> from faintspot.experiments import LoopQuestion
-    >>> question = LoopQuestion(load_loop("canary"), magnitudes=(10.0, 13.0), arms=["window", "map"])
+    >>> question = LoopQuestion(load_loop("canary"), magnitudes=(10.0, 13.0), methods=["window", "map"])
     >>> [round(photons) for photons in question.photons(3)]
     [35, 139, 300]
     """
 
     configuration: LoopConfiguration
     magnitudes: Sequence[float] | None = None
-    arms: Sequence[str] | None = None
+    methods: Sequence[str] | None = None
     strehl: float | None = None
     radius_arcsec: float | None = None
 
@@ -213,13 +213,13 @@ class LoopQuestion:
             number_between("radius_arcsec", self.radius_arcsec, 0.0, 3600.0, low_open=True)
         for kind in self.kinds:
             if kind.control != INTEGRATOR and self.configuration.control.mode != CLOSED:
-                raise InputError(f"arms: {kind.name!r} learns from a closed loop, this one is open")
+                raise InputError(f"methods: {kind.name!r} learns from a closed loop, this one is open")
 
     @property
-    def kinds(self) -> tuple[ArmKind, ...]:
+    def kinds(self) -> tuple[MethodKind, ...]:
         """Candidates: those with the integrator first, also that of each one whose control learns."""
-        names = (SECOND, BASELINE, *(self._default() if self.arms is None else self.arms))
-        asked = {kind.name: kind for kind in map(arm_kind, names)}
+        names = (SECOND, BASELINE, *(self._default() if self.methods is None else self.methods))
+        asked = {kind.name: kind for kind in map(method_kind, names)}
         plain = [replace(kind, control=INTEGRATOR) for kind in asked.values()]
         learning = [kind for kind in asked.values() if kind.control != INTEGRATOR]
         return tuple({kind.name: kind for kind in [*plain, *learning]}.values())
@@ -227,11 +227,11 @@ class LoopQuestion:
     @property
     def left_out(self) -> dict[str, str]:
         """Default candidates that do not suit, and why."""
-        if self.arms is not None:
+        if self.methods is not None:
             return {}
         reasons = {}
         for name in _CANDIDATES:
-            kind = arm_kind(name)
+            kind = method_kind(name)
             if kind.control == KALMAN and self.configuration.control.mode != CLOSED:
                 reasons[name] = "its control learns from a closed loop, this one is open"
         return reasons

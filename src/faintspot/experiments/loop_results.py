@@ -30,7 +30,7 @@ class InterleavedResult:
     block: tuple[NDArray[np.int64], ...]
     """(frames,) each: number of the measurement that a frame belongs to."""
     strengths: tuple[Floats, ...]
-    """(arms,) each: strength of the denoising, electrons; NaN: none."""
+    """(methods,) each: strength of the denoising, electrons; NaN: none."""
     set_names: tuple[str, ...]
     settle_in_block: int
     """Frames at the start of every measurement that are not scored."""
@@ -100,13 +100,13 @@ class InterleavedResult:
 
 @dataclass(frozen=True, eq=False)
 class MagnitudeResult(Stored):
-    """Strehl ratio against the star's flux: A arms, F fluxes, R realisations of the air."""
+    """Strehl ratio against the star's flux: A methods, F fluxes, R realisations of the air."""
 
     WHAT: ClassVar[str] = "a magnitude experiment"
     FORMAT: ClassVar[int] = 3
 
     names: tuple[str, ...]
-    """(A,): of the arms, see `faintspot.experiments.loop_arms.arm_kind`."""
+    """(A,): of the methods, see `faintspot.experiments.loop_methods.method_kind`."""
     labels: tuple[str, ...]
     """(A,)"""
     photons: Floats
@@ -129,13 +129,13 @@ class MagnitudeResult(Stored):
 
 @dataclass(frozen=True, eq=False)
 class BudgetResult(Stored):
-    """Error budget: A arms with T terms switched off, R realisations of the air."""
+    """Error budget: A methods with T terms switched off, R realisations of the air."""
 
     WHAT: ClassVar[str] = "an error budget"
     FORMAT: ClassVar[int] = 2
 
     names: tuple[str, ...]
-    """(A,): of the arms, see `faintspot.experiments.loop_arms.arm_kind`."""
+    """(A,): of the methods, see `faintspot.experiments.loop_methods.method_kind`."""
     terms: tuple[str, ...]
     """(T,): what is switched off; the first is nothing."""
     labels: tuple[str, ...]
@@ -241,14 +241,14 @@ def magnitude_gain(
 ) -> Estimate:
     """Return the gain in limiting magnitude at a Strehl ratio, with its interval over realisations.
 
-    Each arm's mean curve is made to fall with magnitude (isotonic regression) and read off between its
-    points, never beyond them. Realisations are drawn with replacement, the same ones for both arms.
+    Each method's mean curve is made to fall with magnitude (isotonic regression) and read off between its
+    points, never beyond them. Realisations are drawn with replacement, the same ones for both methods.
 
     Parameters
     ----------
     magnitudes : (F,) array
     strehl, reference : (F, R) arrays
-        Of the arm and of what it is compared with; the same realisations. NaN: not measured.
+        Of the method and of what it is compared with; the same realisations. NaN: not measured.
     level : float
         The Strehl ratio.
     rng : numpy.random.Generator, optional
@@ -256,7 +256,7 @@ def magnitude_gain(
     Returns
     -------
     Estimate
-        Infinite where the arm's curve stays above the level and the reference's does not, minus infinite
+        Infinite where the method's curve stays above the level and the reference's does not, minus infinite
         where it stays below; NaN where neither crosses it, or nothing is measured yet. An end of the interval
         is infinite where more than 2.5 % of the draws left the measured magnitudes there.
 

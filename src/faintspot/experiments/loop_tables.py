@@ -19,7 +19,7 @@ from faintspot.experiments.loop_analysis import (
     regression_lines,
     seeing_of_sets,
 )
-from faintspot.experiments.loop_arms import LOOP_GAIN
+from faintspot.experiments.loop_methods import LOOP_GAIN
 from faintspot.experiments.loop_results import (
     BudgetResult,
     InterleavedResult,
@@ -84,12 +84,12 @@ def seeing_table(result: InterleavedResult) -> Table:
     return _TEXT.table("tables.seeing", rows)
 
 
-def gain_table(result: MagnitudeResult, arms: Sequence[int], reference: int) -> Table:
-    """Return the gains in limiting magnitude of arms over a reference at equal Strehl."""
-    gains = {arm: gains_in_magnitude(result, arm, reference) for arm in arms}
+def gain_table(result: MagnitudeResult, methods: Sequence[int], reference: int) -> Table:
+    """Return the gains in limiting magnitude of methods over a reference at equal Strehl."""
+    gains = {method: gains_in_magnitude(result, method, reference) for method in methods}
     rows = [
-        [result.labels[arm], *(with_interval(gain, 2) for gain in found.values())]
-        for arm, found in gains.items()
+        [result.labels[method], *(with_interval(gain, 2) for gain in found.values())]
+        for method, found in gains.items()
     ]
     levels = next(iter(gains.values()), {})
     columns = [f"at Strehl {level:g}" for level in levels]
@@ -97,46 +97,48 @@ def gain_table(result: MagnitudeResult, arms: Sequence[int], reference: int) -> 
 
 
 def difference_table(result: MagnitudeResult, pairs: Sequence[tuple[int, int]]) -> Table:
-    """Return the difference in Strehl of pairs of arms at each flux."""
+    """Return the difference in Strehl of pairs of methods at each flux."""
     rows = [
         [
-            result.labels[arm],
+            result.labels[method],
             result.labels[other],
-            *map(with_interval, differences_by_flux(result, arm, other)),
+            *map(with_interval, differences_by_flux(result, method, other)),
         ]
-        for arm, other in pairs
+        for method, other in pairs
     ]
     return _TEXT.table("tables.difference", rows, _fluxes(result))
 
 
 def strehl_table(result: MagnitudeResult) -> Table:
-    """Return the Strehl ratio of every arm at each flux."""
+    """Return the Strehl ratio of every method at each flux."""
     stars = zip(result.photons, result.magnitudes, strict=True)
     columns = [f"{photons:.3g} e⁻, {magnitude:.1f} mag" for photons, magnitude in stars]
     return _TEXT.table("tables.strehl", _by_flux(result, result.strehl, 3), columns)
 
 
 def centroid_gain_table(result: MagnitudeResult) -> Table:
-    """Return the centroid gain of every arm at each flux."""
+    """Return the centroid gain of every method at each flux."""
     return _TEXT.table("tables.centroid_gain", _by_flux(result, result.centroid_gain, 2), _fluxes(result))
 
 
 def _by_flux(result: MagnitudeResult, values: NDArray[np.float64], digits: int) -> list[list[str]]:
     return [
-        [label, *(with_error(paired_mean(runs), digits) for runs in of_arm)]
-        for label, of_arm in zip(result.labels, values, strict=True)
+        [label, *(with_error(paired_mean(runs), digits) for runs in of_method)]
+        for label, of_method in zip(result.labels, values, strict=True)
     ]
 
 
 def budget_table(result: BudgetResult) -> Table:
-    """Return the Strehl ratio and the rms wavefront of every arm without each term."""
+    """Return the Strehl ratio and the rms wavefront of every method without each term."""
     rows = []
-    for arm, name in enumerate(result.labels):
+    for method, name in enumerate(result.labels):
         for number, term in enumerate(result.terms):
             strehl, residual = (
-                paired_mean(values[arm, number]) for values in (result.strehl, result.residual_nm)
+                paired_mean(values[method, number]) for values in (result.strehl, result.residual_nm)
             )
-            change = None if number == 0 else paired_mean(result.strehl[arm, number] - result.strehl[arm, 0])
+            change = (
+                None if number == 0 else paired_mean(result.strehl[method, number] - result.strehl[method, 0])
+            )
             off = NOTHING if number == 0 else term
             rows.append([name, off, with_error(strehl), with_error(residual, 0), with_interval(change)])
     meanings = "; ".join(f"{term}: {_TEXT[f'terms.{term}']}" for term in result.terms[1:] if term in TERMS)
@@ -152,7 +154,7 @@ def in_columns(table: Table, most: int | None = None) -> str:
 
 
 def settings_table(result: MagnitudeResult) -> Table:
-    """Return the tuned loop gain and settings of every arm at each flux."""
+    """Return the tuned loop gain and settings of every method at each flux."""
     rows = [
         [label, *map(_settings_words, choices, settings)]
         for label, choices, settings in zip(result.labels, result.choices, result.settings, strict=True)

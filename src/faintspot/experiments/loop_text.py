@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from faintspot.experiments.loop_answer import Coverage, LoopAnswer
-from faintspot.experiments.loop_arms import LOOP_GAIN, Choice
+from faintspot.experiments.loop_methods import LOOP_GAIN, Choice
 from faintspot.experiments.loop_question import BASELINE, MODEL_ERROR, PLACES, REFERENCES, magnitudes_apart
 from faintspot.experiments.words import plain_number, with_error
 from faintspot.report.texts import Texts
@@ -78,7 +78,7 @@ def gain_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
 
 
 def limit_in_words(answer: LoopAnswer, name: str) -> str:
-    """Return an arm's limiting magnitude with its error."""
+    """Return a method's limiting magnitude with its error."""
     limit = answer.limit(name)
     if limit.is_known:
         return limit.in_words()

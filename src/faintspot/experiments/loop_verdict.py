@@ -22,7 +22,7 @@ from faintspot.experiments.loop_analysis import (
     group_rows,
     measurements,
 )
-from faintspot.experiments.loop_arms import VARIANTS
+from faintspot.experiments.loop_methods import VARIANTS
 from faintspot.experiments.loop_question import REFERENCES
 from faintspot.experiments.loop_results import (
     BudgetResult,
@@ -79,39 +79,39 @@ def loop_verdict(results: LoopResults) -> list[str]:
     if results.magnitude is not None:
         lines += _magnitude_lines(results.magnitude)
         # What the denoising itself does: against the same without it.
-        tv, reference = tv_arm(results.magnitude), reference_arms(results.magnitude)[-1]
+        tv, reference = tv_method(results.magnitude), reference_methods(results.magnitude)[-1]
         if tv is not None and tv != reference:
             comparisons += differences_by_flux(results.magnitude, tv, reference)
     return _headline(comparisons) + lines
 
 
-def reference_arms(result: MagnitudeResult) -> list[int]:
-    """Return the arms that others are compared with: those of `REFERENCES` that are there, else the first."""
+def reference_methods(result: MagnitudeResult) -> list[int]:
+    """Return the methods to compare others with: those of `REFERENCES` that are present, else the first."""
     return [result.names.index(name) for name in REFERENCES if name in result.names] or [0]
 
 
-def tv_arm(result: MagnitudeResult) -> int | None:
-    """Return the arm with TV, or None."""
+def tv_method(result: MagnitudeResult) -> int | None:
+    """Return the method with TV, or None."""
     return result.names.index(TotalVariation.name) if TotalVariation.name in result.names else None
 
 
 def options_that_may_pay(result: MagnitudeResult) -> list[tuple[str, int, int]]:
-    """Return what arms of a pair differ by, the arm with it and the one without, for each of `VARIANTS`."""
+    """Return the options that methods differ by, the method with it and the one without, for `VARIANTS`."""
     names = result.names
     return [
-        (variant.label, arm, names.index(name.replace(ending, "")))
+        (variant.label, method, names.index(name.replace(ending, "")))
         for ending, variant in VARIANTS.items()
-        for arm, name in enumerate(names)
+        for method, name in enumerate(names)
         if ending in name and name.replace(ending, "") in names
     ]
 
 
-def better_and_worse(result: MagnitudeResult, arm: int, reference: int) -> tuple[str, str]:
-    """Return at which fluxes an arm's Strehl is above and below another's beyond its error, in words.
+def better_and_worse(result: MagnitudeResult, method: int, reference: int) -> tuple[str, str]:
+    """Return at which fluxes a method's Strehl is above and below another's beyond its error, in words.
 
     "" for none.
     """
-    decided = [each.decided for each in differences_by_flux(result, arm, reference)]
+    decided = [each.decided for each in differences_by_flux(result, method, reference)]
     if decided == [1] * len(decided):
         return "all fluxes", ""
     if decided == [-1] * len(decided):
@@ -156,30 +156,30 @@ def _interleaved_lines(table: Measurements) -> list[str]:
 
 
 def _magnitude_lines(result: MagnitudeResult) -> list[str]:
-    references, lines = reference_arms(result), []
+    references, lines = reference_methods(result), []
     for place, reference in enumerate(references):
-        others = [arm for arm in range(len(result.labels)) if arm not in references[: place + 1]]
-        lines += [_comparison(result, arm, reference) for arm in others]
-    for option, arm, without in options_that_may_pay(result):
-        above, below = better_and_worse(result, arm, without)
+        others = [method for method in range(len(result.labels)) if method not in references[: place + 1]]
+        lines += [_comparison(result, method, reference) for method in others]
+    for option, method, without in options_that_may_pay(result):
+        above, below = better_and_worse(result, method, without)
         found = f"pays at {above}" if above else "pays nowhere beyond its error"
         found += f", costs at {below}" if below else ""
-        lines.append(f"{result.labels[arm]} against {result.labels[without]}: {option} {found}.")
+        lines.append(f"{result.labels[method]} against {result.labels[without]}: {option} {found}.")
     return lines
 
 
-def _comparison(result: MagnitudeResult, arm: int, reference: int) -> str:
-    above, below = better_and_worse(result, arm, reference)
+def _comparison(result: MagnitudeResult, method: int, reference: int) -> str:
+    above, below = better_and_worse(result, method, reference)
     parts = [f"more Strehl beyond its error at {above}"] if above else []
     parts += [f"less Strehl beyond its error at {below}"] if below else []
     found = "; ".join(parts) if parts else "no difference beyond its error at any flux"
-    gain = _gain_in_magnitude(result, arm, reference)
-    return f"Magnitudes, {result.labels[arm]} against {result.labels[reference]}: {found}{gain}."
+    gain = _gain_in_magnitude(result, method, reference)
+    return f"Magnitudes, {result.labels[method]} against {result.labels[reference]}: {found}{gain}."
 
 
-def _gain_in_magnitude(result: MagnitudeResult, arm: int, reference: int) -> str:
+def _gain_in_magnitude(result: MagnitudeResult, method: int, reference: int) -> str:
     """Return the gain at the middle one of the Strehl ratios at which there is one."""
-    every = gains_in_magnitude(result, arm, reference)
+    every = gains_in_magnitude(result, method, reference)
     gains = [
         (level, each) for level, each in every.items() if np.isfinite(each.value) and not np.isnan(each.low)
     ]

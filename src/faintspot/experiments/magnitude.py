@@ -1,4 +1,4 @@
-"""Strehl ratio against the star's flux, for any list of arms, each tuned at every flux."""
+"""Strehl ratio against the star's flux, for any list of methods, each tuned at every flux."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.estimators.trained import Trained
 from faintspot.estimators.window import Window
-from faintspot.experiments.loop_arms import ArmKind, Choice, arm_kind, default_arms
+from faintspot.experiments.loop_methods import Choice, MethodKind, default_methods, method_kind
 from faintspot.experiments.loop_results import MagnitudeResult
 from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
 from faintspot.experiments.search import (
@@ -37,7 +37,7 @@ from faintspot.experiments.search import (
 from faintspot.experiments.store import Arrays, ZarrStore, fingerprint_of
 
 KIND = "magnitude"
-QUICK_ARMS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation, Window, Trained))
+QUICK_METHODS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation, Window, Trained))
 _QUICK_RUN = {"frames": 300, "settle_frames": 60, "realisations": 2}
 _QUICK_FLUXES = 3
 
@@ -45,7 +45,7 @@ _QUICK_FLUXES = 3
 def run_magnitude(
     configuration: LoopConfiguration,
     folder: str | Path,
-    arms: Sequence[str] | None = None,
+    methods: Sequence[str] | None = None,
     photons: Sequence[float] | None = None,
     *,
     quick: bool = False,
@@ -53,7 +53,7 @@ def run_magnitude(
     place: WorkerPool | None = None,
     overwrite: bool = False,
 ) -> MagnitudeResult:
-    """Measure the Strehl ratio of arms against the star's flux, or what is left of it.
+    """Measure the Strehl ratio of methods against the star's flux, or what is left of it.
 
     Each method is tuned at each flux in separate turbulence, then scored on the configuration's number of
     realisations, which are the same for all. Numbers among the options follow a power of the flux, see
@@ -64,8 +64,8 @@ def run_magnitude(
     configuration : LoopConfiguration
     folder : path
         Where finished units are remembered; made where it is not there.
-    arms : sequence of str, optional
-        See `faintspot.experiments.loop_arms.arm_kind`. Default: `default_arms`; with `quick`, five.
+    methods : sequence of str, optional
+        See `faintspot.experiments.loop_methods.method_kind`. Default: `default_methods`; with `quick`, five.
     photons : sequence of float, optional
         Photo-electrons of a fully lit sub-aperture in a frame. Default: the configuration's.
     quick : bool
@@ -80,7 +80,7 @@ def run_magnitude(
     Raises
     ------
     InputError
-        For unknown arms, no flux, or a folder that holds another experiment.
+        For unknown methods, no flux, or a folder that holds another experiment.
     MissingExtraError
         When HCIPy, or Dask where it is needed, is not installed.
 
@@ -90,7 +90,7 @@ def run_magnitude(
     >>> from faintspot.ao_loop import load_loop
     >>> result = run_magnitude(load_loop("canary"), "magnitude", quick=True)  # doctest: +SKIP
     """
-    kinds = checked_arms(arms if arms is not None else _default(configuration, quick))
+    kinds = checked_methods(methods if methods is not None else _default(configuration, quick))
     experiment = Experiment.begun(configuration, folder, KIND, quick, search, place, overwrite)
     configuration = experiment.configuration
     fluxes = _checked_fluxes(
@@ -166,28 +166,28 @@ class Experiment:
 
     def measured(
         self,
-        kinds: Sequence[ArmKind],
+        kinds: Sequence[MethodKind],
         fluxes: Sequence[float],
         function: Callable[..., Arrays],
         columns: Mapping[str, Any],
-        arguments: Callable[[ArmKind, Any, Mapping[float, Choice]], tuple[Any, ...]],
+        arguments: Callable[[MethodKind, Any, Mapping[float, Choice]], tuple[Any, ...]],
     ) -> tuple[dict[tuple[str, float], Choice], Callable[[str], NDArray[Any]]]:
-        """Tune every arm at every flux, then run every arm, column and realisation.
+        """Tune every method at every flux, then run every method, column and realisation.
 
         Parameters
         ----------
         kinds, fluxes : sequence
         function : callable
-            Makes one run, given the arm, `arguments`, the realisation and `advance`.
+            Makes one run, given the method, `arguments`, the realisation and `advance`.
         columns : mapping
             Names and values of what the runs differ by.
         arguments : callable
-            Takes the arm, the column's value and the arm's choices by flux.
+            Takes the method, the column's value and the method's choices by flux.
 
         Returns
         -------
         dict, callable
-            Tuned values by name and flux; and what gathers a variable of the runs, (arms, columns, runs).
+            Tuned values by name and flux; and what gathers a variable of the runs, (methods, columns, runs).
         """
         stages = self._stages(kinds, fluxes, len(columns))
         choices = self._choices(kinds, fluxes, stages)
@@ -208,12 +208,12 @@ class Experiment:
         return choices, gathered
 
     def _choices(
-        self, kinds: Sequence[ArmKind], fluxes: Sequence[float], stages: Sequence[WorkerPool]
+        self, kinds: Sequence[MethodKind], fluxes: Sequence[float], stages: Sequence[WorkerPool]
     ) -> dict[tuple[str, float], Choice]:
-        """Return the tuned values of every arm at every flux, tuned now where they are not stored.
+        """Return the tuned values of every method at every flux, tuned now where they are not stored.
 
-        Slopes first, with the integrator, also of arms whose control learns: all their options at each flux
-        alone, then the loop gain with smoothed options. Then what is the control's own.
+        Slopes first, with the integrator, also of methods whose control learns: all their options at each
+        flux alone, then the loop gain with smoothed options. Then what is the control's own.
         """
         stars = {flux: with_flux(self.configuration, flux) for flux in fluxes}
         plain, learning = _plain_and_learning(kinds)
@@ -232,12 +232,12 @@ class Experiment:
     def _tuned(
         self,
         stage: str,
-        kinds: Sequence[ArmKind],
+        kinds: Sequence[MethodKind],
         stars: Mapping[float, LoopConfiguration],
         slopes: Mapping[tuple[str, float], Choice],
         place: WorkerPool,
     ) -> dict[tuple[str, float], Choice]:
-        """Return the tuned values of every arm with every star, given those of its slopes."""
+        """Return the tuned values of every method with every star, given those of its slopes."""
         units = {
             (kind.name, flux): _tuning_unit(
                 kind, star, self.plan, slopes.get((with_integrator(kind).name, flux))
@@ -252,14 +252,14 @@ class Experiment:
         results = run_units(tuning_unit, list(units.values()), store, place)
         return {key: stored_choice(results[unit.key]) for key, unit in units.items()}
 
-    def _stages(self, kinds: Sequence[ArmKind], fluxes: Sequence[float], columns: int) -> list[WorkerPool]:
+    def _stages(self, kinds: Sequence[MethodKind], fluxes: Sequence[float], columns: int) -> list[WorkerPool]:
         """Return where each stage runs, with a progress that is the whole experiment's."""
         star, (plain, learning) = with_flux(self.configuration, fluxes[0]), _plain_and_learning(kinds)
         known = {
             kind.name: {name: each.first[0] for name, each in kind.tuned(star).items()} for kind in plain
         }
 
-        def tuning(kinds: Sequence[ArmKind], slopes: Mapping[str, Choice]) -> int:
+        def tuning(kinds: Sequence[MethodKind], slopes: Mapping[str, Choice]) -> int:
             return len(fluxes) * sum(
                 tuning_frames(kind, star, self.plan, slopes.get(with_integrator(kind).name)) for kind in kinds
             )
@@ -270,7 +270,7 @@ class Experiment:
         return in_stages(self.place, sizes)
 
     def _scoring_unit(
-        self, kind: ArmKind, name: str, function: Callable[..., Arrays], arguments: tuple[Any, ...]
+        self, kind: MethodKind, name: str, function: Callable[..., Arrays], arguments: tuple[Any, ...]
     ) -> Unit:
         run = self.configuration.run
         key = f"{kind.name}-{name}-{_digest(arguments)}"
@@ -279,13 +279,13 @@ class Experiment:
         return Unit(key, (function, every, kind, *arguments), size)
 
 
-def _plain_and_learning(kinds: Sequence[ArmKind]) -> tuple[list[ArmKind], list[ArmKind]]:
-    """Return all arms with the integrator in place of their control, and those whose control learns."""
+def _plain_and_learning(kinds: Sequence[MethodKind]) -> tuple[list[MethodKind], list[MethodKind]]:
+    """Return all methods with the integrator in place of their control, and those whose control learns."""
     plain = {kind.name: kind for kind in map(with_integrator, kinds)}
     return list(plain.values()), [kind for kind in kinds if kind.name not in plain]
 
 
-def _tuning_unit(kind: ArmKind, star: LoopConfiguration, search: Search, slopes: Choice | None) -> Unit:
+def _tuning_unit(kind: MethodKind, star: LoopConfiguration, search: Search, slopes: Choice | None) -> Unit:
     key = f"{kind.name}-{star.camera.photons_per_subaperture:g}"
     if slopes is not None:
         key = f"{key}-{_digest(slopes)}"
@@ -320,18 +320,18 @@ def all_realisations(
 
 
 def scored_run(
-    kind: ArmKind, configuration: LoopConfiguration, choice: Choice, realisation: int, advance: Advance
+    kind: MethodKind, configuration: LoopConfiguration, choice: Choice, realisation: int, advance: Advance
 ) -> dict[str, NDArray[Any]]:
-    """Return what one run of a tuned arm gives, as arrays that can be stored."""
-    arm = kind.arm(configuration, choice)
+    """Return what one run of a tuned method gives, as arrays that can be stored."""
+    method = kind.method(configuration, choice)
     record = simulate_loop(
-        configuration, [arm], realisation=realisation, progress=lambda done, total: advance(done)
+        configuration, [method], realisation=realisation, progress=lambda done, total: advance(done)
     )
     return {
         "strehl": np.asarray(record.mean_strehl()),
         "centroid_gain": record.centroid_gain[0],
         "psf": record.psf[0],
-        "settings": np.asarray(record.arm_settings[0]),
+        "settings": np.asarray(record.method_settings[0]),
     }
 
 
@@ -346,8 +346,8 @@ def quick_run(configuration: LoopConfiguration) -> LoopConfiguration:
     return configuration.replace("run", **run)
 
 
-def checked_arms(names: Sequence[str]) -> list[ArmKind]:
-    """Return arms by their names, each once.
+def checked_methods(names: Sequence[str]) -> list[MethodKind]:
+    """Return methods by their names, each once.
 
     Raises
     ------
@@ -355,13 +355,13 @@ def checked_arms(names: Sequence[str]) -> list[ArmKind]:
         For an unknown one, or none.
     """
     if not names:
-        raise InputError("arms: expected at least one, got none")
-    return list({kind.name: kind for kind in map(arm_kind, names)}.values())
+        raise InputError("methods: expected at least one, got none")
+    return list({kind.name: kind for kind in map(method_kind, names)}.values())
 
 
 def _default(configuration: LoopConfiguration, quick: bool) -> list[str]:
-    names = default_arms(configuration)
-    return [name for name in names if name in QUICK_ARMS] if quick else names
+    names = default_methods(configuration)
+    return [name for name in names if name in QUICK_METHODS] if quick else names
 
 
 def _checked_fluxes(photons: Sequence[float], quick: bool) -> list[float]:

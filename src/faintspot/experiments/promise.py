@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.ao_loop.arms import Arm
+from faintspot.ao_loop.methods import Method
 from faintspot.base.generators import spawn
 from faintspot.camera.calibration import Calibration
 from faintspot.experiments.question import Question
@@ -130,20 +130,20 @@ class Promise:
 
 
 def check_promises(
-    question: Question, arms: Mapping[str, tuple[Arm, float]], *, rng: np.random.Generator | None = None
+    question: Question, methods: Mapping[str, tuple[Method, float]], *, rng: np.random.Generator | None = None
 ) -> dict[str, Promise]:
-    """Predict and measure the slope errors of arms on the recording that a question brought along.
+    """Predict and measure the slope errors of methods on the recording that a question brought along.
 
     Of every frame two images with the star's flux, or half the recording's where that is less, and with the
     camera's own read noise are made: both are the frame, scaled, with noise that is opposite in the two and
     cancels what they have in common, and more noise of their own. What differs in their slopes is error; the
-    spots' movement is the same in both. The same arms measure pairs of simulated spots at the same places.
+    spots' movement is the same in both. The same methods measure pairs of simulated spots at the same places.
 
     Parameters
     ----------
     question : Question
         With `recording`.
-    arms : dict of str to (Arm, float)
+    methods : dict of str to (Method, float)
         Each with the options to check and R at the star's flux as promised.
     rng : numpy.random.Generator, optional
         Default: seed 1.
@@ -158,7 +158,7 @@ def check_promises(
     >>> from faintspot.experiments import check_promises, question_from_frames
     >>> question = question_from_frames(frames)  # doctest: +SKIP
     >>> best = fs.tune(question).best  # doctest: +SKIP
-    >>> promised = {"best": (best.arm, best.statistics.error.value)}  # doctest: +SKIP
+    >>> promised = {"best": (best.method, best.statistics.error.value)}  # doctest: +SKIP
     >>> check_promises(question, promised)["best"].contradicted  # doctest: +SKIP
     """
     pair_rng, *exposures = spawn(np.random.default_rng(1) if rng is None else rng, 4)
@@ -182,8 +182,8 @@ def check_promises(
     assert question.layout is not None
     truth = places.reshape(*images.shape[:2], 2) - question.layout.offsets
     promises = {}
-    for name, (arm, promised_px) in arms.items():
-        first, second, *simulated = (_measure(question, arm, part) for part in (*pair, *alike))
+    for name, (method, promised_px) in methods.items():
+        first, second, *simulated = (_measure(question, method, part) for part in (*pair, *alike))
         promises[name] = Promise(
             share * flux,
             _error_of(simulated[0] - simulated[1], 2),
@@ -299,7 +299,7 @@ def _dealt(
     return first + added[0], second + added[1]
 
 
-def _measure(question: Question, arm: Arm, images: Floats) -> Floats:
+def _measure(question: Question, method: Method, images: Floats) -> Floats:
     """Slopes (n_frames, n, 2) of images as the pipeline measures them."""
     assert question.layout is not None
     n_frames, n, ny, nx = images.shape
@@ -311,7 +311,9 @@ def _measure(question: Question, arm: Arm, images: Floats) -> Floats:
         background_e=question.background_e,
     )
     windows = Layout.grid((n, 1), pixels=(ny, nx))
-    pipeline = SlopePipeline(windows, arm.settings, camera, reference=question.layout.offsets, **arm.parts)
+    pipeline = SlopePipeline(
+        windows, method.settings, camera, reference=question.layout.offsets, **method.parts
+    )
     return _positions(pipeline(images.reshape(n_frames, n * ny, nx).astype(np.float32)))
 
 

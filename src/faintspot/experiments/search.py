@@ -17,7 +17,7 @@ from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.simulation import simulate_loop
 from faintspot.base.checks import number_between
 from faintspot.control.learning import INTEGRATOR
-from faintspot.experiments.loop_arms import LOOP_GAIN, ArmKind, Choice, Tunable
+from faintspot.experiments.loop_methods import LOOP_GAIN, Choice, MethodKind, Tunable
 from faintspot.experiments.running import Advance
 from faintspot.experiments.statistics import slope_statistics
 
@@ -122,14 +122,14 @@ class Tuned:
 
 
 def tune(
-    kind: ArmKind,
+    kind: MethodKind,
     configuration: LoopConfiguration,
     search: Search | None = None,
     advance: Advance | None = None,
     *,
     slopes: Choice | None = None,
 ) -> Tuned:
-    """Find the settings of an arm that give the highest Strehl ratio at the configuration's flux.
+    """Find the settings of a method that give the highest Strehl ratio at the configuration's flux.
 
     All combinations of a few values of each option first, then steps from the best ones to
     neighbouring values of one option at a time, as long as that helps. Where control learns from telemetry,
@@ -140,7 +140,7 @@ def tune(
 
     Parameters
     ----------
-    kind : ArmKind
+    kind : MethodKind
     configuration : LoopConfiguration
     search : Search, optional
     advance : callable, optional
@@ -157,7 +157,7 @@ def tune(
 
 
 def _searched(
-    kind: ArmKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None
+    kind: MethodKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None
 ) -> tuple[Search, dict[str, Tunable]]:
     """Return the search and what it tunes where the settings of the slopes are known, or None."""
     tuned = kind.tuned(configuration)
@@ -174,13 +174,13 @@ def _searched(
     return replace(search, finalists=1), tuned
 
 
-def with_integrator(kind: ArmKind) -> ArmKind:
-    """Return the arm with the same slopes whose control need not learn."""
+def with_integrator(kind: MethodKind) -> MethodKind:
+    """Return the method with the same slopes whose control need not learn."""
     return replace(kind, control=INTEGRATOR)
 
 
 def _sought(
-    kind: ArmKind,
+    kind: MethodKind,
     configuration: LoopConfiguration,
     search: Search,
     tuned: Mapping[str, Tunable],
@@ -215,7 +215,11 @@ def _climbed(
 
 
 def tuning_unit(
-    kind: ArmKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None, advance: Advance
+    kind: MethodKind,
+    configuration: LoopConfiguration,
+    search: Search,
+    slopes: Choice | None,
+    advance: Advance,
 ) -> dict[str, NDArray[Any]]:
     """Return what `tune` found, as arrays that can be stored."""
     tuned = tune(kind, configuration, search, advance, slopes=slopes)
@@ -227,7 +231,7 @@ def tuning_unit(
 
 
 def smoothed(
-    kind: ArmKind, stars: Sequence[LoopConfiguration], choices: Sequence[Choice]
+    kind: MethodKind, stars: Sequence[LoopConfiguration], choices: Sequence[Choice]
 ) -> list[dict[str, Any]]:
     """Return the choices at several fluxes, with numbers among the options that are a power of the flux.
 
@@ -260,7 +264,7 @@ def stored_choice(result: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 
 
 def tuning_frames(
-    kind: ArmKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None = None
+    kind: MethodKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None = None
 ) -> int:
     """Return about how many frames `tune` simulates, with `slopes` for control that learns."""
     search, tuned = _searched(kind, configuration, search, slopes)
@@ -272,8 +276,8 @@ def tuning_frames(
     return simulated + learning_frames(kind, configuration)
 
 
-def learning_frames(kind: ArmKind, configuration: LoopConfiguration) -> int:
-    """Return about how many frames could be simulated while an arm's control learns."""
+def learning_frames(kind: MethodKind, configuration: LoopConfiguration) -> int:
+    """Return about how many frames could be simulated while a method's control learns."""
     if kind.control == INTEGRATOR:
         return 0
     return configuration.control.telemetry_frames + _LEARNING_FRAMES
@@ -283,7 +287,7 @@ class _Trials:
     """Strehl ratios of the settings that were looked at."""
 
     def __init__(
-        self, kind: ArmKind, configuration: LoopConfiguration, search: Search, advance: Advance | None
+        self, kind: MethodKind, configuration: LoopConfiguration, search: Search, advance: Advance | None
     ) -> None:
         self._kind, self._search = kind, search
         self._advance, self._frames = advance, 0
@@ -311,9 +315,11 @@ class _Trials:
 
     def _strehl(self, choice: Choice, frames: int, realisations: int) -> float:
         short = self._configuration.replace("run", frames=frames, settle_frames=self._search.settle_frames)
-        arm = self._kind.arm(short, choice)
+        method = self._kind.method(short, choice)
         runs = range(FIRST_TUNING_REALISATION, FIRST_TUNING_REALISATION + realisations)
-        strehl = float(np.mean([simulate_loop(short, [arm], realisation=run).mean_strehl() for run in runs]))
+        strehl = float(
+            np.mean([simulate_loop(short, [method], realisation=run).mean_strehl() for run in runs])
+        )
         self._frames += frames * realisations
         if self._advance is not None:
             self._advance(self._frames)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.ao_loop.arms import Arm
+from faintspot.ao_loop.methods import Method
 from faintspot.base.generators import spawn
 from faintspot.camera.calibration import Calibration
 from faintspot.experiments.question import Question
@@ -78,28 +78,30 @@ class SimulatedSpots:
     def _pipelines(self) -> dict[str, SlopePipeline]:
         return {}
 
-    def measure(self, sample: Sample, arm: Arm) -> Slopes:
+    def measure(self, sample: Sample, method: Method) -> Slopes:
         """Measure the spots of a sample as the user's own frames would be."""
         # What knows the spot takes time to prepare, and often has the same settings at every flux.
-        key = f"{arm.settings} {id(arm.psf)} {id(arm.score)}"
+        key = f"{method.settings} {id(method.psf)} {id(method.score)}"
         if key not in self._pipelines:
-            self._pipelines[key] = SlopePipeline(self.layout, arm.settings, self.calibration, **arm.parts)
+            self._pipelines[key] = SlopePipeline(
+                self.layout, method.settings, self.calibration, **method.parts
+            )
         return self._pipelines[key](sample.frames)
 
     def measure_each(
-        self, sample: Sample, arm: Arm, name: str, values: Sequence[Any]
+        self, sample: Sample, method: Method, name: str, values: Sequence[Any]
     ) -> list[tuple[NDArray[Any], NDArray[Any]]]:
-        """Return x and y, (n_frames, SPOTS_PER_FRAME), for each value of one of an arm's options.
+        """Return x and y, (n_frames, SPOTS_PER_FRAME), for each value of one of a method's options.
 
         Where sub-apertures may have values of their own, the values share one pipeline.
         """
-        if not arm.estimator.declared()[name].per_subaperture:
-            slopes = [self.measure(sample, arm.with_options({name: value})) for value in values]
+        if not method.estimator.declared()[name].per_subaperture:
+            slopes = [self.measure(sample, method.with_options({name: value})) for value in values]
             return [(each.x, each.y) for each in slopes]
         count = len(values)
         layout = Layout.grid((count * SPOTS_PER_FRAME, 1), pixels=self.layout.window)
-        each = arm.settings.replace(**{name: np.repeat(values, SPOTS_PER_FRAME)})
-        pipeline = SlopePipeline(layout, each, self.calibration, **arm.parts)
+        each = method.settings.replace(**{name: np.repeat(values, SPOTS_PER_FRAME)})
+        pipeline = SlopePipeline(layout, each, self.calibration, **method.parts)
         found = pipeline(np.tile(sample.frames, (1, count, 1)))
         x, y = (part.reshape(len(part), count, SPOTS_PER_FRAME).swapaxes(0, 1) for part in (found.x, found.y))
         return list(zip(x, y, strict=True))

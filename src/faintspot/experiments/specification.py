@@ -16,7 +16,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.sizes import check_size
 from faintspot.base.toml_files import check_keys, checked_table, parse_text, read_text
 from faintspot.estimators.registry import estimators
-from faintspot.experiments.arms import DEFAULT_ARMS, knows_the_spot
+from faintspot.experiments.methods import DEFAULT_METHODS, knows_the_spot
 from faintspot.experiments.store import fingerprint_of
 from faintspot.experiments.sweep import PARAMETERS, PROFILES, RANGES, Cell, Range, Sweep, checked_numbers
 
@@ -49,7 +49,7 @@ class StudySpecification:
     realisations : int
         Simulated images of each cell, at least 20. Settings are chosen on the first half of them and scored
         on the second.
-    arms : sequence of str
+    estimators : sequence of str
         What is compared: names of estimators (`faintspot.estimators.estimators()`).
         Default: the built-in ones that know nothing of the spot.
     strengths : sequence of float
@@ -67,24 +67,24 @@ class StudySpecification:
     model_errors : sequence of float
         Values of the option `model_error` to choose from, together with the blur, for the same spots.
     fixed_k : sequence of int
-        Numbers of kept pixels of the modes in which all arms keep the same number.
+        Numbers of kept pixels of the modes in which all methods keep the same number.
     corrected : bool
         Whether there is also a mode in which settings are chosen for the smallest gain-corrected rms.
     search_range_px : float, optional
-        Largest position of any arm, on each axis. Default: the range of true positions of each cell where an
-        arm is an estimator that knows the spot, so that all have the same; else none.
+        Largest position of any estimator, on each axis. Default: the range of true positions of each cell if
+        an estimator knows the spot, so that all have the same; else none.
 
     Raises
     ------
     InputError
-        For a value out of its range, an empty list, an unknown arm, two sweeps of one name, a `fixed_k`
+        For a value out of its range, an empty list, an unknown method, two sweeps of one name, a `fixed_k`
         that no window of the study has enough pixels for.
 
     Examples
     --------
     >>> from faintspot.experiments import StudySpecification, Sweep
     >>> light = Sweep("light", flux_e=[30, 100])
-    >>> study = StudySpecification("mine", [light], realisations=200, arms=["brightest", "tv"])
+    >>> study = StudySpecification("mine", [light], realisations=200, estimators=["brightest", "tv"])
     >>> len(study.cells()), study.modes
     (2, ('best', 'fixed20', 'fixed40', 'fixed60'))
     """
@@ -93,7 +93,7 @@ class StudySpecification:
     sweeps: Sequence[Sweep]
     seed: int = 1
     realisations: int = 10_000
-    arms: Sequence[str] = DEFAULT_ARMS
+    estimators: Sequence[str] = DEFAULT_METHODS
     strengths: Sequence[float] = (0.3, 0.5, 0.7, 0.85, 1.0)
     widths: Sequence[float] = (0.4, 0.6, 0.8, 1.0, 1.3)
     thresholds: Sequence[float] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
@@ -121,8 +121,11 @@ class StudySpecification:
         number = number_between("realisations", self.realisations, 20, 10_000_000, integer=True)
         self._set("realisations", int(number))
         self._set("sweeps", _checked_sweeps(self.sweeps))
-        arms = [one_of("arms", arm, list(estimators())) for arm in _checked_list("arms", self.arms)]
-        self._set("arms", tuple(dict.fromkeys(arms)))
+        names = [
+            one_of("estimators", name, list(estimators()))
+            for name in _checked_list("estimators", self.estimators)
+        ]
+        self._set("estimators", tuple(dict.fromkeys(names)))
         for name, bounds in _CANDIDATE_RANGES.items():
             items = _checked_list(name, getattr(self, name))
             self._set(name, tuple(checked_numbers(name, items, bounds)))
@@ -154,7 +157,7 @@ class StudySpecification:
         return (BEST, *(f"fixed{k}" for k in self.fixed_k), *([CORRECTED] if self.corrected else []))
 
     def kept_pixels(self, cell: Cell) -> dict[str, int | None]:
-        """Return the number of pixels that each mode keeps, None where arms choose it.
+        """Return the number of pixels that each mode keeps, None where methods choose it.
 
         Modes that keep more pixels than the window of the cell has are left out.
         """
@@ -162,10 +165,10 @@ class StudySpecification:
         return {mode: fixed.get(mode) for mode in self.modes if mode in (BEST, CORRECTED, *fixed)}
 
     def search_range_of(self, cell: Cell) -> float:
-        """Return the largest position of all arms in a cell, px; infinite where there is none."""
+        """Return the largest position of all methods in a cell, px; infinite where there is none."""
         if self.search_range_px is not None:
             return self.search_range_px
-        return cell.position_range_px if any(map(knows_the_spot, self.arms)) else math.inf
+        return cell.position_range_px if any(map(knows_the_spot, self.estimators)) else math.inf
 
     def cells(self) -> list[Cell]:
         """Return all cells, each once, in the order of the sweeps."""

@@ -51,8 +51,8 @@ def new_dataset(specification: StudySpecification) -> xarray.Dataset:
     cells = specification.cells()
     sizes = {
         "cell": len(cells),
-        "arm": len(specification.arms),
-        "arm2": len(specification.arms),
+        "estimator": len(specification.estimators),
+        "estimator2": len(specification.estimators),
         "mode": len(specification.modes),
         "k": specification.largest_k,
     }
@@ -66,8 +66,8 @@ def new_dataset(specification: StudySpecification) -> xarray.Dataset:
     }
     variables[DONE] = (("cell",), np.zeros(len(cells), bool), {"long_name": "whether the cell is measured"})
     coordinates: dict[str, Any] = {
-        "arm": np.array(specification.arms),
-        "arm2": np.array(specification.arms),
+        "estimator": np.array(specification.estimators),
+        "estimator2": np.array(specification.estimators),
         "mode": np.array(specification.modes),
         "k": ("k", np.arange(1, sizes["k"] + 1), {"units": "px", "long_name": "number of kept pixels"}),
     }
@@ -97,11 +97,11 @@ def open_study(path: str | Path) -> xarray.Dataset:
     --------
     >>> from faintspot.experiments import StudySpecification, Sweep, open_study, run
     >>> light = Sweep("light", flux_e=[30, 100], pixels=8)
-    >>> study = StudySpecification("mine", [light], realisations=200, arms=["brightest"], fixed_k=[])
+    >>> study = StudySpecification("mine", [light], realisations=200, estimators=["brightest"], fixed_k=[])
     >>> _ = run(study, "mine.zarr", workers=0)
     >>> results = open_study("mine.zarr")
     >>> bool(results["done"].all()), results["error"].dims
-    (True, ('cell', 'arm', 'mode'))
+    (True, ('cell', 'method', 'mode'))
     """
     path = Path(path)
     if kind_of_store(path) != KIND:
@@ -187,7 +187,7 @@ def run(
     Returns
     -------
     xarray.Dataset
-        Dimensions cell, arm, mode, k, arm2; see `faintspot.experiments.study.VARIABLES`.
+        Dimensions cell, estimator, mode, k, estimator2; see `faintspot.experiments.study.VARIABLES`.
 
     Raises
     ------
@@ -200,10 +200,10 @@ def run(
     --------
     >>> from faintspot.experiments import StudySpecification, Sweep, run
     >>> light = Sweep("light", flux_e=[30, 100], pixels=8)
-    >>> study = StudySpecification("mine", [light], realisations=200, arms=["brightest"], fixed_k=[])
+    >>> study = StudySpecification("mine", [light], realisations=200, estimators=["brightest"], fixed_k=[])
     >>> results = run(study, workers=0)
     >>> dict(results.sizes)
-    {'cell': 2, 'arm': 1, 'mode': 1, 'arm2': 1, 'k': 63}
+    {'cell': 2, 'estimator': 1, 'mode': 1, 'estimator2': 1, 'k': 63}
     """
     if not isinstance(specification, StudySpecification):
         raise InputError(f"specification: expected a StudySpecification, got {type(specification).__name__}")

@@ -1,4 +1,4 @@
-"""Error curves of a study, the kept pixels of figure 5, TV against the other arms, and verdicts on claims."""
+"""Error curves of a study, the kept pixels of figure 5, TV against the other methods, and verdicts."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.experiments.arms import TV
 from faintspot.experiments.curves import Curve
+from faintspot.experiments.methods import TV
 
 if TYPE_CHECKING:
     import xarray
@@ -67,13 +67,13 @@ def study_curves(dataset: xarray.Dataset, mode: str) -> dict[Configuration, Curv
     modes = [str(name) for name in dataset["mode"].values]
     if mode not in modes:
         raise InputError(f"mode {mode!r}: expected one of {', '.join(modes)}")
-    arms = tuple(str(name) for name in dataset["arm"].values)
+    methods = tuple(str(name) for name in dataset["estimator"].values)
     of_mode = dataset[["error", "error_covariance"]].sel(mode=mode)
-    error = of_mode["error"].transpose("cell", "arm").values
-    covariance = of_mode["error_covariance"].transpose("cell", "arm", "arm2").values
+    error = of_mode["error"].transpose("cell", "estimator").values
+    covariance = of_mode["error_covariance"].transpose("cell", "estimator", "estimator2").values
     flux = np.asarray(dataset["flux_e"].values, dtype=np.float64)
     return {
-        configuration: Curve(flux[cells], arms, error[cells], covariance[cells])
+        configuration: Curve(flux[cells], methods, error[cells], covariance[cells])
         for configuration, cells in cells_by_configuration(dataset).items()
     }
 
@@ -151,15 +151,15 @@ def kept_panels(dataset: xarray.Dataset, profile: str) -> list[KeptPanel]:
 
 
 def spread(
-    dataset: xarray.Dataset, cell: int, arm: str, modes: Sequence[str] = ()
+    dataset: xarray.Dataset, cell: int, method: str, modes: Sequence[str] = ()
 ) -> tuple[float, float] | None:
     """Return ln(largest R / smallest R) over k, and an upper limit of its standard error.
 
     Over k within KEPT_RANGE, or over modes of fixed k. The two R are from the same realisations; their
-    correlation, which is not known, would make the error smaller. None when the arm has no k or the cell too
-    few pixels.
+    correlation, which is not known, would make the error smaller. None when the method has no k or the cell
+    too few pixels.
     """
-    part = dataset.sel(arm=arm).isel(cell=cell)
+    part = dataset.sel(estimator=method).isel(cell=cell)
     if modes:
         values, errors = (part[name].sel(mode=modes).values for name in ("error", "error_se"))
     else:
@@ -177,47 +177,47 @@ _FAMILY_FALSE_ALARM = 0.05
 
 @dataclass(frozen=True)
 class AgainstTV:
-    """An arm against TV, over all cells of a spot profile in one mode."""
+    """A method against TV, over all cells of a spot profile in one mode."""
 
-    arm: str
+    method: str
     mode: str
     profile: str
     smaller: int
-    """Cells in which the arm's R is smaller than TV's; paired, 5 % false alarms for all cells together."""
+    """Cells in which the method's R is smaller than TV's; paired, 5 % false alarms for all cells together."""
     larger: int
     cells: int
     mean_ratio: float
     """Geometric mean of R / R of TV."""
     smallest: int
-    """Cells in which the arm's R is the smallest of all arms, decided or not."""
+    """Cells in which the method's R is the smallest of all methods, decided or not."""
 
 
 def against_tv(dataset: xarray.Dataset, mode: str) -> list[AgainstTV]:
-    """Return how each arm compares with TV, by spot profile; nothing when TV is not in the study."""
+    """Return how each method compares with TV, by spot profile; nothing when TV is not in the study."""
     from scipy.stats import norm
 
     curves = study_curves(dataset, mode)
     rows = []
     for profile in sorted({key.profile for key in curves}):
         part = [curve for key, curve in curves.items() if key.profile == profile]
-        arms = part[0].arms
-        if TV not in arms:
+        methods = part[0].methods
+        if TV not in methods:
             continue
         error = np.concatenate([curve.error for curve in part])
         measured = np.all(np.isfinite(error), axis=1)
         winner = np.argmin(error[measured], axis=1)
-        for index, arm in enumerate(arms):
-            pairs = [curve.difference(TV, arm) for curve in part]
+        for index, method in enumerate(methods):
+            pairs = [curve.difference(TV, method) for curve in part]
             difference, se = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
             known = np.isfinite(difference)
             n = int(known.sum())
-            if arm == TV or n == 0:
+            if method == TV or n == 0:
                 continue
             limit = float(norm.isf(_FAMILY_FALSE_ALARM / n))
-            ratio = error[known, index] / error[known, arms.index(TV)]
+            ratio = error[known, index] / error[known, methods.index(TV)]
             rows.append(
                 AgainstTV(
-                    arm,
+                    method,
                     mode,
                     profile,
                     int(np.sum(difference[known] < -limit * se[known])),

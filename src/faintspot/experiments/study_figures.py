@@ -1,4 +1,4 @@
-"""The figures of a study: the slope error against signal by sweep, the arms against each other, figure 1."""
+"""Figures of a study: the slope error against the signal by sweep, comparison of methods, figure 1."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from faintspot.algorithms.noise import suggested_strength
 from faintspot.algorithms.total_variation import tv_denoise
-from faintspot.experiments.arms import NO_TV, TV, knows_the_spot, label_of, style_of
 from faintspot.experiments.claims import fixed_mode
+from faintspot.experiments.methods import NO_TV, TV, knows_the_spot, label_of, style_of
 from faintspot.experiments.specification import BEST
 from faintspot.experiments.study_curves import kept_panels
 from faintspot.experiments.study_tables import (
@@ -22,7 +22,7 @@ from faintspot.experiments.study_tables import (
     table_of_cells,
 )
 from faintspot.experiments.sweep import PARAMETERS
-from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, colour_bar, new_figure, plain_ticks, styled
+from faintspot.report.drawing import GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.texts import Texts
 from faintspot.sensor.layout import Layout
@@ -100,7 +100,7 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
     profiles = sorted({str(p) for p in dataset["profile"].values[dataset["done"].values]})
     panels = [(profile, kept_panels(dataset, profile)) for profile in profiles]
     panels = [(profile, found) for profile, found in panels if found]
-    if not panels or not {NO_TV, TV} <= set(dataset["arm"].values):
+    if not panels or not {NO_TV, TV} <= set(dataset["estimator"].values):
         return None
     figure = new_figure(WIDTH * 1.25, _ROW_HEIGHT * len(panels) * 1.1)
     axes = figure.subplots(len(panels), 3, squeeze=False)
@@ -122,16 +122,16 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
             panel.legend(frameon=False, fontsize=10, handlelength=1.2)
         line[0].set_ylabel(ERROR_AXIS)
     figure.suptitle(f"{_TEXT['fig5.title']}  (solid: TV, dashed: no TV)", fontsize=14)
-    header = ["panel", "arm", "k", "R_px", "R_se_px", *PARAMETERS]
+    header = ["panel", "method", "k", "R_px", "R_se_px", *PARAMETERS]
     return _TEXT.figure("fig5", figure, rows, header, fixed=fixed)
 
 
 @styled
 def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | None:
-    """Draw R of every arm over R without denoising, for the main read noises; None without cells."""
+    """Draw R of every method over R without denoising, for the main read noises; None without cells."""
     cells = _main_cells(dataset, profile)
-    arms = [str(arm) for arm in dataset["arm"].values if not knows_the_spot(str(arm))]
-    if not cells or NO_TV not in arms or len(arms) < 2:
+    methods = [str(method) for method in dataset["estimator"].values if not knows_the_spot(str(method))]
+    if not cells or NO_TV not in methods or len(methods) < 2:
         return None
     modes = _modes(dataset)
     figure = new_figure(WIDTH, _ROW_HEIGHT * len(cells) + 0.8)
@@ -141,12 +141,12 @@ def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | 
         lowest = 0.6
         for panel, mode in zip(panels, modes, strict=True):
             _limit(panel, "flux_e", dataset["flux_e"].values[indices])
-            for arm in arms:
-                flux, ratio, se = _ratio(dataset, indices, arm, mode)
+            for method in methods:
+                flux, ratio, se = _ratio(dataset, indices, method, mode)
                 lowest = min([lowest, *(0.95 * ratio)])
-                style = style_of(arm)
+                style = style_of(method)
                 bars = {"color": style.colour, "marker": style.marker, "ms": 5, "lw": 2, "elinewidth": 1}
-                panel.errorbar(flux, ratio, se, label=label_of(arm), ls=style.line, **bars)
+                panel.errorbar(flux, ratio, se, label=label_of(method), ls=style.line, **bars)
             panel.set_title(f"{mode_in_words(mode)}: {noise:g} e- read noise")
             label_axes(panel, "flux_e", log_y=False)
         panels[0].set_ylim(lowest, _LARGEST_RATIO)
@@ -192,7 +192,7 @@ def _styles(labels: Sequence[str]) -> dict[str, tuple[Any, str]]:
     from matplotlib import colormaps
 
     if len(labels) <= 4:
-        colours: list[Any] = list(ARM_COLOURS)
+        colours: list[Any] = list(METHOD_COLOURS)
     else:
         colours = [colormaps["viridis"](place) for place in np.linspace(0.0, 0.9, len(labels))]
     return {label: (colours[i], _MARKERS[i % len(_MARKERS)]) for i, label in enumerate(dict.fromkeys(labels))}
@@ -203,10 +203,10 @@ def _draw_lines(
 ) -> None:
     for line in lines:
         colour, marker = styles[line.label]
-        for arm, style, face in ((TV, "-", colour), (NO_TV, "--", "white")):
-            if arm not in dataset["arm"].values:
+        for method, style, face in ((TV, "-", colour), (NO_TV, "--", "white")):
+            if method not in dataset["estimator"].values:
                 continue
-            part = dataset[["error", "error_se"]].sel(arm=arm, mode=mode).isel(cell=line.cells)
+            part = dataset[["error", "error_se"]].sel(estimator=method, mode=mode).isel(cell=line.cells)
             y, se = part["error"].values, part["error_se"].values
             known = np.isfinite(y)
             bars = {"color": colour, "marker": marker, "ms": 5, "mfc": face, "elinewidth": 1, "capsize": 0}
@@ -256,18 +256,18 @@ def _draw_over_k(panel: Axes, dataset: xarray.Dataset, cell: int, label: str, co
     rows = []
     k = dataset["k"].values
     parameters = parameters_of(dataset, [cell])[0]
-    for arm, style in ((TV, "-"), (NO_TV, "--")):
-        part = dataset.sel(arm=arm).isel(cell=cell)
+    for method, style in ((TV, "-"), (NO_TV, "--")):
+        part = dataset.sel(estimator=method).isel(cell=cell)
         y, se = part["error_at_k"].values, part["error_at_k_se"].values
         known = np.isfinite(y)
-        panel.plot(k[known], y[known], ls=style, color=colour, lw=1.9, label=label if arm == TV else None)
+        panel.plot(k[known], y[known], ls=style, color=colour, lw=1.9, label=label if method == TV else None)
         panel.fill_between(k[known], (y - se)[known], (y + se)[known], color=colour, alpha=0.25, lw=0)
         chosen = float(part["chosen_k"].sel(mode=BEST))
         if np.isfinite(chosen):
             there = y[k == int(chosen)]
             panel.plot([chosen] * len(there), there, "o", color=colour, mfc="white", ms=7, mew=1.6)
         rows += [
-            [label, arm, int(number), f"{value:.6g}", f"{error:.3g}", *parameters.values()]
+            [label, method, int(number), f"{value:.6g}", f"{error:.3g}", *parameters.values()]
             for number, value, error in zip(k[known], y[known], se[known], strict=True)
         ]
     return rows
@@ -291,14 +291,15 @@ def _main_cells(dataset: xarray.Dataset, profile: str) -> dict[float, list[int]]
 
 
 def _ratio(
-    dataset: xarray.Dataset, cells: Sequence[int], arm: str, mode: str
+    dataset: xarray.Dataset, cells: Sequence[int], method: str, mode: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return flux, R over R without denoising, and its paired standard error, by the delta method."""
     part = dataset.isel(cell=list(cells)).sel(mode=mode)
-    error, plain = part["error"].sel(arm=arm).values, part["error"].sel(arm=NO_TV).values
+    error, plain = part["error"].sel(estimator=method).values, part["error"].sel(estimator=NO_TV).values
     covariance = part["error_covariance"]
     own, its, both = (
-        covariance.sel(arm=a, arm2=b).values for a, b in ((arm, arm), (NO_TV, NO_TV), (arm, NO_TV))
+        covariance.sel(estimator=a, estimator2=b).values
+        for a, b in ((method, method), (NO_TV, NO_TV), (method, NO_TV))
     )
     ratio = error / plain
     variance = (own + ratio**2 * its - 2 * ratio * both) / plain**2

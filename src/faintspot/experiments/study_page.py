@@ -91,8 +91,8 @@ def study_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
     """Yield the figures of a study, as far as its cells are finished.
 
     A sweep is drawn by the first word of its name, so that several make one figure. The paper's pictures
-    (figures 1 and 5) come with the paper's sweeps only. A study with arms that know the spot has the figures
-    of `faintspot.experiments.estimator_figures` instead.
+    (figures 1 and 5) come with the paper's sweeps only. A study with methods that know the spot has the
+    figures of `faintspot.experiments.estimator_figures` instead.
     """
     if compares_estimators(dataset):
         yield from estimator_figures(dataset)

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from faintspot.experiments.arms import NO_TV, TV, TV_OVER_NO_TV, label_of
 from faintspot.experiments.claims import fixed_mode
 from faintspot.experiments.curves import Gain, gain_at_error
 from faintspot.experiments.judges import LEVEL_PX
+from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV, label_of
 from faintspot.experiments.specification import BEST, CORRECTED
 from faintspot.experiments.study_curves import (
     Configuration,
@@ -53,19 +53,20 @@ def parameter_in_words(name: str, value: Any) -> str:
 
 
 def table_of_cells(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[str], list[list[Any]]]:
-    """Return a table of all arms and modes of cells."""
+    """Return a table of all methods and modes of cells."""
     columns = ("chosen_k", "chosen_candidate", "invalid_fraction", *_STATISTICS)
     arrays = [
-        dataset[name].transpose("cell", "mode", "arm").values for name in ("error", "error_se", *columns)
+        dataset[name].transpose("cell", "mode", "estimator").values
+        for name in ("error", "error_se", *columns)
     ]
     rows = []
     for cell, parameters in zip(cells, parameters_of(dataset, cells), strict=True):
         for m, mode in enumerate(dataset["mode"].values):
-            for a, arm in enumerate(dataset["arm"].values):
+            for a, method in enumerate(dataset["estimator"].values):
                 values = [float(array[cell, m, a]) for array in arrays]
                 if np.isfinite(values[0]):
-                    rows.append([*parameters.values(), str(mode), str(arm), *(f"{v:.6g}" for v in values)])
-    return [*PARAMETERS, "mode", "arm", "R_px", "R_se_px", *columns], rows
+                    rows.append([*parameters.values(), str(mode), str(method), *(f"{v:.6g}" for v in values)])
+    return [*PARAMETERS, "mode", "method", "R_px", "R_se_px", *columns], rows
 
 
 _MOST_CASES_SHOWN = 3  # in the verdict table; the page lists all of them below it
@@ -77,7 +78,7 @@ def verdicts_section(judged: list[Verdict], fixed: str) -> Section:
     """Return the section of the verdicts; `fixed` names the mode of a fixed number of pixels."""
     title = "Verdicts on the claims of Basden et al. 2015"
     if not judged:
-        return Section("verdicts", title, missing=f"No verdicts: they need the arms “{NO_TV}” and “{TV}”.")
+        return Section("verdicts", title, missing=f"No verdicts: they need the methods “{NO_TV}” and “{TV}”.")
     text = _TEXT("tables.verdicts.text", summary=_summary(judged, fixed), fixed=fixed)
     rows = [
         [
@@ -121,12 +122,12 @@ def cases_section(judged: list[Verdict]) -> Section:
 
 
 def baselines_section(dataset: xarray.Dataset) -> Section:
-    """Return the section that compares TV with every other arm."""
+    """Return the section that compares TV with every other method."""
     title = "TV and the other methods"
     modes = [mode for mode in ("best", fixed_mode(dataset)) if mode in dataset["mode"].values]
     rows = [
         [
-            label_of(row.arm),
+            label_of(row.method),
             row.profile,
             mode_in_words(mode),
             str(row.cells),
@@ -173,7 +174,7 @@ def gains_by_mode(
     dataset : xarray.Dataset
         Results of a study.
     level_px : float
-        R at which the flux that both arms need is compared, px.
+        R at which the flux that both methods need is compared, px.
 
     Returns
     -------

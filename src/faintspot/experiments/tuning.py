@@ -1,4 +1,4 @@
-"""Choose the settings of every arm on one sample of spots, score them on another, and say which is best."""
+"""Choose the settings of every method on one sample of spots, score them on another, and recommend one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.ao_loop.arms import Arm
+from faintspot.ao_loop.methods import Method
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
@@ -19,10 +19,10 @@ from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.registry import estimators
 from faintspot.estimators.thresholded import Thresholded
-from faintspot.experiments.answer import Answer, ArmResult
-from faintspot.experiments.arms import Knowledge, arm_for_scene, score_for_scene, tuned_options
+from faintspot.experiments.answer import Answer, MethodResult
 from faintspot.experiments.curves import Curve, limiting_flux, magnitude_gain
-from faintspot.experiments.loop_arms import Choice
+from faintspot.experiments.loop_methods import Choice
+from faintspot.experiments.methods import Knowledge, method_for_scene, score_for_scene, tuned_options
 from faintspot.experiments.promise import Promise, check_promises
 from faintspot.experiments.question import Question
 from faintspot.experiments.search import coordinate_search, corrected_badness
@@ -48,7 +48,7 @@ _SPECKLED_SHARE = 0.5  # of the realisations, as speckled spots are slow to simu
 _STEP_MAGNITUDES = 0.75  # between the fluxes of the plot: a factor of 2
 _STEPS_EACH_SIDE = 4
 _BLOCKS = 16  # of the scored spots, whose scatter says how sure a difference is
-_TIE_ERRORS = 2.0  # standard errors of the difference within which two arms are equally good
+_TIE_ERRORS = 2.0  # standard errors of the difference within which two methods are equally good
 _ERROR_TOLERANCE = 0.05  # of the standard errors, below which they need no factor
 _SEARCHED_E = (0.1, 1e7)  # electrons within which the limiting flux is sought
 _SEARCH_STEPS = 4  # fluxes that are added at a time
@@ -68,13 +68,13 @@ def tune(
 
     Every estimator that is registered takes part. Spots are simulated at the star's flux and, for the plot,
     up to 3 magnitudes brighter and fainter; with a budget further, until the limiting flux is found. On one
-    sample each arm's free parameters are chosen for the smallest gain-corrected rms error, along one axis at
-    a time from the automatic rules' values; on another sample, the same for all arms, they are scored.
+    sample each method's free parameters are chosen for the smallest gain-corrected rms error, along one axis
+    at a time from the automatic rules' values; on another sample, the same for all methods, they are scored.
 
-    Recommended is the arm of the smallest gain-corrected rms error at the star's flux, times the factor by
+    Recommended is the method of the smallest gain-corrected rms error at the star's flux, times the factor by
     which the recording, if any, contradicts it (`Answer.promises`). R alone flatters estimators that fall
-    back to the reference position. Of arms within two standard errors (of the difference, on the same spots)
-    of the best, the one that has to know least is taken, and of these the cheapest.
+    back to the reference position. Of methods within two standard errors (of the difference, on the same
+    spots) of the best, the one that has to know least is taken, and of these the cheapest.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def tune(
     >>> from faintspot.experiments import Question
     >>> question = Question(read_noise_e=3.0, pixels=8, fwhm_px=1.8, flux_e=200.0)
     >>> answer = fs.tune(question, realisations=256, steps=1)
-    >>> sorted(result.arm.name for result in answer.results)[:3]
+    >>> sorted(result.method.name for result in answer.results)[:3]
     ['brightest', 'centroid', 'map']
     """
     if not isinstance(question, Question):
@@ -144,9 +144,9 @@ def _flux_of(star_flux_e: float, step: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Scored:
-    """An arm at one flux."""
+    """A method at one flux."""
 
-    arm: Arm
+    method: Method
     errors: Floats
     """(|dx| + |dy|) / 2 of each scored spot."""
     statistics: SlopeStatistics
@@ -211,10 +211,10 @@ class _Trial:
     ) -> _Scored:
         """Choose an estimator's options on the first sample, and score it on the second."""
         scene = self._question.scene(flux_e)
-        arm = arm_for_scene(kind, scene, psf=self._psf, score=score)
-        if arm.estimator.uses_flux and self._question.flux_is_known:
-            arm = arm.with_options({"flux_e": float(f"{flux_e:.4g}")})
-        return _chosen_and_scored(arm, tuned_options(arm, scene), self._spots, *samples)
+        method = method_for_scene(kind, scene, psf=self._psf, score=score)
+        if method.estimator.uses_flux and self._question.flux_is_known:
+            method = method.with_options({"flux_e": float(f"{flux_e:.4g}")})
+        return _chosen_and_scored(method, tuned_options(method, scene), self._spots, *samples)
 
     @cached_property
     def _psf(self) -> PSF:
@@ -246,8 +246,8 @@ class _Trial:
 
         budget = question.budget_px
         results = [
-            ArmResult(
-                at_star[name].arm,
+            MethodResult(
+                at_star[name].method,
                 at_star[name].statistics,
                 curve.of(name),
                 curve.se_of(name),
@@ -264,11 +264,11 @@ class _Trial:
 
     @cached_property
     def _promises(self) -> dict[str, Promise]:
-        """The arms at the star's flux, checked on the recording."""
+        """The methods at the star's flux, checked on the recording."""
         if self._question.recording is None:
             return {}
-        arms = {name: (each.arm, each.statistics.error.value) for name, each in self._scored[0].items()}
-        return check_promises(self._question, arms)
+        methods = {name: (each.method, each.statistics.error.value) for name, each in self._scored[0].items()}
+        return check_promises(self._question, methods)
 
 
 def _default_realisations(question: Question) -> int:
@@ -303,15 +303,19 @@ def _trained(
 
 
 def _chosen_and_scored(
-    arm: Arm, axes: Mapping[str, Sequence[Any]], spots: SimulatedSpots, choosing: Sample, every_k: Sample
+    method: Method,
+    axes: Mapping[str, Sequence[Any]],
+    spots: SimulatedSpots,
+    choosing: Sample,
+    every_k: Sample,
 ) -> _Scored:
-    """Choose an arm's options on one sample, and score it on the other."""
+    """Choose a method's options on one sample, and score it on the other."""
 
     def badness(choice: Choice, name: str, values: Sequence[Any]) -> list[float]:
-        found = spots.measure_each(choosing, arm.with_options(choice), name, values)
+        found = spots.measure_each(choosing, method.with_options(choice), name, values)
         return [corrected_badness(x, y, choosing.truth) for x, y in found]
 
-    chosen = arm.with_options(coordinate_search(axes, badness))
+    chosen = method.with_options(coordinate_search(axes, badness))
     chosen = chosen.with_options(
         {"error_scale": _error_scale(spots.measure(choosing, chosen), choosing.truth)}
     )
@@ -351,29 +355,29 @@ def _by_blocks(slopes: Slopes, truth: Floats) -> Floats:
 
 
 def _ranked(
-    results: list[ArmResult], blocks: Mapping[str, Floats], factors: Mapping[str, float]
+    results: list[MethodResult], blocks: Mapping[str, Floats], factors: Mapping[str, float]
 ) -> tuple[str, ...]:
-    """Return the names of the arms that are as good as the best one, the recommended one first.
+    """Return the names of the methods that are as good as the best one, the recommended one first.
 
     `factors` are those by which a recording has larger errors than the simulated spots.
     """
 
-    def corrected(result: ArmResult) -> float:
-        return result.statistics.ranking_rms * factors.get(result.arm.name, 1.0)
+    def corrected(result: MethodResult) -> float:
+        return result.statistics.ranking_rms * factors.get(result.method.name, 1.0)
 
     best = min(results, key=corrected)
     equal = [best]
     for result in results:
         with np.errstate(invalid="ignore"):
-            difference = blocks[result.arm.name] - blocks[best.arm.name]
-            difference += math.log(factors.get(result.arm.name, 1.0) / factors.get(best.arm.name, 1.0))
+            difference = blocks[result.method.name] - blocks[best.method.name]
+            difference += math.log(factors.get(result.method.name, 1.0) / factors.get(best.method.name, 1.0))
         known = difference[np.isfinite(difference)]
         if result is not best and len(known) == len(difference) > 1:
             error = float(known.std(ddof=1)) / math.sqrt(len(known))
             if float(known.mean()) <= _TIE_ERRORS * error:
                 equal.append(result)
-    equal.sort(key=lambda result: (Knowledge.of(result.arm.estimator), result.arm.estimator.cost))
-    return tuple(result.arm.name for result in equal)
+    equal.sort(key=lambda result: (Knowledge.of(result.method.estimator), result.method.estimator.cost))
+    return tuple(result.method.name for result in equal)
 
 
 def _bound(question: Question, flux: Floats) -> Floats:

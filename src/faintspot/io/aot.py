@@ -104,7 +104,7 @@ def _metadata(telemetry: Telemetry) -> list[Any]:
     return [
         Metadatum("ORIGIN", "faintspot"),
         Metadatum("DROPPED", dropped, "frames measured, lost by the recorder"),
-        Metadatum("ARMS", ", ".join(telemetry.attributes["arms"]), "interleaved settings"),
+        Metadatum("METHODS", ", ".join(telemetry.attributes["methods"]), "interleaved settings"),
         *(Metadatum(f"CHG{i}", json.dumps(each)) for i, each in enumerate(telemetry.changes, 1)),
     ]
 

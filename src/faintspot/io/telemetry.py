@@ -71,8 +71,8 @@ class Telemetry:
 
     frame: NDArray[np.int64]
     """Frame numbers of the camera."""
-    arm: NDArray[np.int64]
-    """Number of the interleaved configuration, an index into ``attributes["arms"]``; 0 without."""
+    method: NDArray[np.int64]
+    """Number of the interleaved configuration, an index into ``attributes["methods"]``; 0 without."""
     change: NDArray[np.int64]
     """Number of the last change of settings that applies, see `changes`; 0: none."""
     last_row_time_ns: NDArray[np.int64]
@@ -105,8 +105,8 @@ class Telemetry:
     changes: list[dict[str, Any]]
     """Changes of settings: frame (the first with it), number, changes (values by name), where (None: all)."""
     attributes: dict[str, Any]
-    """Plain values: layout (``Layout(**attributes["layout"])``), initial settings (TOML), arms (names of the
-    interleaved configurations), reference (slopes that were subtracted, or None), dropped_records,
+    """Plain values: layout (``Layout(**attributes["layout"])``), initial settings (TOML), methods (names of
+    the interleaved configurations), reference (slopes that were subtracted, or None), dropped_records,
     dropped_images, dropped_changes, complete, ended_because."""
 
     def __repr__(self) -> str:

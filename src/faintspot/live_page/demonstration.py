@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.ao_loop.arms import Arm
 from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.configuration import LoopConfiguration, load_loop
 from faintspot.ao_loop.engine_files import fixed_window, write_engine_files
+from faintspot.ao_loop.methods import Method
 from faintspot.ao_loop.simulation import measure_gains
 from faintspot.ao_loop.telescope_model import prepare
 from faintspot.base.closing import Closing
@@ -33,7 +33,7 @@ from faintspot.realtime.private_socket import socket_path
 from faintspot.realtime.stream import Follower
 from faintspot.realtime.telemetry import TelemetryReader
 from faintspot.realtime.telescope import TRUTH
-from faintspot.recorded.telemetry_numbers import ArmDifference, compared_arms
+from faintspot.recorded.telemetry_numbers import MethodDifference, compared_methods
 
 Floats = NDArray[np.float64]
 
@@ -100,7 +100,7 @@ class LiveDemonstration:
         """
         observed = self.observed
         window = fixed_window(observed, centroid_gain=1.0)
-        pipeline = make_pipeline(observed, prepare(observed).sensor, Arm("-", window))
+        pipeline = make_pipeline(observed, prepare(observed).sensor, Method("-", window))
         gain = float(measure_gains(observed, [pipeline], seed=self.seed)[0])
         options = f"window_fwhm_px={window.window_fwhm_px:g}+centroid_gain={gain:.3g}"
         return {
@@ -256,7 +256,7 @@ class Shown:
             MethodShown(
                 compared, int(np.sum(method == place)), *np.percentile(frames[method == place, 3], (50, 99))
             )
-            for place, compared in enumerate(compared_arms(method, self.methods, strehl))
+            for place, compared in enumerate(compared_methods(method, self.methods, strehl))
         ]
 
 
@@ -264,7 +264,7 @@ class Shown:
 class MethodShown:
     """Result of one method: Strehl ratio, frames, and latencies from the last row to the slopes."""
 
-    strehl: ArmDifference
+    strehl: MethodDifference
     frames: int
     p50_us: float
     p99_us: float
@@ -299,5 +299,5 @@ class _Watcher(Closing):
             self._shown.truth[truth.number] = truth.values[_STREHL], truth.values[_COMMAND_FRAME]
         records, self._cursor, _ = self._reader.records.since(self._cursor)
         latency_us = (records["published_time_ns"] - records["last_row_time_ns"]) / 1e3
-        columns = (records["frame"], records["arm"], records["loop"], latency_us)
+        columns = (records["frame"], records["method"], records["loop"], latency_us)
         self._shown.rows += zip(*(each.tolist() for each in columns), strict=True)

@@ -94,7 +94,7 @@ class EngineSource:
             reader.close()
             return False
         self._reader, self.layout = reader, reader.layout
-        self.methods = reader.description["arms"]
+        self.methods = reader.description["methods"]
         self._cursors = [reader.records.written, max(0, reader.images.written - 1), 0]
         return True
 

@@ -13,7 +13,7 @@ from faintspot.base.flags import INVALID, SubapertureFlag
 from faintspot.io.frame_numbers import all_left_out
 from faintspot.live_page.batch import Batch, Floats
 from faintspot.realtime.interleaving import methods_after
-from faintspot.recorded.telemetry_numbers import ArmDifference, compared_arms
+from faintspot.recorded.telemetry_numbers import MethodDifference, compared_methods
 
 STRIP_S = 30.0
 """Time span of the strip charts [s]."""
@@ -109,7 +109,7 @@ class PageState:
         }
         arrays: dict[str, NDArray[Any]] = {"strip": strip.astype(np.float32)}
         if newest is not None:
-            values |= {"frame": int(newest["frame"]), "method": self._method_name(int(newest["arm"]))}
+            values |= {"frame": int(newest["frame"]), "method": self._method_name(int(newest["method"]))}
             arrays |= {name: newest[name] for name in ("x", "y", "flux", "flags")}
         if self.commands is not None:
             arrays["commands"] = self.commands.astype(np.float32)
@@ -156,7 +156,7 @@ class PageState:
         for title, (column, factor) in _COMPARED.items():
             values = factor * frames[:, _FRAME.index(column)]
             if np.isfinite(values).any():
-                for row, compared in zip(rows, compared_arms(method, names, values), strict=True):
+                for row, compared in zip(rows, compared_methods(method, names, values), strict=True):
                     row["figures"][title] = _in_plain(compared)
         return rows
 
@@ -170,7 +170,7 @@ class PageState:
         rows = np.full((len(records), len(_FRAME)), np.nan)
         columns: Mapping[str, Any] = {
             "time_s": records["last_row_time_ns"] / 1e9,
-            "method": records["arm"],
+            "method": records["method"],
             "latency_us": (records["published_time_ns"] - records["last_row_time_ns"]) / 1e3,
             "rms_px": self._rms(records, valid, some),
             "flux_e": np.where(valid, records["flux"], 0.0).sum(axis=1) / some,
@@ -183,8 +183,8 @@ class PageState:
     def _rms(self, records: NDArray[Any], valid: NDArray[np.bool_], some: Floats) -> Floats:
         """Return the rms of each frame's slopes about the sub-apertures' running means for its method."""
         squares = np.full(len(records), np.nan)
-        for method in np.unique(records["arm"]):
-            own = records["arm"] == method
+        for method in np.unique(records["method"]):
+            own = records["method"] == method
             self._seen_of[int(method)] += own.sum()
             used = valid[own]
             slopes = np.stack([records["x"][own], records["y"][own]]).astype(np.float64)
@@ -240,7 +240,7 @@ def flag_names() -> list[dict[str, Any]]:
     ]
 
 
-def _in_plain(compared: ArmDifference) -> dict[str, Any]:
+def _in_plain(compared: MethodDifference) -> dict[str, Any]:
     """Return a figure with half its confidence interval, and its difference from the first method's."""
     mean, difference = compared.mean, compared.difference
     row: dict[str, Any] = {"mean": mean.value, "half": (mean.high - mean.low) / 2}

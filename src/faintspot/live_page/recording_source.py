@@ -45,7 +45,7 @@ class RecordingSource:
         self.name = store.path.name
         try:
             self.layout: Layout | None = Layout(**store.attributes["layout"])
-            self.methods = [str(method) for method in store.attributes.get("arms", [])]
+            self.methods = [str(method) for method in store.attributes.get("methods", [])]
             changed = [(int(change["frame"]), dict(change["changes"]))[0] for change in store.changes]
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"{path}: the store is damaged ({type(error).__name__}: {error})") from None

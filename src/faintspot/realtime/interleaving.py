@@ -15,12 +15,12 @@ from faintspot.pipeline.settings import Settings, without_denoising
 from faintspot.realtime.live import check_names
 
 _SET, _NONE = "set", "none"
-METHODS, FIRST_METHOD, EVERY = "arms", "first_arm", "every"
+METHODS, FIRST_METHOD, EVERY = "methods", "first_method", "every"
 """Keys of a change of the interleaving in telemetry: names, number of the first, frames per turn."""
 
 
 @dataclass(frozen=True)
-class Method:
+class InterleavedMethod:
     """A configuration that takes turns: its changes of the settings, and its name."""
 
     label: str
@@ -49,14 +49,14 @@ class Interleaving:
 
     Parameters
     ----------
-    methods : tuple of Method
+    methods : tuple of InterleavedMethod
     every : int
         Number of frames per turn.
     first : int
         Number of the first configuration in telemetry; those of earlier interleavings keep theirs.
     """
 
-    methods: tuple[Method, ...] = (Method("set", {}),)
+    methods: tuple[InterleavedMethod, ...] = (InterleavedMethod("set", {}),)
     every: int = 1
     first: int = 0
 
@@ -114,22 +114,22 @@ def methods_after(
     return names, first
 
 
-def _parsed_method(text: str) -> Method:
+def _parsed_method(text: str) -> InterleavedMethod:
     measured, _, control = text.rpartition("+")
     if measured and control in CONTROLS:
         return replace(_parsed_settings(measured), label=text, control=control)
     return _parsed_settings(text)
 
 
-def _parsed_settings(text: str) -> Method:
+def _parsed_settings(text: str) -> InterleavedMethod:
     if text in (_SET, _NONE):
-        return Method(text, {}, denoises=text == _SET)
+        return InterleavedMethod(text, {}, denoises=text == _SET)
     if text in estimators():
-        return Method(text, {"estimator": text})
+        return InterleavedMethod(text, {"estimator": text})
     if "=" in text:
         changes = parse_changes(text.split("+"))
         check_names(list(changes))
-        return Method(text, changes)
+        return InterleavedMethod(text, changes)
     known = ", ".join([_SET, _NONE, *estimators()])
     raise InputError(
         f"interleave: {text!r}: expected {known}, or NAME=VALUE with + between several, perhaps "

@@ -101,7 +101,7 @@ class _Waiting:
     def attributes(self, reader: TelemetryReader) -> dict[str, Any]:
         """Return the store's attributes."""
         return {
-            "arms": methods_after(reader.description["arms"], self.changes)[0],
+            "methods": methods_after(reader.description["methods"], self.changes)[0],
             "changes": self.changes,
             "dropped_records": self.dropped,
             "dropped_images": self.dropped_images,

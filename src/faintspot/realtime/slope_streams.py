@@ -23,7 +23,7 @@ from faintspot.realtime.shared_streams import (
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
 """Rows of the stream of details."""
-MARKS = ("frame", "arm", "settings_change", "last_row_ns", "published_ns")
+MARKS = ("frame", "method", "settings_change", "last_row_ns", "published_ns")
 """Contents of the stream of marks; times are those of CLOCK_MONOTONIC."""
 
 

@@ -138,7 +138,7 @@ class TelemetryRing(Closing):
         description = {
             "layout": layout_values(layout),
             "settings": settings,
-            "arms": list(methods),
+            "methods": list(methods),
             "commands": commands,
             "reference": None if reference is None else np.asarray(reference).tolist(),
             "parts": parts,

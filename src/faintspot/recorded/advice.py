@@ -27,13 +27,13 @@ def percentage(fraction: float) -> str:
     return f"{percent:.0f} %" if percent in (0, 100) else f"{percent:.1f} %"
 
 
-def warnings_in_words(arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary]) -> list[str]:
+def warnings_in_words(methods: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary]) -> list[str]:
     """Return what is wrong with a run and what to do next, a sentence or two each."""
     lines = []
-    for arm, summary in zip(arms, summaries, strict=True):
-        prefix = f"{arm.name}: " if len(arms) > 1 else ""
-        lines += [prefix + line for line in _of_arm(arm, summary)]
-    if arms[0].n_frames == 1:
+    for method, summary in zip(methods, summaries, strict=True):
+        prefix = f"{method.name}: " if len(methods) > 1 else ""
+        lines += [prefix + line for line in _of_method(method, summary)]
+    if methods[0].n_frames == 1:
         lines.append(_TEXT["warnings.one_frame"])
     fractions = [summary.valid_fraction for summary in summaries]
     if max(fractions) - min(fractions) > 0.01:
@@ -41,16 +41,16 @@ def warnings_in_words(arms: Sequence[MeasuredSlopes], summaries: Sequence[Slopes
     return lines
 
 
-def _of_arm(arm: MeasuredSlopes, summary: SlopesSummary) -> list[str]:
+def _of_method(method: MeasuredSlopes, summary: SlopesSummary) -> list[str]:
     lines = [] if summary.valid_fraction else [_TEXT["warnings.none_valid"]]
     for flag, advice in _TEXT["advice"].items():
-        fraction = arm.flag_count(SubapertureFlag[flag]) / arm.x.size
+        fraction = method.flag_count(SubapertureFlag[flag]) / method.x.size
         if fraction > advice["above"]:
             lines.append(advice["text"].format(percent=percentage(fraction)))
     never = np.flatnonzero(summary.valid_frames == 0)
-    if 0 < len(never) < arm.n_subapertures:
+    if 0 < len(never) < method.n_subapertures:
         listed = ", ".join(str(number) for number in never[:_MOST_LISTED])
         more = f" and {len(never) - _MOST_LISTED} more" if len(never) > _MOST_LISTED else ""
-        counts = {"count": len(never), "all": arm.n_subapertures, "listed": listed + more}
+        counts = {"count": len(never), "all": method.n_subapertures, "listed": listed + more}
         lines.append(_TEXT("warnings.never_valid", **counts))
     return lines

@@ -35,7 +35,7 @@ class Example:
     ----------
     layout : Layout
     stages : mapping of Stages
-        By arm; images (n_subapertures, ny, nx). The first one's images are shown, the positions of all are
+        By method; images (n_subapertures, ny, nx). The first one's images are shown, the positions of all are
         marked. They must be measured from the sub-apertures' centres (no other reference).
     truth : array (n_subapertures, 2), optional
         True x, y, px.
@@ -65,7 +65,7 @@ class Example:
         return dict(self.steps[:1] if only_twice else self.steps)
 
     def positions(self) -> dict[str, Floats]:
-        """Return valid positions by arm, and the truth, from the middle of the window, px; NaN if invalid."""
+        """Return valid positions by method, and the truth, from the window's middle, px; NaN if invalid."""
         found = {}
         for name, stages in self.stages.items():
             xy = np.stack([stages.slopes.x, stages.slopes.y], axis=-1).astype(np.float64)
@@ -216,7 +216,7 @@ def _draw_steps(
 
 
 def _mark(axes: Axes, positions: Mapping[str, Floats], size: float) -> None:
-    """Mark positions: each arm by a cross of its own, the first one's on top, and the truth by a circle."""
+    """Mark positions: each method by its own cross, the first one's on top, and the truth by a circle."""
     from matplotlib.patheffects import withStroke
 
     width = 0.5 + 0.08 * size

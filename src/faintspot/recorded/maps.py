@@ -9,9 +9,9 @@ import numpy as np
 
 from faintspot.recorded.statistics import Floats, Jitter, MeasuredSlopes, SlopesSummary, median
 from faintspot.report.drawing import (
-    ARM_COLOURS,
     FLUX_GREY,
     GREY,
+    METHOD_COLOURS,
     MOST_WITH_GAPS,
     WIDTH,
     limits_of,
@@ -36,43 +36,43 @@ _MOST_SHORT_ARROWS = 400  # of more sub-apertures, arrows within their own could
 
 @styled
 def flux_and_validity(
-    arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
+    methods: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
 ) -> Figure:
-    """Draw median flux and fraction of valid frames, a row of maps for each arm; of one frame, flux only."""
-    several = arms[0].n_frames > 1
-    figure, axes = _panels(len(arms), 2, layout) if several else _panels(1, len(arms), layout)
+    """Draw median flux and fraction of valid frames, a row of maps a method; of one frame, flux only."""
+    several = methods[0].n_frames > 1
+    figure, axes = _panels(len(methods), 2, layout) if several else _panels(1, len(methods), layout)
     limits = limits_of(*(summary.flux_e for summary in summaries), low=0.0)
-    for number, (arm, summary) in enumerate(zip(arms, summaries, strict=True)):
+    for number, (method, summary) in enumerate(zip(methods, summaries, strict=True)):
         panel = axes[number, 0] if several else axes[0, number]
-        title = f"{arm.name}: {'median ' if several else ''}flux"
+        title = f"{method.name}: {'median ' if several else ''}flux"
         subaperture_map(panel, layout, summary.flux_e, label="flux (e-)", limits=limits, title=title)
         if several:
-            percent = 100.0 * summary.valid_frames / arm.n_frames
+            percent = 100.0 * summary.valid_frames / method.n_frames
             subaperture_map(
                 axes[number, 1],
                 layout,
                 percent,
                 label="valid frames (%)",
                 limits=(0, 100),
-                title=f"{arm.name}: valid frames",
+                title=f"{method.name}: valid frames",
             )
     return figure
 
 
 @styled
 def slope_arrows(
-    arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
+    methods: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
 ) -> Figure:
-    """Draw the mean slope of every sub-aperture, one panel per arm, all at one scale.
+    """Draw the mean slope of every sub-aperture, one panel per method, all at one scale.
 
     Those longer than `longest_arrow` are cut to that length and drawn black.
     """
-    figure, axes = _panels(1, len(arms), layout)
+    figure, axes = _panels(1, len(methods), layout)
     longest, _ = longest_arrow(summaries)
     key = _round_length(longest)
     pitch = layout.pitch_px or max(layout.window)
     length, width = (0.6, 0.004) if len(layout) <= _MOST_SHORT_ARROWS else (2.0, 0.0015)
-    for panel, arm, summary, colour in zip(axes[0], arms, summaries, ARM_COLOURS, strict=False):
+    for panel, method, summary, colour in zip(axes[0], methods, summaries, METHOD_COLOURS, strict=False):
         if len(layout) <= MOST_WITH_GAPS:  # of more, outlines would hide the arrows
             panel.add_collection(_outlines(layout))
         place_axes(panel, layout)
@@ -93,75 +93,75 @@ def slope_arrows(
             arrows, 0.87, -0.1, key, f"{key:g} px", labelpos="E", coordinates="axes", color=colour
         )
         panel.plot(*layout.centres[~known].T, "x", color=GREY, markersize=5)
-        panel.set_title(f"{arm.name}: {'mean slope' if arm.n_frames > 1 else 'slope'}", loc="left")
+        panel.set_title(f"{method.name}: {'mean slope' if method.n_frames > 1 else 'slope'}", loc="left")
     return figure
 
 
 @styled
 def iteration_counts(
-    arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
+    methods: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
 ) -> Figure:
-    """Draw the mean iterations of every sub-aperture (first arm) and how often each number occurred."""
+    """Draw the mean iterations of every sub-aperture (first method) and how often each number occurred."""
     figure, axes = _panels(1, 2, layout)
     limits = limits_of(summaries[0].iterations, low=0.0)
-    title = f"{arms[0].name}: {'mean ' if arms[0].n_frames > 1 else ''}iterations"
+    title = f"{methods[0].name}: {'mean ' if methods[0].n_frames > 1 else ''}iterations"
     subaperture_map(
         axes[0, 0], layout, summaries[0].iterations, label="iterations", limits=limits, title=title
     )
     panel = axes[0, 1]
-    most = max(int(arm.iterations.max()) for arm in arms)
+    most = max(int(method.iterations.max()) for method in methods)
     step = max(1, -(-(most + 1) // _HISTOGRAM_BINS))
     edges = np.arange(0, most + 1 + step, step) - 0.5
-    for arm, colour in zip(arms, ARM_COLOURS, strict=False):
-        counts = np.histogram(arm.iterations[arm.valid], edges)[0]
-        panel.stairs(100.0 * counts / max(1, counts.sum()), edges, fill=True, color=colour, label=arm.name)
+    for method, colour in zip(methods, METHOD_COLOURS, strict=False):
+        counts = np.histogram(method.iterations[method.valid], edges)[0]
+        panel.stairs(100.0 * counts / max(1, counts.sum()), edges, fill=True, color=colour, label=method.name)
     panel.set_xlabel("iterations")
     panel.set_yscale("log")
     panel.yaxis.set_major_formatter("{x:g}")
     panel.set_ylim(top=200)
     panel.set_ylabel("valid measurements (%)")
     panel.set_title("How many iterations it took")
-    if len(arms) > 1:
+    if len(methods) > 1:
         panel.legend(frameon=False)
     return figure
 
 
 @styled
-def jitter_maps(arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitter], layout: Layout) -> Figure:
-    """Draw the jitter of every sub-aperture, one map per arm, on one scale."""
-    figure, axes = _panels(1, len(arms), layout)
+def jitter_maps(methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter], layout: Layout) -> Figure:
+    """Draw the jitter of every sub-aperture, one map per method, on one scale."""
+    figure, axes = _panels(1, len(methods), layout)
     limits = limits_of(*(item.px for item in jitters), low=0.0)
-    for panel, arm, item in zip(axes[0], arms, jitters, strict=True):
-        title = f"{arm.name}: median {median(item.px):.3f} px"
+    for panel, method, item in zip(axes[0], methods, jitters, strict=True):
+        title = f"{method.name}: median {median(item.px):.3f} px"
         subaperture_map(panel, layout, item.px, label="jitter (px)", limits=limits, title=title)
     return figure
 
 
 @styled
-def jitter_plot(arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> Figure:
-    """Draw the jitter of the sub-apertures in order, and one arm against another where there are two."""
-    pair = len(arms) == 2
+def jitter_plot(methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> Figure:
+    """Draw the jitter of the sub-apertures in order, and one method against another where there are two."""
+    pair = len(methods) == 2
     figure = new_figure(WIDTH, _PANEL_HEIGHT)
     axes = figure.subplots(1, 2 if pair else 1, squeeze=False)[0]
     order = np.argsort(jitters[-1].px)
-    for arm, item, colour in zip(arms, jitters, ARM_COLOURS, strict=False):
+    for method, item, colour in zip(methods, jitters, METHOD_COLOURS, strict=False):
         order = order[item.measured[order]]
         place = np.arange(1, len(order) + 1)
-        axes[0].plot(place, item.px[order], ".", color=colour, label=f"{arm.name}: standard deviation")
+        axes[0].plot(place, item.px[order], ".", color=colour, label=f"{method.name}: standard deviation")
         axes[0].plot(
             place,
             _running_median(item.robust_px[order]),
             "-",
             lw=1.3,
             color=colour,
-            label=f"{arm.name}: robust",
+            label=f"{method.name}: robust",
         )
         axes[0].axhline(median(item.px), color=colour, lw=0.9, ls=":")
-    axes[0].set_xlabel(f"sub-apertures, in order of the jitter of {arms[-1].name!r}")
+    axes[0].set_xlabel(f"sub-apertures, in order of the jitter of {methods[-1].name!r}")
     axes[0].set_ylabel("jitter, rms of x and y (px)")
     axes[0].set_ylim(bottom=0)
     if pair:
-        _scatter(axes[1], arms, jitters)
+        _scatter(axes[1], methods, jitters)
     figure.legend(loc="outside lower center", ncols=5, frameon=False)  # beside the data, never on it
     return figure
 
@@ -174,22 +174,22 @@ def _running_median(values: Floats) -> Floats:
     return medians
 
 
-def _scatter(axes: Axes, arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> None:
-    """Draw the second arm's jitter along x against the first's along y."""
+def _scatter(axes: Axes, methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> None:
+    """Draw the second method's jitter along x against the first's along y."""
     across, up = jitters[1].px, jitters[0].px
-    axes.plot(across, up, ".", color=ARM_COLOURS[1], markersize=7 if len(up) < 500 else 3)
+    axes.plot(across, up, ".", color=METHOD_COLOURS[1], markersize=7 if len(up) < 500 else 3)
     _, stop = limits_of(across, up, low=0.0)
     stop *= 1.08
     axes.plot([0, stop], [0, stop], color=GREY, lw=1)
     axes.annotate("equal", (0.93 * stop, 0.95 * stop), ha="right", color="#555555")
     axes.plot(
-        median(across), median(up), "D", color=ARM_COLOURS[0], markersize=9, mec="black", label="medians"
+        median(across), median(up), "D", color=METHOD_COLOURS[0], markersize=9, mec="black", label="medians"
     )
     axes.set_xlim(0, stop)
     axes.set_ylim(0, stop)
     axes.set_aspect("equal")
-    axes.set_xlabel(f"jitter, {arms[1].name} (px)")
-    axes.set_ylabel(f"jitter, {arms[0].name} (px)")
+    axes.set_xlabel(f"jitter, {methods[1].name} (px)")
+    axes.set_ylabel(f"jitter, {methods[0].name} (px)")
     axes.set_title("Below the line: the first method is steadier", fontsize=12)
 
 

@@ -21,7 +21,7 @@ from faintspot.sensor.layout import Layout
 
 
 def slopes_report(
-    arms: Sequence[MeasuredSlopes],
+    methods: Sequence[MeasuredSlopes],
     *,
     layout: Layout | None,
     stages: Mapping[str, Stages] | None,
@@ -39,7 +39,7 @@ def slopes_report(
 
     Parameters
     ----------
-    arms : sequence of MeasuredSlopes
+    methods : sequence of MeasuredSlopes
         The same frames, measured in one or several ways. Others are compared with the last one.
     layout : Layout or None
         None leaves the maps out, which the page says.
@@ -61,7 +61,7 @@ def slopes_report(
     steps : sequence of Step
         Which pictures of the frame are drawn.
     slopes : mapping of Slopes, optional
-        Slopes by arm, whose wavefronts are shown. Default: no wavefronts.
+        Slopes by method, whose wavefronts are shown. Default: no wavefronts.
 
     Raises
     ------
@@ -70,13 +70,13 @@ def slopes_report(
     MissingExtraError
         When matplotlib or jinja2 is not installed.
     """
-    arms = list(arms)
-    _check_arms(arms, layout)
-    shape = arms[0].x.shape
+    methods = list(methods)
+    _check_methods(methods, layout)
+    shape = methods[0].x.shape
     number_between("example_frame", example_frame, 0, shape[0] - 1, integer=True)
     true = None if truth is None else _checked_truth(truth, shape)
     stages = _checked_stages(stages or {}, shape[1])
-    run = make_run(arms, layout, stages, true, int(example_frame), why_no_stages, steps)
+    run = make_run(methods, layout, stages, true, int(example_frame), why_no_stages, steps)
     return html_of(
         Page(
             title=title,
@@ -86,27 +86,27 @@ def slopes_report(
                 *wavefront_sections(slopes or {}, layout),
                 *(configuration_section(text, name) for name, text in configurations.items()),
             ],
-            warnings=[*warnings, *run.comparison.warnings(), *warnings_in_words(run.arms, run.summaries)],
+            warnings=[*warnings, *run.comparison.warnings(), *warnings_in_words(run.methods, run.summaries)],
             remark=POSITIONS,
         )
     )
 
 
-def _check_arms(arms: Sequence[MeasuredSlopes], layout: Layout | None) -> None:
-    if not arms:
-        raise InputError("arms: expected at least one, got none")
-    names = [arm.name for arm in arms]
+def _check_methods(methods: Sequence[MeasuredSlopes], layout: Layout | None) -> None:
+    if not methods:
+        raise InputError("methods: expected at least one, got none")
+    names = [method.name for method in methods]
     if len(set(names)) < len(names):
-        raise InputError(f"arms: expected a different name for each, got {', '.join(names)}")
-    for arm in arms[1:]:
-        if arm.x.shape != arms[0].x.shape:
+        raise InputError(f"methods: expected a different name for each, got {', '.join(names)}")
+    for method in methods[1:]:
+        if method.x.shape != methods[0].x.shape:
             raise InputError(
-                f"arms: expected the same frames and sub-apertures in all, got shape {arms[0].x.shape} in "
-                f"{arms[0].name!r} and {arm.x.shape} in {arm.name!r}"
+                f"methods: expected the same frames and sub-apertures in all, got shape {methods[0].x.shape} "
+                f"in {methods[0].name!r} and {method.x.shape} in {method.name!r}"
             )
-    if layout is not None and len(layout) != arms[0].n_subapertures:
+    if layout is not None and len(layout) != methods[0].n_subapertures:
         raise InputError(
-            f"layout: expected {arms[0].n_subapertures} sub-apertures, as in the slopes, got {len(layout)}"
+            f"layout: expected {methods[0].n_subapertures} sub-apertures, as in the slopes, got {len(layout)}"
         )
 
 

@@ -53,40 +53,42 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
     first = stores[0]
     for other in stores[1:]:
         _check_same_sensor(first, other)
-    arms, notes = _arms(stores)
-    total = np.where(arms[0].valid, arms[0].flux, 0.0).sum(axis=1)
+    methods, notes = _methods(stores)
+    total = np.where(methods[0].valid, methods[0].flux, 0.0).sum(axis=1)
     example_frame = int(np.argsort(total, kind="stable")[(len(total) - 1) // 2])
-    stages, reason = _example(stores, arms, example_frame, frames, notes)
+    stages, reason = _example(stores, methods, example_frame, frames, notes)
     if any(word in reason for word in _SAID_FIRST):
         notes.append(reason)
     return slopes_report(
-        arms,
+        methods,
         layout=first.layout,
         stages=stages,
         title=f"Slopes of {' and '.join(store.path.name for store in stores)}",
-        facts=_facts(stores, arms),
-        configurations=_configurations(stores, arms),
+        facts=_facts(stores, methods),
+        configurations=_configurations(stores, methods),
         example_frame=example_frame,
         steps=(first.estimator or TotalVariation).steps_shown,
-        warnings=list(dict.fromkeys([*_labelled_notes(stores, arms), *notes])),
+        warnings=list(dict.fromkeys([*_labelled_notes(stores, methods), *notes])),
         why_no_stages=reason,
         slopes={
-            arm.name: Slopes.from_variables(store.stored.variables, arm.n_frames)
-            for store, arm in zip(stores, arms, strict=True)
+            method.name: Slopes.from_variables(store.stored.variables, method.n_frames)
+            for store, method in zip(stores, methods, strict=True)
         },
     )
 
 
-def _configurations(stores: Sequence[StoredRun], arms: Sequence[MeasuredSlopes]) -> dict[str, str]:
+def _configurations(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
     """Return the configurations by what they are of: one where all are the same."""
     if len({store.text for store in stores}) == 1:
         return {"Configuration": stores[0].text}
-    return {f"Configuration of {arm.name}": store.text for store, arm in zip(stores, arms, strict=True)}
+    return {
+        f"Configuration of {method.name}": store.text for store, method in zip(stores, methods, strict=True)
+    }
 
 
-def _labelled_notes(stores: Sequence[StoredRun], arms: Sequence[MeasuredSlopes]) -> list[str]:
+def _labelled_notes(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> list[str]:
     """Return the notes of all runs, with the name of their method where there are several."""
-    labels = [f"{arm.name}: " if len(arms) > 1 else "" for arm in arms]
+    labels = [f"{method.name}: " if len(methods) > 1 else "" for method in methods]
     return [label + note for label, store in zip(labels, stores, strict=True) for note in store.notes]
 
 
@@ -105,7 +107,7 @@ def _check_same_sensor(first: StoredRun, other: StoredRun) -> None:
         raise InputError(f"{other.path}: expected the layout of {first.path}, got another")
 
 
-def _arms(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[str]]:
+def _methods(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[str]]:
     """Return the slopes of the frames that all files have, and notes about it."""
     notes = []
     counts = [store.stored.n_finished for store in stores]
@@ -115,19 +117,19 @@ def _arms(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[str]]
     known = [store.sources for store in stores if store.sources]
     if len(known) == 2 and known[0] != known[1]:
         notes.append(_TEXT["stored.other_sources"])
-    arms = []
+    methods = []
     for name, store in zip(_names(stores), stores, strict=True):
         variables = store.stored.variables
         arrays = [variables[of][: min(counts)] for of in ARRAYS]
         # Iterations of other estimators are their own steps.
         denoised = None if store.estimator is None or store.estimator.denoises else False
         stated = _median_standard_error(store)
-        arms.append(MeasuredSlopes(name, *arrays, denoised=denoised, standard_error_px=stated))
-    return arms, notes
+        methods.append(MeasuredSlopes(name, *arrays, denoised=denoised, standard_error_px=stated))
+    return methods, notes
 
 
 def _names(stores: Sequence[StoredRun]) -> list[str]:
-    """Name the arms by what they do where that tells them apart, else by their files."""
+    """Name the methods by what they do where that tells them apart, else by their files."""
     names = [_label(store) for store in stores]
     if len(set(names)) == len(names):
         return names
@@ -145,20 +147,20 @@ def _label(store: StoredRun) -> str:
 
 def _example(
     stores: Sequence[StoredRun],
-    arms: Sequence[MeasuredSlopes],
+    methods: Sequence[MeasuredSlopes],
     number: int,
     frames: Sequence[str | Path] | None,
     notes: list[str],
 ) -> tuple[dict[str, Stages] | None, str]:
-    """Measure the example frame again in every arm; or return why that cannot be done."""
+    """Measure the example frame again in every method; or return why that cannot be done."""
     if stores[0].layout is None:
         return None, "Not drawn: the layout is not known."
     try:
         frame = _frame(stores[0], number, frames)
         stages: dict[str, Stages] = {}
-        for store, arm in zip(stores, arms, strict=True):
-            stages[arm.name] = store.pipeline().explain(frame)
-            notes += _disagreement(store, arm, frame, number)
+        for store, method in zip(stores, methods, strict=True):
+            stages[method.name] = store.pipeline().explain(frame)
+            notes += _disagreement(store, method, frame, number)
         estimator = stores[0].estimator
         without = None if estimator is None else estimator.without_denoising()
         if len(stores) == 1 and without is not None:
@@ -177,12 +179,12 @@ def _frame(store: StoredRun, number: int, frames: Sequence[str | Path] | None) -
     return frame
 
 
-def _disagreement(store: StoredRun, arm: MeasuredSlopes, frame: NDArray[Any], number: int) -> list[str]:
+def _disagreement(store: StoredRun, method: MeasuredSlopes, frame: NDArray[Any], number: int) -> list[str]:
     """Warn if the example frame, measured again, gives other slopes than those stored."""
     slopes = store.pipeline(reference=store.stored.attributes.get("reference"))(frame)
-    both = slopes.valid & arm.valid[number]
+    both = slopes.valid & method.valid[number]
     again = np.stack([slopes.x, slopes.y])[:, both]
-    distance = np.abs(again - np.stack([arm.x[number], arm.y[number]])[:, both])
+    distance = np.abs(again - np.stack([method.x[number], method.y[number]])[:, both])
     if distance.size == 0 or distance.max() <= _SAME_POSITION_PX:
         return []
     names = {"frame": number, "file": store.path.name}
@@ -204,18 +206,18 @@ def _median_standard_error(store: StoredRun) -> float:
     return float(np.median(known)) if known.size else np.nan
 
 
-def _facts(stores: Sequence[StoredRun], arms: Sequence[MeasuredSlopes]) -> dict[str, str]:
+def _facts(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
     sources = list(dict.fromkeys(source for store in stores for source in store.sources))
     shown = ", ".join(sources[:4]) + (f" and {len(sources) - 4} more" if len(sources) > 4 else "")
     versions = dict.fromkeys(
         str(store.stored.attributes.get("faintspot_version", "unknown")) for store in stores
     )
     facts = {"Slopes": ", ".join(str(store.path) for store in stores), "Sources": shown or "not stored"}
-    for store, arm in zip(stores, arms, strict=True):
+    for store, method in zip(stores, methods, strict=True):
         words = "not stored"
         if store.estimator is not None and store.layout is not None:
             words = store.estimator.in_words(len(store.layout), store.layout.pixels) + _range_in_words(store)
-        of = f" of {arm.name!r}" if len(arms) > 1 else ""
+        of = f" of {method.name!r}" if len(methods) > 1 else ""
         facts[f"Settings{of}"] = words
     if any("reference" in store.stored.attributes for store in stores):
         facts["Reference"] = "slopes are relative to stored reference positions; crosses in pictures are not"

@@ -40,7 +40,7 @@ NO_LAYOUT = "Not drawn: the layout of the sub-apertures is not known."
 class ReportInputs:
     """Everything that the sections are made of; see `make_run`."""
 
-    arms: Sequence[MeasuredSlopes]
+    methods: Sequence[MeasuredSlopes]
     layout: Layout | None
     stages: Mapping[str, Stages]
     truth: Floats | None
@@ -55,7 +55,7 @@ class ReportInputs:
 
 
 def make_run(
-    arms: Sequence[MeasuredSlopes],
+    methods: Sequence[MeasuredSlopes],
     layout: Layout | None,
     stages: Mapping[str, Stages],
     truth: Floats | None,
@@ -63,21 +63,21 @@ def make_run(
     why_no_stages: str,
     steps: Sequence[Step],
 ) -> ReportInputs:
-    """Compute the numbers of a run; arms with frames of their own are each taken by themselves."""
-    same = all(np.array_equal(arm.number, arms[0].number) for arm in arms)
-    valid = [valid_in_all(arms)] * len(arms) if same else [arm.valid for arm in arms]
+    """Compute the numbers of a run; methods with frames of their own are each taken by themselves."""
+    same = all(np.array_equal(method.number, methods[0].number) for method in methods)
+    valid = [valid_in_all(methods)] * len(methods) if same else [method.valid for method in methods]
     return ReportInputs(
-        arms,
+        methods,
         layout,
         stages,
         truth,
         example_frame,
         why_no_stages,
         steps,
-        [summarise(arm) for arm in arms],
-        [jitter(arm.x, arm.y, used) for arm, used in zip(arms, valid, strict=True)],
+        [summarise(method) for method in methods],
+        [jitter(method.x, method.y, used) for method, used in zip(methods, valid, strict=True)],
         valid,
-        Comparison.of(arms, valid),
+        Comparison.of(methods, valid),
     )
 
 
@@ -86,9 +86,9 @@ def all_sections(run: ReportInputs) -> list[Section]:
     makers: list[Callable[[ReportInputs], Section]] = [_key_numbers, _flux, _slopes]
     if run.stages or run.why_no_stages:
         makers.insert(1, _frame)
-    if any(arm.is_denoised for arm in run.arms):
+    if any(method.is_denoised for method in run.methods):
         makers.append(_iterations)
-    if run.arms[0].n_frames > 1:
+    if run.methods[0].n_frames > 1:
         makers.append(_jitter)
     return [make(run) for make in makers]
 
@@ -139,22 +139,25 @@ def _scale_in_words(example: frame_pictures.Example) -> str:
 
 
 def _flux(run: ReportInputs) -> Section:
-    header = ["flag", *(arm.name for arm in run.arms), "meaning"]
+    header = ["flag", *(method.name for method in run.methods), "meaning"]
     rows = []
-    denoised = any(arm.is_denoised for arm in run.arms)
+    denoised = any(method.is_denoised for method in run.methods)
     for name, meaning in _TEXT["flags"].items():
         flag = SubapertureFlag[name]
-        counts = [arm.flag_count(flag) for arm in run.arms]
+        counts = [method.flag_count(flag) for method in run.methods]
         if flag in FLAGS_OF_DENOISING and not denoised and not any(counts):
             continue
-        cells = [f"{n} ({percentage(n / arm.flags.size)})" for n, arm in zip(counts, run.arms, strict=True)]
+        cells = [
+            f"{n} ({percentage(n / method.flags.size)})"
+            for n, method in zip(counts, run.methods, strict=True)
+        ]
         rows.append([name, *cells, meaning])
     table = Table(header, rows, _TEXT["flux.table"], words=True)
     if run.layout is None:
         return Section("flux", "Flux and validity", tables=[table], missing=NO_LAYOUT)
-    several = run.arms[0].n_frames > 1
+    several = run.methods[0].n_frames > 1
     maps_shown = "Left: median flux. Right: in how many frames the slope was valid." if several else "Flux."
-    figure = maps.flux_and_validity(run.arms, run.summaries, run.layout)
+    figure = maps.flux_and_validity(run.methods, run.summaries, run.layout)
     shown = _TEXT.figure("flux", figure, maps=maps_shown)
     return Section("flux", "Flux and validity", tables=[table], figures=[shown])
 
@@ -163,39 +166,43 @@ def _slopes(run: ReportInputs) -> Section:
     if run.layout is None:
         return Section("slopes", "Mean slopes", missing=NO_LAYOUT)
     tilts = "; ".join(
-        f"{arm.name}: x {number_text(_mean(summary.x_px), '', 3)}, "
+        f"{method.name}: x {number_text(_mean(summary.x_px), '', 3)}, "
         f"y {number_text(_mean(summary.y_px), 'px', 3)}"
-        for arm, summary in zip(run.arms, run.summaries, strict=True)
+        for method, summary in zip(run.methods, run.summaries, strict=True)
     )
     noise = ""
     if run.jitters[0].measured.any():
         errors = "; ".join(
-            f"{arm.name}: {number_text(median(item.px / np.sqrt(np.maximum(item.n_frames, 1))), 'px', 2)}"
-            for arm, item in zip(run.arms, run.jitters, strict=True)
+            f"{method.name}: {number_text(median(item.px / np.sqrt(np.maximum(item.n_frames, 1))), 'px', 2)}"
+            for method, item in zip(run.methods, run.jitters, strict=True)
         )
         noise = _TEXT("slopes.noise", errors=errors)
-    what = "Mean slope of each sub-aperture over its valid frames" if run.arms[0].n_frames > 1 else "Slopes"
+    what = (
+        "Mean slope of each sub-aperture over its valid frames" if run.methods[0].n_frames > 1 else "Slopes"
+    )
     longest, number = maps.longest_arrow(run.summaries)
     cut = ""
     if number:
         long = number_text(longest, "px", 2)
         cut = _TEXT("slopes.cut", longest=long, percent=maps.ARROWS_WHOLE_PERCENT, number=number)
-    figure = maps.slope_arrows(run.arms, run.summaries, run.layout)
+    figure = maps.slope_arrows(run.methods, run.summaries, run.layout)
     shown = _TEXT.figure("slopes", figure, what=what, cut=cut, tilts=tilts, noise=noise)
     return Section("slopes", "Mean slopes", figures=[shown])
 
 
 def _iterations(run: ReportInputs) -> Section:
     denoised = [
-        (arm, summary) for arm, summary in zip(run.arms, run.summaries, strict=True) if arm.is_denoised
+        (method, summary)
+        for method, summary in zip(run.methods, run.summaries, strict=True)
+        if method.is_denoised
     ]
     if run.layout is None:
         return Section("iterations", "Iterations", missing=NO_LAYOUT)
-    if not any(arm.valid.any() for arm, _ in denoised):
+    if not any(method.valid.any() for method, _ in denoised):
         return Section("iterations", "Iterations", missing="Not drawn: no measurement is valid.")
-    medians = "; ".join(f"{arm.name}: {number.median_iterations:.0f}" for arm, number in denoised)
-    arms, summaries = zip(*denoised, strict=True)
-    figure = maps.iteration_counts(arms, summaries, run.layout)
+    medians = "; ".join(f"{method.name}: {number.median_iterations:.0f}" for method, number in denoised)
+    methods, summaries = zip(*denoised, strict=True)
+    figure = maps.iteration_counts(methods, summaries, run.layout)
     shown = _TEXT.figure("iterations", figure, medians=medians)
     return Section("iterations", "Iterations", figures=[shown])
 
@@ -208,9 +215,9 @@ def _jitter(run: ReportInputs) -> Section:
     if run.truth is not None:
         moved = jitter(run.truth[..., 0], run.truth[..., 1], run.valid[-1])
         text.append(f"The true motion in these frames is {rms(moved.px):.3f} px rms.")
-    shown = [_TEXT.figure("jitter", maps.jitter_plot(run.arms, run.jitters))]
+    shown = [_TEXT.figure("jitter", maps.jitter_plot(run.methods, run.jitters))]
     if run.layout is not None:
-        figure = maps.jitter_maps(run.arms, run.jitters, run.layout)
+        figure = maps.jitter_maps(run.methods, run.jitters, run.layout)
         shown.insert(0, _TEXT.figure("jitter-map", figure))
     return Section("jitter", title, text=text, figures=shown)
 

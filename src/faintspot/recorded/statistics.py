@@ -1,8 +1,8 @@
-"""The numbers of a report: what one or several arms of a slopes run did, over frames and sub-apertures.
+"""The numbers of a report: what one or several methods of a slopes run did, over frames and sub-apertures.
 
 Everything is computed from valid measurements only (one measurement: one sub-aperture in one frame), and
-comparisons between arms from the measurements that are valid in every arm. In the per-sub-aperture arrays NaN
-stands for "no valid frame".
+comparisons between methods from the measurements that are valid in every method. In the per-sub-aperture
+arrays NaN stands for "no valid frame".
 """
 
 from __future__ import annotations
@@ -154,21 +154,21 @@ class Jitter:
         return self.n_frames >= 2
 
 
-def summarise(arm: MeasuredSlopes) -> SlopesSummary:
-    """Return the numbers of one arm."""
-    valid = arm.valid
+def summarise(method: MeasuredSlopes) -> SlopesSummary:
+    """Return the numbers of one method."""
+    valid = method.valid
     parts: dict[str, list[Any]] = {name: [] for name in ("flux", "x", "y", "iterations")}
-    for block in column_blocks(arm.n_frames, arm.n_subapertures):
+    for block in column_blocks(method.n_frames, method.n_subapertures):
         kept = valid[:, block]
-        parts["flux"].append(median_over_valid(arm.flux[:, block], kept))
+        parts["flux"].append(median_over_valid(method.flux[:, block], kept))
         for name in ("x", "y", "iterations"):
-            parts[name].append(mean_over_valid(getattr(arm, name)[:, block], kept))
+            parts[name].append(mean_over_valid(getattr(method, name)[:, block], kept))
     flux, x, y, iterations = (np.concatenate(part) for part in parts.values())
     some = bool(valid.any())
     return SlopesSummary(
         valid_fraction=float(valid.mean()),
-        median_flux_e=float(np.median(arm.flux[valid])) if some else np.nan,
-        median_iterations=float(np.median(arm.iterations[valid])) if some else np.nan,
+        median_flux_e=float(np.median(method.flux[valid])) if some else np.nan,
+        median_iterations=float(np.median(method.iterations[valid])) if some else np.nan,
         valid_frames=valid.sum(axis=0),
         flux_e=flux,
         x_px=x,
@@ -177,9 +177,9 @@ def summarise(arm: MeasuredSlopes) -> SlopesSummary:
     )
 
 
-def valid_in_all(arms: Sequence[MeasuredSlopes]) -> NDArray[np.bool_]:
-    """Return which measurements are valid in every arm, (n_frames, n_subapertures)."""
-    valid: NDArray[np.bool_] = np.logical_and.reduce([arm.valid for arm in arms])
+def valid_in_all(methods: Sequence[MeasuredSlopes]) -> NDArray[np.bool_]:
+    """Return which measurements are valid in every method, (n_frames, n_subapertures)."""
+    valid: NDArray[np.bool_] = np.logical_and.reduce([method.valid for method in methods])
     return valid
 
 
@@ -194,33 +194,35 @@ def jitter(x: NDArray[Any], y: NDArray[Any], valid: NDArray[np.bool_]) -> Jitter
     return Jitter(valid.sum(axis=0), *(np.concatenate(part) for part in zip(*columns, strict=True)))
 
 
-def frame_to_frame_noise(arm: MeasuredSlopes, valid: NDArray[np.bool_]) -> Floats:
+def frame_to_frame_noise(method: MeasuredSlopes, valid: NDArray[np.bool_]) -> Floats:
     """Return the noise per axis of each sub-aperture, px, from successive frames; NaN without any."""
     columns = []
-    for block in column_blocks(arm.n_frames, arm.n_subapertures):
-        both = _successive(arm, valid[:, block])
-        squares = sum(np.diff(axis[:, block].astype(np.float64), axis=0) ** 2 for axis in (arm.x, arm.y))
+    for block in column_blocks(method.n_frames, method.n_subapertures):
+        both = _successive(method, valid[:, block])
+        squares = sum(
+            np.diff(axis[:, block].astype(np.float64), axis=0) ** 2 for axis in (method.x, method.y)
+        )
         columns.append(np.sqrt(mean_over_valid(np.asarray(squares) / 4, both)))
     return np.concatenate(columns)
 
 
 def relative_gain(
-    arm: MeasuredSlopes, reference: MeasuredSlopes, valid: NDArray[np.bool_]
+    method: MeasuredSlopes, reference: MeasuredSlopes, valid: NDArray[np.bool_]
 ) -> tuple[float, float]:
-    """Return the centroid gain of an arm over that of another one, and its standard error.
+    """Return the centroid gain of a method over that of another one, and its standard error.
 
     Both are regressed on the slopes of the frames before and after, whose noise is independent: only motion
     and aberrations that last for two frames count. NaN where there are none.
     """
-    if arm is reference:
+    if method is reference:
         return 1.0, 0.0
-    own, other = np.zeros(arm.n_subapertures), np.zeros(arm.n_subapertures)
+    own, other = np.zeros(method.n_subapertures), np.zeros(method.n_subapertures)
     kept = np.maximum(np.count_nonzero(valid), 1)
     for axis in ("x", "y"):
-        pair = [getattr(each, axis) for each in (arm, reference)]
+        pair = [getattr(each, axis) for each in (method, reference)]
         means = [float(np.sum(values, where=valid, dtype=np.float64)) / kept for values in pair]
-        for block in column_blocks(arm.n_frames, arm.n_subapertures):
-            both = _successive(arm, valid[:, block])
+        for block in column_blocks(method.n_frames, method.n_subapertures):
+            both = _successive(method, valid[:, block])
             a, b = (values[:, block] - mean for values, mean in zip(pair, means, strict=True))
             common = a + b
             for sums, values in ((own, a), (other, b)):
@@ -233,9 +235,9 @@ def relative_gain(
     return ratio, float(np.sqrt(np.sum((own - ratio * other) ** 2) * len(own) / n) / other.sum())
 
 
-def _successive(arm: MeasuredSlopes, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _successive(method: MeasuredSlopes, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return where a measurement and that of the next frame are valid, (n_frames - 1, n)."""
-    both: NDArray[np.bool_] = valid[1:] & valid[:-1] & (np.diff(arm.number) == 1)[:, None]
+    both: NDArray[np.bool_] = valid[1:] & valid[:-1] & (np.diff(method.number) == 1)[:, None]
     return both
 
 
@@ -251,20 +253,20 @@ def median(values: Floats) -> float:
     return float(np.median(kept)) if kept.size else np.nan
 
 
-def slope_error(arm: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]) -> tuple[Estimate, float]:
+def slope_error(method: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]) -> tuple[Estimate, float]:
     """Return the slope error R of the selected measurements [px], and their centroid gain."""
     if not valid.any():
         return Estimate(np.nan), np.nan
-    found = slope_statistics(arm.x[valid], arm.y[valid], truth[valid])
-    error = standard_error(absolute_errors(arm.x, arm.y, truth), valid)
+    found = slope_statistics(method.x[valid], method.y[valid], truth[valid])
+    error = standard_error(absolute_errors(method.x, method.y, truth), valid)
     return Estimate(found.error.value, error), found.gain.value
 
 
 def error_ratio(
-    arm: MeasuredSlopes, reference: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]
+    method: MeasuredSlopes, reference: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]
 ) -> tuple[float, float]:
-    """Return R of `reference` over R of `arm`, and the ratio's standard error, from paired measurements."""
-    own, other = (absolute_errors(each.x, each.y, truth) for each in (arm, reference))
+    """Return R of `reference` over R of `method`, and its standard error, from paired measurements."""
+    own, other = (absolute_errors(each.x, each.y, truth) for each in (method, reference))
     own_mean = own[valid].mean() if valid.any() else 0.0
     if own_mean == 0:
         return np.nan, np.nan

@@ -1,4 +1,4 @@
-"""The pictures of a recorded night: latencies, and arms in turn."""
+"""The pictures of a recorded night: latencies, and methods in turn."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from faintspot.io.telemetry import Telemetry
-from faintspot.recorded.telemetry_numbers import ArmDifference, arm_names
-from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, new_figure, styled
+from faintspot.recorded.telemetry_numbers import MethodDifference, method_names
+from faintspot.report.drawing import GREY, METHOD_COLOURS, WIDTH, new_figure, styled
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.texts import Texts
 
@@ -20,21 +20,23 @@ _MOST_TIMES, _FEWEST_TOGETHER, _FEW_TIMES = 400, 50, 20
 
 @styled
 def latency_figure(telemetry: Telemetry) -> FigureWithData:
-    """Draw how often each latency occurred, by arm, and its course in time."""
+    """Draw how often each latency occurred, by method, and its course in time."""
     figure = new_figure(WIDTH, 4.6)
     left, right = figure.subplots(1, 2)
     latency = 1e6 * telemetry.latency_s
     low, high = float(latency.min()), float(latency.max())
     edges = np.geomspace(max(low, 0.1), max(high, low + 1, 1.0) * 1.001, _BINS + 1)
     rows = []
-    for place, (arm, name) in enumerate(zip(np.unique(telemetry.arm), arm_names(telemetry), strict=True)):
-        counts = np.histogram(latency[telemetry.arm == arm], edges)[0]
-        left.stairs(counts, edges, color=ARM_COLOURS[place % len(ARM_COLOURS)], label=name, lw=1.5)
+    for place, (method, name) in enumerate(
+        zip(np.unique(telemetry.method), method_names(telemetry), strict=True)
+    ):
+        counts = np.histogram(latency[telemetry.method == method], edges)[0]
+        left.stairs(counts, edges, color=METHOD_COLOURS[place % len(METHOD_COLOURS)], label=name, lw=1.5)
         rows += [
             (name, f"{a:.4g}", f"{b:.4g}", int(n)) for a, b, n in zip(edges, edges[1:], counts, strict=False)
         ]
     left.set(xscale="log", yscale="log", xlabel="latency (µs)", ylabel="frames", ylim=(0.7, None))
-    if len(np.unique(telemetry.arm)) > 1:
+    if len(np.unique(telemetry.method)) > 1:
         left.legend(frameon=False)
     stretches = min(_MOST_TIMES, max(min(_FEW_TIMES, len(latency)), len(latency) // _FEWEST_TOGETHER))
     marker = "o" if stretches <= _FEW_TIMES else ""
@@ -54,27 +56,27 @@ def latency_figure(telemetry: Telemetry) -> FigureWithData:
 
 
 @styled
-def arms_figure(telemetry: Telemetry, found: Mapping[str, Sequence[ArmDifference]]) -> FigureWithData:
-    """Draw by how much every arm differs from the first, a panel for each quantity."""
-    figure = new_figure(WIDTH, 1.6 + 0.45 * len(arm_names(telemetry)))
+def methods_figure(telemetry: Telemetry, found: Mapping[str, Sequence[MethodDifference]]) -> FigureWithData:
+    """Draw by how much every method differs from the first, a panel for each quantity."""
+    figure = new_figure(WIDTH, 1.6 + 0.45 * len(method_names(telemetry)))
     rows = []
     for panel, (name, compared) in zip(figure.subplots(1, len(found)), found.items(), strict=True):
-        others = [arm for arm in compared if arm.difference is not None]
-        for place, arm in enumerate(others):
-            of = arm.difference
+        others = [method for method in compared if method.difference is not None]
+        for place, method in enumerate(others):
+            of = method.difference
             assert of is not None
             spread = np.nan_to_num([[of.value - of.low], [of.high - of.value]])
-            colour = ARM_COLOURS[(place + 1) % len(ARM_COLOURS)]
+            colour = METHOD_COLOURS[(place + 1) % len(METHOD_COLOURS)]
             panel.errorbar([of.value], [place], xerr=spread, fmt="o", color=colour, capsize=3)
-            rows.append((name, arm.arm, of.value, of.low, of.high, of.count))
+            rows.append((name, method.method, of.value, of.low, of.high, of.count))
         panel.axvline(0, color=GREY, lw=1)
         panel.set_yticks(
             range(len(others)),
-            [arm.arm for arm in others] if not panel.get_subplotspec().colspan.start else [],
+            [method.method for method in others] if not panel.get_subplotspec().colspan.start else [],
         )
         panel.set_ylim(len(others) - 0.4, -0.6)
         panel.set_title(name, fontsize=10)
         panel.tick_params(axis="x", labelsize=9)
         panel.locator_params(axis="x", nbins=4)
-    first = next(iter(found.values()))[0].arm
-    return _TEXT.figure("arms", figure, rows, first=first)
+    first = next(iter(found.values()))[0].method
+    return _TEXT.figure("methods", figure, rows, first=first)

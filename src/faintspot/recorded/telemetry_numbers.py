@@ -1,4 +1,4 @@
-"""The numbers of a recorded night: rates, latencies, lost frames, and arms in turn."""
+"""The numbers of a recorded night: rates, latencies, lost frames, and methods in turn."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class Gap:
 
 
 @dataclass(frozen=True)
-class ArmDifference:
-    """A quantity in one arm, and by how much it differs from the first arm, turn by turn."""
+class MethodDifference:
+    """A quantity in one method, and by how much it differs from the first method, turn by turn."""
 
-    arm: str
+    method: str
     mean: Estimate
     difference: Estimate | None
-    """None of the first arm."""
+    """None of the first method."""
 
 
 def timing(telemetry: Telemetry) -> Timing:
@@ -70,22 +70,24 @@ def restarts(telemetry: Telemetry) -> int:
     return int(np.count_nonzero(all_left_out(telemetry.frame) < 0))
 
 
-def arm_names(telemetry: Telemetry) -> list[str]:
-    """Return the names of the arms that have frames in the record, by number; one without interleaving."""
-    names = telemetry.attributes.get("arms") or ["slopes"]
-    return [names[arm] if arm < len(names) else f"arm {arm}" for arm in np.unique(telemetry.arm)]
+def method_names(telemetry: Telemetry) -> list[str]:
+    """Return the names of the methods that have frames in the record, by number; one without interleaving."""
+    names = telemetry.attributes.get("methods") or ["slopes"]
+    return [
+        names[method] if method < len(names) else f"method {method}" for method in np.unique(telemetry.method)
+    ]
 
 
 def quantities(telemetry: Telemetry) -> dict[str, Floats]:
-    """Return what arms are compared in, by its name with unit, a number for each frame; NaN where none is.
+    """Return what methods are compared in, by its name with unit, a number for each frame; NaN where none is.
 
-    The rms of slopes is taken about each sub-aperture's mean in the arm, which a change of arm may shift.
+    The rms of slopes is taken about each sub-aperture's mean in the method, which differs between methods.
     """
     valid = telemetry.valid
     count = valid.sum(axis=1)
     squares = np.zeros(len(valid))
-    for arm in np.unique(telemetry.arm):
-        rows = telemetry.arm == arm
+    for method in np.unique(telemetry.method):
+        rows = telemetry.method == method
         used = valid[rows]
         for axis in (telemetry.x, telemetry.y):
             values = np.where(used, axis[rows], 0.0).astype(np.float64)
@@ -101,39 +103,41 @@ def quantities(telemetry: Telemetry) -> dict[str, Floats]:
     }
 
 
-def arms_in_turn(telemetry: Telemetry, values: Floats) -> list[ArmDifference]:
-    """Compare the arms in a number for each frame; see `compared_arms`."""
-    return compared_arms(telemetry.arm, arm_names(telemetry), values)
+def methods_in_turn(telemetry: Telemetry, values: Floats) -> list[MethodDifference]:
+    """Compare the methods in a number for each frame; see `compared_methods`."""
+    return compared_methods(telemetry.method, method_names(telemetry), values)
 
 
-def compared_arms(arms: NDArray[np.int64], names: Sequence[str], values: Floats) -> list[ArmDifference]:
-    """Compare arms in turn in a number for each frame; each turn with the first arm's turn of the same count.
+def compared_methods(
+    methods: NDArray[np.int64], names: Sequence[str], values: Floats
+) -> list[MethodDifference]:
+    """Compare alternating methods in a number for each frame; each turn with the first method's same turn.
 
     Intervals come from a bootstrap of blocks of ten neighbouring turns.
 
     Parameters
     ----------
-    arms : (n,) array
+    methods : (n,) array
         Of each frame.
     names : sequence of str
-        Of the arms that have frames, by number.
+        Of the methods that have frames, by number.
     values : (n,) array
         NaN: not known of that frame.
     """
-    by_turn = [_by_turn(arms, arm, values) for arm in np.unique(arms)]
+    by_turn = [_by_turn(methods, method, values) for method in np.unique(methods)]
     first = by_turn[0]
     compared = []
     for place, (name, own) in enumerate(zip(names, by_turn, strict=True)):
         length = min(len(own), len(first))
         difference = None if place == 0 else _mean(own[:length] - first[:length], len(by_turn) - 1)
-        compared.append(ArmDifference(name, _mean(own), difference))
+        compared.append(MethodDifference(name, _mean(own), difference))
     return compared
 
 
-def _by_turn(arms: NDArray[np.int64], arm: int, values: Floats) -> Floats:
-    """Return the mean of each turn of an arm: of frames of its, one after the other; NaN without any."""
-    number = np.cumsum(np.concatenate([[0], np.diff(arms) != 0]))[arms == arm]
-    own = values[arms == arm]
+def _by_turn(methods: NDArray[np.int64], method: int, values: Floats) -> Floats:
+    """Return the mean of each turn of a method: of frames of its, one after the other; NaN without any."""
+    number = np.cumsum(np.concatenate([[0], np.diff(methods) != 0]))[methods == method]
+    own = values[methods == method]
     _, turn = np.unique(number, return_inverse=True)
     kept = np.isfinite(own)
     count = np.bincount(turn, weights=kept)

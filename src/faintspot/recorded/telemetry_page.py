@@ -13,13 +13,13 @@ from faintspot.pipeline.slopes import Slopes
 from faintspot.recorded.advice import warnings_in_words
 from faintspot.recorded.sections import all_sections, make_run
 from faintspot.recorded.statistics import ARRAYS, MeasuredSlopes
-from faintspot.recorded.telemetry_figures import arms_figure, latency_figure
+from faintspot.recorded.telemetry_figures import latency_figure, methods_figure
 from faintspot.recorded.telemetry_numbers import (
     PERCENTILES,
-    arm_names,
-    arms_in_turn,
     change_rows,
     gaps,
+    method_names,
+    methods_in_turn,
     quantities,
     restarts,
     timing,
@@ -49,8 +49,8 @@ def report_of_telemetry(path: str | Path) -> str:
     layout = Layout(**telemetry.attributes["layout"])
     run = make_run(_measured(telemetry), layout, {}, None, 0, "", ())
     sections = [_timing(telemetry), _lost(telemetry)]
-    if len(arm_names(telemetry)) > 1:
-        sections.append(_arms(telemetry))
+    if len(method_names(telemetry)) > 1:
+        sections.append(_methods(telemetry))
     sections += [_changes(telemetry), *all_sections(run), *wavefront_sections(_slopes(telemetry), layout)]
     settings = str(telemetry.attributes.get("settings", ""))
     return html_of(
@@ -61,7 +61,7 @@ def report_of_telemetry(path: str | Path) -> str:
             warnings=[
                 *_warnings(telemetry),
                 *run.comparison.warnings(),
-                *warnings_in_words(run.arms, run.summaries),
+                *warnings_in_words(run.methods, run.summaries),
             ],
             remark=POSITIONS,
         )
@@ -69,11 +69,11 @@ def report_of_telemetry(path: str | Path) -> str:
 
 
 def _measured(telemetry: Telemetry) -> list[MeasuredSlopes]:
-    """Return the slopes of every arm, each with the frames that it measured."""
+    """Return the slopes of every method, each with the frames that it measured."""
     errors = np.hypot(telemetry.standard_error_x, telemetry.standard_error_y) / np.sqrt(2)
     measured = []
-    for arm, name in zip(np.unique(telemetry.arm), arm_names(telemetry), strict=True):
-        rows = telemetry.arm == arm
+    for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
+        rows = telemetry.method == method
         arrays = [getattr(telemetry, of)[rows] for of in ARRAYS]
         known = errors[rows][np.isfinite(errors[rows])]
         stated = float(np.median(known)) if known.size else np.nan
@@ -94,7 +94,7 @@ def _facts(telemetry: Telemetry, path: Path) -> dict[str, str]:
         "Sub-apertures": str(telemetry.x.shape[1]),
         "Ended": str(ended),
     }
-    names = arm_names(telemetry)
+    names = method_names(telemetry)
     return facts | ({"In turn": ", ".join(names)} if len(names) > 1 else {})
 
 
@@ -113,8 +113,8 @@ def _timing(telemetry: Telemetry) -> Section:
     found = timing(telemetry)
     latency = 1e6 * telemetry.latency_s
     rows = []
-    for arm, name in zip(np.unique(telemetry.arm), arm_names(telemetry), strict=True):
-        own = latency[telemetry.arm == arm]
+    for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
+        own = latency[telemetry.method == method]
         rows.append([name, str(len(own)), *(f"{value:.1f}" for value in np.percentile(own, PERCENTILES))])
     header = ["", "frames", "median (µs)", "99 % (µs)", "99.9 % (µs)", "longest (µs)"]
     table = Table(header, rows, caption="Latency: from a frame's last row to its slopes.")
@@ -148,17 +148,19 @@ def _lost(telemetry: Telemetry) -> Section:
     return Section("lost", "Lost frames", text, tables)
 
 
-def _arms(telemetry: Telemetry) -> Section:
+def _methods(telemetry: Telemetry) -> Section:
     rows = []
-    found = {name: arms_in_turn(telemetry, values) for name, values in quantities(telemetry).items()}
+    found = {name: methods_in_turn(telemetry, values) for name, values in quantities(telemetry).items()}
     for name, compared in found.items():
-        for arm in compared:
-            difference = "–" if arm.difference is None else _in_words(arm.difference)
-            rows.append([name, arm.arm, _with_error(arm.mean), difference])
-    first = next(iter(found.values()))[0].arm
+        for method in compared:
+            difference = "–" if method.difference is None else _in_words(method.difference)
+            rows.append([name, method.method, _with_error(method.mean), difference])
+    first = next(iter(found.values()))[0].method
     header = ["", "method", "mean ± standard error", f"less {first!r} (95 %)"]
-    text = [_TEXT["arms.text"]]
-    return Section("arms", "Methods in turn", text, [Table(header, rows)], [arms_figure(telemetry, found)])
+    text = [_TEXT["methods.text"]]
+    return Section(
+        "methods", "Methods in turn", text, [Table(header, rows)], [methods_figure(telemetry, found)]
+    )
 
 
 def _in_words(estimate: Estimate) -> str:
@@ -190,10 +192,10 @@ def _changes(telemetry: Telemetry) -> Section:
 
 
 def _slopes(telemetry: Telemetry) -> dict[str, Slopes]:
-    """Return the slopes of every arm."""
+    """Return the slopes of every method."""
     names = ("x", "y", "flux", "flags", "iterations", "standard_error_x", "standard_error_y")
     found = {}
-    for arm, name in zip(np.unique(telemetry.arm), arm_names(telemetry), strict=True):
-        own = {of: getattr(telemetry, of)[telemetry.arm == arm] for of in names}
+    for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
+        own = {of: getattr(telemetry, of)[telemetry.method == method] for of in names}
         found[name] = Slopes(**own, bad_pixels=np.zeros(own["x"].shape, np.int32))
     return found

@@ -1,4 +1,4 @@
-"""The section of a report page that shows the wavefronts of its arms."""
+"""The section of a report page that shows the wavefronts of its methods."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TEXT = Texts("faintspot.recorded")
 
 
 def wavefront_sections(slopes: Mapping[str, Slopes], layout: Layout | None) -> list[Section]:
-    """Return the section with the wavefronts fitted to the slopes of each arm; none without a layout."""
+    """Return the section with the wavefronts fitted to the slopes of each method; none without a layout."""
     if layout is None or not slopes:
         return []
     tables, figures, missing = [], [], []

@@ -26,7 +26,7 @@ except ImportError:
 
 COLOUR_MAP = "cividis"
 # Okabe & Ito (2008): readable with any colour vision.
-ARM_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7")
+METHOD_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7")
 TRUTH_COLOUR = "#56B4E9"
 GREY = "#9a9a9a"
 FLUX_GREY = "#e4e4e4"

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from faintspot.report.drawing import ARM_COLOURS, FLUX_GREY, WIDTH, colour_bar, new_figure, styled
+from faintspot.report.drawing import FLUX_GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
 from faintspot.report.figure_data import FigureWithData
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.pupil import lenslet_outlines
@@ -96,7 +96,7 @@ def _bars(axes: Axes, wavefront: Wavefront, part: slice, several: bool) -> None:
         modes,
         wavefront.mean[part],
         0.5,
-        color=ARM_COLOURS[1],
+        color=METHOD_COLOURS[1],
         yerr=np.nan_to_num(wavefront.mean_standard_error[part]),
         ecolor="black",
         capsize=2 if len(modes) < 50 else 0,

@@ -14,23 +14,23 @@ from faintspot.config.options import option
 from faintspot.estimators import registry
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.registry import estimators, register
-from faintspot.experiments.loop_arms import LOOP_GAIN, arm_kind, default_arms
+from faintspot.experiments.loop_methods import LOOP_GAIN, default_methods, method_kind
 
 NAMES = (*estimators(), "ml_weighted", "map_predicted_weighted", "trained_predicted", "tv_uncorrected")
 
 
 def first_choice(name: str) -> dict[str, Any]:
-    return {key: each.first[-1] for key, each in arm_kind(name).tuned(BRIGHT).items()} | {LOOP_GAIN: 0.2}
+    return {key: each.first[-1] for key, each in method_kind(name).tuned(BRIGHT).items()} | {LOOP_GAIN: 0.2}
 
 
 BRIGHT = small().replace("camera", photons_per_subaperture=1000.0)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_arm_closes_the_loop(name: str) -> None:
+def test_every_method_closes_the_loop(name: str) -> None:
     """Not for long and not well, but better than no correction: Strehl ratio 0.17 then."""
-    kind = arm_kind(name)
-    record = simulate_loop(BRIGHT, [kind.arm(BRIGHT, first_choice(name))])
+    kind = method_kind(name)
+    record = simulate_loop(BRIGHT, [kind.method(BRIGHT, first_choice(name))])
     assert record.labels == (kind.label,)
     assert np.isfinite(record.slopes_px).all()
     assert record.mean_strehl() > 0.35
@@ -38,24 +38,24 @@ def test_every_arm_closes_the_loop(name: str) -> None:
 
 def test_names_say_what_the_loop_does() -> None:
     for name in NAMES:
-        assert arm_kind(name).name == name
-    assert arm_kind("map_weighted_predicted").name == "map_predicted_weighted"
-    arm = arm_kind("map_predicted_weighted").arm(BRIGHT, first_choice("map_predicted_weighted"))
-    assert arm.predict_prior
-    assert arm.weighted_reconstructor
-    assert not arm.correct_gain
-    assert arm_kind("weighted").variants == ()
-    assert len({arm_kind(name).label for name in NAMES}) == len(NAMES)
+        assert method_kind(name).name == name
+    assert method_kind("map_weighted_predicted").name == "map_predicted_weighted"
+    method = method_kind("map_predicted_weighted").method(BRIGHT, first_choice("map_predicted_weighted"))
+    assert method.predict_prior
+    assert method.weighted_reconstructor
+    assert not method.correct_gain
+    assert method_kind("weighted").variants == ()
+    assert len({method_kind(name).label for name in NAMES}) == len(NAMES)
 
 
 def test_defaults_suit_the_configuration() -> None:
-    usual = default_arms(small())
+    usual = default_methods(small())
     assert set(estimators()) <= set(usual)
     assert {"ml_weighted", "map_predicted", "map_predicted_weighted", "trained_predicted"} <= set(usual)
     assert not any(name.endswith("_uncorrected") for name in usual)
-    elongated = default_arms(small().replace("sensor", spot_elongation=1.2, samples=12))
+    elongated = default_methods(small().replace("sensor", spot_elongation=1.2, samples=12))
     assert set(usual) - set(elongated) == {"trained", "trained_predicted"}
-    assert "tv_uncorrected" in default_arms(small().replace("control", mode="open"))
+    assert "tv_uncorrected" in default_methods(small().replace("control", mode="open"))
 
 
 @pytest.fixture
@@ -83,28 +83,28 @@ def peak() -> Iterator[type[Estimator]]:
     del registry._kinds["peak"]
 
 
-def test_an_estimator_of_ones_own_is_an_arm(peak: type[Estimator]) -> None:
-    assert "peak" in default_arms(small())
-    kind = arm_kind("peak_uncorrected")
+def test_an_estimator_of_ones_own_is_an_method(peak: type[Estimator]) -> None:
+    assert "peak" in default_methods(small())
+    kind = method_kind("peak_uncorrected")
     tuned = kind.tuned(BRIGHT)
     # Two steps beyond each end, as far as the option goes.
     assert tuned["power"].values == pytest.approx((1.125, 1.5, 2.0, 3.0, 4.0, 5.0, 6.25, 7.8125))
     assert tuned["power"].first == pytest.approx((1.5, 4.0, 6.25))
-    record = simulate_loop(BRIGHT, [kind.arm(BRIGHT, {LOOP_GAIN: 0.3, "power": 2.0})])
+    record = simulate_loop(BRIGHT, [kind.method(BRIGHT, {LOOP_GAIN: 0.3, "power": 2.0})])
     assert record.mean_strehl() > 0.35
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_first_values_are_among_all(name: str) -> None:
-    for each in arm_kind(name).tuned(small()).values():
+    for each in method_kind(name).tuned(small()).values():
         assert set(each.first) <= set(each.values)
         assert list(each.values) == sorted(set(each.values))
 
 
-def test_unknown_arms_and_missing_values() -> None:
-    with pytest.raises(InputError, match=r"^arm = 'kog': expected one of 'brightest'"):
-        arm_kind("kog")
-    with pytest.raises(InputError, match="arm = 'tv_predicted': expected an estimator that takes a prior"):
-        arm_kind("tv_predicted")
-    with pytest.raises(InputError, match="expected a value for 'keep_brightest' of the arm 'brightest'"):
-        arm_kind("brightest").arm(small(), {LOOP_GAIN: 0.5})
+def test_unknown_methods_and_missing_values() -> None:
+    with pytest.raises(InputError, match=r"^method = 'kog': expected one of 'brightest'"):
+        method_kind("kog")
+    with pytest.raises(InputError, match="method = 'tv_predicted': expected an estimator that takes a prior"):
+        method_kind("tv_predicted")
+    with pytest.raises(InputError, match="expected a value for 'keep_brightest' of the method 'brightest'"):
+        method_kind("brightest").method(small(), {LOOP_GAIN: 0.5})

@@ -1,4 +1,4 @@
-"""The arms of a study in one cell: what each may choose from, how it measures, and its errors for every k."""
+"""Methods of a study in one cell: candidates, measured slopes, and errors for every number of kept pixels."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.ao_loop.arms import Arm
+from faintspot.ao_loop.methods import Method
 from faintspot.camera.calibration import Calibration
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.gravity import KeepingBrightest
 from faintspot.estimators.registry import estimator_named
 from faintspot.estimators.scene import Scene
-from faintspot.experiments.arms import Kind, keeps_every_k, score_for_scene
+from faintspot.experiments.methods import Kind, keeps_every_k, score_for_scene
 from faintspot.kernels import every_k
 from faintspot.pipeline.images import measure_images
 from faintspot.pipeline.settings import Settings
@@ -64,7 +64,7 @@ def detector_of(cell: Cell) -> Detector:
     )
 
 
-class CellArms:
+class CellMethods:
     """Methods of a study in one cell: candidates, estimators, and slopes of images.
 
     Parameters
@@ -80,7 +80,7 @@ class CellArms:
         self.flux_e = max(cell.flux_e if flux_e is None else flux_e, _LEAST_FLUX_E)
         self.search_range_px = specification.search_range_of(cell)
         self._within_px = min(self.search_range_px, cell.pixels / 2)
-        self.kinds = {arm: estimator_named(arm) for arm in specification.arms}
+        self.kinds = {method: estimator_named(method) for method in specification.estimators}
         self._calibration = Calibration(
             dark=0.0,
             read_noise_e=cell.read_noise_e * cell.em_gain,
@@ -88,44 +88,44 @@ class CellArms:
             background_e=cell.background_e,
         )
 
-    def candidates(self, arm: str) -> list[Candidate]:
-        """Return what an arm chooses from."""
-        axes = self._axes(self.kinds[arm])
+    def candidates(self, method: str) -> list[Candidate]:
+        """Return what a method chooses from."""
+        axes = self._axes(self.kinds[method])
         return [tuple(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
 
-    def estimator(self, arm: str, candidate: Candidate) -> Estimator:
+    def estimator(self, method: str, candidate: Candidate) -> Estimator:
         """Return the estimator with a candidate's options."""
-        return self.kinds[arm](**{name: value * self._unit(name) for name, value in candidate})
+        return self.kinds[method](**{name: value * self._unit(name) for name, value in candidate})
 
-    def measure(self, arm: str, candidate: Candidate, images: Images) -> Slopes:
+    def measure(self, method: str, candidate: Candidate, images: Images) -> Slopes:
         """Return the slopes of images (n, side, side) in photo-electrons."""
         output = images * np.float32(self.cell.em_gain)  # as the camera gives it
-        made = self._arm(self.estimator(arm, candidate))
+        made = self._method(self.estimator(method, candidate))
         return measure_images(output, made.settings, calibration=self._calibration, **made.parts)
 
-    def parts(self, arm: str, blocks: Sequence[Block]) -> Sequence[Block]:
-        """Return what an arm measures at a time: blocks, or all of them where it has no table."""
-        if keeps_every_k(self.kinds[arm]):
+    def parts(self, method: str, blocks: Sequence[Block]) -> Sequence[Block]:
+        """Return what a method measures at a time: blocks, or all of them where it has no table."""
+        if keeps_every_k(self.kinds[method]):
             return blocks
         images, truth = (np.concatenate(part) for part in zip(*blocks, strict=True))
         return [(images, truth)]
 
-    def positions(self, arm: str, candidate: Candidate, images: Images) -> Measured:
-        """Return the positions in images; K is 1 where an arm has no table of all numbers of kept pixels."""
-        if keeps_every_k(self.kinds[arm]):
-            estimator: Any = self.estimator(arm, candidate)
+    def positions(self, method: str, candidate: Candidate, images: Images) -> Measured:
+        """Return the positions in images; K is 1 for a method without a table of all kept pixels."""
+        if keeps_every_k(self.kinds[method]):
+            estimator: Any = self.estimator(method, candidate)
             return *position_table(estimator, images, self.search_range_px), None
-        slopes = self.measure(arm, candidate, images)
+        slopes = self.measure(method, candidate, images)
         positions = np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64)
         stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1).astype(np.float64)
         return positions[:, None], np.asarray(slopes.valid)[:, None], stated
 
-    def _arm(self, estimator: Estimator) -> Arm:
+    def _method(self, estimator: Estimator) -> Method:
         """Tell an estimator what it has to know."""
         told: dict[str, Any] = {}
         if Need.WIDTH in estimator.needs:
             told["spot_fwhm_px"], told["spot_fwhm_y_px"] = self._spot_fwhm_px
-        return Arm(
+        return Method(
             estimator.label,
             Settings(estimator, search_range_px=self._within_px, flux_e=self.flux_e, **told),
             psf=self._psf if Need.PSF in estimator.needs else None,
@@ -133,7 +133,7 @@ class CellArms:
         )
 
     def _axes(self, kind: Kind) -> dict[str, list[float]]:
-        """Values of every option that an arm chooses, in the units of the specification."""
+        """Values of every option that a method chooses, in the units of the specification."""
         listed = {
             name: list(self._listed(name)) for name in kind.declared() if name in self._specification.LISTED
         }

@@ -1,4 +1,4 @@
-"""The arms that a closed-loop experiment compares: an estimator, and what the loop does with its slopes."""
+"""Methods that closed-loop experiments compare: an estimator, and how the loop uses its slopes."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.ao_loop.arms import PRIOR, Arm
 from faintspot.ao_loop.camera import make_detector
 from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration, RunLength
+from faintspot.ao_loop.methods import PRIOR, Method
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError
 from faintspot.config.options import AUTO, Option
@@ -21,7 +21,7 @@ from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.estimators.registry import estimator_named, estimators
 from faintspot.estimators.window import Window
-from faintspot.experiments.arms import score_for_scene
+from faintspot.experiments.methods import score_for_scene
 from faintspot.pipeline.settings import Settings
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import TrainedScore
@@ -42,14 +42,14 @@ _FIRST_TELEMETRY_GAINS = (0.2,)
 _PRIORS = (0.1, 0.175, 0.25, 0.35, 0.5, 0.75)
 _STEPS_BEYOND = 2  # in the ratio of an end to its neighbour
 _FEWEST_TO_WIDEN = 4
-_FIRST_VALUES = (3, 2)  # of an arm's first option, and of each further one
+_FIRST_VALUES = (3, 2)  # of a method's first option, and of each further one
 _TRAINING_SPOTS = 8000
 _TRAINING_SEED = 4
 
 
 @dataclass(frozen=True)
 class Tunable:
-    """Something of an arm that is tuned."""
+    """Something of a method that is tuned."""
 
     values: tuple[Any, ...]
     """Allowed values, in order."""
@@ -71,7 +71,7 @@ class Variant:
     label: str
     meaning: str
     changes: Mapping[str, bool]
-    """Of the arm."""
+    """Of the method."""
 
 
 VARIANTS = {
@@ -88,14 +88,14 @@ VARIANTS = {
         "gain not corrected", "slopes are not divided by the centroid gain", {"correct_gain": False}
     ),
 }
-"""By what follows the estimator's name in that of an arm: "map_predicted_weighted"."""
+"""By what follows the estimator's name in that of a method: "map_predicted_weighted"."""
 _PREDICTED = "_predicted"
 CONTROL_SIGN = "+"
-"""Between an arm's slopes and its control: "map+kalman"."""
+"""Between a method's slopes and its control: "map+kalman"."""
 
 
 @dataclass(frozen=True)
-class ArmKind:
+class MethodKind:
     """An estimator and what the loop does with it; values are still to be chosen."""
 
     estimator: type[Estimator]
@@ -144,8 +144,8 @@ class ArmKind:
             tuned[name] = _spread(values, _FIRST_VALUES[min(number, len(_FIRST_VALUES) - 1)])
         return tuned
 
-    def arm(self, configuration: LoopConfiguration, choice: Choice) -> Arm:
-        """Return the arm with tuned values, for the configuration's own light.
+    def method(self, configuration: LoopConfiguration, choice: Choice) -> Method:
+        """Return the method with tuned values, for the configuration's own light.
 
         The PSF of those that need one is that of a flat wavefront; the score is trained on simulated spots
         of the same strength of turbulence, light and camera.
@@ -157,12 +157,12 @@ class ArmKind:
         """
         for name in self.tuned(configuration):
             if name not in choice:
-                raise InputError(f"choice: expected a value for {name!r} of the arm {self.name!r}")
+                raise InputError(f"choice: expected a value for {name!r} of the method {self.name!r}")
         of_loop = (LOOP_GAIN, NOISE_SCALE)
         options = {name: value for name, value in choice.items() if name not in of_loop}
         estimator = self._untuned(configuration).replaced(options)
         changes = {key: value for name in self.variants for key, value in VARIANTS[name].changes.items()}
-        return Arm(
+        return Method(
             self.label,
             Settings(estimator),
             float(choice[LOOP_GAIN]),
@@ -178,8 +178,8 @@ class ArmKind:
         return self.estimator(**automatic).for_scene(configuration.scene)
 
 
-def arm_kind(name: str) -> ArmKind:
-    """Return an arm by its name: that of an estimator, of variants and of control, as "ml_weighted+polc".
+def method_kind(name: str) -> MethodKind:
+    """Return a method by its name: that of an estimator, of variants and of control, as "ml_weighted+polc".
 
     With the Kalman filter, estimators that take a prior are given its prediction.
 
@@ -189,7 +189,7 @@ def arm_kind(name: str) -> ArmKind:
         For an unknown estimator or control, or a prediction for one that takes none.
     """
     slopes, _, control = name.partition(CONTROL_SIGN)
-    control = one_of("control of the arm", control or INTEGRATOR, list(CONTROLS))
+    control = one_of("control of the method", control or INTEGRATOR, list(CONTROLS))
     base, variants = slopes, set()
     while base not in estimators():
         ending = next((ending for ending in VARIANTS if base.endswith(ending)), None)
@@ -201,16 +201,16 @@ def arm_kind(name: str) -> ArmKind:
         estimator = estimator_named(base)
     except InputError as error:
         text = str(error).removeprefix("estimator")
-        raise InputError(f"arm{text}; after it may follow {', '.join(VARIANTS)}") from None
+        raise InputError(f"method{text}; after it may follow {', '.join(VARIANTS)}") from None
     if _PREDICTED in variants and not estimator.takes_prior:
-        raise InputError(f"arm = {name!r}: expected an estimator that takes a prior, {base!r} takes none")
+        raise InputError(f"method = {name!r}: expected an estimator that takes a prior, {base!r} takes none")
     if control == KALMAN and estimator.takes_prior:
         variants.add(_PREDICTED)
-    return ArmKind(estimator, tuple(variant for variant in VARIANTS if variant in variants), control)
+    return MethodKind(estimator, tuple(variant for variant in VARIANTS if variant in variants), control)
 
 
-def default_arms(configuration: LoopConfiguration) -> list[str]:
-    """Return the names of the arms that are compared where none are asked for.
+def default_methods(configuration: LoopConfiguration) -> list[str]:
+    """Return the names of the methods that are compared where none are asked for.
 
     Every estimator, as far as it suits; those that take a prior also with the loop's prediction, and those
     that weigh pixels by their noise also with a weighted reconstructor. A score is trained for spots that

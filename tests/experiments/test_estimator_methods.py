@@ -1,4 +1,4 @@
-"""Estimators as arms of a study: at the bound where they should be, with errors that they know."""
+"""Estimators as methods of a study: at the bound where they should be, with errors that they know."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ import pytest
 
 import faintspot as fs
 from faintspot.experiments import StudySpecification, Sweep, measure_cell
-from faintspot.experiments.arms import score_for_scene
 from faintspot.experiments.cell import realisations
-from faintspot.experiments.cell_arms import CellArms
+from faintspot.experiments.cell_methods import CellMethods
+from faintspot.experiments.methods import score_for_scene
 
-ESTIMATOR_ARMS = ("window", "weighted", "matched", "ml", "map", "trained")
-ARMS = ("brightest", *ESTIMATOR_ARMS)
+ESTIMATOR_METHODS = ("window", "weighted", "matched", "ml", "map", "trained")
+METHODS = ("brightest", *ESTIMATOR_METHODS)
 COUNT = 2000
 
 
 def specification_of(**cell: Any) -> StudySpecification:
     sweep = Sweep("a", **{"pixels": 10, **cell})
-    return StudySpecification("s", [sweep], realisations=COUNT, arms=ARMS, fixed_k=(20,))
+    return StudySpecification("s", [sweep], realisations=COUNT, estimators=METHODS, fixed_k=(20,))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -31,7 +31,7 @@ def quick_training() -> Iterator[None]:
     """Train on fewer spots: worse by 2 % (30 e-)."""
     with pytest.MonkeyPatch.context() as patch:
         quick = functools.partial(score_for_scene, realisations=3000)
-        patch.setattr("faintspot.experiments.cell_arms.score_for_scene", quick)
+        patch.setattr("faintspot.experiments.cell_methods.score_for_scene", quick)
         yield
 
 
@@ -43,9 +43,9 @@ def measured() -> dict[str, Any]:
 
 def test_estimators_reach_the_bound(measured: dict[str, Any]) -> None:
     """1000 scored spots: R is known to 1.8 %, the efficiency to 4 %; 5 of those about 1."""
-    efficiency = dict(zip(ARMS, measured["photon_efficiency"][:, 0], strict=True))
-    for arm in ("ml", "map", "trained"):
-        assert 0.8 < efficiency[arm] < 1.2
+    efficiency = dict(zip(METHODS, measured["photon_efficiency"][:, 0], strict=True))
+    for method in ("ml", "map", "trained"):
+        assert 0.8 < efficiency[method] < 1.2
     assert efficiency["brightest"] < efficiency["weighted"] < efficiency["ml"]
 
 
@@ -59,10 +59,10 @@ def test_efficiency_is_that_of_the_public_function(measured: dict[str, Any]) -> 
 
 def test_stated_errors_are_actual_ones(measured: dict[str, Any]) -> None:
     """10 % of the estimators' own accuracy and 5 standard errors of 1.3 %."""
-    stated = dict(zip(ARMS, measured["stated_over_actual"], strict=True))
+    stated = dict(zip(METHODS, measured["stated_over_actual"], strict=True))
     assert np.isnan(stated["brightest"])
-    for arm in ("ml", "map", "trained"):
-        assert stated[arm] == pytest.approx(1.0, abs=0.17)
+    for method in ("ml", "map", "trained"):
+        assert stated[method] == pytest.approx(1.0, abs=0.17)
     assert np.isfinite(measured["stated_over_actual_all"][1:]).all()
 
 
@@ -78,10 +78,10 @@ def test_positions_stay_within_the_search_range() -> None:
     specification = specification_of(flux_e=5, read_noise_e=3)
     cell = specification.cells()[0]
     ((images, _),) = realisations(cell, 200, np.random.default_rng(1))
-    arms = CellArms(cell, specification, 5.0)
-    for arm in ESTIMATOR_ARMS:
-        slopes = arms.measure(arm, arms.candidates(arm)[0], images)
-        assert max(np.abs(slopes.x).max(), np.abs(slopes.y).max()) <= 1.0 + 1e-6, arm
+    methods = CellMethods(cell, specification, 5.0)
+    for method in ESTIMATOR_METHODS:
+        slopes = methods.measure(method, methods.candidates(method)[0], images)
+        assert max(np.abs(slopes.x).max(), np.abs(slopes.y).max()) <= 1.0 + 1e-6, method
 
 
 @pytest.mark.parametrize("changes", [{"em_gain": 300.0}, {"background_e": 2.0}])
@@ -90,7 +90,7 @@ def test_cameras_are_known_to_the_estimators(changes: dict[str, Any]) -> None:
     specification = specification_of(flux_e=200, **changes)
     cell = specification.cells()[0]
     ((images, truth),) = realisations(cell, 1500, np.random.default_rng(1))
-    slopes = CellArms(cell, specification, 200.0).measure("ml", (), images)
+    slopes = CellMethods(cell, specification, 200.0).measure("ml", (), images)
     errors = np.stack([slopes.x, slopes.y], axis=-1) - truth
     stated = np.sqrt(np.mean(np.square([slopes.standard_error_x, slopes.standard_error_y])))
     assert stated == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.2)
@@ -101,7 +101,7 @@ def test_speckled_spots() -> None:
         specification_of(flux_e=200, d_over_r0=3),
         realisations=800,
         corrected=True,
-        arms=["brightest", "ml", "trained"],
+        estimators=["brightest", "ml", "trained"],
         blurs=[0.0, 1.8],
         model_errors=[0.2],
     )
@@ -119,7 +119,7 @@ def test_training_is_not_done_on_the_scored_spots() -> None:
     """Repeated with another study's seed, within 5 standard errors."""
     results = []
     for seed in (1, 2):
-        specification = replace(specification_of(flux_e=30), arms=["trained"], seed=seed)
+        specification = replace(specification_of(flux_e=30), estimators=["trained"], seed=seed)
         results.append(measure_cell(specification.cells()[0], specification))
     (first, second), se = (r["error"][0, 0] for r in results), results[0]["error_se"][0, 0]
     assert abs(first - second) < 5 * np.sqrt(2) * se

@@ -19,7 +19,7 @@ PRIOR = "prior_std_px"
 
 
 @dataclass(frozen=True, eq=False)
-class Arm:
+class Method:
     """Method that experiments compare: estimator, settings, prior knowledge and control.
 
     Parameters
@@ -54,9 +54,9 @@ class Arm:
     Examples
     --------
     >>> import faintspot as fs
-    >>> from faintspot.ao_loop import Arm
-    >>> arm = Arm("a window, less gain", fs.Settings("window"), gain=0.4)
-    >>> arm.control, arm.gain
+    >>> from faintspot.ao_loop import Method
+    >>> method = Method("a window, less gain", fs.Settings("window"), gain=0.4)
+    >>> method.control, method.gain
     ('integrator', 0.4)
     """
 
@@ -75,15 +75,15 @@ class Arm:
 
     def __post_init__(self) -> None:
         if not isinstance(self.label, str) or not self.label:
-            raise InputError(f"arm.label: expected a text, got {self.label!r}")
+            raise InputError(f"method.label: expected a text, got {self.label!r}")
         if not isinstance(self.settings, Settings):
-            raise InputError(f"arm.settings: expected Settings, got {type(self.settings).__name__}")
+            raise InputError(f"method.settings: expected Settings, got {type(self.settings).__name__}")
         if self.gain is not None:
-            number_between("arm.gain", self.gain, 0, 2)
+            number_between("method.gain", self.gain, 0, 2)
         if self.window_pixels is not None:
-            number_between("arm.window_pixels", self.window_pixels, 2, 64, integer=True)
-        one_of("arm.control", self.control, list(CONTROLS))
-        number_between("arm.noise_scale", self.noise_scale, 0, 100, low_open=True)
+            number_between("method.window_pixels", self.window_pixels, 2, 64, integer=True)
+        one_of("method.control", self.control, list(CONTROLS))
+        number_between("method.noise_scale", self.noise_scale, 0, 100, low_open=True)
 
     @property
     def estimator(self) -> Estimator:
@@ -100,6 +100,6 @@ class Arm:
         """Arguments of a pipeline beside settings and calibration."""
         return {"psf": self.psf, "score": self.score}
 
-    def with_options(self, changes: Mapping[str, Any]) -> Arm:
+    def with_options(self, changes: Mapping[str, Any]) -> Method:
         """Return the same with some settings changed."""
         return replace(self, settings=self.settings.replace(**changes)) if changes else self

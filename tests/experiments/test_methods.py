@@ -1,4 +1,4 @@
-"""Arms: estimators made for a scene, by their own word."""
+"""Methods: estimators made for a scene, by their own word."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 
 from faintspot import PSF
 from faintspot.estimators import Scene, estimators
-from faintspot.experiments.arms import Knowledge, arm_for_scene, tuned_options
+from faintspot.experiments.methods import Knowledge, method_for_scene, tuned_options
 
 SCENE = Scene(flux_e=123.456, read_noise_e=3.0, window=(12, 12), spot_fwhm_px=1.77, position_range_px=1.0)
 WITHOUT_OPTIONS = ("centroid", "trained")
@@ -15,16 +15,16 @@ WITHOUT_OPTIONS = ("centroid", "trained")
 @pytest.mark.parametrize("name", list(estimators()))
 def test_every_estimator_is_made_for_a_scene(name: str) -> None:
     kind = estimators()[name]
-    arm = arm_for_scene(kind, SCENE, psf=PSF.analytic())
-    assert (arm.name, arm.label) == (name, kind.label)
-    assert arm.settings.search_range_px == 1.0
-    assert (arm.psf is None) == (Knowledge.of(arm.estimator) < Knowledge.SPOT or name == "trained")
-    options = tuned_options(arm, SCENE)
+    method = method_for_scene(kind, SCENE, psf=PSF.analytic())
+    assert (method.name, method.label) == (name, kind.label)
+    assert method.settings.search_range_px == 1.0
+    assert (method.psf is None) == (Knowledge.of(method.estimator) < Knowledge.SPOT or name == "trained")
+    options = tuned_options(method, SCENE)
     for option, values in options.items():
-        changed = arm.with_options({option: values[-1]})
+        changed = method.with_options({option: values[-1]})
         assert getattr(changed.settings, option) == values[-1]
         assert all(float(f"{value:.3g}") == value for value in values if isinstance(value, float))
-    assert not any(isinstance(value, str) and value == "auto" for value in arm.settings.chosen().values())
+    assert not any(isinstance(value, str) and value == "auto" for value in method.settings.chosen().values())
 
 
 def test_knowledge_follows_from_the_needs() -> None:
@@ -43,6 +43,6 @@ def test_knowledge_follows_from_the_needs() -> None:
 
 def test_speckled_spots_are_blurred_or_doubted() -> None:
     speckled = Scene(**{**vars(SCENE), "d_over_r0": 2.0})
-    arm = arm_for_scene(estimators()["ml"], speckled)
-    assert set(tuned_options(arm, speckled)) == {"blur_px", "model_error"}
-    assert tuned_options(arm, SCENE) == {}
+    method = method_for_scene(estimators()["ml"], speckled)
+    assert set(tuned_options(method, speckled)) == {"blur_px", "model_error"}
+    assert tuned_options(method, SCENE) == {}

@@ -1,4 +1,4 @@
-"""Arms for spots of a scene, what they know, and the arms of studies by name."""
+"""Methods for spots of a scene, what they know, and the methods of studies by name."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.ao_loop.arms import Arm
+from faintspot.ao_loop.methods import Method
 from faintspot.camera.detector import Detector
 from faintspot.config.options import AUTO
 from faintspot.estimators.base import Estimator, Need, Style
@@ -41,9 +41,9 @@ class Knowledge(IntEnum):
         return cls.WIDTH if Need.WIDTH in estimator.needs else cls.NOISE
 
 
-def arm_for_scene(
+def method_for_scene(
     kind: type[Estimator], scene: Scene, *, psf: PSF | None = None, score: Score | None = None
-) -> Arm:
+) -> Method:
     """Return an estimator with the options that a scene asks for, before any are tuned.
 
     Parameters
@@ -68,7 +68,7 @@ def arm_for_scene(
         search_range_px=scene.position_range_px,
         **_rounded(width),
     )
-    return Arm(
+    return Method(
         kind.label,
         settings,
         psf=psf if Need.PSF in kind.needs else None,
@@ -115,11 +115,11 @@ def score_for_scene(
     )
 
 
-def tuned_options(arm: Arm, scene: Scene) -> dict[str, list[Any]]:
-    """Return what an arm may choose from in a scene; the usual value of each option is the first."""
+def tuned_options(method: Method, scene: Scene) -> dict[str, list[Any]]:
+    """Return what a method may choose from in a scene; the usual value of each option is the first."""
     return {
         name: list(dict.fromkeys(_rounded(dict(enumerate(values))).values()))
-        for name, values in arm.estimator.tuned(scene).items()
+        for name, values in method.estimator.tuned(scene).items()
     }
 
 
@@ -133,27 +133,27 @@ def _rounded(values: Mapping[Any, Any]) -> dict[Any, Any]:
 Kind = type[Estimator]
 
 TV, NO_TV, SMOOTHING = TotalVariation.name, BrightestPixels.name, Smoothed.name
-"""The arms that the paper's claims compare, and the simplest rival."""
+"""The methods that the paper's claims compare, and the simplest rival."""
 TV_OVER_NO_TV = {"method": TV, "reference": NO_TV}
 """Curves between which gains are computed."""
 
-DEFAULT_ARMS = tuple(kind.name for kind in (BrightestPixels, TotalVariation, Smoothed, Thresholded))
+DEFAULT_METHODS = tuple(kind.name for kind in (BrightestPixels, TotalVariation, Smoothed, Thresholded))
 """The built-in ones that know nothing of the spot."""
 
 
-def label_of(arm: str) -> str:
-    """Return what tables and figures call an arm; its name where its estimator is not installed here."""
-    return estimators()[arm].label if arm in estimators() else arm
+def label_of(method: str) -> str:
+    """Return what tables and figures call a method; its name where its estimator is not installed here."""
+    return estimators()[method].label if method in estimators() else method
 
 
-def style_of(arm: str) -> Style:
-    """Return how figures draw an arm."""
-    return estimators().get(arm, Estimator).style
+def style_of(method: str) -> Style:
+    """Return how figures draw a method."""
+    return estimators().get(method, Estimator).style
 
 
-def knows_the_spot(arm: str) -> bool:
+def knows_the_spot(method: str) -> bool:
     """Return whether a method knows more than the noise."""
-    return arm in estimators() and Knowledge.of(estimators()[arm]) > Knowledge.NOISE
+    return method in estimators() and Knowledge.of(estimators()[method]) > Knowledge.NOISE
 
 
 def keeps_every_k(kind: Kind) -> bool:

@@ -1,4 +1,4 @@
-"""What the arms do to the images, against the public functions and SciPy."""
+"""What the methods do to the images, against the public functions and SciPy."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.registry import estimator_named
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.experiments import StudySpecification, Sweep
-from faintspot.experiments.arms import (
+from faintspot.experiments.cell import realisations
+from faintspot.experiments.cell_methods import CellMethods, position_table
+from faintspot.experiments.methods import (
     keeps_every_k,
     knows_the_spot,
     label_of,
     style_of,
 )
-from faintspot.experiments.cell import realisations
-from faintspot.experiments.cell_arms import CellArms, position_table
 
 
 @pytest.fixture(scope="module")
@@ -35,22 +35,22 @@ def simulated() -> tuple[NDArray[np.float32], NDArray[np.float64]]:
 
 
 @pytest.mark.parametrize(
-    ("arm", "options"),
+    ("method", "options"),
     [
         ("brightest", {}),
         ("tv", {"noise_std": 1.4}),
         ("smoothed", {"smoothing_px": 0.8}),
     ],
 )
-def test_arms_are_what_they_say(
-    simulated: tuple[NDArray[np.float32], NDArray[np.float64]], arm: str, options: dict[str, float]
+def test_methods_are_what_they_say(
+    simulated: tuple[NDArray[np.float32], NDArray[np.float64]], method: str, options: dict[str, float]
 ) -> None:
     images, _ = simulated
     prepared = {
         "tv": lambda: fs.tv_denoise(images, 1.4),
         "smoothed": lambda: np.stack([gaussian_filter(i, 0.8, mode="constant") for i in images]),
-    }.get(arm, lambda: images)()
-    estimator: Any = estimator_named(arm)(**options)
+    }.get(method, lambda: images)()
+    estimator: Any = estimator_named(method)(**options)
     positions, valid = position_table(estimator, images)
     assert positions.shape == (60, 99, 2)
     assert valid[:, 6:].all()  # denoised pixels often tie, so that few kept pixels may leave nothing
@@ -66,9 +66,9 @@ def test_without_flux_the_position_is_the_centre() -> None:
     positions, valid = position_table(TotalVariation(noise_std=1.4), flat)
     assert not valid.any()
     assert not positions.any()
-    specification = StudySpecification("s", [Sweep("a", pixels=10)], arms=["thresholded"])
-    arms = CellArms(specification.cells()[0], specification)
-    slopes = arms.measure("thresholded", (("threshold_e", 5.0),), flat)
+    specification = StudySpecification("s", [Sweep("a", pixels=10)], estimators=["thresholded"])
+    methods = CellMethods(specification.cells()[0], specification)
+    slopes = methods.measure("thresholded", (("threshold_e", 5.0),), flat)
     assert not slopes.valid.any()
     assert slopes.x[0] == slopes.y[0] == 0.0
 
@@ -83,23 +83,23 @@ def test_positions_become_the_search_range(
 def test_names() -> None:
     assert label_of("of another installation") == "of another installation"
     assert style_of("of another installation") == Estimator.style
-    assert [arm for arm in ("brightest", "weighted", "ml", "nobody's") if knows_the_spot(arm)] == [
+    assert [method for method in ("brightest", "weighted", "ml", "nobody's") if knows_the_spot(method)] == [
         "weighted",
         "ml",
     ]
-    assert [keeps_every_k(estimator_named(arm)) for arm in ("tv", "thresholded")] == [True, False]
+    assert [keeps_every_k(estimator_named(method)) for method in ("tv", "thresholded")] == [True, False]
 
 
 def test_candidates_in_a_cell() -> None:
     specification = StudySpecification(
         "x",
         [Sweep("a", pixels=16, d_over_r0=[0, 2])],
-        arms=["brightest", "tv", "ml", "matched", "trained", "weighted"],
+        estimators=["brightest", "tv", "ml", "matched", "trained", "weighted"],
         strengths=[0.5, 1.0],
         blurs=[0.0, 1.0],
         model_errors=[0.2],
     )
-    still, speckled = (CellArms(cell, specification) for cell in specification.cells())
+    still, speckled = (CellMethods(cell, specification) for cell in specification.cells())
     assert still.candidates("brightest") == [()]
     assert still.candidates("trained") == [()]
     assert still.candidates("tv") == [(("noise_std", 0.5),), (("noise_std", 1.0),)]
@@ -113,14 +113,14 @@ def test_candidates_in_a_cell() -> None:
 def test_an_estimator_of_somebody_else(plugin: type[Estimator]) -> None:
     """It tunes an option of its own, is told the spot's width, and is measured like any other."""
     specification = StudySpecification(
-        "s", [Sweep("a", flux_e=1000, pixels=10)], realisations=200, arms=["own"], fixed_k=[]
+        "s", [Sweep("a", flux_e=1000, pixels=10)], realisations=200, estimators=["own"], fixed_k=[]
     )
     cell = specification.cells()[0]
-    arms = CellArms(cell, specification)
-    assert arms.candidates("own") == [(("power", 1.0),), (("power", 2.0),)]
+    methods = CellMethods(cell, specification)
+    assert methods.candidates("own") == [(("power", 1.0),), (("power", 2.0),)]
     assert specification.search_range_of(cell) == 1.0
     ((images, truth),) = realisations(cell, 50, np.random.default_rng(1))
-    slopes = arms.measure("own", (("power", 2.0),), images)
+    slopes = methods.measure("own", (("power", 2.0),), images)
     found = np.stack([slopes.x, slopes.y], axis=-1)
     assert np.abs(found - truth).mean() < 0.3
     measured = fs.experiments.measure_cell(cell, specification)
