@@ -123,7 +123,7 @@ def run() -> list[Table]:
             pair = [methods[first], methods[name]]
             found = np.array([merits(configuration, pair, 1500 + r) for r in range(REALISATIONS)])
             columns: dict[str, float] = {}
-            for title, values in zip(("told", "true"), found.T[:2], strict=True):
+            for title, values in zip(("measured", "true"), found.T[:2], strict=True):
                 mean = paired_mean(values)
                 columns |= {
                     f"{title}, 1000 nm^2": mean.value / 1e3,

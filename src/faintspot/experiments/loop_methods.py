@@ -56,10 +56,8 @@ class Tunable:
     first: tuple[Any, ...]
     """Those of the first look."""
 
-    def nearest(self, value: Any) -> Tunable:
-        """Return only the value that is nearest to another one, or that one itself."""
-        if value in self.values or isinstance(value, str):
-            return Tunable((value,), (value,))
+    def nearest(self, value: float) -> Tunable:
+        """Return only the value that is nearest to another one."""
         near = min(self.values, key=lambda each: abs(each - value))
         return Tunable((near,), (near,))
 
