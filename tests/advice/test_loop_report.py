@@ -134,6 +134,16 @@ def test_few_frames() -> None:
     assert all("48 frames" in report.parts[name].missing for name in ("noise", "turbulence", "choices"))
 
 
+def test_large_slopes_not_measured() -> None:
+    """Without the largest third of the slopes the others tell no turbulence."""
+    loop = recorded()
+    large = np.abs(loop.slopes) > np.quantile(np.abs(loop.slopes), 0.67)
+    report = report_of_loop(replace(loop, slopes=np.where(large, np.nan, loop.slopes)))
+    for name in ("turbulence", "vibrations", "spectra", "choices"):
+        assert "33% of the slopes" in report.parts[name].missing
+    assert not report.parts["turbulence"].known
+
+
 def test_constant_slopes() -> None:
     loop = recorded()
     with pytest.raises(InputError, match="expected slopes that vary"):

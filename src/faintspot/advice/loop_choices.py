@@ -67,32 +67,30 @@ def compared_choices(
     InputError
         When there are too few frames, or the mirror cannot be controlled by the slopes.
     """
-    telemetry, frames = seen.telemetry, len(seen.telemetry)
+    frames = len(seen.telemetry)
     assert loop.interaction is not None
     if frames < FEWEST_FRAMES:
         raise InputError(f"{frames} frames, expected {FEWEST_FRAMES} for a replay")
     reconstructor = make_reconstructor(loop.interaction)
     plant = Plant(loop.interaction, reconstructor, max(1, round(delay.delay_frames)), _LEAK)
     phase = residual_phase(reconstructor.clean, loop.interaction, loop.cells)
-    scored = telemetry.part(frames // 2, frames)
-    noise = float(seen.variance @ np.square(phase).sum(axis=0))
-    noise_error = noise * float(seen.variance_error.mean()) / math.sqrt(len(reconstructor.modes.T))
-    scale = _Scale.of(loop, r0, delay)
+    views = [_View.of(each, phase) for each in (seen, seen.scaled(delay.gain))]
+    relative = float(seen.variance_error.mean()) / math.sqrt(len(reconstructor.modes.T))
+    scale = _Scale.of(loop, r0, delay, relative)
 
-    def left(make: Make) -> Floats:
-        found = replayed_frames(make, scored, plant.interaction, phase, plant.delay_frames)
-        return found[SETTLE_FRAMES:][_whole(scored)[SETTLE_FRAMES:]]
+    def left(make: Make) -> list[Floats]:
+        return [view.left(make, plant, phase) for view in views]
 
-    def integrator(gain: float) -> Floats:
+    def integrator(gain: float) -> list[Floats]:
         return left(partial(plant.integrator, gain))
 
     ran = None
     if loop.is_closed and loop.commands is not None:
-        residual = seen.residual[frames // 2 :]
-        ran = np.square(residual @ phase.T).sum(axis=1)[SETTLE_FRAMES:][_whole(scored)[SETTLE_FRAMES:]]
-    compare = partial(_choice, ran=ran, noise=(noise, noise_error), scale=scale)
+        ran = [view.ran for view in views]
+    noise = [view.noise for view in views]
+    compare = partial(_choice, ran=ran, noise=noise, scale=scale)
     found = [] if ran is None else [compare(AS_RUN, ran)]
-    first = telemetry.part(0, frames // 2)
+    first = seen.telemetry.part(0, frames // 2)
     if len(seen.variance) <= _MOST_SLOPES:
         learnt = learn(KALMAN, plant, first, site, loop.frame_rate_hz)
         best = learnt.model.plain_gain
@@ -102,12 +100,40 @@ def compared_choices(
         ranked = [plant.left(partial(plant.integrator, gain), first, phase) for gain in GAINS]
         best = GAINS[int(np.argmin(ranked))]
     found.insert(len(found) - 1, compare(BEST, integrator(best), gain=best))
-    uncorrected = float(np.square(scored.open_loop_px @ phase.T).sum(axis=1).mean())
+    uncorrected = float(np.square(views[0].scored.open_loop_px @ phase.T).sum(axis=1).mean())
     for gain in GAINS[1::2]:
         values = integrator(gain)
-        if values.max() < np.inf and values.mean() < uncorrected:  # else it is not stable
+        if values[0].max() < np.inf and values[0].mean() < uncorrected:  # else it is not stable
             found.append(compare("integrator", values, gain=gain))
     return [_at_gain(each, delay.gain) for each in found]
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """Second half of the recording with one centroid gain.
+
+    That of the loop holds for displacements as large as in the recording, that of the interaction matrix for
+    small ones. Another controller's are between them.
+    """
+
+    scored: OpenLoopTelemetry
+    ran: Floats
+    """Squared phase of the loop as it ran, of the frames that are compared."""
+    noise: float
+    """Phase variance of the noise."""
+
+    @classmethod
+    def of(cls, seen: OpenLoop, phase: Floats) -> _View:
+        half = len(seen.telemetry) // 2
+        scored = seen.telemetry.part(half, len(seen.telemetry))
+        ran = np.square(seen.residual[half:] @ phase.T).sum(axis=1)
+        noise = float(seen.variance @ np.square(phase).sum(axis=0))
+        return cls(scored, ran[SETTLE_FRAMES:][_whole(scored)[SETTLE_FRAMES:]], noise)
+
+    def left(self, make: Make, plant: Plant, phase: Floats) -> Floats:
+        """Return what a controller leaves."""
+        found = replayed_frames(make, self.scored, plant.interaction, phase, plant.delay_frames)
+        return found[SETTLE_FRAMES:][_whole(self.scored)[SETTLE_FRAMES:]]
 
 
 @dataclass(frozen=True)
@@ -120,37 +146,39 @@ class _Scale:
     fitting_error_nm2: float
     wavelength_nm: float
     gain_error: float
-    """Relative error of variances due to the centroid gain, which differs for large displacements."""
+    """Relative error of variances due to that of the centroid gain."""
+    noise_error: float
+    """Relative error of the noise's phase variance."""
 
     @classmethod
-    def of(cls, loop: RecordedLoop, r0: Measured, delay: LoopDelay) -> _Scale:
-        gain_error = math.hypot(1 - delay.gain, 2 * np.nan_to_num(delay.gain_error))
+    def of(cls, loop: RecordedLoop, r0: Measured, delay: LoopDelay, noise_error: float) -> _Scale:
+        gain_error = 2 * float(np.nan_to_num(delay.gain_error))
         if loop.subaperture_m is None or loop.pixel_scale_arcsec is None:
             unit = f"{loop.slope_unit} x sub-aperture"
-            return cls(unit, 1.0, math.nan, math.nan, math.nan, gain_error)
+            return cls(unit, 1.0, math.nan, math.nan, math.nan, gain_error, noise_error)
         factor = loop.pixel_scale_arcsec * ARCSEC * loop.subaperture_m * 1e9
         square = (loop.subaperture_m / r0.value) ** (5 / 3) * (_R0_WAVELENGTH_NM / (2 * math.pi)) ** 2
         error = square * math.hypot(_FITTING_ERROR, _FITTING * 5 / 3 * r0.error / r0.value)
-        return cls("nm", factor, _FITTING * square, error, loop.science_wavelength_m * 1e9, gain_error)
+        wavelength_nm = loop.science_wavelength_m * 1e9
+        return cls("nm", factor, _FITTING * square, error, wavelength_nm, gain_error, noise_error)
 
 
 def _choice(
     name: str,
-    left: Floats,
-    ran: Floats | None,
-    noise: tuple[float, float],
+    left: list[Floats],
+    ran: list[Floats] | None,
+    noise: list[float],
     scale: _Scale,
     gain: float = math.nan,
 ) -> Choice:
-    block = max(1, len(left) // _BLOCKS)
-    mean = mean_by_blocks(left, block)
-    square = scale.factor**2 * (mean.value - noise[0])
-    error = math.hypot(scale.factor**2 * math.hypot(mean.standard_error, noise[1]), scale.gain_error * square)
+    """Return a choice from its squared phase in each view."""
+    unit = scale.factor**2
+    square, error = _mean_of_views([values - each for values, each in zip(left, noise, strict=True)], unit)
+    error = math.hypot(error, unit * noise[0] * scale.noise_error, scale.gain_error * square)
     less = Measured("less than as it ran", scale.unit, remark="the loop was open")
     if ran is not None:
-        difference = mean_by_blocks(ran - left, block)
-        squares = scale.factor**2 * difference.value, scale.factor**2 * difference.standard_error
-        less = _root(less.name, scale.unit, *squares)
+        saved = [before - after for before, after in zip(ran, left, strict=True)]
+        less = _root(less.name, scale.unit, *_mean_of_views(saved, unit))
     total = square + scale.fitting_nm2
     total_error = math.hypot(error, scale.fitting_error_nm2)
     wave = (2 * math.pi / scale.wavelength_nm) ** 2
@@ -164,6 +192,15 @@ def _choice(
         Measured("Strehl ratio", "", min(strehl, 1.0), strehl * wave * total_error, remark),
         gain,
     )
+
+
+def _mean_of_views(values: list[Floats], unit: float) -> tuple[float, float]:
+    """Return the mean of all views and its standard error."""
+    block = max(1, len(values[0]) // _BLOCKS)
+    means = [mean_by_blocks(each, block) for each in values]
+    found = [each.value for each in means]
+    error = math.hypot(means[0].standard_error, 0.5 * (max(found) - min(found)))
+    return unit * float(np.mean(found)), unit * error
 
 
 def _root(name: str, unit: str, square: float, error: float, remark: str = "") -> Measured:

@@ -20,14 +20,16 @@ from faintspot.base.errors import InputError
 from faintspot.control.identification import Identification, Identified
 from faintspot.control.loop_delay import LoopDelay, loop_delay
 from faintspot.control.recording import subapertures_across
+from faintspot.turbulence.strength import turbulence_strength
 
 Floats = NDArray[np.float64]
 
 _WHOLE_FRAMES = 0.1  # closer to a whole number of frames than this, a delay is taken for that
 _TIMES_AT_LIMIT = 3  # that a largest value occurs, to be taken for a limit
 _DRAWS = 1000
-_GAIN_IN_R0 = 0.3  # relative change of r0 with the centroid gain
-_PARABOLA_ERROR = 0.01  # of the noise: turbulence within two frames is no parabola
+_GAIN_SPREAD = 0.5  # of the deviation of the centroid gain from 1: it differs between spatial scales
+_MOST_UNMEASURED = 0.2  # of the slopes; large ones are missed most, so that the others vary too little
+_PARABOLA_ERROR = 0.03  # of the noise: turbulence and speckles within two frames are no parabola
 
 
 @dataclass
@@ -205,6 +207,11 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
     else:
         to_nm = scale * ARCSEC * loop.subaperture_m * 1e9
         part.known.append(Measured("tilt over a sub-aperture", "nm", rms * to_nm, spread * to_nm, over))
+    unmeasured = 1 - float(found.telemetry.trust[found.telemetry.trust.any(axis=1)].mean())
+    if unmeasured > _MOST_UNMEASURED:
+        why = f"{unmeasured:.0%} of the slopes were not measured, more than {_MOST_UNMEASURED:.0%}."
+        for name in ("turbulence", "vibrations", "spectra", "choices"):
+            report.parts[name].missing = report.parts[name].missing or why
     return None if report.parts["turbulence"].missing else found
 
 
@@ -224,12 +231,17 @@ def _turbulence(report: LoopReport, seen: OpenLoop, delay: LoopDelay) -> None:
         return
     r0 = Measured("r0 at 500 nm", "m", remark="pixel_scale_arcsec is unknown")
     if loop.pixel_scale_arcsec is not None:
-        shaking = sum(each.rms_px**2 for each in identified.vibrations)
-        part.known += outer_scale_and_r0(
-            seen.telemetry.open_loop_px, seen.run, site, shaking, loop.outer_scale_m
+        rows = seen.telemetry.trust.any(axis=1)
+        slopes = seen.telemetry.open_loop_px[rows], seen.residual[rows], seen.run[rows]
+        found = turbulence_strength(
+            *slopes,
+            site,
+            gain_error=delay.gain_error / delay.gain,
+            gain_spread=_GAIN_SPREAD * abs(1 - delay.gain),
+            outer_scale_m=loop.outer_scale_m,
         )
-        of_gain = _GAIN_IN_R0 * abs(1 - delay.gain)
-        r0 = part.known[-1] = part.known[-1].with_relative_error(of_gain)
+        part.known += outer_scale_and_r0(found, loop.outer_scale_m)
+        r0 = part.known[-1]
     else:
         part.known.append(r0)
     part.known += _winds(identified, r0)

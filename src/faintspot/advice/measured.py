@@ -12,22 +12,18 @@ from numpy.typing import NDArray
 from faintspot.advice.centroid_gain import calibration_of_electrons
 from faintspot.advice.loop_telemetry import LoopTelemetry
 from faintspot.algorithms.noise import pixel_noise
-from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
-from faintspot.control.recording import OUTER_SCALE_M, side_m
+from faintspot.control.recording import side_m, site_of
 from faintspot.sensor.layout import Layout
 from faintspot.training.psf_learning import learn_psf_from_images
-from faintspot.turbulence.seeing import estimate_r0, slope_variance
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.turbulence.strength import OUTER_SCALE_M, Strength, turbulence_strength
 
 Floats = NDArray[np.float64]
 
-_SCALE_SPREAD = 0.7  # of the logarithm of the outer scale, where it is assumed
-_THEORY_ERROR = 0.03  # of r0: centroids are not quite mean gradients over squares
 _STRETCHES = 5  # parts of the telemetry whose scatter gives an error
 _FEWEST_IMAGES = 10
-_FEWEST_OF_STRETCH = 40  # frames
 _WIND_LAG = 8  # frames; long enough for a visible change of the turbulence
 _WINDS_M_PER_S = np.geomspace(1.0, 60.0, 9)
 _BINS = 256  # in a spectrum
@@ -48,10 +44,6 @@ class Measured:
     """Standard error; NaN if unknown."""
     remark: str = ""
     """Reason why it is unknown, or assumptions of the value."""
-
-    def with_relative_error(self, more: float) -> Measured:
-        """Return the quantity with a further independent error, relative to its value."""
-        return replace(self, error=math.hypot(self.error, more * self.value))
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -116,16 +108,17 @@ def of_images(frames_e: NDArray[np.float32], layout: Layout, calibration: Calibr
 
 def of_atmosphere(seen: LoopTelemetry, layout: Layout, gain: float = 1.0) -> list[Measured]:
     """Return r0, the wind and vibrations, from slopes without the mirror's contribution."""
-    _, atmosphere = seen.weighted(gain)
+    residual, atmosphere = seen.weighted(gain)
     r0, wind = ("r0 at 500 nm", "m"), ("wind", "m/s")
     side = side_m(layout.cells, layout.subaperture_m, layout.diameter_m)
     if side is None or layout.pixel_scale_arcsec is None:
         why = "the layout lacks subaperture_m or pixel_scale_arcsec"
         found = [Measured(*r0, remark=why), Measured(*wind, remark=why)]
     else:
+        site = site_of(layout)
         found = [
-            _r0(Measured(*r0), seen, atmosphere, layout, side),
-            _wind(Measured(*wind), seen, atmosphere, layout, side),
+            *outer_scale_and_r0(turbulence_strength(atmosphere, residual, seen.segment, site)),
+            _wind(Measured(*wind), seen, atmosphere, site),
         ]
     return [*found, *_vibrations(seen, atmosphere)]
 
@@ -143,110 +136,23 @@ def _of_stretches(kind: Measured, whole: float, parts: list[float], remark: str)
     return Measured(kind.name, kind.unit, whole, error, remark)
 
 
-def _r0(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, layout: Layout, side: float) -> Measured:
-    def estimated(rows: NDArray[np.int64]) -> float:
-        return estimate_r0(
-            atmosphere[rows],
-            cells=layout.cells,
-            subaperture_m=side,
-            pixel_scale_rad=(layout.pixel_scale_arcsec or 1.0) * ARCSEC,
-            outer_scale_m=OUTER_SCALE_M,
-            segment=seen.segment[rows],
-            static_px=atmosphere.mean(axis=0),
-        ).r0_m
-
-    parts = _stretches(seen)
-    if min(len(part) for part in parts) < _FEWEST_OF_STRETCH:
-        return Measured(kind.name, kind.unit, remark=f"{len(seen)} frames are too few")
-    whole = estimated(np.arange(len(seen)))
-    return _of_stretches(
-        kind, whole, [estimated(part) for part in parts], f"outer scale {OUTER_SCALE_M:g} m assumed"
-    )
+def outer_scale_and_r0(found: Strength, known_scale_m: float | None = None) -> list[Measured]:
+    """Return the outer scale, where it is known with this value, and r0."""
+    remark = f"{OUTER_SCALE_M:g} m within a factor of two was expected" if known_scale_m is None else "given"
+    name, unit = "r0 at 500 nm", "m"
+    if not math.isfinite(found.r0_m):
+        outer = Measured("outer scale", "m", remark="unknown without r0")
+        return [outer, Measured(name, unit, remark="the slopes vary no more than their noise")]
+    outer = Measured("outer scale", "m", found.outer_scale_m, found.outer_scale_error_m, remark)
+    return [outer, Measured(name, unit, found.r0_m, found.r0_error_m)]
 
 
-def outer_scale_and_r0(
-    atmosphere: Floats,
-    run: NDArray[np.int64],
-    site: SlopeTurbulence,
-    vibration_px2: float,
-    known_m: float | None,
-) -> list[Measured]:
-    """Return outer scale and r0 from the variance of slopes with and without their mean over the pupil.
-
-    Parameters
-    ----------
-    atmosphere : (frames, 2 n) array
-        Open-loop slopes.
-    run : (frames,) array of int
-        Frames with the same number are consecutive.
-    site : SlopeTurbulence
-        Geometry.
-    vibration_px2 : float
-        Variance of the slopes due to vibrations.
-    known_m : float, optional
-        Outer scale, where it is known; else 25 m are assumed within a factor of two, and corrected.
-    """
-    cells = np.rint(site.positions_m[:, ::-1] / site.subaperture_m).astype(np.int64)
-    static, without_tilt = atmosphere.mean(axis=0), len(cells) > 2
-
-    def r0_m(rows: NDArray[np.int64], scale_m: float, without_tilt: bool = without_tilt) -> float:
-        return estimate_r0(
-            atmosphere[rows],
-            cells=cells,
-            subaperture_m=site.subaperture_m,
-            pixel_scale_rad=site.pixel_scale_rad,
-            outer_scale_m=scale_m,
-            segment=run[rows],
-            static_px=static,
-            remove_tip_tilt=without_tilt,
-        ).r0_m
-
-    def share(rows: NDArray[np.int64]) -> float:
-        within, total = (
-            r0_m(rows, OUTER_SCALE_M, each) ** (-5 / 3)
-            * slope_variance(site.subaperture_m, OUTER_SCALE_M, positions=site.positions_m if each else None)
-            for each in (True, False)
-        )
-        return float(within / max(total - vibration_px2 * site.pixel_scale_rad**2, within))
-
-    whole, parts = np.arange(len(atmosphere)), np.array_split(np.arange(len(atmosphere)), _STRETCHES)
-    if known_m is not None:
-        outer = Measured("outer scale", "m", known_m, 0.0, "given")
-    elif without_tilt:
-        outer = _outer_scale(site, share(whole), [share(part) for part in parts])
-    else:
-        outer = Measured("outer scale", "m", OUTER_SCALE_M, _SCALE_SPREAD * OUTER_SCALE_M, "assumed")
-    values = [r0_m(rows, outer.value) for rows in (whole, *parts)]
-    found = _of_stretches(Measured("r0 at 500 nm", "m"), values[0], values[1:], "")
-    if not math.isfinite(found.value):
-        return [outer, found]
-    change = (r0_m(whole, 1.2 * outer.value) / found.value - 1) / 0.2
-    of_scale = change * outer.error / outer.value
-    error = math.hypot(1.4 * found.error, found.value * math.hypot(of_scale, _THEORY_ERROR))
-    return [outer, Measured(found.name, found.unit, found.value, error)]
-
-
-def _outer_scale(site: SlopeTurbulence, whole: float, parts: list[float]) -> Measured:
-    """Return the outer scale from the share of the slopes' variance that is not their mean over the pupil."""
-    scales = np.geomspace(4.0, 160.0, 9)
-    side, positions = site.subaperture_m, site.positions_m
-    theory = [slope_variance(side, each, positions=positions) / slope_variance(side, each) for each in scales]
-    logarithms = np.interp([whole, *parts], theory[::-1], np.log(scales)[::-1])
-    scatter = float(np.std(logarithms[1:], ddof=1)) / math.sqrt(len(parts))
-    weight = _SCALE_SPREAD**-2 / (_SCALE_SPREAD**-2 + (1.4 * max(scatter, 0.05)) ** -2)
-    value = math.exp(weight * math.log(OUTER_SCALE_M) + (1 - weight) * logarithms[0])
-    remark = f"{OUTER_SCALE_M:g} m within a factor of two was expected"
-    return Measured("outer scale", "m", value, value * _SCALE_SPREAD * math.sqrt(weight), remark)
-
-
-def _wind(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, layout: Layout, side: float) -> Measured:
+def _wind(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, site: SlopeTurbulence) -> Measured:
     """Return the wind speed of a layer that changes the slopes as fast as observed, from any direction."""
-    positions = layout.cells[:, ::-1].astype(np.float64) * side
     far = _WIND_LAG
     if seen.rate_hz <= 0 or len(seen) < 10 * far:
         return Measured(kind.name, kind.unit, remark=f"{len(seen)} frames are too few")
-    alone = SlopeTurbulence(positions, side, 1.0, 0.15, OUTER_SCALE_M, np.ones(1), np.array([[1.0, 0.0]]))
-    anywhere = alone.from_anywhere()
+    anywhere = replace(site, wind_m_per_s=np.array([[1.0, 0.0]])).from_anywhere()
     still = _without_tilt(anywhere.covariance_px2(0.0))
     metres = np.concatenate([[0.0], _WINDS_M_PER_S * far / seen.rate_hz])
     theory = np.array([_without_tilt(anywhere.covariance_px2(each)) for each in metres]) / still

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,9 @@ from faintspot.advice.recorded_loop import RecordedLoop
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
 from faintspot.control.loop_delay import LoopDelay
-from faintspot.control.recording import OUTER_SCALE_M
 from faintspot.control.telemetry import LEAST_VARIANCE_PX2, OpenLoopTelemetry
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.turbulence.strength import OUTER_SCALE_M
 
 Floats = NDArray[np.float64]
 
@@ -38,6 +38,13 @@ class OpenLoop:
     def variance(self) -> Floats:
         """(2 n,): variance of the noise."""
         return np.asarray(np.min(self.telemetry.variance_px2, axis=0))
+
+    def scaled(self, gain: float) -> OpenLoop:
+        """Return the same with residual slopes multiplied by a gain."""
+        telemetry, residual = self.telemetry, gain * self.residual
+        slopes = telemetry.open_loop_px + residual - self.residual
+        scaled = OpenLoopTelemetry(slopes, gain**2 * telemetry.variance_px2, telemetry.trust)
+        return replace(self, telemetry=scaled, residual=residual)
 
 
 def site_of_loop(loop: RecordedLoop) -> SlopeTurbulence:

@@ -24,7 +24,10 @@ _FEWEST_PIECES = 8
 _MOST_DELAY = 5
 _DELAYS = np.arange(1.0, _MOST_DELAY + 0.01, 0.1)
 _GAINS, _FINE_GAINS = np.arange(0.5, 1.51, 0.05), np.arange(0.5, 1.51, 0.0125)
-_GAIN_SPREAD = 0.2  # before telemetry: the interaction matrix is as good as that
+_EXPECTED_GAIN, _GAIN_SPREAD = (
+    0.9,
+    0.15,
+)  # before telemetry: noise and speckles reduce the gain, little raises it
 _SPEEDS_M_PER_S = (1.0, 3.0, 6.0, 10.0, 15.0, 22.0, 32.0)
 _DIRECTIONS = 4  # of half a turn: opposite winds have the same spectrum
 _MOST_SUBAPERTURES = 40
@@ -85,7 +88,10 @@ def loop_delay(
     misfit = misfit.reshape(len(delays), len(gains))
     # As many independent values as the best fit is good, so that a model that does not fit has wide errors;
     # half of them, as neighbouring frequencies are alike under the window.
-    likelihood = -0.25 * (_WINDOW // 2 - 1) * misfit / misfit.min() - 0.5 * ((gains - 1) / _GAIN_SPREAD) ** 2
+    likelihood = (
+        -0.25 * (_WINDOW // 2 - 1) * misfit / misfit.min()
+        - 0.5 * ((gains - _EXPECTED_GAIN) / _GAIN_SPREAD) ** 2
+    )
     weight = np.exp(likelihood - likelihood.max())
     delay, delay_error = _moments(delays, weight.sum(axis=1))
     gain, gain_error = _moments(gains, weight.sum(axis=0))

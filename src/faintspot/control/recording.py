@@ -16,6 +16,7 @@ from faintspot.control.learnt import INTEGRATOR, KALMAN, MODAL
 from faintspot.control.telemetry import OpenLoopTelemetry, make_telemetry
 from faintspot.sensor.layout import Layout
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.turbulence.strength import OUTER_SCALE_M
 
 if TYPE_CHECKING:
     from faintspot.io.telemetry import Telemetry as Recording
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 200
-OUTER_SCALE_M = 25.0
 _ARCSEC = math.pi / 180 / 3600
 CLOSED = 2
 """State of a closed loop in telemetry."""

@@ -1,0 +1,175 @@
+"""Simulated loops of various seeds, turbulence, flux, gain and delay, as recordings with their truth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.advice.recorded_loop import RecordedLoop
+from faintspot.ao_loop import Arm, LoopConfiguration, load_loop
+from faintspot.ao_loop.calibration import make_pipeline
+from faintspot.ao_loop.configuration import ARCSEC
+from faintspot.ao_loop.simulation import measure_gains
+from faintspot.ao_loop.telescope_model import TelescopeModel
+from faintspot.control.commands import CommandDelayLine
+from faintspot.control.integrator import Integrator
+from faintspot.pipeline.settings import Settings
+
+Floats = NDArray[np.float64]
+
+SETTLE_FRAMES = 100
+_LEAK = 0.01
+_WAVELENGTH_M = 500e-9
+
+
+@dataclass(frozen=True)
+class Case:
+    """A loop with an integrator."""
+
+    seed: int
+    photons: float
+    gain: float
+    r0_m: float
+    outer_scale_m: float
+    delay_frames: int
+    wind_factor: float
+    wind_turn_deg: float
+    from_hcipy: bool
+    """Whether the turbulence is that of HCIPy's layers, which are extended row by row."""
+    frames: int = 3000
+
+    def configuration(self) -> LoopConfiguration:
+        """Return the loop, a variation of `diffraction_limit`."""
+        plain = load_loop("diffraction_limit")
+        speeds = tuple(self.wind_factor * each for each in plain.atmosphere.wind_speed_m_per_s)
+        directions = tuple((each + self.wind_turn_deg) % 360 for each in plain.atmosphere.wind_direction_deg)
+        air = {"r0_m": self.r0_m, "outer_scale_m": self.outer_scale_m}
+        winds = {"wind_speed_m_per_s": speeds, "wind_direction_deg": directions}
+        found = plain.replace("atmosphere", **air, **winds).replace("run", seed=self.seed)
+        found = found.replace("camera", photons_per_subaperture=self.photons)
+        return found.replace("control", delay_frames=self.delay_frames)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Values that the recording does not hold."""
+
+    noise_px: float
+    """Rms of the slopes' standard errors, at the calibrated centroid gain."""
+    residual_nm: Floats
+    """(frames,): rms of the residual wavefront, fitting error included."""
+    winds_m_per_s: Floats
+    """(layers, 2)"""
+
+
+def drawn_cases(number: int, seed: int) -> list[Case]:
+    """Return random cases, every second one with HCIPy's turbulence."""
+    rng = np.random.default_rng(seed)
+    cases = []
+    for place in range(number):
+        photons = float(np.exp(rng.uniform(math.log(20), math.log(300))))
+        usual = 0.17 * (photons / 20) ** 0.37  # about the best gain
+        cases.append(
+            Case(
+                int(rng.integers(1, 2**31)),
+                photons,
+                usual * rng.uniform(0.7, 1.2),
+                rng.uniform(0.18, 0.32),
+                float(np.exp(rng.uniform(math.log(12), math.log(50)))),
+                int(rng.integers(1, 3, endpoint=True)),
+                rng.uniform(0.6, 1.3),
+                rng.uniform(0, 360),
+                place % 2 == 1,
+            )
+        )
+    return cases
+
+
+def recorded(case: Case) -> tuple[RecordedLoop, Truth]:
+    """Run the loop of a case; slopes by `window`, divided by the calibrated centroid gain."""
+    configuration, arm = case.configuration(), Arm("window", Settings("window"))
+    telescope = TelescopeModel(configuration, case.seed)
+    if case.from_hcipy:
+        telescope.atmosphere = HcipyLayers(configuration, case.seed)  # type: ignore[assignment]
+    optics, rate = telescope.optics, configuration.control.frame_rate_hz
+    pipeline = make_pipeline(configuration, optics.sensor, arm)
+    gain = float(measure_gains(configuration, [pipeline], seed=case.seed)[0])
+    line = CommandDelayLine(optics.mirror.commands, case.delay_frames)
+    controller = Integrator(line, optics.interaction, optics.reconstructor, case.gain, _LEAK)
+    slopes, errors, commands, residual = [], [], [], []
+    for frame in range(case.frames):
+        after, seen = telescope.wavefronts((frame + 0.5) / rate, line.acting)
+        found = pipeline(telescope.frame(frame, seen))
+        error = np.concatenate([found.standard_error_x, found.standard_error_y]) / gain
+        vector = found.vector.astype(np.float64) / gain
+        controller.update(vector, error.astype(np.float64))
+        vector[~np.tile(found.valid, 2)] = np.nan
+        slopes.append(vector)
+        errors.append(error)
+        commands.append(line.latest.copy())
+        residual.append(optics.pupil.rms(after))
+    kept = np.square(np.array(errors)[SETTLE_FRAMES:])
+    loop = RecordedLoop(
+        "simulated",
+        np.array(slopes)[SETTLE_FRAMES:],
+        np.arange(SETTLE_FRAMES, case.frames),
+        rate,
+        "px",
+        optics.sensor.layout.cells,
+        np.array(commands)[SETTLE_FRAMES:],
+        optics.interaction,
+        configuration.subaperture_m,
+        configuration.pixel_scale_rad / ARCSEC,
+    )
+    noise = float(np.sqrt(kept[np.isfinite(kept)].mean()))
+    return loop, Truth(noise, np.array(residual)[SETTLE_FRAMES:], winds_of(configuration))
+
+
+def winds_of(configuration: LoopConfiguration) -> Floats:
+    """Return the winds of a configuration, (layers, 2) m/s."""
+    atmosphere = configuration.atmosphere
+    angle = np.deg2rad(atmosphere.wind_direction_deg)
+    speed = np.array(atmosphere.wind_speed_m_per_s)
+    return np.asarray((speed * np.array([np.cos(angle), np.sin(angle)])).T)
+
+
+class HcipyLayers:
+    """HCIPy's infinite layers in place of our own screens."""
+
+    def __init__(self, configuration: LoopConfiguration, seed: int) -> None:
+        import hcipy
+
+        atmosphere, sensor = configuration.atmosphere, configuration.sensor
+        self._r0_m = float(np.mean(atmosphere.r0_m))
+        points = sensor.subapertures * sensor.samples
+        grid = hcipy.make_pupil_grid(points, configuration.width_m)
+        share = np.array(atmosphere.fraction) / sum(atmosphere.fraction)
+        strengths = self._r0_m * share ** (-3 / 5)
+        # HCIPy moves the pupil over the turbulence: the wind has the opposite sign.
+        self._layers: list[Any] = [
+            hcipy.InfiniteAtmosphericLayer(
+                grid,
+                hcipy.Cn_squared_from_fried_parameter(float(r0), 500e-9),
+                atmosphere.outer_scale_m,
+                -wind,
+                seed=seed + number,
+            )
+            for number, (r0, wind) in enumerate(zip(strengths, winds_of(configuration), strict=True))
+        ]
+        self._points = points
+
+    def r0_m(self, time_s: float) -> float:
+        """Return the Fried parameter at 500 nm."""
+        return self._r0_m
+
+    def wavefront_nm(self, time_s: float) -> NDArray[np.float32]:
+        """Return the wavefront above the pupil, (points, points) nm."""
+        total = np.zeros(self._points**2)
+        for layer in self._layers:
+            layer.evolve_until(time_s)
+            total += layer.phase_for(_WAVELENGTH_M) * (_WAVELENGTH_M * 1e9 / (2 * np.pi))
+        return np.asarray(total.reshape(self._points, -1) - total.mean(), np.float32)
