@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.advice.recorded_loop import RecordedLoop
-from faintspot.ao_loop import Arm, LoopConfiguration, load_loop
+from faintspot.ao_loop import LoopConfiguration, Method, load_loop
 from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.ao_loop.simulation import measure_gains
@@ -91,12 +91,12 @@ def drawn_cases(number: int, seed: int) -> list[Case]:
 
 def recorded(case: Case) -> tuple[RecordedLoop, Truth]:
     """Run the loop of a case; slopes by `window`, divided by the calibrated centroid gain."""
-    configuration, arm = case.configuration(), Arm("window", Settings("window"))
+    configuration, method = case.configuration(), Method("window", Settings("window"))
     telescope = TelescopeModel(configuration, case.seed)
     if case.from_hcipy:
         telescope.atmosphere = HcipyLayers(configuration, case.seed)  # type: ignore[assignment]
     optics, rate = telescope.optics, configuration.control.frame_rate_hz
-    pipeline = make_pipeline(configuration, optics.sensor, arm)
+    pipeline = make_pipeline(configuration, optics.sensor, method)
     gain = float(measure_gains(configuration, [pipeline], seed=case.seed)[0])
     line = CommandDelayLine(optics.mirror.commands, case.delay_frames)
     controller = Integrator(line, optics.interaction, optics.reconstructor, case.gain, _LEAK)
