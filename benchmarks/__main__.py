@@ -28,6 +28,7 @@ _ORDER = (
     "breakdown",
     "realtime",
     "realtime_loop",
+    "realtime_guard",
     "advice",
     "telemetry",
     "live_page",

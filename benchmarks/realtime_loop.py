@@ -107,7 +107,7 @@ def _row(label: str, layout: Layout, control: Control, target_us: float) -> Row:
                 times[:, index] = middle - start, time.perf_counter_ns() - middle
                 if index % 40 == 0:
                     loop.controller.begin()  # so that the guard has not seen enough to take the integrator
-                loop.look_after()
+                loop.look_after(path.slopes.flux)
         streams.close()
         engine._telemetry.close()
     work, publishing = times / 1e3

@@ -138,7 +138,7 @@ def run(loop: ControlLoop, stroke: float, taken: list[Slopes]) -> str:
         with np.errstate(all="ignore"):
             sent = loop.follow(slopes, number).copy()
             failed = not loop.closed
-            loop.look_after()
+            loop.look_after(slopes.flux)
         assert np.isfinite(sent.astype(np.float32)).all()
         assert np.abs(sent).max() <= stroke
         if failed:

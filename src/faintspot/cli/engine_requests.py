@@ -43,8 +43,10 @@ def loop_in_words(loop: dict[str, Any]) -> str:
         return "no loop: the engine makes no commands"
     gain = "" if loop["gain"] is None else f", gain {loop['gain']:g}"
     text = f"loop {loop['state']}: {loop['controller']}{gain}"
-    obstacle = loop["obstacle"] or loop["opened_because"]
-    return f"{text}; {obstacle}" if obstacle else f"{text}, slopes of {loop['residual_px']:.2f} px rms"
+    if obstacle := loop["obstacle"] or loop["opened_because"]:
+        return f"{text}; {obstacle}"
+    again = f"; again, it had been opened: {before}" if (before := loop["closed_again_because"]) else ""
+    return f"{text}, slopes of {loop['residual_px']:.2f} px rms{again}"
 
 
 def summary(reply: dict[str, Any]) -> str:

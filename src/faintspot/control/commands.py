@@ -45,7 +45,10 @@ class CommandDelayLine:
 
     @property
     def spare(self) -> Floats:
-        """Row into which the next command may be written before `sent`."""
+        """Row into which the next command may be written before `sent`.
+
+        Until then it holds what the mirror held during the last frame.
+        """
         return self._rows[self.place]
 
     def put(self, command: Floats) -> None:

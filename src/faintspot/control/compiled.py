@@ -81,6 +81,39 @@ def add_products(columns: Any, vectors: Any, out: Any) -> None:
                 out[k, i] += columns[s, i] * vectors[k, s]
 
 
+FLUX, DISPLACEMENT, FLUX_TIMES_DISPLACEMENT = range(3)
+"""Summary of a frame from `displaced_flux`: means over the sub-apertures."""
+
+
+@_compiled
+def displaced_flux(commands: Any, flux: Any, columns: Any, displaced: Any, said: Any) -> None:
+    """Write means of the flux, of the squared displacement by the mirror, and of their product.
+
+    Parameters
+    ----------
+    commands : (commands,) float64 array
+        Commands that acted in the frame.
+    flux : (n,) float32 array
+        What is not finite counts as 0.
+    columns : (commands, 2 n) float64 array
+        The interaction matrix, transposed, see `add_products`.
+    displaced : (1, 2 n) float64 array
+        Work array: displacements, all x, then all y.
+    said : (3,) float64 array
+        `FLUX`, `DISPLACEMENT` (px^2), `FLUX_TIMES_DISPLACEMENT`.
+    """
+    n = flux.shape[0]
+    displaced[:] = 0.0
+    add_products(columns, commands.reshape(1, commands.shape[0]), displaced)
+    said[:] = 0.0
+    for s in range(n):
+        square = displaced[0, s] * displaced[0, s] + displaced[0, n + s] * displaced[0, n + s]
+        seen = flux[s] if np.isfinite(flux[s]) else 0.0
+        said[FLUX] += seen / n
+        said[DISPLACEMENT] += square / n
+        said[FLUX_TIMES_DISPLACEMENT] += seen * square / n
+
+
 @_compiled
 def integrate(slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, place: Any) -> float:
     """Write the next command: `keep` times the latest minus `gain` times the wavefront, clipped.

@@ -130,6 +130,11 @@ class CompiledKalman:
             return Expected(rows[HELD] - rows[LATEST_PLAIN], None)
         return Expected(rows[HELD] + rows[PREDICTED], self._std_px)
 
+    def fall_back(self) -> None:
+        """See `Guarded`."""
+        self._catch_up()
+        self._memory.guard[CHOSEN] = 1.0
+
     def begin(self) -> None:
         """See `Controller`; open-loop slopes are assumed to equal the mirror's correction."""
         latest = self._line.latest

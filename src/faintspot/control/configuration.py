@@ -114,6 +114,14 @@ class ControlOptions(Options):
         low=0,
         high=1,
     )
+    proven_frames: int = _setting(
+        1000,
+        "Number of frames after which a closed loop counts as proven. If the guard opens a proven loop, it "
+        "closes it again after `guard_frames`, with a learnt controller's integrator; 0: never.",
+        low=0,
+        high=1_000_000,
+        whole=True,
+    )
 
 
 @dataclass(frozen=True, eq=False)

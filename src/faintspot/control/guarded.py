@@ -75,6 +75,10 @@ class Guarded:
         other = self._line.acting - self._lines[self.chosen].acting
         return Expected(mean + self._interaction @ other, std)
 
+    def fall_back(self) -> None:
+        """Let the plain controller drive the mirror until the learnt one leaves less."""
+        self.chosen = 1
+
     def begin(self) -> None:
         """See `Controller`; both restart from there."""
         for controller, line in zip(self.controllers, self._lines, strict=True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -12,12 +11,13 @@ from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandDelayLine
-from faintspot.control.compiled import INVALID_PART, MEAN_SQUARE, CompiledIntegrator, true_slopes
+from faintspot.control.compiled import CompiledIntegrator, true_slopes
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.configuration import CONTROLLER, Control
 from faintspot.control.guarded import Guarded
 from faintspot.kernels.compiling import Direct
 from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
+from faintspot.realtime.guard import Guard
 from faintspot.realtime.prior import Prior
 from faintspot.realtime.timing import Latencies
 from faintspot.sensor.layout import Layout
@@ -28,8 +28,6 @@ STATES = (NONE, OPEN, CLOSED)
 _AT_START = "not closed since the engine began"
 BY_REQUEST = "asked to"
 """Reason given when a user has opened the loop."""
-_BEYOND_OPEN = 1.25  # times the open loop's slopes; a loop that leaves more makes things worse
-_LARGEST_RESIDUAL = 0.25  # of a window's side, used if the open loop's slopes are not known
 
 
 class _Ready(NamedTuple):
@@ -97,6 +95,8 @@ class ControlLoop:
         self._centroid_gain = float(control.options.centroid_gain)
         self.guard = Guard(control, layout)
         self.closed, self.opened_because = False, _AT_START
+        self.closed_again_because = ""
+        """Reason for which the guard had opened the loop before it closed it again; "" without."""
         self._flattened, self._begins, self._number = False, False, -1
         self._warm_up(len(layout))
 
@@ -143,14 +143,32 @@ class ControlLoop:
             line.put(line.latest)
         return line.latest
 
-    def look_after(self) -> None:
-        """Open the loop if the last frame shows a fault, and predict the next frame."""
+    def look_after(self, flux: NDArray[np.float32]) -> None:
+        """Open the loop if the last frame shows a fault, or close it again, and predict the next frame.
+
+        Parameters
+        ----------
+        flux : (n,) array
+            Flux of that frame.
+        """
+        line, guard = self._line, self.guard
+        frame = self._said, line.spare, flux
         if not self.closed:
-            self.guard.watch(self._said)
-        elif reason := self.guard.objection(self._said, self._line.latest):
+            guard.watch(*frame)
+            if guard.may_close_again:
+                self._close_again()
+        elif reason := guard.objection(*frame, line.latest):
             self.closed, self.opened_because = False, reason
-            self._flattened = self.guard.flattens
+            self._flattened = guard.flattens
         self._expect()
+
+    def _close_again(self) -> None:
+        """Close a loop that the guard has opened; a learnt controller leaves the mirror to its integrator."""
+        reason = self.opened_because
+        if isinstance(self._on.controller, Guarded | CompiledKalman):
+            self._on.controller.fall_back()
+        self.close()
+        self.closed_again_because = reason
 
     def take_turn(self, kind: str | None) -> None:
         """Hand the coming frames to a controller; None: the configured one.
@@ -220,14 +238,14 @@ class ControlLoop:
         if self.closed:
             return
         self.guard.begin()
-        self.opened_because, self._begins = "", True
-        self.closed = True
+        self.opened_because = self.closed_again_because = ""
+        self._begins = self.closed = True
 
     def open(self) -> None:
         """Open the loop; the mirror keeps its commands."""
         if self.closed:
             self.opened_because = BY_REQUEST
-            self.guard.end()
+        self.guard.end()
         self.closed = False
 
     def flatten(self) -> None:
@@ -278,6 +296,7 @@ class ControlLoop:
             "state": self.state,
             "gain": self.gain,
             "opened_because": None if self.closed else self.opened_because,
+            "closed_again_because": (self.closed and self.closed_again_because) or None,
             "controller": self._on.kind,
             "commands": self.control.commands,
             **self.guard.status(),
@@ -291,88 +310,3 @@ class ControlLoop:
         self.follow(Slopes(*(np.zeros(n, kind) for kind in RESULT_TYPES)), -1)
         self.closed, self._begins = False, False
         self._line.hold(held)
-
-
-class Guard:
-    """Monitor that detects when a loop must be opened: it diverges, or the flux is too low.
-
-    Means are exponentially weighted over frames. While the loop is open, they measure its slopes.
-
-    Parameters
-    ----------
-    control : Control
-    layout : Layout
-    """
-
-    def __init__(self, control: Control, layout: Layout) -> None:
-        self._options = options = control.options
-        self._share = 1 / options.guard_frames
-        self._usual_px = _LARGEST_RESIDUAL * max(layout.window)
-        self.flattens = False
-        """Whether the mirror should be flattened, because its commands are at fault."""
-        self._forget()
-        self.begin()
-
-    def begin(self) -> None:
-        """Treat the loop as closed from now on; the open loop's slopes set the limit."""
-        limit = self._options.largest_residual_px
-        if limit is None and self._frames >= self._options.guard_frames:
-            limit = _BEYOND_OPEN * self.residual_px
-        self._largest_px = self._usual_px if limit is None else limit
-        self._forget()
-
-    def watch(self, said: NDArray[np.float64]) -> None:
-        """Take the summary that `true_slopes` gives of a frame."""
-        self._frames += 1
-        self._invalid += self._share * (said.item(INVALID_PART) - self._invalid)
-        self._square += self._share * (said.item(MEAN_SQUARE) - self._square)
-
-    def objection(self, said: NDArray[np.float64], commands: NDArray[np.float64]) -> str:
-        """Take a frame of a closed loop and its commands; return why the loop must be opened, or "".
-
-        A mean starts as if all earlier values had been 0, so that no single frame decides.
-        """
-        self.watch(said)
-        options = self._options
-        if options.largest_command is not None:
-            at_limit = np.count_nonzero(np.abs(commands) >= options.largest_command) / len(commands)
-            self._at_limit += self._share * (at_limit - self._at_limit)
-        self.flattens = True
-        if self._square > self._largest_px**2:
-            rms = f"{math.sqrt(self._square):.2f} px rms, more than {self._largest_px:.2f}"
-            return self.end(f"diverged: slopes of {rms}")
-        if self._at_limit > options.most_at_limit:
-            parts = f"{100 * self._at_limit:.0f} % of the commands at their limit, more than"
-            return self.end(f"diverged: {parts} {100 * options.most_at_limit:g} %")
-        self.flattens = False
-        if self._invalid > options.most_invalid:
-            parts = f"{100 * self._invalid:.0f} % of the slopes not valid, more than"
-            return self.end(f"too low flux: {parts} {100 * options.most_invalid:g} %")
-        return ""
-
-    @property
-    def residual_px(self) -> float:
-        """Recent rms of the slopes along one axis."""
-        return math.sqrt(self._square / self._weight)
-
-    def status(self) -> dict[str, Any]:
-        """Return the guard's figures as plain values."""
-        return {
-            "residual_px": self.residual_px,
-            "invalid_part": self._invalid / self._weight,
-            "at_limit_part": self._at_limit / self._weight,
-        }
-
-    @property
-    def _weight(self) -> float:
-        """Total weight of the frames so far."""
-        return 1 - (1 - self._share) ** max(self._frames, 1) if self._share < 1 else 1.0
-
-    def end(self, reason: str = "") -> str:
-        """Treat the loop as open from now on; return the reason."""
-        self._forget()
-        return reason
-
-    def _forget(self) -> None:
-        self._frames = 0
-        self._invalid = self._square = self._at_limit = 0.0

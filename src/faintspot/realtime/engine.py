@@ -363,7 +363,7 @@ class Engine:
             self._streams.publish_commands(commands, number)
             loop.latencies.add(time.monotonic_ns() - moment)
             state = STATES.index(CLOSED if was_closed else OPEN)
-            loop.look_after()
+            loop.look_after(slopes.flux)
         self.latencies.add(latency)
         path.flag_doubtful()
         change = self.live.change_number
@@ -449,7 +449,13 @@ class Engine:
         """Write to telemetry when the loop was opened, and why, or closed, or its gain changed."""
         if self.loop is None:
             return told
-        now = {"loop": self.loop.state, "gain": self.loop.gain, "opened_because": self.loop.opened_because}
+        loop = self.loop
+        now = {
+            "loop": loop.state,
+            "gain": loop.gain,
+            "opened_because": loop.opened_because,
+            "closed_again_because": loop.closed_again_because,
+        }
         if now != told:
             self._telemetry.write_change(self._number, self.live.change_number, now, None)
         return now

@@ -161,7 +161,9 @@ export class Controls {
     const there = Boolean(loop) && loop.state !== "none";
     byId("loop-form").hidden = !there;
     if (there) {
-      byId("loop-state").textContent = [loop.state, loop.opened_because, loop.obstacle].filter(Boolean).join(": ");
+      const again = loop.closed_again_because && `again, it had been opened: ${loop.closed_again_because}`;
+      const parts = [loop.state, loop.opened_because, again, loop.obstacle];
+      byId("loop-state").textContent = parts.filter(Boolean).join(": ");
       const gain = byId("gain");
       if (document.activeElement !== gain && !this.gainEdited) gain.value = loop.gain ?? "";
     }
