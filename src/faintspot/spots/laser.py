@@ -118,10 +118,8 @@ class LaserGuideStar:
         InputError
             If an altitude is less than 1 km above the site.
         """
-        altitudes = numbers_between("altitudes_m", altitudes_m, self.site_altitude_m + 1e3, 1e6)
-        inverse: Floats = math.cos(math.radians(self.zenith_distance_deg)) / (
-            altitudes - self.site_altitude_m
-        )
+        heights = self._altitudes(altitudes_m) - self.site_altitude_m
+        inverse: Floats = math.cos(math.radians(self.zenith_distance_deg)) / heights
         return inverse
 
     def offsets_px(self, altitudes_m: ArrayLike) -> Floats:
@@ -167,8 +165,6 @@ class LaserGuideStar:
         altitudes_m: ArrayLike,
         shape: tuple[int, int] = (16, 16),
         positions: ArrayLike | None = None,
-        *,
-        blur_px: float = 0.0,
     ) -> Floats:
         """Return images of a density of 1 per metre at each altitude, and 0 at all others.
 
@@ -182,8 +178,6 @@ class LaserGuideStar:
             Rows and columns of the windows, which truncate the images.
         positions : (n, 2) array, optional
             Slopes of the spots: x and y of the focus, px from the window centre. Default: 0.
-        blur_px : float
-            Standard deviation of the motion of the spots [px].
 
         Returns
         -------
@@ -195,19 +189,14 @@ class LaserGuideStar:
         InputError
             If a value is out of range, or positions have another shape.
         """
-        ny, nx = image_shape("shape", shape)
-        altitudes = numbers_between("altitudes_m", altitudes_m, self.site_altitude_m + 1e3, 1e6)
-        where = np.zeros((len(self), 2)) if positions is None else position_array(positions)
-        if where.shape != self.subapertures_m.shape:
-            raise InputError(f"positions: expected shape {self.subapertures_m.shape}, got {where.shape}")
-        check_size("responses", (len(self), ny, nx, len(altitudes)))
+        rows, columns, where = self._pixels(shape, positions)
+        altitudes = self._altitudes(altitudes_m)
+        check_size("responses", (len(self), len(rows), len(columns), len(altitudes)))
         points, parts = self._points(altitudes)
         offsets = self.offsets_px(points)
-        spot = self.spot if blur_px == 0 else self.spot.blurred(blur_px)
-        rows, columns = (np.arange(side, dtype=np.float64) - 0.5 * (side - 1) for side in (ny, nx))
-        found = np.empty((len(self), ny, nx, len(altitudes)))
-        for block in self._blocks(len(points) * ny * nx):
-            along, across = _profiles(spot, where[block, None] + offsets[block], columns, rows)
+        found = np.empty((len(self), len(rows), len(columns), len(altitudes)))
+        for block in self._blocks(len(points) * len(rows) * len(columns)):
+            along, across = _profiles(self.spot, where[block, None] + offsets[block], columns, rows)
             each = np.einsum("rskx,rsky->sxyk", along, across, optimize=True)
             found[block] = (each @ parts).swapaxes(1, 2)
         return found
@@ -216,8 +205,9 @@ class LaserGuideStar:
         self, profile: SodiumProfile, shape: tuple[int, int] = (16, 16), positions: ArrayLike | None = None
     ) -> Floats:
         """Return the mean image of each sub-aperture for a flux of 1: (n, ny, nx), as `responses`."""
-        images: Floats = self.responses(profile.altitudes_m, shape, positions) @ profile.density
-        return images
+        rows, columns, where = self._pixels(shape, positions)
+        points, parts = self._points(self._altitudes(profile.altitudes_m))
+        return self._along_lines(self.offsets_px(points), parts @ profile.density, where, columns, rows)
 
     def psf(
         self, profile: SodiumProfile, *, radius_px: float | None = None, oversampling: int = _OVERSAMPLING
@@ -245,11 +235,31 @@ class LaserGuideStar:
         half = math.ceil(oversampling * number_between("radius_px", radius_px, 1.0, 2 * _LARGEST_RADIUS_PX))
         nodes = np.arange(-half, half + 1) / oversampling
         check_size("psf.samples", (len(self), len(nodes), len(nodes)), hint="give a smaller radius_px")
-        samples = np.empty((len(self), len(nodes), len(nodes)))
-        for block in self._blocks(len(points) * len(nodes)):
-            along, across = _profiles(self.spot, offsets[block], nodes, nodes)
-            samples[block] = (across.swapaxes(2, 3) @ (flux[:, None] * along)).sum(axis=0)
+        samples = self._along_lines(offsets, flux, np.zeros((len(self), 2)), nodes, nodes)
         return PSF(samples, oversampling, range(len(self)))
+
+    def _along_lines(
+        self, offsets: Floats, flux: Floats, where: Floats, columns: Floats, rows: Floats
+    ) -> Floats:
+        """Return the sum of spots with a flux (k,) at offsets (n, k, 2) from `where` (n, 2)."""
+        images = np.empty((len(self), len(rows), len(columns)))
+        for block in self._blocks(len(flux) * max(len(rows), len(columns))):
+            along, across = _profiles(self.spot, where[block, None] + offsets[block], columns, rows)
+            images[block] = (across.swapaxes(2, 3) @ (flux[:, None] * along)).sum(axis=0)
+        return images
+
+    def _pixels(self, shape: Any, positions: Any) -> tuple[Floats, Floats, Floats]:
+        """Return the places of rows and columns [px], and checked positions (n, 2)."""
+        sides = image_shape("shape", shape)
+        where = np.zeros((len(self), 2)) if positions is None else position_array(positions)
+        if where.shape != self.subapertures_m.shape:
+            raise InputError(f"positions: expected shape {self.subapertures_m.shape}, got {where.shape}")
+        rows, columns = (np.arange(side, dtype=np.float64) - 0.5 * (side - 1) for side in sides)
+        return rows, columns, where
+
+    def _altitudes(self, altitudes_m: ArrayLike) -> Floats:
+        """Return altitudes that are surely above the site."""
+        return numbers_between("altitudes_m", altitudes_m, self.site_altitude_m + 1e3, 1e6)
 
     @cached_property
     def _gate(self) -> tuple[float, float]:

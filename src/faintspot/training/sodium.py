@@ -84,15 +84,17 @@ class MeanImages:
             object.__setattr__(self, name, mean)
         object.__setattr__(self, "frames", float(frames))
 
-    def updated(self, images_e: ArrayLike, slopes_px: ArrayLike) -> MeanImages:
-        """Return the mean with one further frame, or several.
+    def updated(
+        self, images_e: ArrayLike, slopes_px: ArrayLike, *, frames: float | None = None
+    ) -> MeanImages:
+        """Return the mean with one further frame, with several, or with the mean of `frames` of them.
 
         Raises
         ------
         InputError
             As for the class.
         """
-        new = MeanImages(images_e, slopes_px)
+        new = MeanImages(images_e, slopes_px, frames=frames)
         if new.images_e.shape != self.images_e.shape:
             raise InputError(f"images_e: expected shape {self.images_e.shape}, got {new.images_e.shape}")
         assert self.frames is not None
