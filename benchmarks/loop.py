@@ -145,7 +145,6 @@ def parts_table(configuration: LoopConfiguration) -> Table:
         name: make_pipeline(configuration, optics.sensor, Method(name, settings))
         for name, settings in (("brightest", BRIGHTEST), ("TV", TV))
     }
-    field = optics.pupil.field(wavefront, configuration.science.wavelength_m)
     commands, slopes = np.ones(optics.mirror.commands), np.ones(2 * len(optics.sensor.layout))
     parts: dict[str, Any] = {
         "air": lambda: atmosphere.wavefront_nm(0.1),
@@ -157,7 +156,6 @@ def parts_table(configuration: LoopConfiguration) -> Table:
         "reconstructor": lambda: optics.reconstructor(slopes),
         "weighted reconstructor": lambda: optics.reconstructor.weighted(slopes, slopes),
         "science field": lambda: optics.pupil.field(wavefront, configuration.science.wavelength_m),
-        "science image": lambda: optics.science.image(field),
     }
     with pinned():
         times = interleaved(parts)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.measuring import Row, Table
-from faintspot.ao_loop import Arm, load_loop
+from faintspot.ao_loop import Method, load_loop
 from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.simulation import measure_gains
 from faintspot.ao_loop.telescope_model import TelescopeModel
@@ -39,7 +39,7 @@ class GuardedRun:
         self.telescope = TelescopeModel(self.configuration, self.configuration.run.seed, realisation)
         optics = self.telescope.optics
         settings = Settings("window", window_fwhm_px=width_px, flux_e=photons)
-        self._pipeline = make_pipeline(self.configuration, optics.sensor, Arm("window", settings))
+        self._pipeline = make_pipeline(self.configuration, optics.sensor, Method("window", settings))
         centroid_gain = measure_gains(
             self.configuration, [self._pipeline], seed=self.configuration.run.seed
         ).item()

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 from tests.cli.cli_cases import Commands
-from tests.experiments.experiment_cases import PLAN, SEARCH, small
+from tests.experiments.experiment_cases import SEARCH, small
 
 import faintspot.cli
 from faintspot.ao_loop.configuration import LoopConfiguration, load_loop, shipped_loops
 from faintspot.control.configuration import load_control
-from faintspot.experiments import budget, interleaved, magnitude
+from faintspot.experiments import budget, magnitude
 from faintspot.pipeline import configuration
 
 pytest.importorskip("hcipy")
@@ -21,7 +21,6 @@ pytestmark = pytest.mark.machine_time("starts other processes")
 @pytest.fixture(autouse=True)
 def _small_experiments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(faintspot.cli._COMMANDS, "loop", "")
-    monkeypatch.setattr(interleaved, "QUICK_PLAN", PLAN)
     monkeypatch.setattr(magnitude, "QUICK", SEARCH)
     terms = {name: budget.TERMS[name] for name in ("nothing", "slope error")}
     monkeypatch.setattr(budget, "TERMS", terms)
@@ -37,26 +36,17 @@ def test_list_and_show(run: Commands) -> None:
     assert LoopConfiguration.from_text(shown) == load_loop("canary")
 
 
-def test_run_and_report(run: Commands) -> None:
-    result = run("loop", "run", "small.toml", "--quick", "--workers", 0)
-    assert result.code == 0, result.err
-    assert "75 % of the gain, 3 strengths" in result.out
-    assert "TV, strength 0.6 to 1.1" in result.out
-    assert "paired" in result.out
-    assert result.out.splitlines()[-1] == "small-quick/report.html: open it in a browser"
-    assert "TV" in Path("small-quick/report.html").read_text(encoding="utf-8")
-    again = run("report", "small-quick", "-o", "page.html")
-    assert again.out == "page.html: open it in a browser\n"
-    assert Path("page.html").is_file()
-
-
 def test_magnitude(run: Commands) -> None:
     result = run(
         "loop", "magnitude", "small.toml", "--quick", "--workers", 0, "--methods", "brightest", "-o", "here"
     )
     assert result.code == 0, result.err
     assert result.out.splitlines()[1].startswith("brightest pixels")
-    assert Path("here/report.html").is_file()
+    assert result.out.splitlines()[-1] == "here/report.html: open it in a browser"
+    assert "brightest pixels" in Path("here/report.html").read_text(encoding="utf-8")
+    again = run("report", "here", "-o", "page.html")
+    assert again.out == "page.html: open it in a browser\n"
+    assert Path("page.html").is_file()
 
 
 def test_budget(run: Commands) -> None:
@@ -85,13 +75,13 @@ def test_engine_files_close_the_loop(run: Commands) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["run", "nowhere.toml"], "nowhere.toml: no such file; none of the shipped configurations"),
+        (["magnitude", "nowhere.toml"], "nowhere.toml: no such file; none of the shipped configurations"),
         (["show", "nowhere"], "nowhere: no such file"),
         (["engine", "small.toml", "--frame-rate-hz", "0"], "frame_rate_hz"),
         (["magnitude", "small.toml", "--methods", "kog"], "method = 'kog': expected one of"),
         (["magnitude", "small.toml", "--flux-e", "1,x"], "--flux-e: expected numbers with commas, got 'x'"),
         (["magnitude", "small.toml", "--flux-e", "-1"], "photons"),
-        (["run", "small.toml", "-o", "no/where"], "the folder no does not exist"),
+        (["budget", "small.toml", "-o", "no/where"], "the folder no does not exist"),
         (["budget", "open_loop"], "expected 'closed' for an error budget"),
     ],
 )

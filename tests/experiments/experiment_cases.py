@@ -10,22 +10,11 @@ import numpy as np
 import pytest
 
 from faintspot.ao_loop.configuration import LoopConfiguration
-from faintspot.experiments.interleaved import ObservingPlan
 from faintspot.experiments.running import WorkerPool
 from faintspot.experiments.search import Search
 
 SEARCH = Search(
     coarse_frames=30, frames=40, settle_frames=10, realisations=1, finalists=2, climbs=1, rounds=1
-)
-PLAN = ObservingPlan(
-    block_frames=60,
-    settle_in_block=20,
-    strengths=(2, 3),
-    em_fractions=(1.0, 0.75),
-    repeats=(2, 1),
-    kept=(0.25,),
-    gains=(0.3, 0.5),
-    tuning_frames=30,
 )
 HERE = WorkerPool(workers=0)
 

@@ -62,7 +62,6 @@ def made_up(
         np.full(strehl.shape, 0.9),
         np.full(shape, ""),
         np.repeat(np.array(choices)[:, None], shape[1], axis=1),
-        np.zeros((*shape, 1, 1), np.float32),
         configuration().to_text(),
     )
     return LoopAnswer(question, measured, 300, {"map+kalman": "no time"})

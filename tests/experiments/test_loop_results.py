@@ -8,13 +8,12 @@ import pytest
 
 from faintspot.ao_loop.files import (
     BUDGET_FILE,
-    INTERLEAVED_FILE,
     MAGNITUDE_FILE,
     holds_loop_results,
     make_folder,
 )
 from faintspot.base.errors import InputError
-from faintspot.experiments.loop_results import BudgetResult, InterleavedResult, MagnitudeResult
+from faintspot.experiments.loop_results import BudgetResult, MagnitudeResult
 
 
 def magnitude_result() -> MagnitudeResult:
@@ -30,7 +29,6 @@ def magnitude_result() -> MagnitudeResult:
         rng.uniform(0, 1, (2, 3, 4)),
         np.full((2, 3), "[settings]"),
         np.full((2, 3), '{"loop_gain": 0.5}'),
-        rng.uniform(0, 1, (2, 3, 5, 5)).astype(np.float32),
         "name = 'x'",
     )
 
@@ -72,18 +70,6 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     magnitude_result().save(path)
     with pytest.raises(InputError, match="expected an error budget of format 2"):
         BudgetResult.load(path)
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 2, "sets": []}', '{"format": 1, "sets": [1]}'])
-def test_damaged_description_is_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / INTERLEAVED_FILE).write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match="not the result of interleaved observations"):
-        InterleavedResult.load(tmp_path)
-
-
-def test_no_interleaved_result(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        InterleavedResult.load(tmp_path)
 
 
 def test_folders_that_cannot_be(tmp_path: Path) -> None:

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from tests.experiments.result_cases import made_up_magnitude
 
-from faintspot.base.errors import InputError
 from faintspot.experiments.loop_results import (
+    differences_by_flux,
     falling,
+    gains_in_magnitude,
     limiting_magnitudes,
     magnitude_gain,
-    neighbour_differences,
-    regression_line,
 )
 from faintspot.experiments.statistics import mean_by_blocks
 
@@ -114,41 +114,19 @@ def test_block_intervals_hold_as_often_as_they_say() -> None:
     assert 0.91 <= inside / 300 <= 0.99
 
 
-def test_what_drifts_cancels_between_neighbours() -> None:
-    time = np.arange(10.0)
-    reference = np.arange(10) % 3 == 0
-    found = neighbour_differences(0.2 + 0.03 * time + 0.1 * ~reference, time, reference)
-    np.testing.assert_allclose(found[~reference], 0.1)
-    assert np.isnan(found[reference]).all()
+def test_gains_in_magnitude_are_those_of_the_curves() -> None:
+    result = made_up_magnitude(0.3)
+    gains = gains_in_magnitude(result, 1, 0)
+    assert list(gains)[:2] == [0.05, 0.1]
+    # Straight pieces between points 1 mag apart stand for a curve: a tenth of a magnitude.
+    assert gains[0.3].value == pytest.approx(0.3, abs=0.1)
+    assert gains[0.3].decided == 1
 
 
-@pytest.mark.parametrize(
-    ("values", "time", "reference", "words"),
-    [
-        ([1, 2], [0, 1], [False, False], "at least one measurement without"),
-        ([1, 2], [1, 0], [True, False], "rising"),
-        ([1, 2, 3], [0, 1], [True, False], "same number"),
-    ],
-)
-def test_differences_need_references_in_order(
-    values: list[float], time: list[float], reference: list[bool], words: str
-) -> None:
-    with pytest.raises(InputError, match=words):
-        neighbour_differences(values, time, reference)
-
-
-def test_the_regression_line_is_the_least_squares_one() -> None:
-    rng = np.random.default_rng(6)
-    x = rng.uniform(0.08, 0.2, 40)
-    y = 0.1 + 3 * x + rng.normal(0, 0.05, 40)
-    found = regression_line(x, y)
-    np.testing.assert_allclose([found.slope, found.intercept], np.polyfit(x, y, 1))
-    assert found.correlation == pytest.approx(np.corrcoef(x, y)[0, 1])
-    assert found.slope_low < 3 < found.slope_high
-    np.testing.assert_allclose(found([0.1]), found.intercept + 0.1 * found.slope)
-
-
-def test_a_regression_needs_three_points() -> None:
-    with pytest.raises(InputError, match="three points"):
-        regression_line([1, 2], [1, 2])
-    assert math.isnan(regression_line([1, 1, 1], [1, 2, 3]).correlation)
+def test_differences_by_flux_are_paired() -> None:
+    result = made_up_magnitude(0.3)
+    for estimate, runs in zip(
+        differences_by_flux(result, 1, 0), result.strehl[1] - result.strehl[0], strict=True
+    ):
+        assert estimate.value == pytest.approx(runs.mean())
+        assert estimate.high - estimate.low < 0.02  # the air's 0.02 is common to both

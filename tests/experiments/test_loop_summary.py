@@ -25,7 +25,6 @@ def result() -> MagnitudeResult:
         np.ones((2, 3, 5)),
         np.full((2, 3), ""),
         np.full((2, 3), '{"loop_gain": 0.5}'),
-        np.ones((2, 3, 5, 5), np.float32),
         "",
     )
 

@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 import pytest
-from tests.experiments.result_cases import LABELS, made_up_budget, made_up_interleaved, made_up_magnitude
+from tests.experiments.result_cases import LABELS, made_up_budget, made_up_magnitude
 
 from faintspot.ao_loop.files import BUDGET_FILE, MAGNITUDE_FILE
 from faintspot.base.errors import InputError
@@ -22,13 +22,13 @@ pytest.importorskip("hcipy")
 
 
 def test_no_gain_anywhere_is_said_exactly() -> None:
-    lines = loop_verdict(LoopResults(made_up_interleaved(-0.05), made_up_magnitude(-0.3)))
+    lines = loop_verdict(LoopResults(made_up_magnitude(-0.3)))
     assert lines[0].startswith(NOWHERE)
     assert "lowers it beyond its error" in lines[0]
 
 
 def test_a_gain_is_said() -> None:
-    lines = loop_verdict(LoopResults(made_up_interleaved(0.05), made_up_magnitude(0.3)))
+    lines = loop_verdict(LoopResults(made_up_magnitude(0.3)))
     assert NOWHERE not in " ".join(lines)
     assert "beyond its error in" in lines[0]
 
@@ -52,7 +52,6 @@ def test_results_are_read_from_a_folder(tmp_path: Path) -> None:
     made_up_magnitude().save(tmp_path / MAGNITUDE_FILE)
     made_up_budget().save(tmp_path / BUDGET_FILE)
     found = LoopResults.load(tmp_path)
-    assert found.interleaved is None
     assert found.magnitude is not None
     assert found.budget is not None
 

@@ -66,14 +66,14 @@ def test_more_units_later(tmp_path: Path) -> None:
 
 def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
-    assert ZarrStore(path, "study", "one", ["a"], attributes={"name": "mine"}).is_empty
+    ZarrStore(path, "study", "one", ["a"], attributes={"name": "mine"})
     with pytest.raises(InputError, match=r"belongs to another study \('mine'"):
         ZarrStore(path, "study", "other", ["a"])
     with pytest.raises(InputError, match="not the store of a loop"):
         ZarrStore(path, "loop", "one", ["a"], overwrite=True)
     ZarrStore(path, "study", "other", ["a"], overwrite=True)
     assert kind_of_store(path) == "study"
-    assert ZarrStore(path, "study", "other", ["a"]).is_empty
+    assert not ZarrStore(path, "study", "other", ["a"]).done("a")
     folder = tmp_path / "folder"
     folder.mkdir()
     with pytest.raises(InputError, match="not the store of a study"):

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays, save_arrays
 
-INTERLEAVED_FILE = "interleaved.json"
 MAGNITUDE_FILE = "magnitude.npz"
 BUDGET_FILE = "budget.npz"
-"""Names of the files in a folder of results; the sets beside the first are set-1.npz and so on."""
+"""Names of the files in a folder of results."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +61,7 @@ class Stored:
 
 def holds_loop_results(path: Path) -> bool:
     """Return whether a folder holds results of `faintspot loop`."""
-    return any((path / name).is_file() for name in (INTERLEAVED_FILE, MAGNITUDE_FILE, BUDGET_FILE))
+    return any((path / name).is_file() for name in (MAGNITUDE_FILE, BUDGET_FILE))
 
 
 def make_folder(folder: str | Path) -> Path:

@@ -50,8 +50,6 @@ class LoopRecord(Stored):
     """(methods,): centroid gain of each method at the run's flux."""
     corrected: NDArray[np.bool_]
     """(methods,): whether slopes were divided by the centroid gain."""
-    psf: NDArray[np.float32]
-    """(methods, pixels, pixels): mean image of the frames after settling; a flat wavefront's peak is 1."""
     labels: tuple[str, ...]
     """Labels of the methods."""
     method_settings: tuple[str, ...]
@@ -69,8 +67,6 @@ class LoopRecord(Stored):
     subaperture_m: float
     pixel_scale_rad: float
     wavelength_m: float
-    science_wavelength_m: float
-    psf_pixel_rad: float
     configuration: str
     """Configuration as TOML."""
     seed: int

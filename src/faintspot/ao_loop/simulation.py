@@ -21,7 +21,6 @@ from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
 from faintspot.ao_loop.control import learnt_control, make_controller
 from faintspot.ao_loop.methods import Method
 from faintspot.ao_loop.record import LoopRecord
-from faintspot.ao_loop.telescope import PSF_SAMPLING
 from faintspot.ao_loop.telescope_model import TelescopeModel, atmosphere_of, prepare, without_flux
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
@@ -204,8 +203,6 @@ class _Loop:
         self.commands = np.zeros((frames, optics.mirror.commands), np.float32)
         self.truth = np.zeros((3, frames))
         self.regression = np.zeros((2, len(methods)))
-        pixels = len(optics.science.transform)
-        self.images = np.zeros((len(methods), pixels, pixels))
 
     def _first_flux(self, pipeline: SlopePipeline) -> MeanFlux | None:
         """Return the mean flux of every sub-aperture for an estimator that uses it, as before a run."""
@@ -260,11 +257,9 @@ class _Loop:
         self.valid[frame], self.commands[frame] = slopes.valid, commands
 
     def _observe(self, frame: int, time: float, wavefront: NDArray[np.float32]) -> None:
-        """Add the science image and record the true values."""
+        """Record the true values."""
         truth = self.telescope_model.truth(time, wavefront)
         self.truth[:, frame] = truth.strehl, truth.rms_nm, truth.r0_m
-        if frame >= self.configuration.run.settle_frames:
-            self.images[self.which[frame]] += self.optics.science.image(truth.field)
 
     def _measure(self, frame: int, wavefront: NDArray[np.float32]) -> Slopes:
         """Measure the slopes of the camera's frame."""
@@ -291,8 +286,6 @@ class _Loop:
     def record(self) -> LoopRecord:
         """Return the record of the run."""
         configuration, sensor = self.configuration, self.optics.sensor
-        scored = self.which[configuration.run.settle_frames :]
-        exposures = np.maximum(1, np.bincount(scored, minlength=len(self.methods)))
         strehl, residual, r0 = self.truth
         return LoopRecord(
             self.slopes,
@@ -306,7 +299,6 @@ class _Loop:
             self.optics.interaction,
             self.gains,
             np.array([method.correct_gain for method in self.methods]),
-            (self.images / exposures[:, None, None]).astype(np.float32),
             tuple(method.label for method in self.methods),
             tuple(configuration_file.to_text(method.settings) for method in self.methods),
             sensor.layout.cells,
@@ -318,8 +310,6 @@ class _Loop:
             configuration.subaperture_m,
             configuration.pixel_scale_rad,
             configuration.sensor.wavelength_m,
-            configuration.science.wavelength_m,
-            configuration.science.wavelength_m / configuration.width_m / PSF_SAMPLING,
             configuration.to_text(),
             self.seed,
             self.realisation,

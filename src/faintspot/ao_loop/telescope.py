@@ -12,8 +12,6 @@ from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.base.errors import MissingExtraError
 
 _SUPERSAMPLING = 8
-_PSF_HALF_WIDTH = 8  # lambda / width of the pupil
-PSF_SAMPLING = 4  # pixels for lambda / width
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,30 +51,6 @@ class PupilAmplitude:
     def strehl(self, field: NDArray[np.complex64]) -> float:
         """Return the Strehl ratio on axis: |sum A exp(i phi)|^2 / (sum A)^2."""
         return float(abs(field.sum(dtype=np.complex128)) ** 2 / self.amplitude.sum(dtype=np.float64) ** 2)
-
-
-@dataclass(frozen=True, eq=False)
-class ScienceCamera:
-    """Fraunhofer images on axis, in units of the peak of a flat wavefront."""
-
-    transform: NDArray[np.complex64]
-    """(pixels, n): Fourier transform along one axis."""
-    scale: float
-
-    @classmethod
-    def of(cls, pupil: PupilAmplitude) -> ScienceCamera:
-        """Make the camera of a pupil: four pixels for lambda / width, out to 8, the axis on a pixel."""
-        half = _PSF_HALF_WIDTH * PSF_SAMPLING
-        angle = np.arange(-half, half + 1) / PSF_SAMPLING  # lambda / width
-        line = (np.arange(pupil.points) + 0.5) / pupil.points - 0.5
-        transform = np.exp(-2j * np.pi * np.outer(angle, line)).astype(np.complex64)
-        return cls(transform, 1 / float(pupil.amplitude.sum(dtype=np.float64)) ** 2)
-
-    def image(self, field: NDArray[np.complex64]) -> NDArray[np.float32]:
-        """Return the intensity (pixels, pixels) of a field in the pupil."""
-        amplitude = self.transform @ field @ self.transform.T
-        intensity = (amplitude.real**2 + amplitude.imag**2) * np.float32(self.scale)
-        return np.asarray(intensity, np.float32)
 
 
 def require_hcipy(purpose: str) -> ModuleType:

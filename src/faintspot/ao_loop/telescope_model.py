@@ -20,7 +20,7 @@ from faintspot.ao_loop.configuration import (
     RunLength,
 )
 from faintspot.ao_loop.mirror import BestFit, DeformableMirror, make_mirror
-from faintspot.ao_loop.telescope import PupilAmplitude, ScienceCamera, make_pupil
+from faintspot.ao_loop.telescope import PupilAmplitude, make_pupil
 from faintspot.ao_loop.wavefront_sensor import ShackHartmann, make_sensor
 from faintspot.control.reconstructor import Reconstructor, check_controllable, make_reconstructor
 
@@ -42,15 +42,12 @@ class LoopOptics:
     interaction: NDArray[np.float64]
     """(2 n, commands) px for 1 nm."""
     reconstructor: Reconstructor
-    science: ScienceCamera
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
     """True values of a frame, which only a simulation knows."""
 
-    field: NDArray[np.complex64]
-    """Complex amplitude in the pupil at the science wavelength, (points, points)."""
     strehl: float
     rms_nm: float
     """Rms of the wavefront after the mirror, over the pupil, without piston."""
@@ -114,7 +111,7 @@ class TelescopeModel:
         """Return the true values of a residual wavefront."""
         pupil = self.optics.pupil
         field = pupil.field(wavefront_nm, self._science_wavelength_m)
-        return Truth(field, pupil.strehl(field), pupil.rms(wavefront_nm), self.atmosphere.r0_m(time_s))
+        return Truth(pupil.strehl(field), pupil.rms(wavefront_nm), self.atmosphere.r0_m(time_s))
 
     def frame(self, number: int, wavefront_nm: NDArray[np.float32]) -> NDArray[np.generic]:
         """Return the camera frame [ADU] of a wavefront; the number seeds its noise."""
@@ -163,4 +160,4 @@ def _prepared(configuration: LoopConfiguration) -> LoopOptics:
     check_controllable(mirror.commands, 2 * len(sensor.layout))
     interaction = interaction_matrix(sensor, mirror)
     reconstructor = make_reconstructor(interaction, configuration.control.largest_condition)
-    return LoopOptics(pupil, sensor, mirror, interaction, reconstructor, ScienceCamera.of(pupil))
+    return LoopOptics(pupil, sensor, mirror, interaction, reconstructor)

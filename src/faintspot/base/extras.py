@@ -11,7 +11,7 @@ from faintspot.base.errors import InputError, MissingExtraError
 EXTRAS = {
     "io": ("astropy", "h5py", "PIL", "tifffile", "zarr"),
     "web": ("matplotlib", "jinja2"),
-    "study": ("xarray", "dask", "distributed", "bokeh"),
+    "study": ("xarray",),
     "realtime": ("pyshmem", "aotpy"),
     "live": ("tornado",),
     "loop": ("hcipy",),

@@ -22,9 +22,6 @@ def _experiment_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of every experiment."""
     for each in (
         option("--overwrite", is_flag=True, help="Replace another experiment in the folder."),
-        option(
-            "--scheduler", metavar="ADDRESS", help="Running Dask scheduler to use instead: tls://HOST:PORT."
-        ),
         WORKERS,
         option("--quick", is_flag=True, help="Fewer and shorter runs: a few minutes."),
         option(
@@ -78,25 +75,6 @@ def show(name: str) -> None:
     from faintspot.ao_loop.configuration import load_loop
 
     click.echo(load_loop(name).to_text(), nl=False)
-
-
-@_needs_loop
-@command.command(short_help="Observe alternately with and without denoising.")
-@_experiment_options
-def run(configuration: str, **options: Any) -> None:
-    """Observe alternately with and without TV denoising, as on the sky.
-
-    Four sets: two at full multiplication gain of the camera and two at 75 %; in each, a measurement without
-    denoising, then 8 or 20 strengths rising from 0 to 2 electrons, repeated, while the turbulence drifts.
-
-    \b
-    Examples:
-      faintspot loop run --quick
-      faintspot loop run mine.toml -o mine
-    """
-    from faintspot.experiments.interleaved import run_interleaved
-
-    _measure(configuration, "interleaved", run_interleaved, **options)
 
 
 @_needs_loop
@@ -192,7 +170,6 @@ def _measure(
     quick: bool,
     overwrite: bool,
     workers: int | None,
-    scheduler: str | None,
 ) -> None:
     """Run an experiment with a progress bar, print the summary of its result and write its page."""
     from faintspot.ao_loop.configuration import load_loop
@@ -203,7 +180,7 @@ def _measure(
     loop = load_loop(configuration)
     folder = output or (f"{loop.name}-quick" if quick else loop.name)
     with progress_bar("loop") as advance:
-        place = WorkerPool(workers, scheduler, advance, lambda text: click.echo(text, err=True))
+        place = WorkerPool(workers, advance, lambda text: click.echo(text, err=True))
         result = run(loop, folder, *what, quick=quick, place=place, overwrite=overwrite)
     click.echo(loop_summary(LoopResults(**{name: result})))
     page = Path(folder) / "report.html"

@@ -25,12 +25,6 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     for each in (
         option("--overwrite", is_flag=True, help="Replace the store of another study."),
         WORKERS,
-        option(
-            "--scheduler",
-            metavar="ADDRESS",
-            help="Running Dask scheduler to use instead: tls://HOST:PORT. Anyone who can reach it can run "
-            "code as you: see docs/study.md.",
-        ),
     ):
         command = each(command)
     return command
@@ -69,9 +63,8 @@ def run(specification: str, output: str | None, **where: Any) -> None:
     xarray.open_zarr.
 
     \b
-    Examples:
+    Example:
       faintspot study run my-study.toml -o my-study.zarr
-      faintspot study run my-study.toml --scheduler tls://head-node:8786
     """
     from faintspot.experiments.specification import StudySpecification
 
@@ -154,11 +147,10 @@ def _measure(described: StudySpecification, target: str, **options: Any) -> xarr
     """Run a study with a progress bar."""
     from faintspot.experiments.study import run as run_study
 
-    realisations, measured = described.realisations, 0
+    realisations, counts = described.realisations, list[int]()
 
     def advance_by_cells(finished: int, total: int) -> None:
-        nonlocal measured
-        measured = finished
+        counts.append(finished)
         advance(finished * realisations, total * realisations)
 
     with progress_bar("study", "realisations") as advance:
@@ -170,8 +162,8 @@ def _measure(described: StudySpecification, target: str, **options: Any) -> xarr
             **options,
         )
     cells = f"{results.sizes['cell']} cells of {realisations} realisations"
-    if measured:
-        click.echo(f"{target}: {cells}, {measured} of them in this run")
+    if counts:
+        click.echo(f"{target}: {cells}, {counts[-1] - counts[0]} of them in this run")
     else:
         click.echo(f"{target}: complete already ({cells}); --overwrite makes it anew")
     return results

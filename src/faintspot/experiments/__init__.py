@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from faintspot.experiments.answer_figures import tune_figure as tune_figure
     from faintspot.experiments.budget import run_budget as run_budget
     from faintspot.experiments.cell import measure_cell as measure_cell
-    from faintspot.experiments.interleaved import run_interleaved as run_interleaved
     from faintspot.experiments.loop_answer import LoopAnswer as LoopAnswer
     from faintspot.experiments.loop_question import LoopQuestion as LoopQuestion
     from faintspot.experiments.loop_tuning import tune_loop as tune_loop
@@ -33,7 +32,6 @@ _NAMES = {
     "answer_figures": "loop_figure tune_figure",
     "budget": "run_budget",
     "cell": "measure_cell",
-    "interleaved": "run_interleaved",
     "loop_answer": "LoopAnswer",
     "loop_question": "LoopQuestion",
     "loop_tuning": "tune_loop",

@@ -73,7 +73,7 @@ def run_budget(
     InputError
         For unknown methods, a folder that holds another experiment, or a loop that is open.
     MissingExtraError
-        When HCIPy, or Dask where it is needed, is not installed.
+        When HCIPy is not installed.
 
     Examples
     --------

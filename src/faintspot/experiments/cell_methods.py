@@ -231,12 +231,6 @@ def position_table(
     return positions, valid
 
 
-def error_sums(estimators: Sequence[KeepingBrightest], images: Images, truth: Floats) -> Floats:
-    """Return sums of (|dx| + |dy|) / 2 over images for every estimator and k, (estimators, K)."""
-    tables = (position_table(each, images)[0] for each in estimators)
-    return np.stack([errors_of(table, truth[:, None]).sum(axis=0) for table in tables])
-
-
 def _prepared(estimator: KeepingBrightest, images: Images) -> Images:
     """Return the images (n, pixels) in which the brightest pixels are found."""
     denoised = estimator.denoised(images)

@@ -9,29 +9,14 @@ import numpy as np
 
 from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.base.errors import InputError
-from faintspot.experiments.loop_analysis import NO_TV, Measurements, measurements
-from faintspot.experiments.loop_figures import (
-    budget_figure,
-    gain_figure,
-    interleaved_figures,
-    magnitude_figure,
-    psf_figure,
-    strehl_axis,
-)
-from faintspot.experiments.loop_results import (
-    BudgetResult,
-    InterleavedResult,
-    MagnitudeResult,
-)
+from faintspot.experiments.loop_figures import budget_figure, gain_figure, magnitude_figure, strehl_axis
+from faintspot.experiments.loop_results import BudgetResult, MagnitudeResult
 from faintspot.experiments.loop_tables import (
     budget_table,
     centroid_gain_table,
     difference_table,
     gain_table,
-    regression_table,
-    seeing_table,
     settings_table,
-    strehl_groups_table,
     strehl_table,
 )
 from faintspot.experiments.loop_verdict import (
@@ -39,38 +24,29 @@ from faintspot.experiments.loop_verdict import (
     loop_verdict,
     options_that_may_pay,
     reference_methods,
-    tv_method,
 )
 from faintspot.experiments.statistics import paired_mean
 from faintspot.experiments.words import with_interval
-from faintspot.report.figure_data import FigureWithData
 from faintspot.report.page import POSITIONS, Page, Section, configuration_section, write_page
 from faintspot.report.texts import Texts
 
 _TEXT = Texts("faintspot.experiments")
 _FEW_REALISATIONS = 5
-_SHOWN_STRENGTH = 0.85  # of the images: in the middle of 0.6 to 1.1
-_LEAST_STREHL = 0.1  # of a flux whose images are shown
 _SLOPE_ERROR = "slope error"
 _NOT_RUN = "Not run: {} does that."
 
 
 def loop_sections(results: LoopResults) -> list[Section]:
     """Return all sections in the page's order."""
-    interleaved, magnitude, budget = results.interleaved, results.magnitude, results.budget
+    magnitude, budget = results.magnitude, results.budget
     lines = loop_verdict(results)
     sections = [
         Section("verdict", "What was found", lines, missing="" if lines else "Nothing to compare yet.")
     ]
-    if interleaved is None:
-        sections.append(_missing("interleaved", "Interleaved observations", "run"))
-    else:
-        sections += _interleaved(interleaved)
     if magnitude is None:
         sections.append(_missing("magnitude", "Strehl against magnitude", "magnitude"))
     else:
         sections += _magnitude(magnitude)
-    sections.append(_images(interleaved, magnitude))
     sections.append(
         _missing("budget", "Error budget", "budget") if budget is None else _budget(budget, results)
     )
@@ -92,17 +68,11 @@ def loop_warnings(results: LoopResults) -> list[str]:
         if strehl.shape[-1] < _FEW_REALISATIONS:
             few = {"count": strehl.shape[-1], "fewest": _FEW_REALISATIONS}
             lines.append(_TEXT("loop.few_realisations", name=name, **few))
-    if results.interleaved is not None:
-        frames = measurements(results.interleaved).frames
-        if frames.min() < 400:
-            lines.append(_TEXT("loop.few_frames", frames=frames.min()))
     return lines
 
 
 def configuration_text(results: LoopResults) -> str:
     """Return the configuration of the experiments as TOML text; "" when not known."""
-    if results.interleaved is not None and results.interleaved.records:
-        return results.interleaved.records[0].configuration
     return "" if results.magnitude is None else results.magnitude.configuration
 
 
@@ -117,41 +87,6 @@ def configuration_of(results: LoopResults) -> LoopConfiguration | None:
 
 def _missing(name: str, title: str, command: str) -> Section:
     return Section(name, title, missing=_NOT_RUN.format(f"“faintspot loop {command}”"))
-
-
-def _interleaved(result: InterleavedResult) -> list[Section]:
-    table = measurements(result)
-    record = result.records[0]
-    strehl, *others = interleaved_figures(table, record.science_wavelength_m)
-    frames = np.median(table.frames)
-    told = {"count": len(table.strehl), "sets": len(result.records), "frames": frames}
-    text = [_TEXT("loop.interleaved", **told, seconds=frames / record.frame_rate_hz)]
-    seeing = _seeing_line(table)
-    return [
-        Section(
-            "interleaved",
-            "Interleaved observations",
-            text,
-            [strehl_groups_table(result, table), regression_table(table)],
-            [strehl],
-        ),
-        Section("differences", "Paired differences by strength", figures=others[:1]),
-        Section("seeing", "r0 from the telemetry", seeing, [seeing_table(result)], others[1:]),
-    ]
-
-
-def _seeing_line(table: Measurements) -> list[str]:
-    known = np.isfinite(table.r0_m)
-    lines = []
-    for name, chosen in (("without TV", known & table.group(NO_TV)), ("of all", known)):
-        if chosen.any():
-            ratio = table.r0_m[chosen] / table.true_r0_m[chosen]
-            within = float((np.abs(ratio - 1) < 0.1).mean())
-            told = {"ratio": np.median(ratio), "within": 100 * within, "count": chosen.sum()}
-            lines.append(_TEXT("loop.r0", name=name, **told))
-    if not known.all():
-        lines.append(_TEXT("loop.no_r0", count=int((~known).sum())))
-    return lines
 
 
 def _magnitude(result: MagnitudeResult) -> list[Section]:
@@ -183,45 +118,6 @@ def _magnitude(result: MagnitudeResult) -> list[Section]:
         Section("gain", "Centroid gain", tables=[centroid_gain_table(result)], figures=[gain_figure(result)]),
         Section("settings", "Tuned settings", tables=[settings_table(result)]),
     ]
-
-
-def _images(interleaved: InterleavedResult | None, magnitude: MagnitudeResult | None) -> Section:
-    figure = None
-    if magnitude is not None:
-        figure = _images_of_methods(magnitude)
-    if figure is None and interleaved is not None:
-        figure = _images_of_set(interleaved)
-    title = "Long-exposure image with and without TV"
-    if figure is None:
-        return Section("psf", title, missing="Not drawn: methods with and without TV are not both there.")
-    return Section("psf", title, figures=[figure])
-
-
-def _images_of_methods(result: MagnitudeResult) -> FigureWithData | None:
-    tv, reference = tv_method(result), reference_methods(result)[-1]
-    if tv is None or tv == reference:
-        return None
-    curve = np.array([paired_mean(values).value for values in result.strehl[reference]])
-    if not np.isfinite(curve).any():
-        return None
-    good = np.flatnonzero(curve >= _LEAST_STREHL)
-    flux = int(good[0]) if len(good) else int(np.nanargmax(curve))
-    images = [result.psf[method, flux] for method in (reference, tv)]
-    where = _TEXT(
-        "loop.images_of_methods", realisations=result.strehl.shape[-1], photons=result.photons[flux]
-    )
-    return psf_figure(images, [result.labels[method] for method in (reference, tv)], where)
-
-
-def _images_of_set(result: InterleavedResult) -> FigureWithData | None:
-    strengths, record = result.strengths[0], result.records[0]
-    without, strong = np.flatnonzero(np.isnan(strengths)), np.flatnonzero(strengths > 0)
-    if not len(without) or not len(strong):
-        return None
-    tv = strong[np.argmin(np.abs(strengths[strong] - _SHOWN_STRENGTH))]
-    names = [NO_TV, f"TV, strength {strengths[tv]:.2g} e⁻"]
-    where = _TEXT("loop.images_of_set", name=result.set_names[0])
-    return psf_figure([record.psf[without[0]], record.psf[tv]], names, where)
 
 
 def _budget(result: BudgetResult, results: LoopResults) -> Section:

@@ -1,101 +1,21 @@
-"""Results of closed-loop experiments: their files, their statistics, and numbers with errors in words."""
+"""Results of closed-loop experiments: their files, and comparisons with errors."""
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.ao_loop.files import INTERLEAVED_FILE, Stored, make_folder
-from faintspot.ao_loop.record import LoopRecord
+from faintspot.ao_loop.files import Stored
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
-from faintspot.base.files import parse_json, write_atomically
-from faintspot.experiments.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, student
+from faintspot.experiments.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
 
 Floats = NDArray[np.float64]
-_FORMAT = 1
-
-
-@dataclass(frozen=True, eq=False)
-class InterleavedResult:
-    """Observations with and without denoising in turn, as on the sky; one item per set."""
-
-    records: tuple[LoopRecord, ...]
-    block: tuple[NDArray[np.int64], ...]
-    """(frames,) each: number of the measurement that a frame belongs to."""
-    strengths: tuple[Floats, ...]
-    """(methods,) each: strength of the denoising, electrons; NaN: none."""
-    set_names: tuple[str, ...]
-    settle_in_block: int
-    """Frames at the start of every measurement that are not scored."""
-
-    def save(self, folder: str | Path) -> None:
-        """Write the sets and what they are to a folder, which is made.
-
-        Raises
-        ------
-        InputError
-            When it cannot be written.
-        """
-        folder = make_folder(folder)
-        for number, record in enumerate(self.records, start=1):
-            record.save(set_file(folder, number))
-        self.save_description(folder)
-
-    def save_description(self, folder: Path) -> None:
-        """Write what the sets are, where their records are written already.
-
-        Raises
-        ------
-        InputError
-            When it cannot be written.
-        """
-        sets = [
-            {
-                "name": name,
-                "strengths_e": [None if math.isnan(strength) else float(strength) for strength in strengths],
-                "block_frames": np.bincount(block).tolist(),
-            }
-            for name, strengths, block in zip(self.set_names, self.strengths, self.block, strict=True)
-        ]
-        document = {"format": _FORMAT, "settle_in_block": self.settle_in_block, "sets": sets}
-        write_atomically(folder / INTERLEAVED_FILE, json.dumps(document, indent=1) + "\n")
-
-    @classmethod
-    def load(cls, folder: str | Path) -> InterleavedResult:
-        """Read what `save` wrote.
-
-        Raises
-        ------
-        InputError
-            When it cannot be read, or is something else.
-        """
-        folder = Path(folder)
-        path = folder / INTERLEAVED_FILE
-        try:
-            document: Any = parse_json(path.read_text(encoding="utf-8"))
-            sets = document["sets"]
-            if document["format"] != _FORMAT:
-                raise ValueError(f"format {document['format']}")
-            strengths = [
-                np.array([math.nan if value is None else value for value in each["strengths_e"]], np.float64)
-                for each in sets
-            ]
-            block = [np.repeat(np.arange(len(each["block_frames"])), each["block_frames"]) for each in sets]
-            names = tuple(str(each["name"]) for each in sets)
-            settle = int(document["settle_in_block"])
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such file") from None
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path}: not the result of interleaved observations ({error})") from None
-        records = tuple(LoopRecord.load(set_file(folder, number)) for number in range(1, len(sets) + 1))
-        return cls(records, tuple(block), tuple(strengths), names, settle)
+_STREHL_LEVELS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +23,7 @@ class MagnitudeResult(Stored):
     """Strehl ratio against the star's flux: A methods, F fluxes, R realisations of the air."""
 
     WHAT: ClassVar[str] = "a magnitude experiment"
-    FORMAT: ClassVar[int] = 3
+    FORMAT: ClassVar[int] = 4
 
     names: tuple[str, ...]
     """(A,): of the methods, see `faintspot.experiments.loop_methods.method_kind`."""
@@ -121,8 +41,6 @@ class MagnitudeResult(Stored):
     """(A, F): TOML text of the tuned settings; "" where not tuned yet."""
     choices: NDArray[np.str_]
     """(A, F): JSON text of the tuned values, loop gain included; "{}" where not tuned yet."""
-    psf: NDArray[np.float32]
-    """(A, F, p, p): long-exposure image, mean over realisations; 1 at the peak of a flat wavefront's."""
     configuration: str
     """TOML text."""
 
@@ -146,90 +64,26 @@ class BudgetResult(Stored):
     """(A, T, R): rms of the wavefront after the mirror, root of the mean square over the frames."""
 
 
-def set_file(folder: Path, number: int) -> Path:
-    """Return where the record of a set is, counted from 1."""
-    return folder / f"set-{number}.npz"
+def differences_by_flux(result: MagnitudeResult, method: int, reference: int) -> list[Estimate]:
+    """Return a method's Strehl less the reference's at each flux, over realisations.
 
-
-@dataclass(frozen=True)
-class RegressionLine:
-    """Least-squares line y = intercept + slope x."""
-
-    slope: float
-    intercept: float
-    correlation: float
-    """Pearson's; NaN when x or y does not vary."""
-    slope_low: float
-    slope_high: float
-    """95 % interval of the slope, as if the points were independent."""
-    count: int
-
-    def __call__(self, x: ArrayLike) -> Floats:
-        """Return the line's values."""
-        return self.intercept + self.slope * np.asarray(x, np.float64)
-
-
-def neighbour_differences(values: ArrayLike, time: ArrayLike, reference: ArrayLike) -> Floats:
-    """Return each value's difference from those of the reference just before and after it.
-
-    Between two references it is taken from the straight line between them, so that what drifts slowly
-    cancels; before the first and after the last from that one.
-
-    Parameters
-    ----------
-    values, time : (n,) arrays
-        In the order of time.
-    reference : (n,) array of bool
-        Which values are references; for them the result is NaN.
-
-    Raises
-    ------
-    InputError
-        When shapes differ, time does not rise, or there is no reference.
+    The intervals hold together, for all fluxes, with 95 %.
     """
-    series, when = (
-        finite_array(name, a).astype(np.float64) for name, a in (("values", values), ("time", time))
-    )
-    chosen = np.asarray(reference, np.bool_)
-    if series.ndim != 1 or series.shape != when.shape or series.shape != chosen.shape:
-        raise InputError(
-            f"values, time, reference: expected the same number of each, got shapes {series.shape}, "
-            f"{when.shape} and {chosen.shape}"
-        )
-    if (np.diff(when) <= 0).any():
-        raise InputError("time: expected rising values")
-    if not chosen.any():
-        raise InputError("reference: expected at least one measurement without denoising")
-    differences = series - np.interp(when, when[chosen], series[chosen])
-    differences[chosen] = np.nan
-    return differences
+    fluxes = len(result.photons)
+    return [
+        paired_mean(result.strehl[method, f] - result.strehl[reference, f], fluxes) for f in range(fluxes)
+    ]
 
 
-def regression_line(x: ArrayLike, y: ArrayLike) -> RegressionLine:
-    """Return the least-squares line through points.
-
-    Raises
-    ------
-    InputError
-        When there are fewer than three points, shapes differ, or a value is not finite.
-    """
-    across, up = (
-        finite_array(name, values).astype(np.float64).ravel() for name, values in (("x", x), ("y", y))
-    )
-    count = len(across)
-    if count < 3 or len(up) != count:
-        raise InputError(f"x, y: expected at least three points, got {count} and {len(up)}")
-    dx, dy = across - across.mean(), up - up.mean()
-    sum_xx, sum_yy, sum_xy = float(dx @ dx), float(dy @ dy), float(dx @ dy)
-    if sum_xx == 0:
-        return RegressionLine(0.0, float(up.mean()), math.nan, math.nan, math.nan, count)
-    slope = sum_xy / sum_xx
-    correlation = sum_xy / math.sqrt(sum_xx * sum_yy) if sum_yy > 0 else math.nan
-    left = max(0.0, sum_yy - slope * sum_xy)
-    half = student(count - 2) * math.sqrt(left / (count - 2) / sum_xx)
-    return RegressionLine(
-        slope, float(up.mean() - slope * across.mean()), correlation, slope - half, slope + half, count
-    )
+def gains_in_magnitude(result: MagnitudeResult, method: int, reference: int) -> dict[float, Estimate]:
+    """Return the gain in limiting magnitude at each Strehl ratio that the reference's curve passes."""
+    curve = np.array([paired_mean(values).value for values in result.strehl[reference]])
+    known = curve[np.isfinite(curve)]
+    return {
+        level: magnitude_gain(result.magnitudes, result.strehl[method], result.strehl[reference], level)
+        for level in _STREHL_LEVELS
+        if len(known) and known.min() < level <= known.max()
+    }
 
 
 def magnitude_gain(

@@ -10,20 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.experiments.budget import TERMS
-from faintspot.experiments.loop_analysis import (
-    NO_TV,
-    Measurements,
-    differences_by_flux,
-    gains_in_magnitude,
-    group_rows,
-    regression_lines,
-    seeing_of_sets,
-)
 from faintspot.experiments.loop_methods import LOOP_GAIN
 from faintspot.experiments.loop_results import (
     BudgetResult,
-    InterleavedResult,
     MagnitudeResult,
+    differences_by_flux,
+    gains_in_magnitude,
 )
 from faintspot.experiments.statistics import paired_mean
 from faintspot.experiments.words import NOTHING, with_error, with_interval
@@ -31,57 +23,6 @@ from faintspot.report.page import Table
 from faintspot.report.texts import Texts
 
 _TEXT = Texts("faintspot.experiments")
-
-
-def strehl_groups_table(result: InterleavedResult, table: Measurements) -> Table:
-    """Return the paper's table, of all sets together and of each, with paired differences."""
-    rows = [_group_rows("all sets", table, None)]
-    rows += [_group_rows(name, table, number) for number, name in enumerate(result.set_names)]
-    return _TEXT.table("tables.strehl_groups", [row for part in rows for row in part])
-
-
-def regression_table(table: Measurements) -> Table:
-    """Return the regression lines of Strehl against r0."""
-    rows = [
-        [
-            name,
-            f"{line.slope / 100:.4f} ({line.slope_low / 100:.4f} to {line.slope_high / 100:.4f})",
-            f"{line.correlation:.2f}",
-            str(line.count),
-        ]
-        for name, line in regression_lines(table).items()
-    ]
-    return _TEXT.table("tables.regression", rows)
-
-
-def _group_rows(name: str, table: Measurements, number: int | None) -> list[list[str]]:
-    return [
-        [
-            name,
-            row.group,
-            f"{row.mean:.3f}",
-            f"{row.standard_deviation:.3f}" if row.count > 1 else NOTHING,
-            str(row.count),
-            *(
-                ("", "")
-                if row.group == NO_TV
-                else (with_interval(row.difference), with_interval(row.at_equal_r0))
-            ),
-        ]
-        for row in group_rows(table, number)
-    ]
-
-
-def seeing_table(result: InterleavedResult) -> Table:
-    """Return r0 of each set, measured in several ways, and the truth."""
-    rows = []
-    for item in seeing_of_sets(result):
-        plain, whole = item.seeing, item.with_tip_tilt
-        found = (plain.r0_m, plain.r0_x_m, plain.r0_y_m, whole.r0_m, whole.r0_kolmogorov_m)
-        apart = [f"{100 * r0:.1f} ({100 * (r0 / item.true_r0_m - 1):+.0f} %)" for r0 in found]
-        cells = [item.set_name, f"{100 * item.true_r0_m:.1f}", *(cell.replace("-", "−") for cell in apart)]
-        rows.append([*cells, f"{plain.noise_std_px:.2f}"])
-    return _TEXT.table("tables.seeing", rows)
 
 
 def gain_table(result: MagnitudeResult, methods: Sequence[int], reference: int) -> Table:

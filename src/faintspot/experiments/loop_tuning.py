@@ -81,7 +81,7 @@ def tune_loop(
     InputError
         For a question of the wrong kind, or a folder that holds another question's units.
     MissingExtraError
-        When HCIPy, zarr, or Dask where it is needed, is not installed.
+        When HCIPy or zarr is not installed.
 
     Examples
     --------

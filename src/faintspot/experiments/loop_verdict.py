@@ -8,28 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from faintspot.ao_loop.files import BUDGET_FILE, INTERLEAVED_FILE, MAGNITUDE_FILE
+from faintspot.ao_loop.files import BUDGET_FILE, MAGNITUDE_FILE
 from faintspot.base.errors import InputError
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.experiments.loop_analysis import (
-    NO_TV,
-    TV,
-    TV_BEST,
-    Measurements,
-    differences_by_flux,
-    differences_by_strength,
-    gains_in_magnitude,
-    group_rows,
-    measurements,
-)
 from faintspot.experiments.loop_methods import VARIANTS
 from faintspot.experiments.loop_question import REFERENCES
 from faintspot.experiments.loop_results import (
     BudgetResult,
-    InterleavedResult,
     MagnitudeResult,
+    differences_by_flux,
+    gains_in_magnitude,
 )
-from faintspot.experiments.loop_tables import budget_table, in_columns, strehl_groups_table, strehl_table
+from faintspot.experiments.loop_tables import budget_table, in_columns, strehl_table
 from faintspot.experiments.statistics import Estimate
 from faintspot.experiments.words import with_interval
 
@@ -40,7 +30,6 @@ NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
 class LoopResults:
     """Results in a folder; None: not run."""
 
-    interleaved: InterleavedResult | None = None
     magnitude: MagnitudeResult | None = None
     budget: BudgetResult | None = None
 
@@ -55,34 +44,24 @@ class LoopResults:
         """
         folder = Path(folder)
         results = cls(
-            InterleavedResult.load(folder) if (folder / INTERLEAVED_FILE).exists() else None,
             MagnitudeResult.load(folder / MAGNITUDE_FILE) if (folder / MAGNITUDE_FILE).exists() else None,
             BudgetResult.load(folder / BUDGET_FILE) if (folder / BUDGET_FILE).exists() else None,
         )
-        if results.interleaved is None and results.magnitude is None and results.budget is None:
-            raise InputError(
-                f"{folder}: no results of a loop: expected {INTERLEAVED_FILE}, {MAGNITUDE_FILE} or "
-                f"{BUDGET_FILE}"
-            )
+        if results.magnitude is None and results.budget is None:
+            raise InputError(f"{folder}: no results of a loop: expected {MAGNITUDE_FILE} or {BUDGET_FILE}")
         return results
 
 
 def loop_verdict(results: LoopResults) -> list[str]:
     """Return what the results say about TV, and then about the other ways to measure slopes."""
-    comparisons: list[Estimate | None] = []
-    lines = []
-    if results.interleaved is not None:
-        table = measurements(results.interleaved)
-        lines += _interleaved_lines(table)
-        comparisons += [row.difference for row in group_rows(table)]
-        comparisons += [row.difference for row in differences_by_strength(table)]
-    if results.magnitude is not None:
-        lines += _magnitude_lines(results.magnitude)
-        # What the denoising itself does: against the same without it.
-        tv, reference = tv_method(results.magnitude), reference_methods(results.magnitude)[-1]
-        if tv is not None and tv != reference:
-            comparisons += differences_by_flux(results.magnitude, tv, reference)
-    return _headline(comparisons) + lines
+    if results.magnitude is None:
+        return []
+    lines = _magnitude_lines(results.magnitude)
+    # What the denoising itself does: against the same without it.
+    tv, reference = tv_method(results.magnitude), reference_methods(results.magnitude)[-1]
+    if tv is None or tv == reference:
+        return lines
+    return [_headline(differences_by_flux(results.magnitude, tv, reference)), *lines]
 
 
 def reference_methods(result: MagnitudeResult) -> list[int]:
@@ -126,33 +105,20 @@ def better_and_worse(result: MagnitudeResult, method: int, reference: int) -> tu
     return above and above + unit, below and below + unit
 
 
-def _headline(comparisons: list[Estimate | None]) -> list[str]:
-    known = [each for each in comparisons if each is not None and np.isfinite(each.low)]
+def _headline(comparisons: list[Estimate]) -> str:
+    known = [each for each in comparisons if np.isfinite(each.low)]
     if not known:
-        return ["Too few measurements to say whether TV raises the Strehl ratio."] if comparisons else []
+        return "Too few measurements to say whether TV raises the Strehl ratio."
     gains, losses = (sum(each.decided == sign for each in known) for sign in (1, -1))
     if gains:
         first = f"TV raises the Strehl ratio beyond its error in {gains} of {len(known)} comparisons"
     else:
         first = NOWHERE
-    return [
+    return (
         f"{first}; it lowers it beyond its error in {losses} of {len(known)} comparisons."
         if losses
         else f"{first}."
-    ]
-
-
-def _interleaved_lines(table: Measurements) -> list[str]:
-    rows = {row.group: row for row in group_rows(table)}
-    if NO_TV not in rows:
-        return ["Interleaved observations: no measurement without TV yet."]
-    return [
-        f"Interleaved, {name}: Strehl {row.mean:.3f} in {row.count} measurements against "
-        f"{rows[NO_TV].mean:.3f} in {rows[NO_TV].count} without; paired difference "
-        f"{with_interval(row.difference)}, {_judgement(row.difference)}."
-        for name, row in rows.items()
-        if name in (TV, TV_BEST)
-    ]
+    )
 
 
 def _magnitude_lines(result: MagnitudeResult) -> list[str]:
@@ -189,21 +155,12 @@ def _gain_in_magnitude(result: MagnitudeResult, method: int, reference: int) -> 
     return f"; limiting magnitude at Strehl {level:g}: {with_interval(middle, 2)} mag"
 
 
-def _judgement(estimate: Estimate | None) -> str:
-    if estimate is None or not np.isfinite(estimate.low):
-        return "too few to judge"
-    return {1: "more beyond its error", -1: "less beyond its error", 0: "within its error"}[estimate.decided]
-
-
 _WIDTH = 100
 
 
 def loop_summary(results: LoopResults) -> str:
     """Return the main tables of results and the verdict as text."""
     tables = []
-    if results.interleaved is not None:
-        table = strehl_groups_table(results.interleaved, measurements(results.interleaved))
-        tables.append(in_columns(table, 5))
     if results.magnitude is not None:
         tables.append(in_columns(strehl_table(results.magnitude)))
     if results.budget is not None:

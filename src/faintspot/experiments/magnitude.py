@@ -82,7 +82,7 @@ def run_magnitude(
     InputError
         For unknown methods, no flux, or a folder that holds another experiment.
     MissingExtraError
-        When HCIPy, or Dask where it is needed, is not installed.
+        When HCIPy is not installed.
 
     Examples
     --------
@@ -112,7 +112,6 @@ def run_magnitude(
         of("centroid_gain"),
         of("settings")[:, :, 0],
         np.array([[json.dumps(choices[kind.name, flux]) for flux in fluxes] for kind in kinds]),
-        of("psf").mean(axis=2),
         configuration.to_text(),
     )
     result.save(experiment.folder / MAGNITUDE_FILE)
@@ -330,7 +329,6 @@ def scored_run(
     return {
         "strehl": np.asarray(record.mean_strehl()),
         "centroid_gain": record.centroid_gain[0],
-        "psf": record.psf[0],
         "settings": np.asarray(record.method_settings[0]),
     }
 

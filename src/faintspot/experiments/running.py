@@ -1,29 +1,24 @@
-"""Running units of work over processes of this machine, or over a Dask cluster that the user has started.
+"""Running units of work over processes of this machine.
 
-Work on this machine opens no port: processes talk through pipes that nobody else can reach.
+No port is opened: processes talk through pipes that nobody else can reach.
 """
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import multiprocessing
 import os
 import signal
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from queue import SimpleQueue
 from typing import Any
 
 from faintspot.base.checks import number_between
-from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.base.version import __version__
+from faintspot.base.errors import InputError
 from faintspot.experiments.store import Arrays, UnitStore
 from faintspot.kernels.parallel import available_cpus
 
@@ -31,7 +26,6 @@ Progress = Callable[[int, int], None]
 Advance = Callable[[int], None]
 """Told how much of a unit is done, in the measure of its `size`."""
 
-_CONNECT_TIMEOUT_S = 10
 _TELLING_S = 0.5  # between what workers tell of their progress
 _ALLOWED_DEATHS = 3  # of processes on this machine
 _WORKER_ENVIRONMENT = {
@@ -58,16 +52,12 @@ class Unit:
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """Processes or cluster that run the units.
+    """Processes that run the units.
 
     Parameters
     ----------
     workers : int, optional
         Processes on this machine; as many as there are processors by default. 0: this process.
-    scheduler : str, optional
-        Address of a running Dask scheduler instead, such as "tcp://host:8786", whose workers have the same
-        version of faintspot. Anyone who can reach it can run anything as the user of its workers: see
-        docs/study.md for one that only you reach.
     progress : callable, optional
         Called with how much is done and how much there is in all.
     announce : callable, optional
@@ -80,7 +70,6 @@ class WorkerPool:
     """
 
     workers: int | None = None
-    scheduler: str | None = None
     progress: Progress | None = None
     announce: Callable[[str], None] | None = None
 
@@ -135,9 +124,7 @@ def run_units(
     Raises
     ------
     InputError
-        When the scheduler is not to be reached, workers die repeatedly, or results cannot be written.
-    MissingExtraError
-        When Dask is needed and not installed.
+        When workers die repeatedly, or results cannot be written.
     """
     missing = sorted((unit for unit in units if not store.done(unit.key)), key=lambda unit: -unit.size)
     if missing:
@@ -190,8 +177,6 @@ def _finished(
     function: Callable[..., Arrays], units: list[Unit], place: WorkerPool, count: _Count
 ) -> Finished:
     """Yield every unit and its result as it finishes."""
-    if place.scheduler is not None:
-        return _by_dask(function, units, place, place.scheduler, count)
     if place.workers == 0:
         return _here(function, units, count)
     processes = min(available_cpus() if place.workers is None else place.workers, len(units))
@@ -202,9 +187,6 @@ def _finished(
 def _here(function: Callable[..., Arrays], units: list[Unit], count: _Count) -> Finished:
     for unit in units:
         yield unit, function(*unit.arguments, lambda done, key=unit.key: count.at(key, done))
-
-
-# Processes of this machine --------------------------------------------------------------------------------
 
 
 def _by_processes(
@@ -301,86 +283,6 @@ def _seldom(tell: Advance) -> Advance:
             tell(done)
 
     return advance
-
-
-# A Dask cluster -------------------------------------------------------------------------------------------
-
-
-def _by_dask(
-    function: Callable[..., Arrays], units: list[Unit], place: WorkerPool, scheduler: str, count: _Count
-) -> Finished:
-    """Let a running cluster do the units."""
-    distributed = _distributed()
-    topic = f"faintspot-{uuid.uuid4()}"
-    # What workers tell and finished units arrive here, so that all is told to the caller in its own thread.
-    news: SimpleQueue[tuple[str, Any]] = SimpleQueue()
-    with _connected(distributed, scheduler) as client:
-        place.say(f"Dask scheduler {client.scheduler.address}{_dashboard(client)}")
-        client.subscribe_topic(topic, lambda event: news.put(event[1]))
-        waiting, futures = {unit.key: unit for unit in units}, dict[str, Any]()
-        try:
-            for unit in units:
-                future = client.submit(
-                    _on_worker, function, unit.key, unit.arguments, topic, __version__, pure=False
-                )
-                futures[unit.key] = future
-                future.add_done_callback(lambda done, key=unit.key: news.put((key, done)))
-            while waiting:
-                key, what = news.get()
-                if isinstance(what, int):
-                    count.at(key, what)
-                else:
-                    yield waiting.pop(key), futures.pop(key).result()
-        except distributed.KilledWorker as error:
-            raise InputError(f"workers died repeatedly, perhaps of lack of memory: {error}") from None
-        finally:
-            client.cancel(list(futures.values()))
-
-
-def _on_worker(
-    function: Callable[..., Arrays], key: str, arguments: tuple[Any, ...], topic: str, version: str
-) -> Mapping[str, Any]:
-    """Run a unit where the code is the same as where the experiment was started."""
-    import distributed
-
-    if version != __version__:
-        raise InputError("a worker has another version of faintspot: install the same on all")
-    worker = distributed.get_worker()
-    return function(*arguments, _seldom(lambda done: worker.log_event(topic, (key, done))))
-
-
-def _distributed() -> Any:
-    """Return the module, of which only a part is typed."""
-    try:
-        return importlib.import_module("distributed")
-    except ImportError:
-        raise MissingExtraError("dask[distributed]", "study", "A Dask scheduler") from None
-
-
-@contextmanager
-def _connected(distributed: Any, scheduler: str) -> Iterator[Any]:
-    """Connect to a running scheduler; never as Dask's default, which what else the process does would use."""
-    certificates = distributed.Security().get_connection_args("client").get("ssl_context")
-    if scheduler.startswith("tls:") and certificates is None:
-        raise InputError(
-            f"scheduler = {scheduler!r}: expected certificates in Dask's configuration, found none; "
-            "docs/study.md says how to give them"
-        )
-    try:
-        client = distributed.Client(scheduler, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"scheduler = {scheduler!r}: cannot be reached, expected an address such as "
-            f"tcp://host:8786 ({' '.join(str(error).split())})"
-        ) from None
-    with client:
-        yield client
-
-
-def _dashboard(client: Any) -> str:
-    """Return where the dashboard is; without Bokeh, which draws it, Dask links to a missing page."""
-    link = client.dashboard_link
-    return f", dashboard {link}" if link and importlib.util.find_spec("bokeh") else ""
 
 
 __all__ = ["Advance", "Progress", "Unit", "WorkerPool", "run_units"]

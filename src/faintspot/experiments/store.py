@@ -137,11 +137,6 @@ class ZarrStore:
         if len(self._rows) > len(stored):
             self._lengthen()
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether no unit is done."""
-        return not self._is_done.any()
-
     def done(self, key: str) -> bool:
         """See `UnitStore`."""
         return bool(self._is_done[self._rows[key]])

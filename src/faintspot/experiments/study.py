@@ -153,7 +153,6 @@ def dataset_of(specification: StudySpecification, units: UnitStore) -> xarray.Da
 def run(
     specification: StudySpecification,
     store: str | Path | None = None,
-    scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
     *,
     workers: int | None = None,
@@ -171,14 +170,11 @@ def run(
     store : path, optional
         Zarr store to write every cell to as it finishes, and to go on with when it is there. Without one,
         results are in memory only.
-    scheduler : str, optional
-        Address of a running Dask scheduler, such as "tcp://host:8786", whose workers have the same version
-        of faintspot; docs/study.md says who may reach it. Without one, processes are started on this machine
-        for the time of the run; a script must then call this function under ``if __name__ == "__main__":``.
     progress : callable, optional
-        Called with the number of cells measured in this run and the number to measure.
+        Called with the number of finished cells and of all, if any are missing.
     workers : int, optional
-        Processes on this machine; as many as there are processors by default. 0 works in this process.
+        Processes on this machine; as many as there are processors by default. A script must then call this
+        function under ``if __name__ == "__main__":``. 0 works in this process.
     overwrite : bool
         Replace the store, if it is one of a study.
     announce : callable, optional
@@ -192,9 +188,7 @@ def run(
     Raises
     ------
     InputError
-        When the store belongs to another study or cannot be written, or the scheduler is not to be reached.
-    MissingExtraError
-        When Dask is needed and not installed.
+        When the store belongs to another study or cannot be written.
 
     Examples
     --------
@@ -207,7 +201,7 @@ def run(
     """
     if not isinstance(specification, StudySpecification):
         raise InputError(f"specification: expected a StudySpecification, got {type(specification).__name__}")
-    place = WorkerPool(workers, scheduler, progress, announce)
+    place = WorkerPool(workers, progress, announce)
     units = [Unit(str(index), (cell, specification)) for index, cell in enumerate(specification.cells())]
     if store is None:
         memory = MemoryStore()

@@ -30,9 +30,6 @@ from faintspot.kernels.spot_rows import (
 
 REACH = 4.0  # standard deviations of the prior beyond which no position is looked at
 _NEGLIGIBLE = 25.0  # differences of the logarithm that count as probability 0
-BROAD_FROM = (
-    0.5  # standard deviation, in units of the grid's spacing, above which sums over the grid are good
-)
 
 
 @compiled
