@@ -109,3 +109,16 @@ def test_impossible_fits_are_refused() -> None:
         known: dict[str, Any] = options
         with refused():
             fit_sodium_profile(mean, STAR, START, **known)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_images_without_spots_give_a_profile_or_a_refusal(scale: float) -> None:
+    rng = np.random.default_rng(4)
+    shape, slopes = (len(PLACES), SIDE, SIDE), np.zeros((len(PLACES), 2))
+    for images in (rng.normal(0.1, 1.0, shape), np.eye(shape[0] * SIDE, SIDE).reshape(shape)):
+        try:
+            found = fit_sodium_profile(MeanImages(scale * images, slopes), STAR, START, dark_variance_e2=1.0)
+        except fs.InputError:
+            continue
+        assert np.isfinite(found.profile.density).all()
+        assert np.isfinite(found.flux_e).all()

@@ -132,7 +132,7 @@ def fit_sodium_profile(
     profile : SodiumProfile
         The profile so far, whose altitudes are kept. It gives the first weights.
     dark_variance_e2 : float or (n, ny, nx) array
-        Variance of a dark pixel in one frame [electrons^2].
+        Variance of a dark pixel in one frame [electrons^2]; large for pixels to be ignored.
     smoothness : float
         Expected second difference of the density, as a fraction of its peak.
 
@@ -258,6 +258,9 @@ def _solved(normal: Floats, right: Floats, centred: Floats, second_difference: f
     total = normal + curvature.T @ curvature + _RIDGE * scale * np.eye(count)
     centred = centred / np.abs(centred).max()
     total += _CENTRED * scale * np.outer(centred, centred)
-    root = np.linalg.cholesky(total)
-    solution: Floats = nnls(root.T, solve_triangular(root, right, lower=True), maxiter=30 * count)[0]
+    try:
+        root = np.linalg.cholesky(total)
+        solution: Floats = nnls(root.T, solve_triangular(root, right, lower=True), maxiter=30 * count)[0]
+    except (RuntimeError, np.linalg.LinAlgError):
+        raise InputError("images_e: expected images of spots, got ones that no profile fits") from None
     return solution
