@@ -31,6 +31,7 @@ _ORDER = (
     "realtime_guard",
     "advice",
     "telemetry",
+    "recorded_tip_tilt",
     "live_page",
     "latency",
     "realtime_sustained",
@@ -43,8 +44,8 @@ _ORDER = (
     "gpu",
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
-LONG = {"realtime_sustained"}
-"""Run only when named, or with --full: 12 minutes."""
+LONG = {"realtime_sustained", "telemetry", "recorded_tip_tilt"}
+"""Run only when named, or with --full: 12 minutes, an hour, and with a recording of its own."""
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _FOLDER = click.option(
     "--folder",

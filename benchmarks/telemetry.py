@@ -1,8 +1,8 @@
 """How well a recorded loop tells delay, noise, turbulence and what other control would leave.
 
-Loops near the diffraction limit are simulated with one gain and reported as `faintspot telemetry` does. Their
-delay is not given. The same turbulence with another gain and with the predictive filter shows what these
-really leave.
+Loops near the diffraction limit are simulated and reported as `faintspot telemetry` does. Their delay is not
+given. Random loops, half of them with HCIPy's turbulence, show how often intervals hold. Others are run again
+in the same turbulence with another gain and with the predictive filter, which shows what these really leave.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.measuring import Row, Table
+from benchmarks.recorded_loops import Case, drawn_cases, recorded, winds_of
 from faintspot.advice.loop_choices import AS_RUN, FILTER, Choice
 from faintspot.advice.loop_report import LoopReport, report_of_loop
 from faintspot.advice.measured import Measured
@@ -21,7 +22,8 @@ from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.control.learning import KALMAN
 from faintspot.pipeline.settings import Settings
 
-FRAMES, REALISATIONS = 3000, 5
+FRAMES, REALISATIONS = 3000, 2
+RANDOM_LOOPS, RANDOM_SEED = 14, 1
 _GAINS = {20.0: (0.17, 0.1), 200.0: (0.4, 0.25)}
 """Gain of the recorded loop and of the other one, by photons per sub-aperture and frame."""
 
@@ -46,14 +48,54 @@ def recording(record: LoopRecord) -> RecordedLoop:
 
 
 def run() -> list[Table]:
-    """Report loops at each flux."""
-    tables = []
+    """Report random loops, and loops at each flux."""
+    tables = [_coverage()]
     for photons in _GAINS:
         rows = [_row(photons, realisation) for realisation in range(REALISATIONS)]
         title = f"A recorded loop, {photons:g} photons: value / truth, and errors"
         note = f"{FRAMES} frames, diffraction_limit, slopes by window; residuals with the fitting error"
         tables.append(Table(f"telemetry-{photons:g}", title, rows, [note]))
     return tables
+
+
+def _coverage() -> Table:
+    """Report random loops: value / truth, and whether the 95 % interval holds."""
+    found = [_of_case(case) for case in drawn_cases(RANDOM_LOOPS, RANDOM_SEED)]
+    rows = []
+    for name in found[0]:
+        known = [each[name] for each in found if each[name] is not None]
+        ratio, relative, holds = np.array(known, np.float64).T
+        values = {
+            "mean value / truth": float(ratio.mean()),
+            "standard deviation": float(ratio.std(ddof=1)),
+            "mean error": float(relative.mean()),
+            "intervals that hold": float(holds.mean()),
+            "loops": float(len(known)),
+        }
+        rows.append(Row(name, values))
+    title = "Random recorded loops: value / truth, and share of 95 % intervals that hold"
+    return Table("telemetry-random", title, rows, ["20 to 300 photons, r0 0.18 to 0.32 m, delay 1 to 3"])
+
+
+def _of_case(case: Case) -> dict[str, tuple[float, float, bool] | None]:
+    """Return value / truth, relative error, and whether the interval holds; None if not known."""
+    loop, truth = recorded(case)
+    report = report_of_loop(loop)
+    ran = [each.total for each in report.choices if each.name == AS_RUN]
+    left = float(np.sqrt(np.square(truth.residual_nm[len(loop.slopes) // 2 :]).mean()))
+    pairs = {
+        "delay": (_values(report, "loop", "delay"), case.delay_frames),
+        "noise": (_values(report, "noise", "noise of a slope"), truth.noise_px),
+        "r0": (_values(report, "turbulence", "r0 at 500 nm"), case.r0_m),
+        "outer scale": (_values(report, "turbulence", "outer scale"), case.outer_scale_m),
+        "residual": (ran, left),
+    }
+    found: dict[str, tuple[float, float, bool] | None] = dict.fromkeys(pairs)
+    for name, (values, true) in pairs.items():
+        for each in values:
+            low, high = each.interval
+            found[name] = each.value / true, each.error / true, low <= true <= high
+    return found
 
 
 def _row(photons: float, realisation: int) -> Row:
@@ -91,15 +133,17 @@ def _named(report: LoopReport, name: str) -> Choice:
     return next(each for each in report.choices if each.name == name)
 
 
+def _values(report: LoopReport, part: str, name: str) -> list[Measured]:
+    return [each for each in report.parts[part].known if each.name == name]
+
+
 def _value(report: LoopReport, part: str, name: str) -> Measured:
-    return next(each for each in report.parts[part].known if each.name == name)
+    return _values(report, part, name)[0]
 
 
 def _wind_error(report: LoopReport, configuration: LoopConfiguration) -> float:
     """Return the largest distance of a layer's true wind from the nearest one found."""
     assert report.turbulence is not None
-    atmosphere = configuration.atmosphere
-    angle = np.deg2rad(atmosphere.wind_direction_deg)
-    true = np.array(atmosphere.wind_speed_m_per_s) * np.array([np.cos(angle), np.sin(angle)])
+    true = winds_of(configuration).T
     apart = np.hypot(*(true[:, :, None] - report.turbulence.turbulence.wind_m_per_s.T[:, None]))
     return float(apart.min(axis=1).max())

@@ -54,7 +54,8 @@ def atmosphere(seed: int) -> list[np.ndarray]:
         paths = []
         for _ in range(FRAMES):
             layer.update()
-            paths.append(np.array(layer.OPD))
+            star**layer * telescope  # OOPAO updates the path difference when light passes
+            paths.append(np.array(star.OPD))
     return paths
 
 

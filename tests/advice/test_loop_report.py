@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tests.advice.loop_cases import AIR, LOOP_GAIN, NOISE_PX, recorded
 
-from faintspot.advice.loop_choices import AS_RUN, BEST, FILTER
+from faintspot.advice.loop_choices import AS_RUN, BEST, FILTER, MODES
 from faintspot.advice.loop_report import LoopReport, report_of_loop
 from faintspot.advice.measured import Measured
 from faintspot.base.errors import InputError
@@ -62,6 +62,7 @@ def test_other_choices(report: LoopReport) -> None:
     """The filter leaves less than the best integrator; an integrator of the loop's gain leaves as much."""
     found = {each.name: each for each in report.choices if each.name != "integrator"}
     assert found[FILTER].residual.value < found[BEST].residual.value
+    assert found[MODES].residual.value < found[AS_RUN].residual.value + 3 * found[MODES].residual.error
     curve = [each for each in report.choices if each.name == "integrator"]
     like = min(curve, key=lambda each: abs(each.gain - LOOP_GAIN))
     assert like.residual.value == pytest.approx(found[AS_RUN].residual.value, rel=0.1)

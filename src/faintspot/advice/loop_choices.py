@@ -15,7 +15,7 @@ from faintspot.advice.open_loop import OpenLoop
 from faintspot.advice.recorded_loop import RecordedLoop
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
-from faintspot.control.learning import GAINS, KALMAN, learn
+from faintspot.control.learning import GAINS, KALMAN, MODAL, learn
 from faintspot.control.learnt import SETTLE_FRAMES, Make, Plant
 from faintspot.control.loop_delay import LoopDelay
 from faintspot.control.phase import residual_phase
@@ -26,7 +26,8 @@ from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 
-BEST, AS_RUN, FILTER = "integrator, best gain", "as it ran", "predictive Kalman filter"
+BEST, AS_RUN = "integrator, best gain", "as it ran"
+MODES, FILTER = "integrator, a gain for each mode", "predictive Kalman filter"
 FEWEST_FRAMES = 600
 _MOST_SLOPES = 500  # beyond, the filter takes too long to learn
 _LEAK = 0.01
@@ -92,14 +93,16 @@ def compared_choices(
     found = [] if ran is None else [compare(AS_RUN, ran)]
     first = seen.telemetry.part(0, frames // 2)
     if len(seen.variance) <= _MOST_SLOPES:
-        learnt = learn(KALMAN, plant, first, site, loop.frame_rate_hz)
-        best = learnt.model.plain_gain
-        own = learnt.model.controller
-        found.append(compare(FILTER, left(lambda line: own(plant, line))))
+        modal, learnt = (
+            learn(kind, plant, first, site, loop.frame_rate_hz).model for kind in (MODAL, KALMAN)
+        )
+        found.append(compare(BEST, integrator(learnt.plain_gain), gain=learnt.plain_gain))
+        found.append(compare(MODES, left(partial(modal.controller, plant))))
+        found.append(compare(FILTER, left(partial(learnt.controller, plant))))
     else:
         ranked = [plant.left(partial(plant.integrator, gain), first, phase) for gain in GAINS]
         best = GAINS[int(np.argmin(ranked))]
-    found.insert(len(found) - 1, compare(BEST, integrator(best), gain=best))
+        found.append(compare(BEST, integrator(best), gain=best))
     uncorrected = float(np.square(views[0].scored.open_loop_px @ phase.T).sum(axis=1).mean())
     for gain in GAINS[1::2]:
         values = integrator(gain)

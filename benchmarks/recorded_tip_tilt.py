@@ -1,0 +1,89 @@
+"""Controllers replayed on a recorded tip-tilt loop of a telescope.
+
+They learn on its first half, within which gains and the options of pyRTC's predictor (`pip install pyrtcao`,
+GPL-3) are tuned, and are scored on the second. The recording (telemetry/keck_tt of the public repository
+aditya-sengupta/tip-tilt-control) lies in the folder keck_tt of FAINTSPOT_SHARED.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measuring import Row, Table
+from benchmarks.prediction import Make, rivals
+from faintspot.advice.open_loop import open_loop_of, site_of_loop
+from faintspot.advice.recorded_loop import RecordedLoop
+from faintspot.control.learning import GAINS, KALMAN, Plant, learn
+from faintspot.control.loop_delay import loop_delay
+from faintspot.control.reconstructor import make_reconstructor
+from faintspot.control.telemetry import replayed_frames
+from faintspot.experiments.statistics import mean_by_blocks
+
+RATE_HZ, DIAMETER_M, LEAK = 1000.0, 10.0, 0.01
+TUNED_FRAMES, SETTLE, BLOCK = 4000, 100, 1000
+
+
+def recording() -> RecordedLoop:
+    """Return centroids and commands, which are subtracted from the turbulence."""
+    folder = Path(os.environ.get("FAINTSPOT_SHARED", "")) / "keck_tt"
+    slopes, commands = (
+        np.load(folder / f"{name}_n0088.npy").astype(np.float64) for name in ("Centroid", "Commands")
+    )
+    frame, cells = np.arange(len(slopes)), np.zeros((1, 2), np.int64)
+    return RecordedLoop(
+        "tip-tilt", slopes, frame, RATE_HZ, "arcsec", cells, -commands, np.eye(2), DIAMETER_M, 1.0
+    )
+
+
+def run() -> list[Table]:
+    """Score the loop as it ran, a tuned integrator, least squares and the learnt filter."""
+    loop = recording()
+    assert loop.commands is not None
+    site = site_of_loop(loop)
+    found = loop_delay(loop.slopes, loop.commands, np.zeros(len(loop.slopes), np.int64), site, RATE_HZ)
+    delay = max(1, round(found.delay_frames))
+    known = loop_delay(loop.slopes, loop.commands, np.zeros(len(loop.slopes), np.int64), site, RATE_HZ, delay)
+    seen = open_loop_of(loop, known)
+    half = len(seen.telemetry) // 2
+    first, second = seen.telemetry.part(0, half), seen.telemetry.part(half, len(seen.telemetry))
+    tuning = first.part(half - TUNED_FRAMES, half)
+    plant, phase = Plant(np.eye(2), make_reconstructor(np.eye(2)), delay, LEAK), np.eye(2)
+
+    def best(candidates: list[Make]) -> Make:
+        return min(candidates, key=lambda each: plant.left(each, tuning, phase))
+
+    makes: dict[str, Make] = {"integrator": best([partial(plant.integrator, gain) for gain in GAINS])}
+    if importlib.util.find_spec("pyrtc"):
+        earlier = first.part(0, half - TUNED_FRAMES)
+        makes["least_squares"] = best(list(rivals("least_squares", plant, earlier)))
+    learnt = learn(KALMAN, plant, first, site, RATE_HZ)
+    makes["learnt"] = partial(learnt.model.controller, plant)
+    makes["learnt, guarded"] = learnt.controller
+    left = {"as it ran": np.square(seen.residual[half:]).sum(axis=1)}
+    for name, make in makes.items():
+        left[name] = replayed_frames(make, second, np.eye(2), phase, delay)
+    rows = []
+    for name, values in left.items():
+        mean = mean_by_blocks(values[SETTLE:], BLOCK)
+        less = mean_by_blocks((values - left["integrator"])[SETTLE:], BLOCK)
+        columns = {
+            "rms (mas)": 1e3 * mean.value**0.5,
+            "error": 1e3 * mean.standard_error / (2 * mean.value**0.5),
+            "variance minus the integrator's": less.value / mean.value,
+            "its error": less.standard_error / mean.value,
+        }
+        rows.append(Row(name, columns))
+    noise = 1e3 * float(np.sqrt(seen.variance.sum()))
+    note = (
+        f"noise of {noise:.3g} mas included; delay {found.delay_frames:.2f} +- {found.delay_error:.2f} frames"
+    )
+    return [
+        Table(
+            "recorded-tip-tilt", "A recorded tip-tilt loop, replayed", rows, [note, learnt.model.description]
+        )
+    ]
