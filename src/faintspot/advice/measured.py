@@ -44,11 +44,13 @@ class Measured:
     """Standard error; NaN if unknown."""
     remark: str = ""
     """Reason why it is unknown, or assumptions of the value."""
+    is_positive: bool = False
+    """Whether negative values are impossible."""
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % interval; of positive values with small errors it is that of the logarithm."""
-        if not self.value > 0 or self.error > 0.5 * self.value:
+        """95 % interval; with small errors, or where only positive values occur, that of the logarithm."""
+        if not self.value > 0 or (self.error > 0.5 * self.value and not self.is_positive):
             return self.value - 1.96 * self.error, self.value + 1.96 * self.error
         factor = math.exp(1.96 * self.error / self.value)
         return self.value / factor, self.value * factor
@@ -143,7 +145,7 @@ def outer_scale_and_r0(found: Strength, known_scale_m: float | None = None) -> l
     if not math.isfinite(found.r0_m):
         outer = Measured("outer scale", "m", remark="unknown without r0")
         return [outer, Measured(name, unit, remark="the slopes vary no more than their noise")]
-    outer = Measured("outer scale", "m", found.outer_scale_m, found.outer_scale_error_m, remark)
+    outer = Measured("outer scale", "m", found.outer_scale_m, found.outer_scale_error_m, remark, True)
     return [outer, Measured(name, unit, found.r0_m, found.r0_error_m)]
 
 

@@ -23,11 +23,10 @@ _WINDOW = 128  # frames
 _FEWEST_PIECES = 8
 _MOST_DELAY = 5
 _DELAYS = np.arange(1.0, _MOST_DELAY + 0.01, 0.1)
-_GAINS, _FINE_GAINS = np.arange(0.5, 1.51, 0.05), np.arange(0.5, 1.51, 0.0125)
-_EXPECTED_GAIN, _GAIN_SPREAD = (
-    0.9,
-    0.15,
-)  # before telemetry: noise and speckles reduce the gain, little raises it
+_GAINS, _FINE_GAINS = np.arange(0.25, 1.51, 0.05), np.arange(0.25, 1.51, 0.0125)
+_EXPECTED_GAIN, _LOWER_SPREAD, _HIGHER_SPREAD = 0.9, 0.3, 0.15
+"""Gain before telemetry: wide spots, noise and speckles reduce it, little raises it."""
+_MODEL_ERROR = 0.05  # frames: spectra of real slopes differ from the theory
 _SPEEDS_M_PER_S = (1.0, 3.0, 6.0, 10.0, 15.0, 22.0, 32.0)
 _DIRECTIONS = 4  # of half a turn: opposite winds have the same spectrum
 _MOST_SUBAPERTURES = 40
@@ -88,13 +87,14 @@ def loop_delay(
     misfit = misfit.reshape(len(delays), len(gains))
     # As many independent values as the best fit is good, so that a model that does not fit has wide errors;
     # half of them, as neighbouring frequencies are alike under the window.
-    likelihood = (
-        -0.25 * (_WINDOW // 2 - 1) * misfit / misfit.min()
-        - 0.5 * ((gains - _EXPECTED_GAIN) / _GAIN_SPREAD) ** 2
-    )
+    spread = np.where(gains < _EXPECTED_GAIN, _LOWER_SPREAD, _HIGHER_SPREAD)
+    likelihood = -0.25 * (_WINDOW // 2 - 1) * misfit / misfit.min()
+    likelihood -= 0.5 * ((gains - _EXPECTED_GAIN) / spread) ** 2
     weight = np.exp(likelihood - likelihood.max())
     delay, delay_error = _moments(delays, weight.sum(axis=1))
     gain, gain_error = _moments(gains, weight.sum(axis=0))
+    if delay_frames is None:
+        delay_error = math.hypot(delay_error, _MODEL_ERROR)
     return LoopDelay(delay, delay_error, gain, gain_error)
 
 
