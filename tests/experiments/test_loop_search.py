@@ -13,7 +13,7 @@ from faintspot.experiments.search import (
     FIRST_TUNING_REALISATION,
     Search,
     smoothed,
-    stored_choice,
+    stored,
     tune,
     tuning_unit,
 )
@@ -92,7 +92,7 @@ def test_without_rounds_the_best_coarse_choice(hill: list[int]) -> None:
 def test_is_repeatable_and_stored() -> None:
     centroid = method_kind("centroid")
     one, other = (tuning_unit(centroid, small(), SEARCH, None, lambda frames: None) for _ in range(2))
-    assert stored_choice(one) == stored_choice(other)
+    assert stored(one) == stored(other)
     np.testing.assert_array_equal(one["strehl"], other["strehl"])
     assert 0 < one["strehl"] < 1
 

@@ -27,9 +27,10 @@ from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, 
 from faintspot.experiments.search import (
     QUICK,
     Search,
+    Tuned,
     learning_frames,
     smoothed,
-    stored_choice,
+    stored,
     tuning_frames,
     tuning_unit,
     with_integrator,
@@ -40,6 +41,7 @@ KIND = "magnitude"
 QUICK_METHODS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation, Window, Trained))
 _QUICK_RUN = {"frames": 300, "settle_frames": 60, "realisations": 2}
 _QUICK_FLUXES = 3
+_NO_LOSS = 0.02  # of Strehl ratio: the best one of many short runs is that much too high
 
 
 def run_magnitude(
@@ -212,21 +214,25 @@ class Experiment:
         """Return the tuned values of every method at every flux, tuned now where they are not stored.
 
         Slopes first, with the integrator, also of methods whose control learns: all their options at each
-        flux alone, then the loop gain with smoothed options. Then what is the control's own.
+        flux alone, then the loop gain with smoothed options, which are kept where they lose nothing. Then
+        what is the control's own.
         """
         stars = {flux: with_flux(self.configuration, flux) for flux in fluxes}
         plain, learning = _plain_and_learning(kinds)
-        first = self._tuned("tuning", plain, stars, {}, stages[0])
-        slopes: dict[tuple[str, float], Choice] = {
+        alone = self._tuned("tuning", plain, stars, {}, stages[0])
+        best = {key: tuned.choice for key, tuned in alone.items()}
+        smooth: dict[tuple[str, float], Choice] = {
             (kind.name, flux): choice
             for kind in plain
-            for found in [[first[kind.name, flux] for flux in fluxes]]
+            for found in [[best[kind.name, flux] for flux in fluxes]]
             for flux, choice in zip(fluxes, smoothed(kind, list(stars.values()), found), strict=True)
         }
-        if slopes != first:
-            slopes = self._tuned("tuning of the loop gain", plain, stars, slopes, stages[1])
-        own = self._tuned("tuning of control", learning, stars, slopes, stages[2])
-        return {**slopes, **own}
+        if smooth != best:
+            again = self._tuned("tuning of the loop gain", plain, stars, smooth, stages[1])
+            kept = {key: each for key, each in again.items() if each.strehl >= alone[key].strehl - _NO_LOSS}
+            best |= {key: each.choice for key, each in kept.items()}
+        own = self._tuned("tuning of control", learning, stars, best, stages[2])
+        return {**best, **{key: tuned.choice for key, tuned in own.items()}}
 
     def _tuned(
         self,
@@ -235,7 +241,7 @@ class Experiment:
         stars: Mapping[float, LoopConfiguration],
         slopes: Mapping[tuple[str, float], Choice],
         place: WorkerPool,
-    ) -> dict[tuple[str, float], Choice]:
+    ) -> dict[tuple[str, float], Tuned]:
         """Return the tuned values of every method with every star, given those of its slopes."""
         units = {
             (kind.name, flux): _tuning_unit(
@@ -249,7 +255,7 @@ class Experiment:
         place.say(stage)
         store = self.store(list(units.values()), "-tuning")
         results = run_units(tuning_unit, list(units.values()), store, place)
-        return {key: stored_choice(results[unit.key]) for key, unit in units.items()}
+        return {key: stored(results[unit.key]) for key, unit in units.items()}
 
     def _stages(self, kinds: Sequence[MethodKind], fluxes: Sequence[float], columns: int) -> list[WorkerPool]:
         """Return where each stage runs, with a progress that is the whole experiment's."""

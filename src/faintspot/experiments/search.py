@@ -257,10 +257,9 @@ def smoothed(
     return found
 
 
-def stored_choice(result: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return the choice that `tuning_unit` stored."""
-    choice: dict[str, Any] = json.loads(str(result["choice"]))
-    return choice
+def stored(result: Mapping[str, NDArray[Any]]) -> Tuned:
+    """Return what `tuning_unit` stored."""
+    return Tuned(json.loads(str(result["choice"])), float(result["strehl"]), int(result["tried"]))
 
 
 def tuning_frames(
