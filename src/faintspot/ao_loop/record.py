@@ -14,17 +14,7 @@ from faintspot.base.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class LoopRecord(Stored):
-    """One run of the loop, n sub-apertures and m commands.
-
-    Examples
-    --------
-    >>> import faintspot as fs
-    >>> from faintspot.ao_loop import Method, LoopConfiguration, simulate_loop
-    >>> loop = LoopConfiguration().replace("run", frames=40, settle_frames=20)
-    >>> record = simulate_loop(loop, [Method("brightest", fs.Settings("brightest"))])
-    >>> record.labels, record.frames, 0.0 < record.mean_strehl() < 1.0
-    (('brightest',), 40, True)
-    """
+    """One run of `simulate_loop`, n sub-apertures and m commands."""
 
     WHAT: ClassVar[str] = "a record of a loop"
 

@@ -91,8 +91,7 @@ class _Plan(GravityPlan):
         variances = None
         noise = self.sensor.calibration.read_noise_map(self.sensor.layout.frame_shape)
         if noise is not None:
-            background = self.sensor.excess_noise * self.sensor.calibration.background_e
-            variances = (np.square(noise) + background).astype(np.float32)
+            variances = (np.square(noise) + self.sensor.background_variance).astype(np.float32)
         return RowTables(lanes_for(np.float32, max(self._widths)), maps, ramp, tables, variances)
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:

@@ -50,18 +50,7 @@ class MethodResult:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Result of `faintspot.experiments.tune`.
-
-    Examples
-    --------
-    >>> import faintspot as fs
-    >>> from faintspot.experiments import Question
-    >>> question = Question(read_noise_e=3.0, pixels=8, fwhm_px=1.8, flux_e=200.0)
-    >>> answer = fs.tune(question, realisations=256, steps=1)
-    >>> answer.save("faintspot.toml")
-    >>> fs.Settings.load("faintspot.toml").estimator.name == answer.best.method.name
-    True
-    """
+    """Result of `faintspot.experiments.tune`."""
 
     question: Question
     curve: Curve

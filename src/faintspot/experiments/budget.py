@@ -59,21 +59,15 @@ def run_budget(
 
     Parameters
     ----------
-    configuration : LoopConfiguration
-    folder : path
-        Where finished units are remembered; made where it is not there.
     methods : sequence of str, optional
-        See `faintspot.experiments.loop_methods.method_kind`. Default: brightest pixels, Gaussian smoothing
-        and TV.
-    quick, search, place, overwrite
+        Default: brightest pixels, Gaussian smoothing and TV.
+    configuration, folder, quick, search, place, overwrite
         As for `run_magnitude`.
 
     Raises
     ------
     InputError
-        For unknown methods, a folder that holds another experiment, or a loop that is open.
-    MissingExtraError
-        When HCIPy is not installed.
+        As `run_magnitude`, and for a loop that is open.
 
     Examples
     --------

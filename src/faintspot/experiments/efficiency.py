@@ -13,6 +13,7 @@ from faintspot.estimators.weighted import Weighted
 from faintspot.experiments.methods import knows_the_spot
 from faintspot.experiments.specification import BEST, CORRECTED
 from faintspot.experiments.study_curves import Configuration
+from faintspot.experiments.words import number_or_dash
 from faintspot.report.page import Section
 from faintspot.report.texts import Texts
 
@@ -166,11 +167,14 @@ def result_sections(dataset: xarray.Dataset) -> list[Section]:
     cells, speckled = _Cells(dataset, speckled=False), _Cells(dataset, speckled=True)
     if cells.count:
         efficiency, bound = cells.values("photon_efficiency", BEST), cells.coordinate("bound")
-        rows = [[f"{bound[i]:.4f}", *map(_number, efficiency[i])] for i in cells.order()]
+        rows = [[f"{bound[i]:.4f}", *map(number_or_dash, efficiency[i])] for i in cells.order()]
         sections.append(_section(cells, "efficiency", rows, cells.methods))
         near, whole = (cells.values(f"stated_over_actual{part}") for part in ("", "_all"))
         kept = [i for i, method in enumerate(cells.methods) if knows_the_spot(method)]
-        rows = [[f"{_number(near[i, j])} ({_number(whole[i, j])})" for j in kept] for i in cells.order()]
+        rows = [
+            [f"{number_or_dash(near[i, j])} ({number_or_dash(whole[i, j])})" for j in kept]
+            for i in cells.order()
+        ]
         sections.append(_section(cells, "calibration", rows, [cells.methods[j] for j in kept]))
     if speckled.count:
         values = speckled.values("corrected_rms", _corrected_mode(dataset))
@@ -179,7 +183,7 @@ def result_sections(dataset: xarray.Dataset) -> list[Section]:
             [
                 f"{values[i, best[i]]:.4f}",
                 speckled.methods[best[i]],
-                *(_number(each, 0) for each in excess[i]),
+                *(number_or_dash(each, 0) for each in excess[i]),
             ]
             for i in speckled.order()
         ]
@@ -196,7 +200,3 @@ def _section(cells: _Cells, name: str, rows: list[list[str]], methods: list[str]
 
 def _corrected_mode(dataset: xarray.Dataset) -> str:
     return CORRECTED if CORRECTED in dataset["mode"].values else BEST
-
-
-def _number(value: float, digits: int = 2) -> str:
-    return f"{value:.{digits}f}" if np.isfinite(value) else "–"

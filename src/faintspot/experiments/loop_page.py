@@ -156,21 +156,12 @@ def _without(number: int, term: str) -> str:
 
 
 def write_loop_report(folder_of_results: str | Path, out_html: str | Path) -> list[Path]:
-    """Write the report of what `faintspot loop` left in a folder, finished or not.
-
-    Beside the page, a folder holds each figure as PNG and SVG and its numbers as CSV.
-
-    Returns
-    -------
-    list of Path
-        The files written, the page first.
+    """Write the report of what `faintspot loop` left in a folder, finished or not, as `write_page` does.
 
     Raises
     ------
     InputError
         When there are no results, or a file cannot be written.
-    MissingExtraError
-        When matplotlib or jinja2 is not installed.
     """
     return write_page(loop_page(LoopResults.load(folder_of_results)), out_html)
 

@@ -72,18 +72,7 @@ def study_report(dataset: xarray.Dataset) -> str:
 
 
 def write_study_report(dataset: xarray.Dataset, path: str | Path) -> list[Path]:
-    """Write the page and, in a folder beside it, each figure as PNG and SVG and its numbers as CSV.
-
-    Returns
-    -------
-    list of Path
-        The files written, the page first.
-
-    Raises
-    ------
-    InputError
-        As `study_report`, and when a file cannot be written.
-    """
+    """Write the page of a study, checked as by `study_report`, as `write_page` does."""
     return write_page(_page(_checked(dataset)), path)
 
 

@@ -21,6 +21,7 @@ from faintspot.experiments.study_curves import (
     study_curves,
 )
 from faintspot.experiments.sweep import PARAMETERS
+from faintspot.experiments.words import NOTHING
 from faintspot.report.figure_data import csv_text
 from faintspot.report.page import Badge, Cell, Section, Table
 from faintspot.report.texts import Texts
@@ -153,7 +154,7 @@ def gains_section(dataset: xarray.Dataset) -> Section:
     rows = [
         [
             configuration.in_words(),
-            *("–" if (gain := gains.get(mode)) is None else gain.in_words() for mode in modes),
+            *(NOTHING if (gain := gains.get(mode)) is None else gain.in_words() for mode in modes),
         ]
         for configuration, gains in gains_by_mode(dataset).items()
     ]

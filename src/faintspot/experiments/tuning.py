@@ -106,6 +106,9 @@ def tune(
     >>> answer = fs.tune(question, realisations=256, steps=1)
     >>> sorted(result.method.name for result in answer.results)[:3]
     ['brightest', 'centroid', 'map']
+    >>> answer.save("faintspot.toml")
+    >>> fs.Settings.load("faintspot.toml").estimator.name == answer.best.method.name
+    True
     """
     if not isinstance(question, Question):
         raise InputError(f"question: expected a Question, got {type(question).__name__}")

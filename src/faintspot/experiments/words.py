@@ -19,6 +19,11 @@ def signed(value: float, digits: int = 3) -> str:
     return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "−")
 
 
+def number_or_dash(value: float, digits: int = 2) -> str:
+    """Return a number to so many decimals, a dash where there is none."""
+    return f"{value:.{digits}f}" if math.isfinite(value) else NOTHING
+
+
 def with_error(estimate: Estimate, digits: int = 3, *, sign: bool = False, smallest: float = 0.0) -> str:
     """Return a value with its standard error, at least `smallest`, as "0.512 ± 0.004".
 

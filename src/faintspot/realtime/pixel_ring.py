@@ -290,16 +290,10 @@ class PixelRing:
     def intact(self, frame: int, arrival: int | None = None) -> bool:
         """Return whether the slot still holds that frame, complete or arriving.
 
-        If frame numbers may repeat, pass the value of `arrival(frame)` from before the use.
+        If frame numbers may repeat, pass the number of its arrival, counted from 1.
         """
         fence()  # after the last pixel was read
         return self._holds(frame, arrival)
-
-    def arrival(self, frame: int) -> int:
-        """Return the arrival, from 1, that put a frame into its slot; -1 when the slot does not hold it."""
-        slot = FIRST_SLOT + frame % self.slots
-        arrival = self._look(slot, SLOT_ARRIVAL)
-        return arrival if self._look(slot, SLOT_FRAME) == frame else -1
 
     def number_of(self, arrival: int) -> int:
         """Return the frame number of an arrival, counted from 1; -1 when no slot holds it."""
