@@ -17,6 +17,8 @@ ROOMS = ["faintspot", *(f"faintspot.{page.stem}" for page in sorted(PAGES.glob("
 WITHOUT_EXAMPLE = {
     "faintspot.SubapertureFlag": "in that of Slopes",
     "faintspot.Wavefront": "in that of fit_wavefront",
+    "faintspot.ao_loop.LoopRecord": "in that of simulate_loop",
+    "faintspot.experiments.Answer": "in that of tune",
     "faintspot.io.StoredSlopes": "in that of read_slopes",
     "faintspot.training.CentroidGain": "in that of measure_centroid_gain",
     "faintspot.training.SodiumFit": "in that of fit_sodium_profile",
@@ -26,7 +28,6 @@ WITHOUT_EXAMPLE = {
 }
 NEEDED = {
     "simulate_loop": ("hcipy",),
-    "LoopRecord": ("hcipy",),
     "run": ("xarray",),
     "open_study": ("xarray", "zarr"),
 }

@@ -101,7 +101,7 @@ def open_study(path: str | Path) -> xarray.Dataset:
     >>> _ = run(study, "mine.zarr", workers=0)
     >>> results = open_study("mine.zarr")
     >>> bool(results["done"].all()), results["error"].dims
-    (True, ('cell', 'method', 'mode'))
+    (True, ('cell', 'estimator', 'mode'))
     """
     path = Path(path)
     if kind_of_store(path) != KIND:
