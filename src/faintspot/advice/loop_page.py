@@ -15,6 +15,7 @@ from faintspot.report.page import Page, Section, Table, html_of
 from faintspot.report.texts import Texts
 
 _TEXT = Texts("faintspot.advice")
+_MOST_DECIMALS = 6
 
 
 def page_of_loop(report: LoopReport) -> str:
@@ -59,9 +60,9 @@ def _with_interval(measured: Measured, unit: str = "") -> str:
         return f"{measured.value:.6g} {unit}".rstrip()
     if not np.isfinite(measured.error):
         return "not known"
-    low, high = measured.interval
-    digits = max(1, min(6, 1 + int(np.floor(np.log10(max(abs(measured.value), 1e-12) / measured.error))) + 1))
-    value, low_text, high_text = (f"{each:.{digits}g}" for each in (measured.value, low, high))
+    decimals = max(0, 1 - int(np.floor(np.log10(measured.error))))
+    style = f".{decimals}f" if decimals <= _MOST_DECIMALS else ".1e"
+    value, low_text, high_text = (f"{each:{style}}" for each in (measured.value, *measured.interval))
     text = f"{value} {unit}".rstrip() + f" ({low_text} to {high_text})"
     return text.replace("-", "−")
 

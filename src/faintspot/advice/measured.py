@@ -146,7 +146,7 @@ def outer_scale_and_r0(found: Strength, known_scale_m: float | None = None) -> l
         outer = Measured("outer scale", "m", remark="unknown without r0")
         return [outer, Measured(name, unit, remark="the slopes vary no more than their noise")]
     outer = Measured("outer scale", "m", found.outer_scale_m, found.outer_scale_error_m, remark, True)
-    return [outer, Measured(name, unit, found.r0_m, found.r0_error_m)]
+    return [outer, Measured(name, unit, found.r0_m, found.r0_error_m, is_positive=True)]
 
 
 def _wind(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, site: SlopeTurbulence) -> Measured:
