@@ -39,7 +39,6 @@ NOT_RUN = {
     "import soapy": "run by tests/adapters/test_manual.py",
     "import specula": "run by tests/adapters/test_manual.py",
     "from pyrtc import": "run by tests/adapters/test_manual.py",
-    'LoopRecord.load("canary': "needs half an hour of results",
     "simulate_loop(": "the tutorial on loops runs it",
     "open_study(": "needs a study's results",
     "PixelRing.create": "needs a camera",
