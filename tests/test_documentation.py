@@ -40,6 +40,7 @@ NOT_RUN = {
     "import specula": "run by tests/adapters/test_manual.py",
     "from pyrtc import": "run by tests/adapters/test_manual.py",
     "simulate_loop(": "the tutorial on loops runs it",
+    "wfs.valid_subapertures": "needs a loop of OOPAO",
     "open_study(": "needs a study's results",
     "PixelRing.create": "needs a camera",
     "pyshmem.open": "needs a running engine",
