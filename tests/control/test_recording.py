@@ -143,6 +143,7 @@ def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         arguments = ["night.zarr", "--config", str(path), *options]
         return CliRunner().invoke(realtime_learn.learn, arguments, standalone_mode=False)
 
+    assert "expected either STORE or --every" in str(learn("--every", "5").exception)
     assert "expected a table [control]" in str(learn().exception)
     save_control(path, interaction_matrix="m.npy", centroid_gain=GAIN)
     pytest.importorskip("zarr")

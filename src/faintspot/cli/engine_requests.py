@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from typing import Any
 
 import click
@@ -49,6 +50,15 @@ def loop_in_words(loop: dict[str, Any]) -> str:
     return f"{text}, slopes of {loop['residual_px']:.2f} px rms{again}"
 
 
+def learnt_in_words(learning: dict[str, Any]) -> str:
+    """Describe the latest learning beside an engine."""
+    if "found" not in learning:
+        return f"not again: {learning['fault']}"
+    seconds, fault = time.time() - learning["unix_time_s"], learning.get("fault")
+    taken = f"refused: {fault}" if fault else "taken" if learning["taken"] else "not taken"
+    return f"{seconds:.0f} s ago: {learning['found']}; {taken}"
+
+
 def summary(reply: dict[str, Any]) -> str:
     """Summarise the counters and latencies of an engine."""
     counters, latency = reply["counters"], reply["latency"]
@@ -70,6 +80,8 @@ def summary(reply: dict[str, Any]) -> str:
 def notes(reply: dict[str, Any]) -> dict[str, str]:
     """Return what is unusual about an engine: faults, and settings that are being prepared."""
     found = {key.replace("_", " "): reply[key] for key in ("source_refused", "estimator_fault") if reply[key]}
+    if learning := reply["learning"]:
+        found["learnt"] = learnt_in_words(learning)
     if reply["preparing"]:
         names, seconds = ", ".join(reply["preparing"]["changes"]), reply["preparing"]["seconds"]
         found["preparing"] = f"{names} (for {seconds:.0f} s)"

@@ -117,7 +117,7 @@ def _table(name: str) -> Any:
     grid.add_column("", justify="right")
     grid.add_row("source", "none" if source is None else f"process {source['pid']}, frame {source['frame']}")
     for title, text in notes(reply).items():
-        grid.add_row(title, text, style="bold red" if title != "preparing" else None)
+        grid.add_row(title, text, style=None if title in ("preparing", "learnt") else "bold red")
     if len(reply["methods"]) > 1:
         grid.add_row("methods", ", ".join(reply["methods"]))
     if reply["loop"]["state"] != "none":

@@ -7,16 +7,24 @@ from pathlib import Path
 import click
 
 from faintspot.base.errors import InputError
+from faintspot.base.extras import require_linux
 from faintspot.base.files import derived
 from faintspot.cli.commands import option
 from faintspot.cli.needs import needs
-from faintspot.cli.shared_options import configuration_option
+from faintspot.cli.shared_options import ENGINE_NAME, configuration_option
 
 
 @needs("realtime", "zarr")
 @click.command("learn", short_help="Have a controller learn from a recording of the closed loop.")
-@click.argument("store", type=click.Path(path_type=Path), metavar="STORE")
+@click.argument("store", type=click.Path(path_type=Path), metavar="STORE", required=False)
 @configuration_option("Configuration with [control].")
+@option(
+    "--every",
+    type=click.FloatRange(0, min_open=True),
+    metavar="S",
+    help="Instead of from STORE, learn from the running engine, whenever this many seconds have passed.",
+)
+@ENGINE_NAME
 @option(
     "--control",
     "kind",
@@ -39,7 +47,13 @@ from faintspot.cli.shared_options import configuration_option
     help="Assume a layer with this wind, m/s and degrees from +x to +y; repeatable.",
 )
 def learn(
-    store: Path, config: str, kind: str, winds: str, layers: tuple[tuple[float, float, float], ...]
+    store: Path | None,
+    config: str,
+    every: float | None,
+    name: str,
+    kind: str,
+    winds: str,
+    layers: tuple[tuple[float, float, float], ...],
 ) -> None:
     """Have a controller learn from a recording of the loop, closed with an integrator, and put it into TOML.
 
@@ -47,12 +61,37 @@ def learn(
     without a gap; 2000 are better. The layout must know subaperture_m or diameter_m. Takes up to some
     minutes; writes TOML's name with .model.npz, and controller and model of [control].
 
+    With --every, learn a Kalman filter again from a running engine until it ends. A new filter is compared
+    with the running one on frames that neither learnt from; the engine takes it if it is better beyond the
+    error. The engine does this by itself, see learn_every_s of [control]. Nothing is written.
+
     \b
-    Example:
+    Examples:
       faintspot realtime record night.zarr --seconds 10
       faintspot realtime learn night.zarr --control kalman
       faintspot realtime learn night.zarr --layer 6 20 0.6 --layer 14 150 0.4
+      faintspot realtime learn --every 10
     """
+    if (store is None) == (every is None):
+        raise InputError("learn: expected either STORE or --every")
+    if store is None and every is not None:
+        _learn_repeatedly(name, config, every)
+    elif store is not None:
+        _learn_from(store, config, kind, winds, layers)
+
+
+def _learn_repeatedly(name: str, config: str, every_s: float) -> None:
+    """Learn from a running engine again and again."""
+    require_linux("realtime learn --every")
+    from faintspot.realtime.learning import learn_repeatedly
+
+    learn_repeatedly(name, config, every_s, click.echo)
+
+
+def _learn_from(
+    store: Path, config: str, kind: str, winds: str, layers: tuple[tuple[float, float, float], ...]
+) -> None:
+    """Learn from a recording."""
     from faintspot.control.base import ASSUMED
     from faintspot.control.configuration import load_control, prior_std_px, save_control
     from faintspot.control.learning import learn as learnt_by

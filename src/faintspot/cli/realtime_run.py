@@ -128,7 +128,8 @@ def run(
             f"{name}: {len(layout)} sub-apertures, estimator {settings.estimator.name}; waiting for frames, "
             "Ctrl-C stops"
         )
-        with stop_on_signal() as stop, page_beside(name) if live else nullcontext():
+        learns = nullcontext() if interleave else _learning(engine, config)
+        with stop_on_signal() as stop, learns, page_beside(name) if live else nullcontext():
             threading.Thread(target=_stop_when_set, args=(stop, engine), daemon=True).start()
             engine.run(frames)
     click.echo(summary(engine.status()))
@@ -139,6 +140,17 @@ def _pipeline(layout: Any, calibration: Any, psf: Any, score: Any, reference: An
     from faintspot.pipeline.slope_pipeline import SlopePipeline
 
     return SlopePipeline(layout, settings, calibration, reference, psf=psf, score=score)
+
+
+def _learning(engine: Any, config: str) -> Any:
+    """The process that learns for the engine, as a context, if it can learn and shall."""
+    from faintspot.control.learnt import KALMAN
+    from faintspot.realtime.learning import learning_beside
+
+    options = None if engine.loop is None else engine.loop.control.options
+    if options is None or options.controller != KALMAN or not options.learn_every_s:
+        return nullcontext()
+    return learning_beside(engine, config, options.learn_every_s, partial(click.echo, err=True))
 
 
 def _followed(stream: str, name: str) -> Any:

@@ -86,6 +86,14 @@ class ControlOptions(Options):
         'by the stream NAME_prediction; or "none". Default: "controller" for a Kalman filter, else "none".',
         choices=(NONE, CONTROLLER, STREAM),
     )
+    learn_every_s: float = _setting(
+        10.0,
+        "Time between two learnings of a Kalman filter while the engine runs, each from the telemetry since "
+        "the one before; 0: never.",
+        unit="s",
+        low=0,
+        high=3600,
+    )
     guard_frames: int = _setting(
         50,
         "Number of frames over which the guard averages.",
@@ -216,6 +224,16 @@ class Control:
         if kind == self.options.controller:
             return self
         return replace(self, options=self.options.replaced({"controller": kind}))
+
+    def with_model(self, model: Model) -> Control:
+        """Return the same configuration with a learnt controller.
+
+        Raises
+        ------
+        InputError
+            If the model belongs to another loop.
+        """
+        return replace(self, options=self.options.replaced({"controller": model.kind}), model=model)
 
     @property
     def commands(self) -> int:

@@ -45,6 +45,12 @@ class Identified:
             return self.turbulence.lagged_px2(frame_s)[None]
         return np.array([layer.lagged_px2(frame_s) for layer in self.turbulence.layers()])
 
+    def parameters(self) -> Layers:
+        """Return the parameters of the layers' likelihood."""
+        air = self.turbulence
+        strength = air.fraction * air.r0_m ** (-5 / 3)
+        return Layers(air.wind_m_per_s, strength, self.noise_factor, air.outer_scale_m)
+
     def slope_model(self) -> SlopeModel:
         """Return the temporal model of the slopes, vibrations included."""
         model = SlopeModel.of_covariances(self.covariances_px2())
@@ -85,9 +91,10 @@ class Identification:
         self._vibrations = find_vibrations(records.modes(), rate_hz, records.slopes.shape[1])
         self._likelihood = LayerLikelihood(records, rate_hz, self._vibrations)
 
-    def layers(self) -> Identified:
-        """Return layers with winds fitted to the telemetry."""
-        layers = self._likelihood.selected(self._likelihood.peaks())
+    def layers(self, start: Identified | None = None) -> Identified:
+        """Return layers with winds fitted to the telemetry, from earlier ones on, if any."""
+        first = self._likelihood.peaks() if start is None else start.parameters()
+        layers = self._likelihood.selected(first)
         return self._identified(layers, self._likelihood.errors(layers))
 
     def of_winds(self, winds_m_per_s: Floats) -> Identified:

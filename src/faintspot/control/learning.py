@@ -48,6 +48,7 @@ def learn(
     rate_hz: float,
     winds: str = LEARNT,
     noise_scale: float = 1.0,
+    start: Identified | None = None,
 ) -> Learnt:
     """Return a controller of the given kind, learnt from telemetry.
 
@@ -65,6 +66,8 @@ def learn(
         One of `WINDS`.
     noise_scale : float
         Factor on the noise variance that telemetry shows.
+    start : Identified, optional
+        Earlier turbulence of the same site, from which winds are learnt faster.
     """
     cells = np.rint(site.positions_m[:, ::-1] / site.subaperture_m).astype(np.int64)
     phase = residual_phase(plant.reconstructor.matrix, plant.interaction, cells)
@@ -74,7 +77,7 @@ def learn(
     identification = Identification(telemetry, site, rate_hz)
     tried = [identification.anywhere()]
     if winds == LEARNT:
-        tried.append(identification.layers())
+        tried.append(identification.layers(start))
     elif winds == ASSUMED:
         tried.append(identification.of_winds(site.wind_m_per_s))
     make = _pseudo_open_loop if kind == POLC else _kalman
@@ -82,7 +85,7 @@ def learn(
     left, arrays, found = min(made, key=lambda each: each[0])
     text = f"{found.summary()}, noise variance x {found.noise_factor:.2f}"
     model = Model(kind, arrays, gain, found.noise_factor, (left, plain_left), phase, text)
-    return Learnt(plant, model.with_noise(noise_scale) if kind == KALMAN else model)
+    return Learnt(plant, model.with_noise(noise_scale) if kind == KALMAN else model, found)
 
 
 def _kalman(

@@ -18,6 +18,7 @@ from faintspot.control.base import Controller
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.guarded import Guarded
+from faintspot.control.identification import Identified
 from faintspot.control.integrator import Integrator
 from faintspot.control.kalman import SlopePredictor, steady_covariance
 from faintspot.control.models import SlopeModel
@@ -202,6 +203,8 @@ class Learnt:
 
     plant: Plant
     model: Model
+    found: Identified | None = None
+    """Turbulence that the model follows from; None for modal gains and models read from a file."""
 
     @property
     def noise_factor(self) -> float:

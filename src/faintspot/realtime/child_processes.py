@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from faintspot.base.closing import Closing
@@ -37,8 +37,17 @@ class ChildProcesses(Closing):
         self._folder = folder
         self._started: dict[str, subprocess.Popen[bytes]] = {}
 
-    def start(self, name: str, arguments: Sequence[str]) -> None:
+    def start(
+        self, name: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None
+    ) -> None:
         """Start `faintspot ARGUMENTS`; the calling thread must live as long as the process is needed.
+
+        Parameters
+        ----------
+        name : str
+        arguments : sequence of str
+        environment : mapping, optional
+            Variables to set for it.
 
         Raises
         ------
@@ -56,6 +65,7 @@ class ChildProcesses(Closing):
                 stdout=log,
                 stderr=log,
                 start_new_session=True,
+                env={**os.environ, **(environment or {})},
                 preexec_fn=lambda: library.prctl(_DIES_WITH_PARENT, signal.SIGTERM),
             )
         finally:
@@ -74,8 +84,9 @@ class ChildProcesses(Closing):
             When one has ended; the message holds its last line.
         """
         for name, process in self._started.items():
-            if process.poll() is not None:
-                words = (self.said(name) or [f"exit code {process.returncode}"])[-1]
+            code = process.poll()
+            if code is not None:
+                words = (self.said(name) or [f"exit code {code}"])[-1] if code >= 0 else f"signal {-code}"
                 raise InputError(f"{name}: the process has ended: {words.removeprefix(_ERROR)}")
 
     def wait_until(self, condition: Callable[[], bool], what: str, timeout_s: float) -> None:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 from faintspot.base.checks import number_between, one_of
 from faintspot.base.errors import InputError
+from faintspot.control.learnt import Model
 from faintspot.realtime.control import EFFECT_TIMEOUT_S, Handler, changes_of
 from faintspot.realtime.engine import Engine
 
-LENGTHY = ("set", "interleave", "load", "swap", "unload")
+LENGTHY = ("set", "interleave", "load", "swap", "unload", "learnt")
 """Commands that prepare something new and may compile; other commands are answered meanwhile."""
 _USUAL_TURN = 50  # frames
 _MOST_LINES, _LONGEST_LINE = 40, 400  # of advice
@@ -19,7 +21,7 @@ LOOP_ACTIONS = ("status", "open", "close", "gain", "flat")
 
 
 def commands_of(engine: Engine) -> dict[str, Handler]:
-    """Return the commands: status, get, set, interleave, loop, advice, stop, load, swap and unload."""
+    """Return the commands: status, get, set, interleave, loop, advice, learnt, stop, load, swap, unload."""
     estimators = engine.estimators
     return {
         "status": lambda fields: engine.status(),
@@ -28,6 +30,7 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
         "interleave": partial(_interleave, engine),
         "loop": partial(loop_command, engine),
         "advice": partial(_advise, engine),
+        "learnt": partial(_take_learnt, engine),
         "stop": partial(_stop, engine),
         "load": lambda fields: estimators.load(_text(fields, "source")),
         "swap": lambda fields: estimators.load(_text(fields, "source"), swap=True),
@@ -60,6 +63,23 @@ def _advise(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
         raise InputError(f"lines = {lines!r:.80}: expected a list of texts")
     engine.advice = [line[:_LONGEST_LINE] for line in lines[:_MOST_LINES]]
+    return {}
+
+
+def _take_learnt(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+    """Note what was learnt beside the engine, and take the new model, if one is handed over."""
+    known: dict[str, Any] = {"found": _text(fields, "found"), "unix_time_s": time.time(), "taken": False}
+    engine.learning = known
+    if fields.get("model") is None:
+        return {}
+    if engine.loop is None:
+        raise InputError("learnt: this engine makes no commands; add [control] to its configuration")
+    try:
+        engine.loop.renew(Model.load(_text(fields, "model"), engine.loop.control.plant))
+    except InputError as error:
+        engine.learning = {**known, "fault": f"{error}"}
+        raise
+    engine.learning = {**known, "taken": True}
     return {}
 
 

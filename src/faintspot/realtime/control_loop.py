@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -15,6 +16,7 @@ from faintspot.control.compiled import CompiledIntegrator, true_slopes
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.configuration import CONTROLLER, Control
 from faintspot.control.guarded import Guarded
+from faintspot.control.learnt import Model
 from faintspot.kernels.compiling import Direct
 from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.realtime.guard import Guard
@@ -226,6 +228,21 @@ class ControlLoop:
         control = self.control.with_controller(kind)
         control.rehearse()
         self._ready[kind] = _Ready.of(control, self._line)
+
+    def renew(self, model: Model) -> None:
+        """Replace the model of a learnt controller from the next frame on.
+
+        The new controller starts from the mirror's present commands.
+
+        Raises
+        ------
+        InputError
+            When the model is for another loop, or its commands are not finite.
+        """
+        control = self.control.with_model(model)
+        control.rehearse()
+        self._ready[model.kind] = _Ready.of(control, self._line)
+        self.control = replace(self.control, model=model)
 
     @property
     def controller(self) -> Controller:

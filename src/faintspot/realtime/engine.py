@@ -111,6 +111,8 @@ class Engine:
         """Parts of the real-time scheduling that were not permitted."""
         self.advice: list[str] = []
         """Latest advice, shown in the status."""
+        self.learning: dict[str, Any] | None = None
+        """Result of the latest learning beside the engine, or the fault that ended it, for the status."""
         self._source, self._incompatible = source, ""
         self._path: FramePath | None = None
         self._waiting = False
@@ -179,6 +181,7 @@ class Engine:
             "not_permitted": list(self.refused),
             "advice": self.advice,
             "loop": self.loop_status(),
+            "learning": self.learning,
             "prediction": None if self._prediction is None else self._prediction.status(),
         }
 

@@ -14,6 +14,13 @@ function answer(id, reply) {
   place.textContent = reply.ok ? reply.text || "done" : reply.error;
 }
 
+function learntInWords({ found, taken, fault, unix_time_s }) {
+  if (!found) return `Not learnt again: ${fault}`;
+  const time = new Date(1000 * unix_time_s).toLocaleTimeString("en-GB");
+  const outcome = fault ? `refused: ${fault}` : taken ? "taken" : "not taken";
+  return `Learnt at ${time}: ${found}; ${outcome}`;
+}
+
 export class Controls {
   constructor(connection) {
     this.connection = connection;
@@ -157,13 +164,15 @@ export class Controls {
   // State of the engine ---------------------------------------------------------------------------------
 
   status(status) {
-    const { loop, recording, methods } = status;
+    const { loop, learning, recording, methods } = status;
     const there = Boolean(loop) && loop.state !== "none";
     byId("loop-form").hidden = !there;
     if (there) {
       const again = loop.closed_again_because && `again, it had been opened: ${loop.closed_again_because}`;
       const parts = [loop.state, loop.opened_because, again, loop.obstacle];
       byId("loop-state").textContent = parts.filter(Boolean).join(": ");
+      byId("loop-learnt").hidden = !learning;
+      byId("loop-learnt").textContent = learning ? learntInWords(learning) : "";
       const gain = byId("gain");
       if (document.activeElement !== gain && !this.gainEdited) gain.value = loop.gain ?? "";
     }

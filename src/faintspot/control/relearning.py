@@ -1,0 +1,112 @@
+"""Learn a Kalman filter again from a stretch of a running loop, and judge it on frames not learnt from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.control.identification import Identified
+from faintspot.control.learning import learn
+from faintspot.control.learnt import KALMAN, SETTLE_FRAMES, Learnt, Make, Model, Plant
+from faintspot.control.telemetry import OpenLoopTelemetry, replayed_frames
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
+
+Floats = NDArray[np.float64]
+
+JUDGED_PART = 0.35
+"""Part of a stretch, its end, on which models are judged; they are learnt from the rest."""
+STANDARD_ERRORS = 2.0
+_BLOCK_FRAMES = 25
+_FEWEST_BLOCKS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Relearnt:
+    """New filter, and the residual phase variance that it and others would have left on the same frames."""
+
+    learnt: Learnt
+    left: float
+    left_by_running: float
+    left_by_integrator: float
+    error: float
+    """Standard error of `left_by_running` minus `left`."""
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the new filter leaves less than the running one, beyond the error, and the integrator."""
+        gain = self.left_by_running - self.left
+        return gain > STANDARD_ERRORS * self.error and self.left < self.left_by_integrator
+
+    def summary(self) -> str:
+        """Return a summary of one line."""
+        part, error = self.left / self.left_by_running, self.error / self.left_by_running
+        of_integrator = self.left / self.left_by_integrator
+        return (
+            f"{self.learnt.model.description}; phase variance {part:.3f} +- {error:.3f} of the running "
+            f"filter's, {of_integrator:.2f} of the integrator's"
+        )
+
+
+def relearn(
+    plant: Plant,
+    running: Model,
+    telemetry: OpenLoopTelemetry,
+    site: SlopeTurbulence,
+    rate_hz: float,
+    start: Identified | None = None,
+) -> Relearnt:
+    """Learn from the first part of telemetry, and judge on the rest by replay; nothing else is changed.
+
+    All filters are replayed on the same open-loop slopes, each with its own commands, so that nothing is
+    risked on the mirror. The running filter must not have learnt from this telemetry.
+
+    Parameters
+    ----------
+    plant : Plant
+    running : Model
+        Model of the Kalman filter in use.
+    telemetry : OpenLoopTelemetry
+        Consecutive frames.
+    site : SlopeTurbulence
+    rate_hz : float
+        Frames per second.
+    start : Identified, optional
+        Turbulence that was found before, from which the search starts: faster, but finds no new layer.
+
+    Raises
+    ------
+    InputError
+        When there are too few frames.
+    """
+    judged = round(JUDGED_PART * len(telemetry))
+    if judged < SETTLE_FRAMES + _FEWEST_BLOCKS * _BLOCK_FRAMES:
+        raise InputError(f"telemetry: expected more frames to judge a filter on, got {len(telemetry)}")
+    first = len(telemetry) - judged
+    learnt = learn(KALMAN, plant, telemetry.part(0, first), site, rate_hz, start=start)
+    new, rest = learnt.model, telemetry.part(first, len(telemetry))
+    left, by_running = (
+        _left(partial(model.controller, plant), plant, rest.scaled(model.noise_factor), new.phase)
+        for model in (new, running)
+    )
+    by_integrator = _left(partial(plant.integrator, new.plain_gain), plant, rest, new.phase)
+    means = float(left.mean()), float(by_running.mean()), float(by_integrator.mean())
+    return Relearnt(learnt, *means, _error_of_mean(by_running - left))
+
+
+def _left(make: Make, plant: Plant, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
+    """Return the squared residual phase of a controller in each frame, once it has settled."""
+    return replayed_frames(make, telemetry, plant.interaction, phase, plant.delay_frames)[SETTLE_FRAMES:]
+
+
+def _error_of_mean(values: Floats) -> float:
+    """Return the standard error of the mean of correlated values, from the scatter of blocks."""
+    blocks = len(values) // _BLOCK_FRAMES
+    means = values[: blocks * _BLOCK_FRAMES].reshape(blocks, _BLOCK_FRAMES).mean(axis=1)
+    with np.errstate(invalid="ignore"):
+        error = float(means.std(ddof=1)) / math.sqrt(blocks)
+    return error if math.isfinite(error) else math.inf
