@@ -38,12 +38,14 @@ class Identified:
     criterion: float
     """Half the Bayesian information criterion, up to a constant."""
 
+    @property
+    def layers(self) -> list[SlopeTurbulence]:
+        """Turbulence of each part of the slopes that has a state of its own."""
+        return self.turbulence.layers() if self.is_layered else [self.turbulence]
+
     def covariances_px2(self) -> Floats:
         """Return (layers, 3, m, m): covariances of each layer's slopes for lags of 0, 1 and 2 frames."""
-        frame_s = 1 / self.rate_hz
-        if not self.is_layered:
-            return self.turbulence.lagged_px2(frame_s)[None]
-        return np.array([layer.lagged_px2(frame_s) for layer in self.turbulence.layers()])
+        return np.array([layer.lagged_px2(1 / self.rate_hz) for layer in self.layers])
 
     def parameters(self) -> Layers:
         """Return the parameters of the layers' likelihood."""

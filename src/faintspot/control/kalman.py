@@ -52,6 +52,7 @@ class SlopePredictor:
         self._gain = np.linalg.solve(self.usual_px2, self.with_slopes.T).T
         self.state = np.zeros(model.states)
         self._correction = np.zeros(model.states)
+        self._ahead: dict[int, Floats] = {}
 
     @property
     def mean_px(self) -> Floats:
@@ -67,6 +68,12 @@ class SlopePredictor:
     def _of_layers(self) -> Floats:
         """(layers, 2, m): the state."""
         return self.state.reshape(self.model.layers, 2, self.model.slopes)
+
+    def ahead(self, frames: int) -> Floats:
+        """Return (m,): the slopes predicted for a number of frames after the current one."""
+        if frames not in self._ahead:
+            self._ahead[frames] = self.model.ahead(frames)
+        return np.asarray(self._ahead[frames] @ self.state)
 
     def begin(self, slopes_px: Floats) -> None:
         """Restart from constant open-loop slopes."""

@@ -23,6 +23,7 @@ from faintspot.control.learnt import (
     Model,
     Plant,
 )
+from faintspot.control.local_kalman import LocalPredictor, local_filter
 from faintspot.control.modal_gains import largest_stable_gain, modal_gains
 from faintspot.control.phase import residual_phase
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
@@ -37,6 +38,8 @@ Floats = NDArray[np.float64]
 GAINS = (0.03, 0.05, 0.07, 0.1, 0.13, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5, 0.6, 0.7, 0.8)
 """Gains of an integrator that are tried."""
 _POLC_GAINS = (0.05, 0.1, 0.2, 0.3, 0.45, 0.65)
+_MOST_SLOPES = 300  # whose filter lets each correct all others
+_MOST_REPLAYED, _FEWEST_REPLAYED = 1_200_000, 500  # slopes, and frames, by which controllers are compared
 _LARGEST_PART = 0.85  # of the gain at which a mode would be unstable where slopes are fully trusted
 
 
@@ -71,10 +74,12 @@ def learn(
     """
     cells = np.rint(site.positions_m[:, ::-1] / site.subaperture_m).astype(np.int64)
     phase = residual_phase(plant.reconstructor.matrix, plant.interaction, cells)
+    frames = max(_FEWEST_REPLAYED, _MOST_REPLAYED // len(site.positions_m) // 2)
+    whole, telemetry = telemetry, telemetry.part(-frames, None)
     gain, plain_left = _best_gain(lambda gain: partial(plant.integrator, gain), plant, telemetry, phase)
     if kind == MODAL:
         return Learnt(plant, _modal(plant, telemetry, gain, plain_left, phase))
-    identification = Identification(telemetry, site, rate_hz)
+    identification = Identification(whole, site, rate_hz)
     tried = [identification.anywhere()]
     if winds == LEARNT:
         tried.append(identification.layers(start))
@@ -92,18 +97,24 @@ def _kalman(
     plant: Plant, telemetry: OpenLoopTelemetry, found: Identified, phase: Floats
 ) -> tuple[float, dict[str, Floats]]:
     """Return the Kalman filter's model and its residual."""
-    model, variance, clean = found.slope_model(), usual_variance(telemetry), plant.reconstructor.clean
-    predictor = SlopePredictor(model, variance)
+    variance = usual_variance(telemetry)
+    predictor: SlopePredictor | LocalPredictor
+    if len(variance) > _MOST_SLOPES:
+        arrays = local_filter(found.layers, 1 / found.rate_hz, variance)
+        predictor = LocalPredictor(arrays)
+    else:
+        model = found.slope_model()
+        predictor = SlopePredictor(model, variance)
+        arrays = {
+            "first": model.first,
+            "second": model.second,
+            "driving_px2": model.driving,
+            "variance_px2": variance,
+        }
 
     def predictive(line: CommandDelayLine) -> Controller:
-        return Predictive(line, plant.interaction, predictor, clean)
+        return Predictive(line, plant.interaction, predictor, plant.reconstructor.clean)
 
-    arrays = {
-        "first": model.first,
-        "second": model.second,
-        "driving_px2": model.driving,
-        "variance_px2": variance,
-    }
     return plant.left(predictive, telemetry, phase), arrays
 
 

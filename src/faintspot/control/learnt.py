@@ -21,6 +21,7 @@ from faintspot.control.guarded import Guarded
 from faintspot.control.identification import Identified
 from faintspot.control.integrator import Integrator
 from faintspot.control.kalman import SlopePredictor, steady_covariance
+from faintspot.control.local_kalman import LocalPredictor, local_shapes
 from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
 from faintspot.control.reconstructor import Reconstructor
@@ -39,10 +40,12 @@ CONTROLS = {
 """Kinds of control and their names in reports."""
 
 SETTLE_FRAMES = 50
+_LOCAL = "local kalman"  # in files: KALMAN for a large sensor
 _OF_KIND = {
     MODAL: ("gains",),
     POLC: ("now_px2", "ahead_px2", "gain"),
     KALMAN: ("first", "second", "driving_px2", "variance_px2"),
+    _LOCAL: ("near", "around", "weights", "corrections", "variance_px2", "predicted_px2", "share"),
 }
 _SQUARE = {"now_px2", "ahead_px2"}
 _OF_LAYERS = {"first", "second", "driving_px2"}
@@ -57,6 +60,10 @@ _RANGES = {
     "now_px2": _COVARIANCE,
     "ahead_px2": _COVARIANCE,
     "driving_px2": _COVARIANCE,
+    "predicted_px2": (0.0, 1e8),
+    "share": (0.0, 1.0),
+    "weights": (-1e6, 1e6),
+    "corrections": (-1e6, 1e6),
     "first": (-1e6, 1e6),
     "second": (-1e6, 1e6),
 }
@@ -89,7 +96,7 @@ class Model:
     kind: str
     arrays: Mapping[str, Floats]
     """modal: gains (modes,). polc: now_px2 and ahead_px2 (m, m), gain. kalman: first, second and driving_px2
-    (layers, m, m), variance_px2 (m,) of the slopes' noise."""
+    (layers, m, m), variance_px2 (m,) of the slopes' noise; for large sensors those of `local_filter`."""
     plain_gain: float
     """Gain of the fallback integrator."""
     noise_factor: float
@@ -112,12 +119,19 @@ class Model:
         return Predictive(line, plant.interaction, self.predictor(), clean)
 
     @property
+    def is_local(self) -> bool:
+        """Whether the Kalman filter is one for large sensors, in which only near sub-apertures interact."""
+        return "around" in self.arrays
+
+    @property
     def expected_std_px(self) -> Floats | None:
         """(m,): standard deviations of the predicted slopes; None if unknown."""
         return self.predictor().std_px if self.kind == KALMAN else None
 
-    def predictor(self) -> SlopePredictor:
+    def predictor(self) -> SlopePredictor | LocalPredictor:
         """Return the Kalman filter of the model."""
+        if self.is_local:
+            return LocalPredictor(self.arrays)
         model, variance = self._slopes, self.arrays["variance_px2"]
         return SlopePredictor(model, variance, covariance=self._covariance)
 
@@ -125,7 +139,9 @@ class Model:
         """Return the model of "kalman" with the noise variances scaled by a factor."""
         if scale == 1.0:
             return self
-        arrays = {**self.arrays, "variance_px2": scale * self.arrays["variance_px2"]}
+        arrays = self.arrays
+        if not self.is_local:  # which has gains for several variances
+            arrays = {**arrays, "variance_px2": scale * arrays["variance_px2"]}
         text = f"{self.description}, and {scale:g} of that"
         return replace(self, arrays=arrays, noise_factor=scale * self.noise_factor, description=text)
 
@@ -146,7 +162,8 @@ class Model:
             When it cannot be written.
         """
         numbers = {name: np.asarray(getattr(self, name), np.float64) for name in _OF_ALL}
-        save_arrays(path, {"kind": np.array(self.kind), **numbers, **self.arrays})
+        kind = _LOCAL if self.is_local else self.kind
+        save_arrays(path, {"kind": np.array(kind), **numbers, **self.arrays})
 
     @classmethod
     def load(cls, path: str | Path, plant: Plant) -> Model:
@@ -162,7 +179,7 @@ class Model:
         numbers = _checked(read_arrays(path, what, (*_OF_ALL, *_OF_KIND[kind])), plant)
         learnt, plain = numbers["left"]
         return cls(
-            kind,
+            KALMAN if kind == _LOCAL else kind,
             {name: numbers[name] for name in _OF_KIND[kind]},
             float(numbers["plain_gain"]),
             float(numbers["noise_factor"]),
@@ -184,13 +201,16 @@ class Model:
 
 def _checked(found: Mapping[str, Any], plant: Plant) -> dict[str, Floats]:
     """Return a model's arrays as float64, with checked shapes and ranges."""
-    numbers = {name: numbers_between(name, value, *_RANGES.get(name, ())) for name, value in found.items()}
     (slopes, commands), modes = plant.interaction.shape, plant.reconstructor.modes.shape[1]
+    ranges = {**_RANGES, "near": (0, slopes // 2), "around": (0, slopes // 2)}
+    numbers = {name: numbers_between(name, value, *ranges.get(name, ())) for name, value in found.items()}
     shapes: dict[str, tuple[int, ...]] = {"gains": (modes,), "variance_px2": (slopes,), "left": (2,)}
     shapes["phase"] = commands, slopes
     shapes |= dict.fromkeys(_SQUARE, (slopes, slopes))
     layers = len(numbers["first"]) if "first" in numbers and numbers["first"].ndim == 3 else 1
     shapes |= dict.fromkeys(_OF_LAYERS, (layers, slopes, slopes))
+    if "around" in numbers:
+        shapes |= local_shapes(numbers, slopes)
     for name, array in numbers.items():
         if array.shape != shapes.get(name, ()):
             raise InputError(f"{name}: expected shape {shapes.get(name, ())}, got {array.shape}")
@@ -221,13 +241,14 @@ class Learnt:
     ) -> Guarded | CompiledKalman:
         """Return the controller, with the estimator's prior if it has one."""
         plant, model = self.plant, self.model
-        if model.kind == KALMAN:
+        predictor = model.predictor() if model.kind == KALMAN else None
+        if isinstance(predictor, SlopePredictor):
             return CompiledKalman(
                 line,
                 plant.interaction,
                 plant.reconstructor.matrix,
                 model.phase,
-                model.predictor(),
+                predictor,
                 plant.reconstructor.clean,
                 model.plain_gain,
                 plant.leak,

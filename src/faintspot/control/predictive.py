@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from faintspot.control.base import Expected
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.kalman import LARGEST_VARIANCE_PX2, SlopePredictor
+from faintspot.control.local_kalman import LocalPredictor
 
 Floats = NDArray[np.float64]
 
@@ -70,7 +71,7 @@ class Predictive:
     ----------
     line : CommandDelayLine
     interaction : (m, commands) array
-    predictor : SlopePredictor
+    predictor : SlopePredictor or LocalPredictor
     reconstruct : (commands, m) array
         The wavefront, as commands that cause it, from open-loop slopes without noise.
     """
@@ -78,10 +79,14 @@ class Predictive:
     undoes_prior = True
 
     def __init__(
-        self, line: CommandDelayLine, interaction: Floats, predictor: SlopePredictor, reconstruct: Floats
+        self,
+        line: CommandDelayLine,
+        interaction: Floats,
+        predictor: SlopePredictor | LocalPredictor,
+        reconstruct: Floats,
     ) -> None:
         self._line, self._interaction, self.predictor = line, interaction, predictor
-        self._command = -reconstruct @ predictor.model.ahead(line.delay_frames)
+        self._reconstruct = reconstruct
 
     def expected(self) -> Expected:
         """See `Controller`."""
@@ -96,5 +101,5 @@ class Predictive:
         """See `Controller`."""
         open_loop = slopes_px - self._interaction @ self._line.acting
         self.predictor.correct(open_loop, np.square(standard_error_px))
-        self._line.put(self._command @ self.predictor.state)
+        self._line.put(-self._reconstruct @ self.predictor.ahead(self._line.delay_frames))
         self.predictor.advance()

@@ -34,7 +34,7 @@ class OpenLoopTelemetry:
     def __len__(self) -> int:
         return len(self.open_loop_px)
 
-    def part(self, start: int, stop: int) -> OpenLoopTelemetry:
+    def part(self, start: int, stop: int | None) -> OpenLoopTelemetry:
         """Return a selection of frames."""
         return OpenLoopTelemetry(*(each[start:stop] for each in vars(self).values()))
 

@@ -1,0 +1,133 @@
+"""Error covariance and gains of the Kalman filter of a `LocalModel`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import cholesky
+from scipy.linalg.blas import ssyrk, strsm
+
+from faintspot.control.kalman import LARGEST_VARIANCE_PX2
+from faintspot.control.local_model import Indices, LocalModel, both_axes, solve_locally
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+
+STEPS = (8, 20), (1, 3)
+"""Frames that count as one, and number of such steps: long steps converge soon, the last ones are exact."""
+
+
+def steady_covariance(
+    layers: Sequence[SlopeTurbulence],
+    frame_s: float,
+    variance_px2: Floats,
+    progress: Callable[[], None] | None = None,
+) -> Singles:
+    """Return the covariance (states, states) px^2 of the predicted state's error.
+
+    The state is y[k] of every layer, then y[k - 1] of every layer, each all x, then all y. The Riccati
+    recursion runs from the turbulence's own covariance, first with the mean of several frames as one.
+
+    Parameters
+    ----------
+    layers : sequence of SlopeTurbulence
+    frame_s : float
+        Time between two frames.
+    variance_px2 : (m,) array
+        Variance of the slopes' noise.
+    progress : callable, optional
+        Called after each of the steps.
+    """
+    covariance = _prior(layers, STEPS[0][0] * frame_s)
+    for number, (frames, steps) in enumerate(STEPS):
+        model = LocalModel.of_layers(layers, frames * frame_s)
+        onward, driving = _transition(model), model.driving.astype(np.float32)
+        noise = (np.minimum(variance_px2, LARGEST_VARIANCE_PX2) / frames).astype(np.float32)
+        if number:  # what was before a long step is not known better than what is now
+            half = len(covariance) // 2
+            covariance = np.tile(covariance[:half, :half], (2, 2))
+        for _ in range(steps):
+            covariance = _next(covariance, onward, driving, noise)
+            if progress is not None:
+                progress()
+    return covariance
+
+
+def of_slopes(covariance: Singles, layers: int) -> tuple[Floats, Floats]:
+    """Return the covariance of the errors of state and slopes, (states, m), and of the slopes, (m, m)."""
+    half = len(covariance) // 2
+    m = half // layers
+    seen = covariance[:, :half].reshape(2 * half, layers, m).sum(axis=1, dtype=np.float64)
+    slopes = seen[:half].reshape(layers, m, m).sum(axis=0)
+    return seen, 0.5 * (slopes + slopes.T)
+
+
+def local_gains(
+    with_slopes: Floats, predicted_px2: Floats, variance_px2: Floats, neighbours: Indices
+) -> Floats:
+    """Return how the states of each sub-aperture are corrected, (n, 4 layers, 2 k).
+
+    Rows are y[k], then y[k - 1] of every layer, x and y; columns the x, then the y slopes of neighbours. Each
+    sub-aperture is corrected as if there were no others, so that only small equations are solved.
+
+    Parameters
+    ----------
+    with_slopes, predicted_px2
+        As from `of_slopes`.
+    variance_px2 : (m,) array
+    neighbours : (n, k) array
+        As from `neighbours_within`.
+    """
+    n = len(neighbours)
+    total = predicted_px2 + np.diag(np.minimum(variance_px2, LARGEST_VARIANCE_PX2))
+    own = with_slopes.reshape(-1, n, 2 * n).swapaxes(0, 1)
+    return solve_locally(total, own, both_axes(neighbours, n))
+
+
+def _prior(layers: Sequence[SlopeTurbulence], step_s: float) -> Singles:
+    """Return the covariance of the state before any measurement."""
+    m = 2 * len(layers[0].positions_m)
+    prior = np.zeros((2, len(layers), m, 2, len(layers), m), np.float32)
+    for number, layer in enumerate(layers):
+        same, one = layer.covariance_px2(), layer.covariance_px2(step_s)
+        prior[0, number, :, 0, number] = prior[1, number, :, 1, number] = same
+        prior[0, number, :, 1, number], prior[1, number, :, 0, number] = one, one.T
+    return prior.reshape(2 * len(layers) * m, -1)
+
+
+def _transition(model: LocalModel) -> sparse.csr_matrix:
+    """Return the matrix (states / 2, states) from the state to y[k + 1]."""
+    n, m, half = len(model.neighbours), model.slopes, model.layers * model.slopes
+    there = np.broadcast_to((model.neighbours < n)[:, None, None, None], model.weights.shape)
+    layer, own, axis, time, other, place = np.nonzero(there)
+    seen = model.neighbours[own, place]
+    rows = layer * m + axis * n + own
+    columns = time * half + layer * m + other * n + seen
+    values = model.weights.astype(np.float32)[there]
+    return sparse.csr_matrix((values, (rows, columns)), shape=(half, 2 * half))
+
+
+def _next(covariance: Singles, onward: sparse.csr_matrix, driving: Singles, noise: Singles) -> Singles:
+    """Return the covariance one step later: a measurement, then the prediction."""
+    layers, m, _ = driving.shape
+    half = layers * m
+    seen, slopes = of_slopes(covariance, layers)
+    slopes[np.diag_indices(m)] += noise
+    lower = cholesky(slopes, lower=True).astype(np.float32)
+    known = strsm(1.0, lower, seen.T.astype(np.float32), lower=1)
+    covariance = np.tril(ssyrk(-1.0, known, 1.0, covariance.T, trans=1, lower=1))  # half of it is computed
+    covariance += np.tril(covariance, -1).T
+    across = onward @ covariance
+    now = onward @ np.ascontiguousarray(across.T)
+    now = 0.5 * (now + now.T)
+    blocks = now.reshape(layers, m, layers, m)
+    for layer in range(layers):
+        blocks[layer, :, layer] += driving[layer]
+    after = np.empty_like(covariance)
+    after[:half, :half], after[half:, half:] = now, covariance[:half, :half]
+    after[:half, half:], after[half:, :half] = across[:, :half], across[:, :half].T
+    return after

@@ -1,0 +1,206 @@
+"""Kalman filter of a `LocalModel`: each sub-aperture is corrected by those around it.
+
+The work of a frame is proportional to the number of slopes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.control.kalman import LARGEST_VARIANCE_PX2
+from faintspot.control.local_covariance import local_gains, of_slopes, steady_covariance
+from faintspot.control.local_model import LocalModel, neighbours_within
+from faintspot.kernels.compiling import Direct, compiled_with
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
+
+Floats = NDArray[np.float64]
+
+_REACH = 5.0  # sub-apertures, from which corrections come
+NOISE_STEP = 2.0
+_LEVELS = range(-3, 4)
+_compiled = partial(compiled_with, source=__file__)
+
+
+class LocalPredictor:
+    """Predict open-loop slopes by a Kalman filter in which only sub-apertures near each other interact.
+
+    Noise that changes from frame to frame selects one of a few gains, by its mean over the sensor.
+
+    Parameters
+    ----------
+    arrays : mapping
+        As from `local_filter`.
+    """
+
+    def __init__(self, arrays: Mapping[str, Any]) -> None:
+        self._near, self._around = (np.asarray(arrays[name], np.int32) for name in ("near", "around"))
+        n = len(self._near)
+        weights = np.asarray(arrays["weights"], np.float32)
+        self._weights = np.ascontiguousarray(weights.transpose(1, 5, 3, 0, 2, 4))
+        gains = np.asarray(arrays["corrections"], np.float32)
+        self._gains = np.ascontiguousarray(gains.reshape(*gains.shape[:3], 2, -1).transpose(0, 1, 4, 3, 2))
+        self._usual_px2 = np.asarray(arrays["variance_px2"], np.float64)
+        self.std_px = np.sqrt(arrays["predicted_px2"])
+        """(m,): standard deviations of the prediction."""
+        self._shares = np.asarray(arrays["share"], np.float32)
+        layers = len(weights)
+        self._state = np.zeros((n + 1, 2, layers, 2), np.float32)
+        self._later = np.zeros_like(self._state)
+        self._surprise = np.zeros((n + 1, 2), np.float32)
+
+    @property
+    def mean_px(self) -> Floats:
+        """(m,): predicted open-loop slopes of the next frame."""
+        return _slopes(self._state)
+
+    def begin(self, slopes_px: Floats) -> None:
+        """Restart from constant open-loop slopes."""
+        of_each = slopes_px.reshape(2, -1).T
+        self._state[:-1] = self._shares[:, None] * of_each[:, None, None, :]
+
+    def correct(self, slopes_px: Floats, variance_px2: Floats) -> None:
+        """Update with the measured open-loop slopes of this frame; infinite variance: invalid."""
+        measured = variance_px2 < LARGEST_VARIANCE_PX2
+        surprise = np.where(measured, slopes_px - self.mean_px, 0.0)
+        self._surprise[:-1] = surprise.reshape(2, -1).T
+        _CORRECT(self._state, self._gains[self._level(variance_px2, measured)], self._around, self._surprise)
+
+    def _level(self, variance_px2: Floats, measured: NDArray[np.bool_]) -> int:
+        """Return the gains for the mean noise of the slopes that were measured."""
+        if not measured.any():
+            return 0
+        more = np.log(variance_px2[measured] / self._usual_px2[measured]).mean() / math.log(NOISE_STEP)
+        return int(np.clip(round(float(more)) - _LEVELS[0], 0, len(_LEVELS) - 1))
+
+    def advance(self) -> None:
+        """Predict the next frame."""
+        _ADVANCE(self._state, self._weights, self._near, self._later)
+        self._state, self._later = self._later, self._state
+
+    def ahead(self, frames: int) -> Floats:
+        """Return (m,): the slopes predicted for a number of frames later."""
+        state = self._state
+        for _ in range(frames):
+            later = np.zeros_like(state)
+            _ADVANCE(state, self._weights, self._near, later)
+            state = later
+        return _slopes(state)
+
+
+def local_filter(
+    layers: Sequence[SlopeTurbulence],
+    frame_s: float,
+    variance_px2: Floats,
+    progress: Callable[[], None] | None = None,
+) -> dict[str, Floats]:
+    """Return the arrays of a `LocalPredictor` for frozen layers.
+
+    Parameters
+    ----------
+    layers : sequence of SlopeTurbulence
+    frame_s : float
+        Time between two frames.
+    variance_px2 : (m,) array
+        Usual variance of the slopes' noise.
+    progress : callable, optional
+        See `steady_covariance`.
+
+    Returns
+    -------
+    dict
+        near (n, k), around (n, c): sub-apertures by which each is predicted and corrected. weights
+        (layers, n, 2, 2, 2, k), corrections (levels, n, 4 layers, 2 c): see `LocalModel`, `local_gains`.
+        variance_px2, predicted_px2 (m,): of noise and of the prediction's error. share (layers,).
+    """
+    model = LocalModel.of_layers(layers, frame_s)
+    covariance = steady_covariance(layers, frame_s, variance_px2, progress)
+    with_slopes, predicted = of_slopes(covariance, model.layers)
+    del covariance
+    around = neighbours_within(layers[0].positions_m, _REACH * layers[0].subaperture_m)
+    gains = [
+        local_gains(with_slopes, predicted, NOISE_STEP**level * variance_px2, around) for level in _LEVELS
+    ]
+    return {
+        "near": model.neighbours,
+        "around": around,
+        "weights": model.weights.astype(np.float32),
+        "corrections": np.array(gains, np.float32),
+        "variance_px2": variance_px2,
+        "predicted_px2": np.diag(predicted).copy(),
+        "share": model.variance_px2 / model.variance_px2.sum(),
+    }
+
+
+def local_shapes(arrays: Mapping[str, Any], slopes: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes that the arrays of a filter must have, given its numbers of neighbours and layers."""
+    n, layers = slopes // 2, len(np.atleast_1d(arrays["share"]))
+    near, around = (np.shape(arrays[name])[-1] for name in ("near", "around"))
+    return {
+        "near": (n, near),
+        "around": (n, around),
+        "weights": (layers, n, 2, 2, 2, near),
+        "corrections": (len(_LEVELS), n, 4 * layers, 2 * around),
+        "predicted_px2": (slopes,),
+        "share": (layers,),
+    }
+
+
+def _slopes(state: Any) -> Floats:
+    """Return the slopes (m,) of a state."""
+    return np.asarray(state[:-1, 0].sum(axis=1, dtype=np.float64).T.ravel())
+
+
+@_compiled
+def _correct(state: Any, gains: Any, around: Any, surprise: Any) -> None:
+    """Add to the state of each sub-aperture what the surprise around it tells.
+
+    Parameters
+    ----------
+    state : (n + 1, 2, layers, 2) float32
+    gains : (n, c, 2, 4 layers) float32
+    around : (n, c) int32
+    surprise : (n + 1, 2) float32
+        The last row is 0.
+    """
+    flat = state.reshape(state.shape[0], gains.shape[3])
+    for i in range(around.shape[0]):
+        own = flat[i]
+        for j in range(around.shape[1]):
+            x, y = surprise[around[i, j], 0], surprise[around[i, j], 1]
+            of_x, of_y = gains[i, j, 0], gains[i, j, 1]
+            for s in range(own.shape[0]):
+                own[s] += of_x[s] * x + of_y[s] * y
+
+
+@_compiled
+def _advance(state: Any, weights: Any, near: Any, later: Any) -> None:
+    """Write the state of the next frame.
+
+    Parameters
+    ----------
+    state, later : (n + 1, 2, layers, 2) float32
+        The last row is 0.
+    weights : (n, k, 2, layers, 2, 2) float32
+        From this frame and the one before, to x and y, from x and y.
+    near : (n, k) int32
+    """
+    for i in range(near.shape[0]):
+        for layer in range(state.shape[2]):
+            x = y = np.float32(0.0)
+            for j in range(near.shape[1]):
+                for time in range(2):
+                    w, other = weights[i, j, time, layer], state[near[i, j], time, layer]
+                    from_x, from_y = other[0], other[1]
+                    x += w[0, 0] * from_x + w[0, 1] * from_y
+                    y += w[1, 0] * from_x + w[1, 1] * from_y
+            later[i, 1, layer, 0], later[i, 1, layer, 1] = state[i, 0, layer, 0], state[i, 0, layer, 1]
+            later[i, 0, layer, 0], later[i, 0, layer, 1] = x, y
+
+
+_CORRECT, _ADVANCE = Direct(_correct), Direct(_advance)
