@@ -25,7 +25,6 @@ _ORDER = (
     "estimators",
     "pictures",
     "roofline",
-    "breakdown",
     "realtime",
     "realtime_loop",
     "realtime_guard",

@@ -10,7 +10,6 @@ handed the stack of images, ready made.
   solution than 20 of faintspot's; its positions are therefore compared where both have converged.
 - NumPy and JAX: faintspot's algorithm, see rival_numpy.py and rival_jax.py. All
   images at once, and in blocks that fit the cache; the faster one counts.
-- C++: only the sweep, see sweep.cpp.
 
 Optional packages that are not installed are named below the table.
 """
@@ -27,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from benchmarks import sweeps
 from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, pinned, ratio
 from benchmarks.rival_numpy import NumpyRival, locate
 from faintspot.estimators import estimator_named
@@ -44,7 +42,6 @@ SKIMAGE_IMAGES = 36  # takes one image after the other: so many tell the time of
 TARGETS = {"scikit-image": 200.0, "NumPy": 9.0, "JAX": 9.0}
 SAME_POSITION_PX = 2e-3  # same algorithm from p = 0: after so many iterations the start is all but forgotten
 SAME_SOLUTION_PX = 0.01  # another algorithm, where both have converged
-SAME_FIELD = 1e-4  # dual fields, of order one, after 20 sweeps in another order of rounding
 
 GRIDS = {
     36: (7, 3.5, 0.5),
@@ -237,37 +234,6 @@ def _threads_used(run: Candidate) -> float:
     return (time.process_time() - processor) / (time.perf_counter() - wall)
 
 
-def _against_cpp() -> Table:
-    library = sweeps.cpp_library()
-    title = "One sweep (16 x 16 pixels): Numba against C++ with vector extensions"
-    if library is None:
-        return Table("rivals_cpp", title, [], ["no g++ here"])
-    rows, count = [], 200
-    for width in (16, 8, 4):
-        differs = _check(f"C++, W = {width}", sweeps.largest_difference(library, width), SAME_FIELD)
-        ours, theirs = sweeps.Group(width), sweeps.Group(width)
-        cpp = theirs.cpp(library)
-        candidates: dict[str, Candidate] = {
-            "numba": lambda group=ours: group.numba(count),  # type: ignore[misc]
-            "cpp": lambda run=cpp: run(count),  # type: ignore[misc]
-        }
-        times = interleaved(candidates, seconds=3.0)
-        found, scale = ratio(times, "numba", "cpp"), 1e9 / (count * sweeps.SIDE**2)
-        values = {
-            "Numba ns/pixel": best(times, "numba") * scale,
-            "C++ ns/pixel": best(times, "cpp") * scale,
-            **found.values,
-            "differs": differs,
-        }
-        rows.append(Row(f"W = {width}", values, "<= 1.1", found.larger <= 1.1, found.spread))
-    return Table(
-        "rivals_cpp",
-        title,
-        rows,
-        ["ns for one pixel of all W images; C++: a row at a time"],
-    )
-
-
 def run() -> list[Table]:
     """Run the comparisons."""
     notes = ["us per sub-aperture, best of all turns; a target is met when both ratios meet it"]
@@ -284,4 +250,4 @@ def run() -> list[Table]:
             notes.append(f"JAX used {used:.2f} threads")
         notes += _missing("skimage", "jax")
         title = "Frame to slopes, one thread: faintspot against others"
-        return [Table("rivals", title, rows, notes), _against_cpp()]
+        return [Table("rivals", title, rows, notes)]

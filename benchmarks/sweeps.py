@@ -1,13 +1,7 @@
-"""The denoiser's sweep on its own, many times in one call: as Numba compiles it, and in C++ (sweep.cpp)."""
+"""The denoiser's sweep on its own, many times in one call."""
 
 from __future__ import annotations
 
-import ctypes
-import shutil
-import subprocess
-import tempfile
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +16,6 @@ from faintspot.kernels.simd import splat, store
 SIDE = 16
 MOMENTUM, INVERSE = 0.5, 0.3  # of an ordinary iteration; their values do not change the work
 _sweep = kernel.sweep_fgp
-
-Sweeps = Callable[[int], None]
 
 
 # Not cached on disk: Numba shows the assembly of what it has just compiled only.
@@ -58,41 +50,3 @@ class Group:
         numba_sweeps(
             self.lanes, self.state, self.rows, self.side, self.side, count, MOMENTUM, INVERSE, self.norm
         )
-
-    def cpp(self, library: ctypes.CDLL) -> Sweeps:
-        """Return the function that sweeps `count` times in C++."""
-        function = getattr(library, f"sweeps_{self.width}")
-        function.restype = None
-        pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (self.state, self.rows, self.norm)]
-        side = ctypes.c_long(self.side)
-        momentum, inverse = ctypes.c_float(MOMENTUM), ctypes.c_float(INVERSE)
-
-        def sweep(count: int) -> None:
-            function(
-                pointers[0], pointers[1], side, side, ctypes.c_long(count), momentum, inverse, pointers[2]
-            )
-
-        return sweep
-
-
-def cpp_library() -> ctypes.CDLL | None:
-    """Compile sweep.cpp for this machine and load it; None where there is no g++."""
-    compiler = shutil.which("g++")
-    if compiler is None:
-        return None
-    source = Path(__file__).with_name("sweep.cpp")
-    with tempfile.TemporaryDirectory() as folder:
-        module, library = f"{folder}/sweep.o", f"{folder}/sweep.so"
-        options = ["-std=c++17", "-O3", "-march=native", "-ffast-math", "-fPIC"]
-        subprocess.run([compiler, *options, "-c", str(source), "-o", module], check=True)
-        # Linked without -ffast-math, which would switch off denormal numbers in this whole process.
-        subprocess.run([compiler, "-shared", module, "-o", library], check=True)
-        return ctypes.CDLL(library)
-
-
-def largest_difference(library: ctypes.CDLL, width: int, count: int = 20) -> float:
-    """Return the largest difference of the dual fields after `count` sweeps, Numba against C++."""
-    ours, theirs = Group(width), Group(width)
-    ours.numba(count)
-    theirs.cpp(library)(count)
-    return float(np.abs(ours.state - theirs.state).max())

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
-
 import pytest
-from benchmarks import rivals, sweeps
+from benchmarks import rivals
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +30,3 @@ def test_layouts_have_as_many_subapertures_as_they_say(n: int) -> None:
 def test_scikit_image_converges_to_the_same_positions(case: rivals.Problem) -> None:
     pytest.importorskip("skimage")
     assert rivals.skimage_difference(case, count=2) <= rivals.SAME_SOLUTION_PX
-
-
-@pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
-@pytest.mark.parametrize("width", [4, 8, 16])
-def test_cpp_gives_the_same_fields(width: int) -> None:
-    library = sweeps.cpp_library()
-    assert library is not None
-    assert sweeps.largest_difference(library, width) <= rivals.SAME_FIELD
