@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Self
 
 import numpy as np
@@ -58,12 +58,21 @@ class SlopeTurbulence:
 
     def covariance_px2(self, later_s: float = 0.0) -> Floats:
         """Return E[slopes at t + later_s, slopes at t], (2 n, 2 n) px^2: all x, then all y."""
-        x, y = (line[:, None] - line for line in self.positions_m.T)
         part = np.asarray(self.fraction, np.float64) / np.sum(self.fraction)
-        total = 0.0
-        for strength, (wind_x, wind_y) in zip(part, self.wind_m_per_s, strict=True):
-            total = total + strength * self._of_layer(x - wind_x * later_s, y - wind_y * later_s)
-        return np.asarray(self.r0_m ** (-5 / 3) * self.px2_per_rad2_per_m2 * total)
+        apart_m, which = self._separations
+        total = np.zeros((3, len(apart_m)))
+        for strength, wind in zip(part, np.asarray(self.wind_m_per_s), strict=True):
+            along, across = (apart_m - wind * later_s).T
+            total += strength * gradient_covariances(along, across, self.subaperture_m, self.outer_scale_m)
+        xx, xy, yy = (self.r0_m ** (-5 / 3) * self.px2_per_rad2_per_m2 * total)[:, which]
+        return np.block([[xx, xy], [xy, yy]])
+
+    @cached_property
+    def _separations(self) -> tuple[Floats, NDArray[np.int64]]:
+        """Distinct separations of sub-apertures (distinct, 2) m, and which of them each pair has, (n, n)."""
+        apart = (self.positions_m[:, None] - self.positions_m).reshape(-1, 2)
+        distinct, which = np.unique(np.round(apart, 9), axis=0, return_inverse=True)
+        return distinct, which.reshape(len(self.positions_m), -1)
 
     @property
     def px2_per_rad2_per_m2(self) -> float:
@@ -101,16 +110,6 @@ class SlopeTurbulence:
         speeds = np.hypot(*np.asarray(self.wind_m_per_s).T)
         winds = (speeds[:, None, None] * around).reshape(-1, 2)
         return replace(self, fraction=np.repeat(self.fraction, _DIRECTIONS), wind_m_per_s=winds)
-
-    def _of_layer(self, x: Floats, y: Floats) -> Floats:
-        """Return the covariance of gradients at the given separations [rad^2 m^-2] for r0 = 1 m."""
-        offsets, which = np.unique(
-            np.round(np.column_stack([x.ravel(), y.ravel()]), 9), axis=0, return_inverse=True
-        )
-        along, across = offsets.T
-        values = gradient_covariances(along, across, self.subaperture_m, self.outer_scale_m)
-        xx, xy, yy = (each[which.reshape(-1)].reshape(x.shape) for each in values)
-        return np.block([[xx, xy], [xy, yy]])
 
 
 def gradient_covariances(along: Floats, across: Floats, side_m: float, outer_scale_m: float) -> Floats:
