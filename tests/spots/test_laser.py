@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from types import SimpleNamespace
 from typing import Any
 
@@ -164,7 +165,9 @@ def same_kernels(theirs: NDArray[np.float64], sky: fs.LaserGuideStar, profile: f
 
 
 def test_kernels_are_those_of_specula() -> None:
-    kernels = pytest.importorskip("specula.data_objects.convolution_kernel")
+    specula = pytest.importorskip("specula")
+    specula.init(-1, precision=1)  # before any other import of it
+    kernels = importlib.import_module("specula.data_objects.convolution_kernel")
     field = FINE_ARCSEC * (SIDE - 1) / SIDE  # samples reach from edge to edge of the field
     layers = LAYERS - 90e3, NARROW.density
     theirs = kernels.lgs_map_sh(5, 8.0, [5.0, 1.0, 0.0], 90e3, *layers, 1.2, field, SIDE, overs=1)

@@ -168,6 +168,8 @@ class LostSpots:
         self._displaced = np.zeros((1, len(interaction)))
         self._summarise = Direct(displaced_flux)
         self.forget()
+        self.take(np.zeros(interaction.shape[1]), np.zeros(len(interaction) // 2, np.float32))  # compiles
+        self.forget()
 
     def forget(self) -> None:
         """Start again."""
