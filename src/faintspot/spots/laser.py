@@ -152,11 +152,10 @@ class LaserGuideStar:
 
     def focused(self, profile: SodiumProfile) -> SodiumProfile:
         """Return the profile moved in altitude so that the centre of gravity of every spot is at 0."""
+        height = self.focus_altitude_m - self.site_altitude_m
+        per_metre = float(self.inverse_distances(self.focus_altitude_m)) / height
         for _ in range(3):  # Newton's method; the first step leaves metres
             away = float(self.defocus(profile.altitudes_m) @ profile.density)
-            per_metre = float(self.inverse_distances(self.focus_altitude_m)) / (
-                self.focus_altitude_m - self.site_altitude_m
-            )
             profile = SodiumProfile(profile.altitudes_m + away / per_metre, profile.density)
         return profile
 
