@@ -19,6 +19,7 @@ from scipy.optimize import minimize
 from faintspot.control.slope_records import SlopeRecords
 from faintspot.control.vibrations import MODES, Vibration, mode_shapes
 from faintspot.turbulence.slope_spectra import SlopeSpectra
+from faintspot.turbulence.strength import OUTER_SCALE_SPREAD
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -29,7 +30,6 @@ _RINGS_M_PER_S = (0.0, 1.5, 3.0, 4.5, 6.0, 8.0, 10.5, 13.5, 17.5, 22.5, 29.0, 37
 _UPDATES, _FIRST_UPDATES = 60, 3
 _MOST_LAYERS = 6
 _LEAST_SHARE = 0.03
-_OUTER_SCALE_SPREAD = 0.7  # of its logarithm, before telemetry
 _REFINEMENTS = 40
 _SPEED_UNIT = 2.0  # m/s, in which winds have about the same effect as logarithms of strengths
 _STEP_M_PER_S = 0.02  # of differences
@@ -184,8 +184,8 @@ class LayerLikelihood:
 
         def misfit(x: Floats) -> tuple[float, Floats]:
             value, gradient = self._of_layers(_unpacked(x, count))
-            prior = (x[-1] - math.log(self._site.outer_scale_m)) / _OUTER_SCALE_SPREAD
-            gradient[-1] += prior / _OUTER_SCALE_SPREAD
+            prior = (x[-1] - math.log(self._site.outer_scale_m)) / OUTER_SCALE_SPREAD
+            gradient[-1] += prior / OUTER_SCALE_SPREAD
             return (value + 0.5 * prior**2) / scale, gradient / scale
 
         found = minimize(
@@ -233,7 +233,7 @@ class LayerLikelihood:
         information = self._weight * np.array(
             [[np.einsum("fij,fji->", one, other).real for other in changes] for one in changes]
         )
-        information[-2, -2] += _OUTER_SCALE_SPREAD**-2
+        information[-2, -2] += OUTER_SCALE_SPREAD**-2
         count = len(layers.strength)
         errors = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information, hermitian=True)), 0.0))
         winds = _SPEED_UNIT * errors[: 2 * count].reshape(count, 2)
