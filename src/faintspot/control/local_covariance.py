@@ -26,8 +26,8 @@ def steady_covariance(
     frame_s: float,
     variance_px2: Floats,
     progress: Callable[[], None] | None = None,
-) -> Singles:
-    """Return the covariance (states, states) px^2 of the predicted state's error.
+) -> tuple[LocalModel, Singles]:
+    """Return the model for single frames, and the covariance (states, states) px^2 of its prediction's error.
 
     The state is y[k] of every layer, then y[k - 1] of every layer, each all x, then all y. The Riccati
     recursion runs from the turbulence's own covariance, first with the mean of several frames as one.
@@ -54,7 +54,7 @@ def steady_covariance(
             covariance = _next(covariance, onward, driving, noise)
             if progress is not None:
                 progress()
-    return covariance
+    return model, covariance
 
 
 def of_slopes(covariance: Singles, layers: int) -> tuple[Floats, Floats]:

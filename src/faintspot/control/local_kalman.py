@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from faintspot.control.kalman import LARGEST_VARIANCE_PX2
 from faintspot.control.local_covariance import local_gains, of_slopes, steady_covariance
-from faintspot.control.local_model import LocalModel, neighbours_within
+from faintspot.control.local_model import neighbours_within
 from faintspot.kernels.compiling import Direct, compiled_with
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
@@ -118,8 +118,7 @@ def local_filter(
         (layers, n, 2, 2, 2, k), corrections (levels, n, 4 layers, 2 c): see `LocalModel`, `local_gains`.
         variance_px2, predicted_px2 (m,): of noise and of the prediction's error. share (layers,).
     """
-    model = LocalModel.of_layers(layers, frame_s)
-    covariance = steady_covariance(layers, frame_s, variance_px2, progress)
+    model, covariance = steady_covariance(layers, frame_s, variance_px2, progress)
     with_slopes, predicted = of_slopes(covariance, model.layers)
     del covariance
     around = neighbours_within(layers[0].positions_m, _REACH * layers[0].subaperture_m)
