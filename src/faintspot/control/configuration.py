@@ -22,6 +22,7 @@ from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled import CompiledIntegrator
 from faintspot.control.learnt import CONTROLS, INTEGRATOR, KALMAN, MODAL, POLC, Learnt, Model, Plant
 from faintspot.control.reconstructor import Reconstructor, make_reconstructor
+from faintspot.control.removed_modes import REMOVED_MODES, TIP_TILT_FOCUS, RemovedModes
 from faintspot.io.frames import read_array
 from faintspot.pipeline.settings import Settings
 from faintspot.sensor.layout import Layout
@@ -79,6 +80,12 @@ class ControlOptions(Options):
         "with the same estimator at the same flux.",
         low=0.01,
         high=100,
+    )
+    removed_modes: str = _setting(
+        REMOVED_MODES[0],
+        'Modes that slopes of a laser guide star do not show: "tip_tilt" or "tip_tilt_focus". They are '
+        "removed before reconstruction and are not controlled; for integrators.",
+        choices=REMOVED_MODES,
     )
     prediction: str | None = _setting(
         None,
@@ -145,6 +152,8 @@ class Control:
     options : ControlOptions
     model : path, optional
         Learnt model of the controller, a file written by `Model.save`. The integrator ignores it.
+    positions : (n, 2) array, optional
+        x and y of the sub-apertures in any unit, if focus is removed from the slopes.
 
     Raises
     ------
@@ -157,6 +166,7 @@ class Control:
     reference: Any = None
     options: ControlOptions = field(default_factory=ControlOptions)
     model: Any = None
+    positions: Any = None
 
     def __post_init__(self) -> None:
         matrix = finite_array(INTERACTION, self.interaction).astype(np.float64)
@@ -182,6 +192,11 @@ class Control:
 
     def _checked_model(self) -> Any:
         kind = self.options.controller
+        if self.removed_modes and kind not in (INTEGRATOR, MODAL):
+            raise InputError(
+                f"removed_modes = {self.removed_modes.name!r}: expected an integrator, as the model of "
+                f"{kind!r} has all modes"
+            )
         if kind == KALMAN and self.options.prediction == STREAM:
             raise InputError(
                 'prediction = "stream": expected "controller", as a Kalman filter predicts itself'
@@ -197,15 +212,25 @@ class Control:
         return model
 
     @cached_property
+    def removed_modes(self) -> RemovedModes:
+        """Modes that are removed from the slopes before reconstruction."""
+        return RemovedModes(self.options.removed_modes, self.positions)
+
+    @cached_property
+    def controlled(self) -> Floats:
+        """Interaction matrix without the removed modes, whose reconstructor does not drive them."""
+        return self.removed_modes.removed(self.interaction)
+
+    @cached_property
     def reconstructor(self) -> Reconstructor:
         """Reconstructor from slopes to the commands that cause them."""
-        return make_reconstructor(self.interaction, self.options.largest_condition)
+        return make_reconstructor(self.controlled, self.options.largest_condition)
 
     @property
     def plant(self) -> Plant:
         """Loop properties that controllers use."""
         options = self.options
-        return Plant(self.interaction, self.reconstructor, options.delay_frames, options.leak)
+        return Plant(self.controlled, self.reconstructor, options.delay_frames, options.leak)
 
     @property
     def prediction(self) -> str:
@@ -285,11 +310,11 @@ class Control:
         """Return the controller, which sends its commands along `line`."""
         options, matrix = self.options, self.reconstructor.matrix
         if options.controller == INTEGRATOR:
-            return CompiledIntegrator(line, self.interaction, matrix, options.gain, options.leak)
+            return CompiledIntegrator(line, self.controlled, matrix, options.gain, options.leak)
         if options.controller == MODAL:
             modes = self.reconstructor.modes
             matrix = (modes * self.model.arrays["gains"]) @ modes.T @ matrix
-            return CompiledIntegrator(line, self.interaction, matrix, 1.0, options.leak)
+            return CompiledIntegrator(line, self.controlled, matrix, 1.0, options.leak)
         return Learnt(self.plant, self.model).controller(line)
 
     def rehearse(self) -> None:
@@ -351,9 +376,9 @@ def _of_table(path: Path, values: Mapping[str, Any]) -> Control:
     if model is not None and not isinstance(model, str):
         raise InputError(f"{MODEL}: expected the name of a file, found {model!r:.80}")
     options = ControlOptions(**{name: value for name, value in values.items() if name in declared})
-    return Control(
-        arrays[INTERACTION], arrays.get(REFERENCE), options, None if model is None else path.parent / model
-    )
+    places = Layout.load(path).centres if options.removed_modes == TIP_TILT_FOCUS else None
+    file = None if model is None else path.parent / model
+    return Control(arrays[INTERACTION], arrays.get(REFERENCE), options, file, places)
 
 
 def _read(path: Path, name: str, location: Any) -> NDArray[Any]:

@@ -94,6 +94,7 @@ class ControlLoop:
         self._slopes, self._errors = np.zeros((2, 2 * len(layout)))
         self._said = np.zeros(2)
         self._true_slopes = Direct(true_slopes)
+        self._removed_modes = control.removed_modes
         self._centroid_gain = float(control.options.centroid_gain)
         self.guard = Guard(control, layout)
         self.closed, self.opened_because = False, _AT_START
@@ -133,6 +134,8 @@ class ControlLoop:
             self._errors,
             self._said,
         )
+        if self._removed_modes:
+            self._removed_modes.remove(slopes.flags, self._slopes, self._said)
         if self._flattened:
             self._flattened = False
             line.hold(np.zeros_like(line.latest))
