@@ -5,10 +5,15 @@ its guard, as the engine and the simulation run it. Of an extremely large telesc
 commands, the products that a Kalman filter with a constant gain consists of: whole matrices, and sparse ones
 of which each slope knows its neighbours within four sub-apertures. They are filled with random numbers: what
 they hold does not change the time.
+
+Learning the Kalman filter from telemetry of the 4.2 m telescope: seconds of processor time, from nothing, and
+again from the turbulence known before, which is then judged on frames not learnt from.
 """
 
 from __future__ import annotations
 
+import resource
+import time
 from functools import partial
 from typing import Any
 
@@ -16,6 +21,7 @@ import numpy as np
 from scipy import sparse
 
 from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
+from benchmarks.prediction import TELEMETRY_GAIN, Case
 from faintspot.ao_loop import load_loop
 from faintspot.ao_loop.control import slope_turbulence
 from faintspot.ao_loop.telescope_model import prepare
@@ -24,12 +30,15 @@ from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.guarded import Guarded
 from faintspot.control.kalman import SlopePredictor
-from faintspot.control.learning import Plant
+from faintspot.control.learning import KALMAN, Plant, learn
 from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
+from faintspot.control.relearning import relearn
 
 _NOISE_PX = 0.5
 _SIZES = (72, 54), (160, 97), (640, 400)
+_PHOTONS, _LEARNING, _LEARNT = 20.0, (2010, 8100), 4000
+"""Realisation and frames of the telemetry to learn from; frames learnt from at first."""
 _LARGE, _LARGE_COMMANDS, _ACROSS, _REACH = 9232, 4600, 68, 4
 
 
@@ -147,6 +156,32 @@ def _neighbours() -> Any:
     return sparse.kron(band, band)
 
 
+def learning_table() -> Table:
+    """Time the learning of a Kalman filter."""
+    case = Case(_PHOTONS, 0.0)
+    plant, configuration = case.plant, case.configuration
+    site = slope_turbulence(configuration, prepare(configuration).sensor.layout.cells)
+    rate_hz = configuration.control.frame_rate_hz
+    _, telemetry = case.observed(partial(plant.integrator, TELEMETRY_GAIN), *_LEARNING)
+    first, rest = telemetry.part(0, _LEARNT), telemetry.part(_LEARNT, None)
+    learn(KALMAN, plant, first.part(0, _LEARNT // 8), site, rate_hz)  # compile
+    begun = time.process_time()
+    learnt = learn(KALMAN, plant, first, site, rate_hz)
+    cold = time.process_time()
+    found = relearn(plant, learnt.model, rest, site, rate_hz, learnt.found)
+    warm = time.process_time()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    rows = [
+        Row("from nothing", {"s": cold - begun, "frames": float(len(first))}, "< 10 s", cold - begun < 10),
+        Row("again, and judged", {"s": warm - cold, "frames": float(len(rest))}, "< 1 s", warm - cold < 1),
+    ]
+    notes = [
+        f"{len(site.positions_m)} sub-apertures, {_PHOTONS:g} photons; {peak:.0f} MiB with the simulation"
+    ]
+    notes += [learnt.model.description, found.summary()]
+    return Table("control-learning", "Learning the Kalman filter, processor time", rows, notes)
+
+
 def run() -> list[Table]:
     """Time control."""
-    return [small_table(), sizes_table(), large_table()]
+    return [small_table(), sizes_table(), large_table(), learning_table()]

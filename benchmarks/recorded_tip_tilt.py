@@ -21,7 +21,7 @@ from faintspot.advice.recorded_loop import RecordedLoop
 from faintspot.control.learning import GAINS, KALMAN, Plant, learn
 from faintspot.control.loop_delay import loop_delay
 from faintspot.control.reconstructor import make_reconstructor
-from faintspot.control.telemetry import replayed_frames
+from faintspot.control.replay import replayed_frames
 from faintspot.experiments.statistics import mean_by_blocks
 
 RATE_HZ, DIAMETER_M, LEAK = 1000.0, 10.0, 0.01

@@ -74,9 +74,3 @@ def test_the_best_gain_is_that_of_a_loop_run_through() -> None:
     found = modal_gains(modes, 2, 0.01)
     assert np.all(np.abs(np.searchsorted(stable, found) - np.searchsorted(stable, run_through)) <= 1)
     assert found[0] > 1.5 * found[1]
-
-
-def test_replay_of_an_unstable_loop_leaves_infinitely_much() -> None:
-    """Of commands that double every few frames until they are no numbers."""
-    seen = telemetry(frames=3000)
-    assert PLANT.left(partial(PLANT.integrator, 1.9), seen, PHASE) == np.inf

@@ -105,6 +105,7 @@ def test_a_better_filter_is_handed_to_the_engine(
         return Relearnt(Learnt(plant, model), 1.0, 1.0 if running is model else 2.0, 3.0, 0.1)
 
     monkeypatch.setattr("faintspot.realtime.learning.relearn", relearnt)
+    monkeypatch.setattr("faintspot.realtime.learning.FEWEST_FRAMES", 90)
     path = tmp_path / "faintspot.toml"
     configuration_file.save(path, LAYOUT)
     configuration_file.save(path, Settings("brightest"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,11 +17,11 @@ from faintspot.advice.recorded_loop import RecordedLoop
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
 from faintspot.control.learning import GAINS, KALMAN, MODAL, learn
-from faintspot.control.learnt import SETTLE_FRAMES, Make, Plant
+from faintspot.control.learnt import SETTLE_FRAMES, Model, Plant
 from faintspot.control.loop_delay import LoopDelay
 from faintspot.control.phase import residual_phase
 from faintspot.control.reconstructor import make_reconstructor
-from faintspot.control.telemetry import OpenLoopTelemetry, replayed_frames
+from faintspot.control.telemetry import OpenLoopTelemetry
 from faintspot.experiments.statistics import mean_by_blocks
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
@@ -79,11 +80,12 @@ def compared_choices(
     relative = float(seen.variance_error.mean()) / math.sqrt(len(reconstructor.modes.T))
     scale = _Scale.of(loop, r0, delay, relative)
 
-    def left(make: Make) -> list[Floats]:
-        return [view.left(make, plant, phase) for view in views]
+    def learnt_left(model: Model) -> list[Floats]:
+        return [model.replayed(plant, view.replayed, phase)[view.scored] for view in views]
 
-    def integrator(gain: float) -> list[Floats]:
-        return left(partial(plant.integrator, gain))
+    def integrators(gains: Sequence[float]) -> list[list[Floats]]:
+        of_views = [plant.replayed_integrators(gains, view.replayed, phase)[:, view.scored] for view in views]
+        return [list(each) for each in zip(*of_views, strict=True)]
 
     ran = None
     if loop.is_closed and loop.commands is not None:
@@ -96,16 +98,14 @@ def compared_choices(
         modal, learnt = (
             learn(kind, plant, first, site, loop.frame_rate_hz).model for kind in (MODAL, KALMAN)
         )
-        found.append(compare(BEST, integrator(learnt.plain_gain), gain=learnt.plain_gain))
-        found.append(compare(MODES, left(partial(modal.controller, plant))))
-        found.append(compare(FILTER, left(partial(learnt.controller, plant))))
+        found.append(compare(BEST, *integrators([learnt.plain_gain]), gain=learnt.plain_gain))
+        found.append(compare(MODES, learnt_left(modal)))
+        found.append(compare(FILTER, learnt_left(learnt)))
     else:
-        ranked = [plant.left(partial(plant.integrator, gain), first, phase) for gain in GAINS]
-        best = GAINS[int(np.argmin(ranked))]
-        found.append(compare(BEST, integrator(best), gain=best))
-    uncorrected = float(np.square(views[0].scored.open_loop_px @ phase.T).sum(axis=1).mean())
-    for gain in GAINS[1::2]:
-        values = integrator(gain)
+        best, _ = plant.best_gain(GAINS, first, phase)
+        found.append(compare(BEST, *integrators([best]), gain=best))
+    uncorrected = float(np.square(views[0].replayed.open_loop_px @ phase.T).sum(axis=1).mean())
+    for gain, values in zip(GAINS[1::2], integrators(GAINS[1::2]), strict=True):
         if values[0].max() < np.inf and values[0].mean() < uncorrected:  # else it is not stable
             found.append(compare("integrator", values, gain=gain))
     return [_at_gain(each, delay.gain) for each in found]
@@ -119,24 +119,23 @@ class _View:
     small ones. Another controller's are between them.
     """
 
-    scored: OpenLoopTelemetry
+    replayed: OpenLoopTelemetry
+    """Second half, and the frames before it in which controllers settle."""
+    scored: NDArray[np.int64]
+    """Frames of these that are compared."""
     ran: Floats
-    """Squared phase of the loop as it ran, of the frames that are compared."""
+    """Squared phase of the loop as it ran in the frames that are compared."""
     noise: float
     """Phase variance of the noise."""
 
     @classmethod
     def of(cls, seen: OpenLoop, phase: Floats) -> _View:
         half = len(seen.telemetry) // 2
-        scored = seen.telemetry.part(half, len(seen.telemetry))
-        ran = np.square(seen.residual[half:] @ phase.T).sum(axis=1)
+        replayed = seen.telemetry.part(half - SETTLE_FRAMES, None)
+        scored = SETTLE_FRAMES + np.flatnonzero(_whole(replayed.part(SETTLE_FRAMES, None)))
+        ran = np.square(seen.residual[half - SETTLE_FRAMES :][scored] @ phase.T).sum(axis=1)
         noise = float(seen.variance @ np.square(phase).sum(axis=0))
-        return cls(scored, ran[SETTLE_FRAMES:][_whole(scored)[SETTLE_FRAMES:]], noise)
-
-    def left(self, make: Make, plant: Plant, phase: Floats) -> Floats:
-        """Return what a controller leaves."""
-        found = replayed_frames(make, self.scored, plant.interaction, phase, plant.delay_frames)
-        return found[SETTLE_FRAMES:][_whole(self.scored)[SETTLE_FRAMES:]]
+        return cls(replayed, scored, ran, noise)
 
 
 @dataclass(frozen=True)

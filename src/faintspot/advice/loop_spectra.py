@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from faintspot.control.identification import Identified
 from faintspot.control.slope_records import SlopeRecords
+from faintspot.control.slope_spectra import SlopeSpectra
 from faintspot.control.telemetry import OpenLoopTelemetry
 from faintspot.control.vibrations import MODES, mode_shapes
-from faintspot.turbulence.slope_spectra import SlopeSpectra
 
 Floats = NDArray[np.float64]
 

@@ -22,7 +22,9 @@ from faintspot.control.kalman_kernels import (
     Lines,
     Matrices,
     Memory,
+    replay,
 )
+from faintspot.control.telemetry import LEAST_VARIANCE_PX2, OpenLoopTelemetry
 
 Floats = NDArray[np.float64]
 
@@ -169,6 +171,19 @@ class CompiledKalman:
         )
         self._line.sent(total)
         self._is_behind = True
+
+    def replayed(self, telemetry: OpenLoopTelemetry) -> Floats:
+        """Return the squared residual that the filter alone would have left, (frames,).
+
+        See `replayed_frames`. Turbulence and mirror, of unlimited stroke, begin flat. The state is lost.
+        """
+        squares = np.zeros(len(telemetry))
+        variance = np.maximum(self._noise_factor * telemetry.variance_px2, LEAST_VARIANCE_PX2)
+        slopes, trust = telemetry.open_loop_px, telemetry.trust
+        self._memory.state[:], self._memory.slopes[PREDICTED] = 0.0, 0.0
+        line = np.zeros_like(self._lines.learnt)
+        replay(slopes, variance, trust, self._numbers[-1], self._matrices, line, self._memory, squares)
+        return squares
 
     def _catch_up(self) -> None:
         """Complete the previous frame."""

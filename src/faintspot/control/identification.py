@@ -96,8 +96,7 @@ class Identification:
     def layers(self, start: Identified | None = None) -> Identified:
         """Return layers with winds fitted to the telemetry, from earlier ones on, if any."""
         first = self._likelihood.peaks() if start is None else start.parameters()
-        layers = self._likelihood.selected(first)
-        return self._identified(layers, self._likelihood.errors(layers))
+        return self._identified(*self._likelihood.selected(first))
 
     def of_winds(self, winds_m_per_s: Floats) -> Identified:
         """Return layers with given winds, (layers, 2), and fitted strengths."""

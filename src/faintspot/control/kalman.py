@@ -10,7 +10,7 @@ from faintspot.control.models import SlopeModel
 Floats = NDArray[np.float64]
 
 _MOST_DOUBLINGS = 40
-_CONVERGED = 1e-9
+_CONVERGED = 1e-5  # the next step's change is the square of that
 LARGEST_VARIANCE_PX2 = 1e6
 """Variance of an invalid slope."""
 

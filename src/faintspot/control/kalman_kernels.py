@@ -10,6 +10,8 @@ import math
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from faintspot.control.compiled import add_products
 from faintspot.control.guarded import CORRELATED_FRAMES, FEWEST_FRAMES, MEMORY_FRAMES, STANDARD_ERRORS
 from faintspot.control.kalman import LARGEST_VARIANCE_PX2
@@ -291,6 +293,48 @@ def go_on(numbers: Any, matrices: Any, lines: Any, places: Any, memory: Any) -> 
     _choose(memory.guard, learnt, plain)
     _advance(matrices, memory)
     return total
+
+
+@_compiled
+def replay(
+    open_loop: Any, variance: Any, trust: Any, steps: Any, matrices: Any, line: Any, memory: Any, squares: Any
+) -> None:
+    """Write the squared residual that the filter alone would have left in each recorded frame.
+
+    Parameters
+    ----------
+    open_loop, variance, trust : (frames, m) float64 arrays
+        See `OpenLoopTelemetry`.
+    steps : int
+        Of conjugate gradients.
+    matrices : Matrices
+    line : (delay + 1, commands) float64 array
+        Zeros.
+    memory : Memory
+    squares : (frames,) float64 array
+        Infinite from the first command on that is not finite.
+    """
+    rows, delay = memory.slopes, line.shape[0] - 1
+    squares[:] = math.inf
+    for frame in range(open_loop.shape[0]):
+        place = frame % (delay + 1)
+        acting = (place + 1) % (delay + 1)
+        rows[HELD] = 0.0
+        add_products(matrices.interaction, line[acting : acting + 1], rows[HELD : HELD + 1])
+        for s in range(rows.shape[1]):
+            measured = variance[frame, s] < LARGEST_VARIANCE_PX2
+            rows[_LEFT_LEARNT, s] = trust[frame, s] * (open_loop[frame, s] + rows[HELD, s])
+            rows[_VARIANCE, s] = variance[frame, s] if measured else math.inf
+            rows[_SURPRISE, s] = open_loop[frame, s] - rows[PREDICTED, s] if measured else 0.0
+        left, square = memory.commands[_LEFT : _LEFT + 1], 0.0
+        left[:] = 0.0
+        add_products(matrices.phase, rows[_LEFT_LEARNT : _LEFT_LEARNT + 1], left)
+        for c in range(left.shape[1]):
+            square += left[0, c] * left[0, c]
+        if not np.isfinite(_filter(matrices, memory, steps, math.inf, line[place])):
+            return
+        squares[frame] = square
+        _advance(matrices, memory)
 
 
 HOLD, FOLLOW, GO_ON = Direct(hold), Direct(follow), Direct(go_on)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from faintspot.control.slope_records import SlopeRecords
+from faintspot.control.slope_spectra import SlopeSpectra
 from faintspot.control.vibrations import MODES, Vibration, mode_shapes
-from faintspot.turbulence.slope_spectra import SlopeSpectra
 from faintspot.turbulence.strength import OUTER_SCALE_SPREAD
 
 Floats = NDArray[np.float64]
@@ -30,9 +30,12 @@ _RINGS_M_PER_S = (0.0, 1.5, 3.0, 4.5, 6.0, 8.0, 10.5, 13.5, 17.5, 22.5, 29.0, 37
 _UPDATES, _FIRST_UPDATES = 60, 3
 _MOST_LAYERS = 6
 _LEAST_SHARE = 0.03
+_CLEAR = np.array([2.0, 6.0])
+"""Expected rises of the misfit, in penalties of a layer, beyond which the layers are not tried without the
+weakest, and with the nearest two merged. The first is underestimated by up to three times, the second
+overestimated as much."""
 _REFINEMENTS = 40
 _SPEED_UNIT = 2.0  # m/s, in which winds have about the same effect as logarithms of strengths
-_STEP_M_PER_S = 0.02  # of differences
 _NOISE = 1e-3, 1e3
 
 
@@ -164,18 +167,21 @@ class LayerLikelihood:
         x, y, peak = np.array(found).T
         return Layers(np.column_stack([x, y]), peak, noise, self._site.outer_scale_m)
 
-    def selected(self, start: Layers) -> Layers:
-        """Return the layers selected by the information criterion, starting from `start`."""
+    def selected(self, start: Layers) -> tuple[Layers, Floats]:
+        """Return the layers that the information criterion selects, from a start on, and their `errors`."""
         best = self.refined(start)
+        errors = self.errors(best)
         while len(best.strength) > 1:
-            fewer = min(
-                (self.refined(each) for each in _with_one_less(best)), key=lambda each: each.criterion
-            )
             is_weak = best.strength.min() < _LEAST_SHARE * best.strength.sum()
-            if fewer.criterion > best.criterion and not is_weak:
+            is_clear = (_rises(best, errors) > _CLEAR * self._penalty(3)) & (not is_weak)
+            fewer = [each for each, clear in zip(_with_one_less(best), is_clear, strict=True) if not clear]
+            if not fewer:
                 break
-            best = fewer
-        return best
+            other = min(map(self.refined, fewer), key=lambda each: each.criterion)
+            if other.criterion > best.criterion and not is_weak:
+                break
+            best, errors = other, self.errors(other)
+        return best, errors
 
     def refined(self, start: Layers) -> Layers:
         """Return the maximum-likelihood layers near a starting point."""
@@ -209,17 +215,14 @@ class LayerLikelihood:
 
     def _derivatives(self, layers: Layers) -> tuple[list[Complex], Complex]:
         """Return the derivatives of the distinct spectra with winds, strengths and outer scale, and them."""
-        tables, slope = self._spectra.tables(layers.outer_scale_m)
+        tables, slopes = self._spectra.tables(layers.outer_scale_m)
         of_winds, of_strengths = [], []
         total, of_scale = 0.0, 0.0
         for wind, strength in zip(layers.wind_m_per_s, layers.strength, strict=True):
-            here = strength * self._spectra.of_wind(wind, tables)
-            for step in _STEP_M_PER_S * np.eye(2):
-                there = strength * self._spectra.of_wind(wind + step, tables)
-                of_winds.append((there - here) * (_SPEED_UNIT / _STEP_M_PER_S))
+            here, *along, scale = strength * self._spectra.changes(wind, tables, slopes)
+            of_winds += [_SPEED_UNIT * each for each in along]
             of_strengths.append(here)
-            total = total + here
-            of_scale = of_scale + strength * self._spectra.of_wind(wind, slope)
+            total, of_scale = total + here, of_scale + scale
         return [*of_winds, *of_strengths, np.asarray(of_scale)], np.asarray(total)
 
     def errors(self, layers: Layers) -> Floats:
@@ -229,10 +232,9 @@ class LayerLikelihood:
         noise = np.zeros_like(inverse)
         diagonal = np.arange(len(self._noise_px2))
         noise[:, diagonal, diagonal] = layers.noise * self._noise_px2
-        changes = [inverse @ self._spectra.matrices(each) for each in derivatives] + [inverse @ noise]
-        information = self._weight * np.array(
-            [[np.einsum("fij,fji->", one, other).real for other in changes] for one in changes]
-        )
+        changes = np.array([inverse @ each for each in (*map(self._spectra.matrices, derivatives), noise)])
+        flat = changes.reshape(len(changes), -1)
+        information = self._weight * (flat @ changes.swapaxes(2, 3).reshape(len(changes), -1).T).real
         information[-2, -2] += OUTER_SCALE_SPREAD**-2
         count = len(layers.strength)
         errors = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information, hermitian=True)), 0.0))
@@ -264,14 +266,34 @@ def _near(winds_m_per_s: Floats) -> Floats:
     return np.asarray(np.maximum(2.5, 0.3 * np.hypot(*winds_m_per_s.T)))
 
 
-def _with_one_less(layers: Layers) -> list[Layers]:
-    """Return the layers without the weakest, and with the nearest two merged."""
-    strength, winds = layers.strength, layers.wind_m_per_s
-    weakest = int(np.argmin(strength))
+def _doubtful(layers: Layers) -> tuple[int, int, int]:
+    """Return the weakest layer, and the nearest two."""
+    winds = layers.wind_m_per_s
     apart = np.hypot(*(winds[:, None] - winds).transpose(2, 0, 1)) / np.minimum(
         *np.meshgrid(*[_near(winds)] * 2)
     )
     one, other = np.unravel_index(np.argmin(apart + np.diag(np.full(len(winds), np.inf))), apart.shape)
+    return int(np.argmin(layers.strength)), int(one), int(other)
+
+
+def _rises(layers: Layers, errors: Floats) -> Floats:
+    """Return the expected rises of the misfit without the weakest layer, and with the nearest two merged.
+
+    They are those of a parabola with the curvature that the errors tell (Wald's test); 0 if not known.
+    """
+    weakest, one, other = _doubtful(layers)
+    apart = layers.wind_m_per_s[one] - layers.wind_m_per_s[other]
+    variance = np.square(errors)
+    of_winds = variance[[one, other], :2].sum(axis=0)
+    if min(variance[weakest, 2], *of_winds) == 0:
+        return np.zeros(2)
+    return 0.5 * np.array([1 / variance[weakest, 2], (apart**2 / of_winds).sum()])
+
+
+def _with_one_less(layers: Layers) -> list[Layers]:
+    """Return the layers without the weakest, and with the nearest two merged."""
+    strength, winds = layers.strength, layers.wind_m_per_s
+    weakest, one, other = _doubtful(layers)
     merged, pair = winds.copy(), strength[[one, other]]
     merged[one] = pair @ winds[[one, other]] / pair.sum()
     sums = strength.copy()

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.control.base import ASSUMED, LEARNT, Controller
-from faintspot.control.commands import CommandDelayLine
+from faintspot.control.base import ASSUMED, LEARNT
 from faintspot.control.identification import Identification, Identified
-from faintspot.control.kalman import SlopePredictor
 from faintspot.control.learnt import (
     CONTROLS,
     INTEGRATOR,
@@ -19,14 +17,12 @@ from faintspot.control.learnt import (
     MODAL,
     POLC,
     Learnt,
-    Make,
     Model,
     Plant,
 )
-from faintspot.control.local_kalman import LocalPredictor, local_filter
+from faintspot.control.local_kalman import local_filter
 from faintspot.control.modal_gains import largest_stable_gain, modal_gains
 from faintspot.control.phase import residual_phase
-from faintspot.control.predictive import Predictive, PseudoOpenLoop
 from faintspot.control.telemetry import OpenLoopTelemetry, usual_variance
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
@@ -76,84 +72,61 @@ def learn(
     phase = residual_phase(plant.reconstructor.matrix, plant.interaction, cells)
     frames = max(_FEWEST_REPLAYED, _MOST_REPLAYED // len(site.positions_m) // 2)
     whole, telemetry = telemetry, telemetry.part(-frames, None)
-    gain, plain_left = _best_gain(lambda gain: partial(plant.integrator, gain), plant, telemetry, phase)
+    gain, plain_left = plant.best_gain(GAINS, telemetry, phase)
+    plain = Model(kind, {}, gain, 1.0, (math.inf, plain_left), phase)
     if kind == MODAL:
-        return Learnt(plant, _modal(plant, telemetry, gain, plain_left, phase))
+        return Learnt(plant, _modal(plain, plant, telemetry))
     identification = Identification(whole, site, rate_hz)
-    tried = [identification.anywhere()]
+    tried = []
+    known = start if start is not None and start.is_layered and winds == LEARNT else None
+    if known is None:  # else the comparison was made before
+        tried.append(identification.anywhere())
     if winds == LEARNT:
-        tried.append(identification.layers(start))
+        tried.append(identification.layers(known))
     elif winds == ASSUMED:
         tried.append(identification.of_winds(site.wind_m_per_s))
-    make = _pseudo_open_loop if kind == POLC else _kalman
-    made = [(*make(plant, telemetry.scaled(each.noise_factor), each, phase), each) for each in tried]
-    left, arrays, found = min(made, key=lambda each: each[0])
-    text = f"{found.summary()}, noise variance x {found.noise_factor:.2f}"
-    model = Model(kind, arrays, gain, found.noise_factor, (left, plain_left), phase, text)
+    make, made = _pseudo_open_loop if kind == POLC else _kalman, []
+    for found in tried:
+        text = f"{found.summary()}, noise variance x {found.noise_factor:.2f}"
+        model = replace(plain, noise_factor=found.noise_factor, description=text)
+        made.append((make(model, plant, telemetry, found), found))
+    model, found = min(made, key=lambda each: each[0].left[0])
     return Learnt(plant, model.with_noise(noise_scale) if kind == KALMAN else model, found)
 
 
-def _kalman(
-    plant: Plant, telemetry: OpenLoopTelemetry, found: Identified, phase: Floats
-) -> tuple[float, dict[str, Floats]]:
-    """Return the Kalman filter's model and its residual."""
-    variance = usual_variance(telemetry)
-    predictor: SlopePredictor | LocalPredictor
+def _kalman(model: Model, plant: Plant, telemetry: OpenLoopTelemetry, found: Identified) -> Model:
+    """Return the model with its Kalman filter and residual."""
+    variance = usual_variance(telemetry.scaled(found.noise_factor))
     if len(variance) > _MOST_SLOPES:
         arrays = local_filter(found.layers, 1 / found.rate_hz, variance)
-        predictor = LocalPredictor(arrays)
     else:
-        model = found.slope_model()
-        predictor = SlopePredictor(model, variance)
+        slopes = found.slope_model()
         arrays = {
-            "first": model.first,
-            "second": model.second,
-            "driving_px2": model.driving,
+            "first": slopes.first,
+            "second": slopes.second,
+            "driving_px2": slopes.driving,
             "variance_px2": variance,
         }
-
-    def predictive(line: CommandDelayLine) -> Controller:
-        return Predictive(line, plant.interaction, predictor, plant.reconstructor.clean)
-
-    return plant.left(predictive, telemetry, phase), arrays
+    return replace(model, arrays=arrays).scored(plant, telemetry)
 
 
-def _modal(
-    plant: Plant, telemetry: OpenLoopTelemetry, plain_gain: float, plain_left: float, phase: Floats
-) -> Model:
-    """Return the model of an integrator with one gain per mode."""
+def _modal(model: Model, plant: Plant, telemetry: OpenLoopTelemetry) -> Model:
+    """Return the model with one gain per mode."""
     trust = max(float(telemetry.trust.mean()), 1e-6)  # by which slopes are smaller than they should be
     weighted = telemetry.trust * telemetry.open_loop_px / trust
     modes = weighted @ plant.reconstructor.matrix.T @ plant.reconstructor.modes
     gains = modal_gains(modes, plant.delay_frames, plant.leak) / trust
     gains = np.minimum(gains, _LARGEST_PART * largest_stable_gain(plant.delay_frames))
-    left = plant.left(partial(plant.integrator, gains), telemetry, phase)
     text = f"gains {gains.min():g} to {gains.max():g}"
-    return Model(MODAL, {"gains": gains}, plain_gain, 1.0, (left, plain_left), phase, text)
+    return replace(model, arrays={"gains": gains}, description=text).scored(plant, telemetry)
 
 
-def _pseudo_open_loop(
-    plant: Plant, telemetry: OpenLoopTelemetry, found: Identified, phase: Floats
-) -> tuple[float, dict[str, Floats]]:
-    """Return the model of pseudo-open-loop control for the time at which the command acts."""
-    covariances, clean = found.covariances_px2().sum(axis=0), plant.reconstructor.clean
-    now, ahead = covariances[0], covariances[min(plant.delay_frames, 2)]
-
-    def made(gain: float) -> Make:
-        return lambda line: PseudoOpenLoop(line, plant.interaction, now, ahead, clean, gain)
-
-    gain, left = _best_gain(made, plant, telemetry, phase, _POLC_GAINS)
-    return left, {"now_px2": now, "ahead_px2": ahead, "gain": np.array(gain)}
-
-
-def _best_gain(
-    made: Callable[[float], Make],
-    plant: Plant,
-    telemetry: OpenLoopTelemetry,
-    phase: Floats,
-    gains: Sequence[float] = GAINS,
-) -> tuple[float, float]:
-    """Return the gain with the smallest residual on the telemetry, and that residual."""
-    left = [plant.left(made(gain), telemetry, phase) for gain in gains]
-    best = int(np.argmin(left))
-    return gains[best], left[best]
+def _pseudo_open_loop(model: Model, plant: Plant, telemetry: OpenLoopTelemetry, found: Identified) -> Model:
+    """Return the model with pseudo-open-loop control for the time at which the command acts."""
+    covariances = found.covariances_px2().sum(axis=0)
+    arrays = {"now_px2": covariances[0], "ahead_px2": covariances[min(plant.delay_frames, 2)]}
+    made = [
+        replace(model, arrays={**arrays, "gain": np.array(gain)}).scored(plant, telemetry)
+        for gain in _POLC_GAINS
+    ]
+    return min(made, key=lambda each: each.left[0])

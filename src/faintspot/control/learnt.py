@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -25,7 +25,8 @@ from faintspot.control.local_kalman import LocalPredictor, local_shapes
 from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
 from faintspot.control.reconstructor import Reconstructor
-from faintspot.control.telemetry import OpenLoopTelemetry, replayed
+from faintspot.control.replay import mean_left, replayed_frames, replayed_integrators
+from faintspot.control.telemetry import OpenLoopTelemetry
 
 Floats = NDArray[np.float64]
 Make = Callable[[CommandDelayLine], Controller]
@@ -39,7 +40,8 @@ CONTROLS = {
 }
 """Kinds of control and their names in reports."""
 
-SETTLE_FRAMES = 50
+SETTLE_FRAMES = 200
+"""Frames after which a replayed controller has settled; predictive filters take longer than integrators."""
 _LOCAL = "local kalman"  # in files: KALMAN for a large sensor
 _OF_KIND = {
     MODAL: ("gains",),
@@ -70,6 +72,11 @@ _RANGES = {
 """Accepted range; other values are damaged or in another unit, and products may overflow."""
 
 
+def settled(telemetry: OpenLoopTelemetry) -> int:
+    """Return the number of frames at the start of a replay that are not scored."""
+    return min(SETTLE_FRAMES, len(telemetry) // 3)
+
+
 @dataclass(frozen=True, eq=False)
 class Plant:
     """Loop properties that a controller needs."""
@@ -84,9 +91,29 @@ class Plant:
         """Return an integrator of this loop."""
         return Integrator(line, self.interaction, self.reconstructor, gain, self.leak)
 
+    def replayed(self, make: Make, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
+        """Return the squared residual that a controller would have left; see `replayed_frames`."""
+        return replayed_frames(make, telemetry, self.interaction, phase, self.delay_frames)
+
+    def replayed_integrators(
+        self, gains: Sequence[float], telemetry: OpenLoopTelemetry, phase: Floats
+    ) -> Floats:
+        """Return the squared residuals of integrators, (gains, frames)."""
+        of_loop = self.interaction, self.reconstructor, phase, self.delay_frames, self.leak
+        return replayed_integrators(gains, telemetry, *of_loop)
+
+    def best_gain(
+        self, gains: Sequence[float], telemetry: OpenLoopTelemetry, phase: Floats
+    ) -> tuple[float, float]:
+        """Return the gain of the integrator that leaves the least phase variance, and that variance."""
+        found = self.replayed_integrators(gains, telemetry, phase)
+        left = [mean_left(each, telemetry, settled(telemetry)) for each in found]
+        best = int(np.argmin(left))
+        return gains[best], left[best]
+
     def left(self, make: Make, telemetry: OpenLoopTelemetry, phase: Floats) -> float:
-        """Return the phase variance that a controller would have left; see `replayed`."""
-        return replayed(make, telemetry, self.interaction, phase, self.delay_frames, SETTLE_FRAMES)
+        """Return the phase variance that a controller would have left; see `mean_left`."""
+        return mean_left(self.replayed(make, telemetry, phase), telemetry, settled(telemetry))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +133,8 @@ class Model:
     phase: Floats
     """(commands, m): matrix of the measure that compares both; see `residual_phase`."""
     description: str = ""
+    covariance: Floats | None = None
+    """(states, states) px^2: as from `steady_covariance`, where it is known already."""
 
     def controller(self, plant: Plant, line: CommandDelayLine) -> Controller:
         """Return the learnt controller."""
@@ -117,6 +146,38 @@ class Model:
             covariances = arrays["now_px2"], arrays["ahead_px2"]
             return PseudoOpenLoop(line, plant.interaction, *covariances, clean, float(arrays["gain"]))
         return Predictive(line, plant.interaction, self.predictor(), clean)
+
+    def compiled(self, plant: Plant, line: CommandDelayLine, phase: Floats, **options: Any) -> CompiledKalman:
+        """Return the Kalman filter of a small sensor with its fallback, see `CompiledKalman`."""
+        predictor, reconstructor = self.predictor(), plant.reconstructor
+        assert isinstance(predictor, SlopePredictor)
+        return CompiledKalman(
+            line,
+            plant.interaction,
+            reconstructor.matrix,
+            phase,
+            predictor,
+            reconstructor.clean,
+            self.plain_gain,
+            plant.leak,
+            noise_factor=self.noise_factor,
+            prefers_plain=self.left[1] < self.left[0],
+            **options,
+        )
+
+    def replayed(self, plant: Plant, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
+        """Return the squared residual that the learnt controller would have left; see `replayed_frames`."""
+        if self.kind != KALMAN or self.is_local:
+            scaled = telemetry.scaled(self.noise_factor)
+            return plant.replayed(partial(self.controller, plant), scaled, phase)
+        line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames)
+        return self.compiled(plant, line, phase).replayed(telemetry)
+
+    def scored(self, plant: Plant, telemetry: OpenLoopTelemetry) -> Model:
+        """Return the model with its residual on telemetry."""
+        left = mean_left(self.replayed(plant, telemetry, self.phase), telemetry, settled(telemetry))
+        is_dense = self.kind == KALMAN and not self.is_local
+        return replace(self, left=(left, self.left[1]), covariance=self._covariance if is_dense else None)
 
     @property
     def is_local(self) -> bool:
@@ -142,8 +203,8 @@ class Model:
         arrays = self.arrays
         if not self.is_local:  # which has gains for several variances
             arrays = {**arrays, "variance_px2": scale * arrays["variance_px2"]}
-        text = f"{self.description}, and {scale:g} of that"
-        return replace(self, arrays=arrays, noise_factor=scale * self.noise_factor, description=text)
+        text, factor = f"{self.description}, and {scale:g} of that", scale * self.noise_factor
+        return replace(self, arrays=arrays, noise_factor=factor, description=text, covariance=None)
 
     @cached_property
     def _slopes(self) -> SlopeModel:
@@ -151,6 +212,8 @@ class Model:
 
     @cached_property
     def _covariance(self) -> Floats:
+        if self.covariance is not None:
+            return self.covariance
         return steady_covariance(self._slopes, self.arrays["variance_px2"])
 
     def save(self, path: str | Path) -> None:
@@ -241,21 +304,8 @@ class Learnt:
     ) -> Guarded | CompiledKalman:
         """Return the controller, with the estimator's prior if it has one."""
         plant, model = self.plant, self.model
-        predictor = model.predictor() if model.kind == KALMAN else None
-        if isinstance(predictor, SlopePredictor):
-            return CompiledKalman(
-                line,
-                plant.interaction,
-                plant.reconstructor.matrix,
-                model.phase,
-                predictor,
-                plant.reconstructor.clean,
-                model.plain_gain,
-                plant.leak,
-                prior_std_px=prior_std_px,
-                noise_factor=model.noise_factor,
-                prefers_plain=model.left[1] < model.left[0],
-            )
+        if model.kind == KALMAN and not model.is_local:
+            return model.compiled(plant, line, model.phase, prior_std_px=prior_std_px)
         return Guarded(
             line,
             plant.interaction,

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.control.slope_spectra import SlopeSpectra
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
-from faintspot.turbulence.slope_spectra import SlopeSpectra
 
 Floats = NDArray[np.float64]
 

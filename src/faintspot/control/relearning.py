@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +11,8 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.control.identification import Identified
 from faintspot.control.learning import learn
-from faintspot.control.learnt import KALMAN, SETTLE_FRAMES, Learnt, Make, Model, Plant
-from faintspot.control.telemetry import OpenLoopTelemetry, replayed_frames
+from faintspot.control.learnt import KALMAN, SETTLE_FRAMES, Learnt, Model, Plant
+from faintspot.control.telemetry import OpenLoopTelemetry
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
@@ -22,7 +21,9 @@ JUDGED_PART = 0.35
 """Part of a stretch, its end, on which models are judged; they are learnt from the rest."""
 STANDARD_ERRORS = 2.0
 _BLOCK_FRAMES = 25
-_FEWEST_BLOCKS = 8
+_FEWEST_BLOCKS = 10
+FEWEST_FRAMES = math.ceil(_FEWEST_BLOCKS * _BLOCK_FRAMES / JUDGED_PART) + 1
+"""Frames of a stretch that can be learnt from and judged on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,24 +84,20 @@ def relearn(
     InputError
         When there are too few frames.
     """
+    if len(telemetry) < FEWEST_FRAMES:
+        raise InputError(
+            f"telemetry: expected {FEWEST_FRAMES} frames to judge a filter, got {len(telemetry)}"
+        )
     judged = round(JUDGED_PART * len(telemetry))
-    if judged < SETTLE_FRAMES + _FEWEST_BLOCKS * _BLOCK_FRAMES:
-        raise InputError(f"telemetry: expected more frames to judge a filter on, got {len(telemetry)}")
     first = len(telemetry) - judged
     learnt = learn(KALMAN, plant, telemetry.part(0, first), site, rate_hz, start=start)
-    new, rest = learnt.model, telemetry.part(first, len(telemetry))
-    left, by_running = (
-        _left(partial(model.controller, plant), plant, rest.scaled(model.noise_factor), new.phase)
-        for model in (new, running)
-    )
-    by_integrator = _left(partial(plant.integrator, new.plain_gain), plant, rest, new.phase)
+    new, begin = learnt.model, max(0, first - SETTLE_FRAMES)
+    replayed = telemetry.part(begin, None)  # all have settled when the part begins that they are judged on
+    by_integrator = plant.replayed_integrators([new.plain_gain], replayed, new.phase)[0]
+    found = *(model.replayed(plant, replayed, new.phase) for model in (new, running)), by_integrator
+    left, by_running, by_integrator = (each[first - begin :] for each in found)
     means = float(left.mean()), float(by_running.mean()), float(by_integrator.mean())
     return Relearnt(learnt, *means, _error_of_mean(by_running - left))
-
-
-def _left(make: Make, plant: Plant, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
-    """Return the squared residual phase of a controller in each frame, once it has settled."""
-    return replayed_frames(make, telemetry, plant.interaction, phase, plant.delay_frames)[SETTLE_FRAMES:]
 
 
 def _error_of_mean(values: Floats) -> float:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.base import Controller
-from faintspot.control.commands import CommandDelayLine
 
 Floats = NDArray[np.float64]
 
@@ -91,63 +88,6 @@ def usual_variance(telemetry: OpenLoopTelemetry) -> Floats:
     """Return (m,): the variance of noise that gives as much information as the frames do on average."""
     information = np.where(np.isfinite(telemetry.variance_px2), 1 / telemetry.variance_px2, 0.0)
     return np.asarray(1 / np.maximum(information.mean(axis=0), 1e-6))
-
-
-def replayed(
-    make: Callable[[CommandDelayLine], Controller],
-    telemetry: OpenLoopTelemetry,
-    interaction: Floats,
-    phase: Floats,
-    delay_frames: int,
-    settle_frames: int = 0,
-) -> float:
-    """Return the mean square residual that a controller would have left: the mean of `replayed_frames`.
-
-    Parameters
-    ----------
-    make : callable
-        Returns the controller, given where its commands go.
-    telemetry : Telemetry
-    interaction : (m, commands) array
-    phase : (k, m) array
-        From slopes to what is scored, see `residual_phase`.
-    delay_frames, settle_frames : int
-        Frames at the start that are not scored.
-    """
-    frames = replayed_frames(make, telemetry, interaction, phase, delay_frames)
-    with np.errstate(over="ignore", invalid="ignore"):
-        seen = float(frames[settle_frames:].mean())
-    share = np.square(telemetry.trust[settle_frames:]).mean()
-    return float(seen / share) if np.isfinite(seen) and share > 0 else math.inf
-
-
-def replayed_frames(
-    make: Callable[[CommandDelayLine], Controller],
-    telemetry: OpenLoopTelemetry,
-    interaction: Floats,
-    phase: Floats,
-    delay_frames: int,
-) -> Floats:
-    """Return the squared residual that a controller would have left on recorded frames, (frames,).
-
-    The commands that it would have sent are added to the recorded open-loop slopes. As these commands do not
-    know the noise of the frame that they act in, that noise adds the same to every controller's result.
-    Parameters are those of `replayed`; slopes count by `OpenLoopTelemetry.trust`.
-    """
-    line = CommandDelayLine(interaction.shape[1], delay_frames)
-    controller = make(line)
-    error = np.sqrt(telemetry.variance_px2)
-    left = np.zeros_like(telemetry.open_loop_px)
-    with np.errstate(over="ignore", invalid="ignore"):  # an unstable loop leaves more than can be told
-        for frame, slopes in enumerate(telemetry.open_loop_px):
-            residual = slopes + interaction @ line.acting
-            trust = telemetry.trust[frame]
-            left[frame] = trust * residual
-            try:
-                controller.update(as_estimated(residual, trust, controller), error[frame])
-            except ArithmeticError:  # its commands are not finite
-                return np.full(len(left), np.inf)
-        return np.asarray(np.square(left @ phase.T).sum(axis=1))
 
 
 def as_estimated(slopes_px: Floats, trust: Floats, controller: Controller) -> Floats:

@@ -23,7 +23,7 @@ from faintspot.base.errors import InputError
 from faintspot.control.configuration import Control, load_control, prior_std_px
 from faintspot.control.learnt import KALMAN
 from faintspot.control.recording import CLOSED, site_of, telemetry_of_recording
-from faintspot.control.relearning import Relearnt, relearn
+from faintspot.control.relearning import FEWEST_FRAMES, Relearnt, relearn
 from faintspot.io.telemetry import Telemetry, stored_names
 from faintspot.pipeline.settings import Settings
 from faintspot.realtime.child_processes import ChildProcesses
@@ -52,7 +52,7 @@ class LearningBeside:
     config : path
         Configuration of the engine.
     every_s : float
-        Seconds of telemetry, with a closed loop, for each learning.
+        Seconds of telemetry, with a closed loop, for each learning; at least `FEWEST_FRAMES` frames.
 
     Raises
     ------
@@ -90,9 +90,14 @@ class LearningBeside:
             self._records.clear()
         elif len(records):
             self._records.append(records)
-        while len(self._records) > 1 and self._seconds > 2 * self._every_s:  # learning took long
+        while len(self._records) > 1 and self._are_enough(2):  # learning took long
             del self._records[0]
-        return self._seconds >= self._every_s
+        return self._are_enough(1)
+
+    def _are_enough(self, times: int) -> bool:
+        """Return whether the records that wait are enough for a number of learnings."""
+        frames = sum(map(len, self._records))
+        return self._seconds >= times * self._every_s and frames >= times * FEWEST_FRAMES
 
     @property
     def _seconds(self) -> float:

@@ -9,6 +9,7 @@ by the wind and otherwise unchanged.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Self
@@ -58,14 +59,26 @@ class SlopeTurbulence:
 
     def covariance_px2(self, later_s: float = 0.0) -> Floats:
         """Return E[slopes at t + later_s, slopes at t], (2 n, 2 n) px^2: all x, then all y."""
+        return np.asarray(self._covariances_px2((later_s,))[0])
+
+    def lagged_px2(self, frame_s: float) -> Floats:
+        """Return `covariance_px2` for delays of 0, 1 and 2 frames, (3, 2 n, 2 n)."""
+        return self._covariances_px2((0.0, frame_s, 2 * frame_s))
+
+    def _covariances_px2(self, later_s: Sequence[float]) -> Floats:
+        """Return `covariance_px2` for each delay, (delays, 2 n, 2 n); equal shifts of layers count once."""
         part = np.asarray(self.fraction, np.float64) / np.sum(self.fraction)
-        apart_m, which = self._separations
-        total = np.zeros((3, len(apart_m)))
-        for strength, wind in zip(part, np.asarray(self.wind_m_per_s), strict=True):
-            along, across = (apart_m - wind * later_s).T
-            total += strength * gradient_covariances(along, across, self.subaperture_m, self.outer_scale_m)
-        xx, xy, yy = (self.r0_m ** (-5 / 3) * self.px2_per_rad2_per_m2 * total)[:, which]
-        return np.block([[xx, xy], [xy, yy]])
+        (apart_m, which), wind = self._separations, np.asarray(self.wind_m_per_s, np.float64)
+        shifts_m = np.asarray(later_s)[:, None, None] * wind
+        distinct_m, of_layer = np.unique(shifts_m.reshape(-1, 2), axis=0, return_inverse=True)
+        along, across = (apart_m - distinct_m[:, None]).transpose(2, 0, 1)
+        found = gradient_covariances(along, across, self.subaperture_m, self.outer_scale_m)
+        found *= self.r0_m ** (-5 / 3) * self.px2_per_rad2_per_m2
+        blocks = [
+            np.tensordot(part, found[:, each], axes=([0], [1]))[:, which]
+            for each in of_layer.reshape(shifts_m.shape[:2])
+        ]
+        return np.array([np.block([[xx, xy], [xy, yy]]) for xx, xy, yy in blocks])
 
     @cached_property
     def _separations(self) -> tuple[Floats, NDArray[np.int64]]:
@@ -84,10 +97,6 @@ class SlopeTurbulence:
         angle = math.radians(degrees)
         turn = factor * np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         return replace(self, wind_m_per_s=np.asarray(self.wind_m_per_s) @ turn.T)
-
-    def lagged_px2(self, frame_s: float) -> Floats:
-        """Return `covariance_px2` for delays of 0, 1 and 2 frames, (3, 2 n, 2 n)."""
-        return np.array([self.covariance_px2(lag * frame_s) for lag in range(3)])
 
     def layers(self) -> list[Self]:
         """Return each layer separately, with its own strength."""

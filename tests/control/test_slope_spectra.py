@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from tests.control.control_cases import TURBULENCE
 
-from faintspot.turbulence.slope_spectra import SlopeSpectra
+from faintspot.control.slope_spectra import SlopeSpectra
 
 LENGTH, STEP_S = 24, 0.01
 BINS = np.array([1, 4, 9])
@@ -35,6 +35,17 @@ def test_tables_follow_the_outer_scale() -> None:
     """Their derivative is that of a step."""
     (low, slope), (high, _) = (SPECTRA.tables(scale_m) for scale_m in (20.0, 20.0 * np.exp(0.01)))
     np.testing.assert_allclose(high - low, 0.01 * slope, rtol=1e-6, atol=1e-9 * np.abs(slope).max())
+
+
+def test_derivatives_are_those_of_steps() -> None:
+    tables, slopes = SPECTRA.tables(25.0)
+    value, *found = SPECTRA.changes(WIND, tables, slopes)
+    np.testing.assert_allclose(value, SPECTRA.of_wind(WIND, tables), rtol=0, atol=1e-15)
+    step = 1e-4
+    stepped = [(WIND + step * each, tables) for each in np.eye(2)] + [(WIND, tables + step * slopes)]
+    for derivative, place in zip(found, stepped, strict=True):
+        expected = (SPECTRA.of_wind(*place) - value) / step
+        np.testing.assert_allclose(derivative, expected, rtol=0, atol=1e-4 * np.abs(expected).max())
 
 
 def test_sums_over_pairs() -> None:
