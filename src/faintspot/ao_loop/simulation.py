@@ -32,6 +32,8 @@ from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.pipeline.slopes import Slopes
 
 _MOST_METHODS = 127
+_FLUX_FRAMES = 20
+"""Frames after which pipelines follow the mean flux, which changes over a thousand."""
 
 
 @dataclass(frozen=True)
@@ -273,7 +275,8 @@ class _Loop:
         known = self.fluxes[number]
         if known is not None:
             self.fluxes[number] = known.updated(slopes.flux)
-            self._follow_flux(number)
+            if frame % _FLUX_FRAMES == 0:
+                self._follow_flux(number)
         if self.disabled_errors.exact_gain and frame >= self.configuration.run.settle_frames:
             true = sensor.mean_slopes_px(wavefront)
             self.regression[:, number] += slopes.vector.astype(np.float64) @ true, true @ true

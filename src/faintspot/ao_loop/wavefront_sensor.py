@@ -65,21 +65,16 @@ class ShackHartmann:
         phase = self.lenslets(wavefront_nm) * np.float32(2e-9 * np.pi / self.wavelength_m)
         if displacement_px:
             phase += self._tilt(displacement_px)
-        field = np.empty(phase.shape, np.complex64)
-        np.cos(phase, out=field.real)
-        np.sin(phase, out=field.imag)
-        field *= self.amplitude
-        amplitude = _both_axes(self.rows, field, self.columns)
+        phase, lit = (np.ascontiguousarray(part.transpose(1, 2, 0)) for part in (phase, self.amplitude))
+        amplitude = _both_axes(self.rows, _field(phase, lit), self.columns)
         intensity = amplitude.real**2 + amplitude.imag**2
-        images: Floats = _both_axes(self.row_pixels, intensity, self.column_pixels)
-        return images
+        images = _both_axes(self.row_pixels, intensity, self.column_pixels)
+        return np.ascontiguousarray(images.transpose(2, 0, 1))
 
     def frame(self, spots: Floats) -> NDArray[np.float64]:
         """Return a camera frame with the spots in their windows."""
         frame = np.zeros(self.layout.frame_shape)
-        height, width = self.layout.window
-        for (row, column), spot in zip(self.layout.corners, spots, strict=True):
-            frame[row : row + height, column : column + width] = spot
+        frame[self.layout.window_pixels] = spots
         return frame
 
     def mean_slopes_px(self, wavefront_nm: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -169,8 +164,16 @@ def _image_axis(
     return transform.astype(np.complex64), to_pixels.astype(np.float32)
 
 
+def _field(phase: Floats, amplitude: Floats) -> NDArray[np.complex64]:
+    """Return the complex amplitude."""
+    field = np.empty(phase.shape, np.complex64)
+    np.multiply(np.cos(phase), amplitude, out=field.real)
+    np.multiply(np.sin(phase), amplitude, out=field.imag)
+    return field
+
+
 def _both_axes(left: Any, images: Any, right: Any) -> Any:
-    """Return left @ image @ right.T for each image, as two large products."""
-    n, ny, nx = images.shape
-    half = (images.reshape(n * ny, nx) @ right.T).reshape(n, ny, len(right))
-    return np.matmul(left, half)
+    """Return left @ image @ right.T for each of the images (ny, nx, n), as a few large products."""
+    ny, nx, n = images.shape
+    half = (left @ images.reshape(ny, nx * n)).reshape(len(left), nx, n)
+    return np.matmul(right, half)
