@@ -17,7 +17,7 @@ from faintspot.turbulence.slope_covariance import SlopeTurbulence
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-STEPS = (8, 20), (1, 3)
+STEPS = (8, 4), (1, 8)
 """Frames that count as one, and number of such steps: long steps converge soon, the last ones are exact."""
 
 
