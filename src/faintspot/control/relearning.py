@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,7 +97,8 @@ def relearn(
     found = *(model.replayed(plant, replayed, new.phase) for model in (new, running)), by_integrator
     left, by_running, by_integrator = (each[first - begin :] for each in found)
     means = float(left.mean()), float(by_running.mean()), float(by_integrator.mean())
-    return Relearnt(learnt, *means, _error_of_mean(by_running - left))
+    judged = replace(new, left=(means[0], means[2]))  # by which the engine chooses what begins
+    return Relearnt(replace(learnt, model=judged), *means, _error_of_mean(by_running - left))
 
 
 def _error_of_mean(values: Floats) -> float:
