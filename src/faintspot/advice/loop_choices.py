@@ -33,6 +33,7 @@ FEWEST_FRAMES = 600
 _MOST_SLOPES = 500  # beyond, the filter takes too long to learn
 _LEAK = 0.01
 _BLOCKS = 12
+_LEAST_COMPARED = 0.25  # of the frames: those with the largest shares of measured slopes
 _FITTING, _FITTING_ERROR = 0.28, 0.04  # rad^2 at (sub-aperture / r0)^(5/3): continuous mirrors
 _R0_WAVELENGTH_NM = 500.0
 
@@ -81,10 +82,10 @@ def compared_choices(
     scale = _Scale.of(loop, r0, delay, relative)
 
     def learnt_left(model: Model) -> list[Floats]:
-        return [model.replayed(plant, view.replayed, phase)[view.scored] for view in views]
+        return [view.compared(model.replayed(plant, view.replayed, phase)) for view in views]
 
     def integrators(gains: Sequence[float]) -> list[list[Floats]]:
-        of_views = [plant.replayed_integrators(gains, view.replayed, phase)[:, view.scored] for view in views]
+        of_views = [view.compared(plant.replayed_integrators(gains, view.replayed, phase)) for view in views]
         return [list(each) for each in zip(*of_views, strict=True)]
 
     ran = None
@@ -123,6 +124,8 @@ class _View:
     """Second half, and the frames before it in which controllers settle."""
     scored: NDArray[np.int64]
     """Frames of these that are compared."""
+    share: Floats
+    """Share of the slopes that were measured in them."""
     ran: Floats
     """Squared phase of the loop as it ran in the frames that are compared."""
     noise: float
@@ -132,10 +135,17 @@ class _View:
     def of(cls, seen: OpenLoop, phase: Floats) -> _View:
         half = len(seen.telemetry) // 2
         replayed = seen.telemetry.part(half - SETTLE_FRAMES, None)
-        scored = SETTLE_FRAMES + np.flatnonzero(_whole(replayed.part(SETTLE_FRAMES, None)))
-        ran = np.square(seen.residual[half - SETTLE_FRAMES :][scored] @ phase.T).sum(axis=1)
+        share = replayed.trust.mean(axis=1)
+        least = np.quantile(share[SETTLE_FRAMES:], 1 - _LEAST_COMPARED)
+        scored = SETTLE_FRAMES + np.flatnonzero(share[SETTLE_FRAMES:] >= max(float(least), 1e-9))
         noise = float(seen.variance @ np.square(phase).sum(axis=0))
-        return cls(replayed, scored, ran, noise)
+        view = cls(replayed, scored, share[scored], np.zeros(0), noise)
+        ran = np.square(seen.residual[half - SETTLE_FRAMES :] @ phase.T).sum(axis=1)
+        return replace(view, ran=view.compared(ran))
+
+    def compared(self, frames: Floats) -> Floats:
+        """Return the squared phase in the frames that are compared, for slopes that are all measured."""
+        return np.asarray(frames[..., self.scored] / self.share)
 
 
 @dataclass(frozen=True)
@@ -213,12 +223,6 @@ def _root(name: str, unit: str, square: float, error: float, remark: str = "") -
     if name == "residual" and square < error:
         return Measured(name, unit, remark=f"less than {math.sqrt(max(square, 0.0) + 2 * error):.3g}")
     return Measured(name, unit, root, error / max(2 * abs(root), math.sqrt(error), 1e-12), remark)
-
-
-def _whole(telemetry: OpenLoopTelemetry) -> NDArray[np.bool_]:
-    """Return the frames with the largest share of measured slopes."""
-    share = telemetry.trust.mean(axis=1)
-    return np.asarray(share >= max(0.999 * float(share.max()), 1e-9))
 
 
 def _at_gain(choice: Choice, gain: float) -> Choice:

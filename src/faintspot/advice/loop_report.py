@@ -15,6 +15,7 @@ from faintspot.advice.loop_spectra import ModalSpectra, modal_spectra
 from faintspot.advice.measured import Measured, outer_scale_and_r0
 from faintspot.advice.open_loop import OpenLoop, open_loop_of, runs_of, site_of_loop
 from faintspot.advice.recorded_loop import RecordedLoop
+from faintspot.advice.slope_discrepancy import recorded_discrepancy
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
 from faintspot.control.identification import Identification, Identified
@@ -226,6 +227,7 @@ def _turbulence(report: LoopReport, seen: OpenLoop, delay: LoopDelay) -> None:
     report.turbulence = identified
     report.spectra = modal_spectra(seen.telemetry, identified)
     _vibrations(report, identified)
+    report.parts["noise"].known += recorded_discrepancy(loop, seen, identified)
     if loop.subaperture_m is None:
         part.missing = "Without subaperture_m (or diameter_m) neither r0 nor winds are known."
         return

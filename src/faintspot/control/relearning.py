@@ -84,12 +84,10 @@ def relearn(
     InputError
         When there are too few frames.
     """
-    if len(telemetry) < FEWEST_FRAMES:
-        raise InputError(
-            f"telemetry: expected {FEWEST_FRAMES} frames to judge a filter, got {len(telemetry)}"
-        )
-    judged = round(JUDGED_PART * len(telemetry))
-    first = len(telemetry) - judged
+    frames = len(telemetry)
+    if frames < FEWEST_FRAMES:
+        raise InputError(f"telemetry: expected {FEWEST_FRAMES} frames to judge a filter, got {frames}")
+    first = frames - round(JUDGED_PART * frames)
     learnt = learn(KALMAN, plant, telemetry.part(0, first), site, rate_hz, start=start)
     new, begin = learnt.model, max(0, first - SETTLE_FRAMES)
     replayed = telemetry.part(begin, None)  # all have settled when the part begins that they are judged on
@@ -97,8 +95,8 @@ def relearn(
     found = *(model.replayed(plant, replayed, new.phase) for model in (new, running)), by_integrator
     left, by_running, by_integrator = (each[first - begin :] for each in found)
     means = float(left.mean()), float(by_running.mean()), float(by_integrator.mean())
-    judged = replace(new, left=(means[0], means[2]))  # by which the engine chooses what begins
-    return Relearnt(replace(learnt, model=judged), *means, _error_of_mean(by_running - left))
+    scored = replace(new, left=(means[0], means[2]))  # by which the engine chooses what begins
+    return Relearnt(replace(learnt, model=scored), *means, _error_of_mean(by_running - left))
 
 
 def _error_of_mean(values: Floats) -> float:

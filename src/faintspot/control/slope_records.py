@@ -51,7 +51,7 @@ class SlopeRecords:
             raise InputError("telemetry: expected slopes that were measured in half of the frames, got none")
         kept = np.flatnonzero(enough)[:: math.ceil(np.count_nonzero(enough) / _MOST_SUBAPERTURES)]
         both = np.concatenate([kept, kept + n])
-        slopes = _interpolated(telemetry.open_loop_px[:, both], measured[:, both])
+        slopes = interpolated(telemetry.open_loop_px[:, both], measured[:, both])
         counted = np.where(measured[:, both], variance[:, both], np.nan)
         return cls(
             replace(site, positions_m=site.positions_m[kept]),
@@ -81,7 +81,7 @@ class SlopeRecords:
         return np.array(found)
 
 
-def _interpolated(values: Floats, measured: NDArray[np.bool_]) -> Floats:
+def interpolated(values: Floats, measured: NDArray[np.bool_]) -> Floats:
     """Return values (frames, m), interpolated in time where not measured."""
     if measured.all():
         return values

@@ -75,7 +75,7 @@ def slope_discrepancy(slopes: Slopes, layout: Layout) -> Discrepancy:
         n = vector.shape[1] // 2
         raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {n}")
     used = np.tile(valid.all(axis=0), 2)
-    others = _not_gradients(_corner_gradients(layout)[used])
+    others = not_gradients(layout.cells, used)
     if not others.shape[1]:
         raise InputError("slopes: expected more valid sub-apertures; these cannot show a discrepancy")
     errors = np.concatenate(
@@ -89,13 +89,32 @@ def slope_discrepancy(slopes: Slopes, layout: Layout) -> Discrepancy:
     return Discrepancy(rms, np.where(np.isfinite(expected), expected, np.nan), degrees)
 
 
-def _corner_gradients(layout: Layout) -> Floats:
+def not_gradients(cells: NDArray[np.int64], used: NDArray[np.bool_]) -> Floats:
+    """Return an orthonormal basis (slopes used, k) of the slopes that no phase at the corners causes.
+
+    Parameters
+    ----------
+    cells : (n, 2) array of int
+        Row and column of each sub-aperture in the lenslet array.
+    used : (2 n,) array of bool
+        Slopes, all x, then all y, that are compared.
+    """
+    gradients = _corner_gradients(cells)[used]
+    if not len(gradients):
+        return np.zeros((0, 0))
+    left, size, _ = np.linalg.svd(gradients, full_matrices=True)
+    rank = int(np.count_nonzero(size > _NEGLIGIBLE * size[0]))
+    basis: Floats = left[:, rank:]
+    return basis
+
+
+def _corner_gradients(cells: NDArray[np.int64]) -> Floats:
     """Return the slopes (2 n, corners) of a phase of 1 at each corner of the illuminated sub-apertures."""
-    rows, columns = layout.cells.T
+    rows, columns = cells.T
     places = np.stack([[rows + down, columns + right] for down in (0, 1) for right in (0, 1)])
     corners, index = np.unique(places.transpose(0, 2, 1).reshape(-1, 2), axis=0, return_inverse=True)
     top_left, top_right, bottom_left, bottom_right = index.reshape(4, -1)
-    n = len(layout)
+    n = len(cells)
     gradients = np.zeros((2 * n, len(corners)))
     which = np.arange(n)
     for corner, x, y in (
@@ -107,13 +126,3 @@ def _corner_gradients(layout: Layout) -> Floats:
         gradients[which, corner] += x
         gradients[n + which, corner] += y
     return gradients
-
-
-def _not_gradients(gradients: Floats) -> Floats:
-    """Return an orthonormal basis (slopes, k) orthogonal to the gradients (slopes, corners)."""
-    if not len(gradients):
-        return np.zeros((0, 0))
-    left, size, _ = np.linalg.svd(gradients, full_matrices=True)
-    rank = int(np.count_nonzero(size > _NEGLIGIBLE * size[0]))
-    basis: Floats = left[:, rank:]
-    return basis
