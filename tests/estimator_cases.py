@@ -14,7 +14,10 @@ from faintspot.spots.psf import PSF
 from faintspot.spots.score import TrainedScore
 
 NEED_PSF = ("matched", "ml", "map")
-FIELDS = ("x", "y", "flux", "flags", "iterations", "bad_pixels", "standard_error_x", "standard_error_y")
+FIELDS = (
+    *("x", "y", "flux", "flags", "iterations", "bad_pixels"),
+    *("standard_error_x", "standard_error_y", "covariance_xy"),
+)
 
 
 @dataclass
@@ -215,6 +218,10 @@ def assert_sane(slopes: fs.Slopes) -> None:
         assert np.all(getattr(slopes, name)[invalid] == 0)
         assert np.all(np.isposinf(error[invalid]))
         assert np.all(error[slopes.valid] >= 0)  # and not NaN; 0 where a single pixel is left
+    known = np.isfinite(slopes.standard_error_x)
+    largest = slopes.standard_error_x[known].astype(float) * slopes.standard_error_y[known]
+    assert np.all(np.abs(slopes.covariance_xy[known]) <= largest * (1 + 1e-6))  # rounding of float32
+    assert np.all(slopes.covariance_xy[~known] == 0)
 
 
 def assert_same(a: fs.Slopes, b: fs.Slopes, select: Any = slice(None)) -> None:

@@ -87,6 +87,7 @@ class EstimatorTests:
             for values in (slopes.x, slopes.y, slopes.flux):
                 assert np.all(np.isfinite(values))
             assert not np.any(np.isnan(slopes.standard_error_x) | np.isnan(slopes.standard_error_y))
+            assert np.all(np.isfinite(slopes.covariance_xy))
             assert np.all((slopes.flags & INVALID == 0) | ((slopes.x == 0) & (slopes.y == 0)))
 
     def test_finds_the_centre_of_symmetric_spots(self) -> None:
@@ -177,5 +178,5 @@ def hostile_frames() -> list[NDArray[np.float32]]:
 
 def assert_same(one: Slopes, several: Slopes, frame: int) -> None:
     """Assert that the slopes of a frame measured among several equal those measured alone, bit for bit."""
-    for name in ("x", "y", "flux", "flags", "standard_error_x", "standard_error_y"):
+    for name in ("x", "y", "flux", "flags", "standard_error_x", "standard_error_y", "covariance_xy"):
         np.testing.assert_array_equal(getattr(one, name), getattr(several, name)[frame], err_msg=name)

@@ -79,7 +79,7 @@ class TestThresholded(EstimatorTests):
         wide = fs.SlopePipeline(layout, Thresholded(threshold_e=0.7), calibration)
         for width in (4, 8, 16):
             narrow = wide.with_width(width)(frames)
-            for field in (*FIELDS, "standard_error_x", "standard_error_y"):
+            for field in (*FIELDS, "standard_error_x", "standard_error_y", "covariance_xy"):
                 np.testing.assert_array_equal(getattr(narrow, field), getattr(wide(frames), field))
 
 

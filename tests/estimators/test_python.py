@@ -96,6 +96,19 @@ def test_what_is_not_usable_is_flagged_alone() -> None:
         assert np.all(np.isfinite(values))
 
 
+def test_a_covariance_counts_where_both_errors_are_known() -> None:
+    """And is at most their product."""
+
+    def locate(images: Any, sensor: Any) -> Any:
+        x, error = np.zeros(6), np.full(6, 0.1)
+        covariance = np.array([0.004, -0.02, np.nan, 0.004, 0.004, 0.0])
+        error[3] = np.inf
+        return Positions(x, x, standard_error_x=error, standard_error_y=error, covariance_xy=covariance)
+
+    slopes = pipeline(locate)(FRAME * BRIGHT)
+    np.testing.assert_allclose(slopes.covariance_xy, [0.004, -0.01, 0, 0, 0.004, 0], rtol=1e-6)
+
+
 def test_what_it_is_given_is_its_own() -> None:
     """Images may be written into; the reference positions may not."""
 

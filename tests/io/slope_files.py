@@ -36,6 +36,7 @@ def result(n_frames: int = 50, n_subapertures: int = 7) -> dict[str, NDArray[Any
         "bad_pixels": generator.integers(0, 9, shape).astype(np.int32),
         "standard_error_x": generator.exponential(0.1, shape).astype(np.float32),
         "standard_error_y": np.where(generator.random(shape) > 0.2, 0.1, np.inf).astype(np.float32),
+        "covariance_xy": generator.normal(scale=1e-3, size=shape).astype(np.float32),
     }
 
 

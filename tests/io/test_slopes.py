@@ -6,7 +6,7 @@ import shutil
 import sys
 import tracemalloc
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ from tests.io.slope_files import (
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.io import csv_files, open_frames, read_slopes, slopes_zarr
-from faintspot.io.slopes_format import VARIABLES
+from faintspot.io.slopes_format import VARIABLES, Variable
 
 ERRORS = ("standard_error_x", "standard_error_y")
 fits = pytest.importorskip("astropy.io.fits")
@@ -120,7 +120,7 @@ def test_csv_is_a_plain_table(tmp_path: Path) -> None:
     lines = (tmp_path / "slopes.csv").read_text().splitlines()
     assert lines[0] == (
         "frame,subaperture,x_px,y_px,flux_e,valid,flags,iterations,bad_pixels,"
-        "standard_error_x_px,standard_error_y_px"
+        "standard_error_x_px,standard_error_y_px,covariance_xy_px2"
     )
     assert len(lines) == 1 + 50 * 7
     assert lines[1 + 7 + 2].startswith("1,2,0.1,")
@@ -132,6 +132,17 @@ def test_standard_errors_that_are_not_given_are_infinite(tmp_path: Path, name: s
     write(tmp_path / name, {key: array for key, array in whole.items() if key not in ERRORS})
     unknown = np.full((50, 7), np.inf, np.float32)
     assert_stored(tmp_path / name, {**whole, **dict.fromkeys(ERRORS, unknown)})
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_file_without_covariances_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    whole = result()
+    with monkeypatch.context() as before:
+        before.delitem(cast("dict[str, Variable]", VARIABLES), "covariance_xy")
+        write(tmp_path / name, {key: array for key, array in whole.items() if key != "covariance_xy"})
+    assert_stored(tmp_path / name, {**whole, "covariance_xy": np.zeros((50, 7), np.float32)})
 
 
 def test_slopes_are_read_as_frames_by_name(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.simulated import frames_of
 
-from faintspot import InputError, Layout, MissingExtraError, Settings, SlopePipeline, Slopes
+from faintspot import Calibration, InputError, Layout, MissingExtraError, Settings, SlopePipeline, Slopes
 
 LAYOUT = Layout.grid((2, 3), pixels=8, pixel_scale_arcsec=0.5)
 
@@ -15,7 +15,8 @@ LAYOUT = Layout.grid((2, 3), pixels=8, pixel_scale_arcsec=0.5)
 @pytest.fixture(scope="module")
 def slopes() -> Slopes:
     frames, _ = frames_of(LAYOUT, 4, rng=np.random.default_rng(1))
-    return SlopePipeline(LAYOUT, Settings(estimator="brightest", keep_brightest=8))(frames)
+    settings, noise = Settings(estimator="brightest", keep_brightest=8), Calibration(read_noise_e=1.0)
+    return SlopePipeline(LAYOUT, settings, noise)(frames)
 
 
 def test_a_dataset_has_names_and_units(slopes: Slopes) -> None:
@@ -23,11 +24,13 @@ def test_a_dataset_has_names_and_units(slopes: Slopes) -> None:
     dataset = slopes.to_xarray(LAYOUT, unit="arcsec")
     assert dict(dataset.sizes) == {"frame": 4, "subaperture": 6}
     np.testing.assert_allclose(dataset.x, 0.5 * slopes.x)
+    assert slopes.covariance_xy.any()
+    np.testing.assert_allclose(dataset.covariance_xy, 0.25 * slopes.covariance_xy)
     np.testing.assert_array_equal(dataset.valid, slopes.valid)
     np.testing.assert_array_equal(dataset.centre_x, LAYOUT.centres[:, 0])
-    assert [dataset[name].attrs["units"] for name in ("x", "standard_error_y", "flux", "centre_y")] == [
+    assert [dataset[name].attrs["units"] for name in ("x", "covariance_xy", "flux", "centre_y")] == [
         "arcsec",
-        "arcsec",
+        "arcsec^2",
         "e-",
         "px",
     ]
@@ -42,7 +45,9 @@ def test_a_table_has_a_row_for_each_slope(slopes: Slopes) -> None:
     assert table.index.names == ["frame", "subaperture"]
     assert table.loc[(3, 5), "y_px"] == slopes.y[3, 5]
     assert table.loc[(3, 5), "centre_x_px"] == LAYOUT.centres[5, 0]
-    assert slopes.to_pandas(LAYOUT, unit="arcsec").loc[(2, 1), "x_arcsec"] == 0.5 * slopes.x[2, 1]
+    table = slopes.to_pandas(LAYOUT, unit="arcsec")
+    assert table.loc[(2, 1), "x_arcsec"] == 0.5 * slopes.x[2, 1]
+    assert table.loc[(2, 1), "covariance_xy_arcsec2"] == 0.25 * slopes.covariance_xy[2, 1]
     one = replace(slopes, **{name: values[0] for name, values in vars(slopes).items()})
     assert len(one.to_pandas()) == 6
 

@@ -323,7 +323,7 @@ def _true_slopes(vector: NDArray[np.float64]) -> Slopes:
     """Return slopes without an error."""
     x, y = vector.astype(np.float32).reshape(2, -1)
     zeros, counts = np.zeros(len(x), np.float32), np.zeros(len(x), np.int32)
-    return Slopes(x, y, zeros, np.zeros(len(x), np.uint8), counts, counts, zeros, zeros)
+    return Slopes(x, y, zeros, np.zeros(len(x), np.uint8), counts, counts, zeros, zeros, zeros)
 
 
 def _checked_schedule(

@@ -142,18 +142,25 @@ def make_standard_errors(strips: Strips) -> Any:
     def standard_errors(
         image: Any, left: Any, from_x: Any, from_y: Any, variance: Any, excess: Any, total: Any
     ) -> Any:
-        """`from_x` and `from_y`: of the thread's first pixel from the centre of gravity, px."""
+        """Return standard errors of x and y, and their correlation.
+
+        `from_x` and `from_y`: of the thread's first pixel from the centre of gravity, px.
+        """
         within = float32(1.0 / 12.0)  # of the flux in a pixel, where in it is not known: px^2
-        noise, noise_y = float32(0.0), float32(0.0)
+        noise, noise_y, first_y = float32(0.0), float32(0.0), float32(0.0)
         for r in range(rows):
             if left[r] != float32(0.0):
                 pixel = max(image[r], float32(0.0)) * excess + variance
                 away = from_y + float32(r)
                 noise += pixel
                 noise_y += pixel * (away * away + within)
+                first_y += pixel * away
         noise_x = warp_total(noise * (from_x * from_x + within))
         noise_y = warp_total(noise_y)
+        noise_xy = warp_total(first_y * from_x)
         inverse = float32(1.0) / total if total > float32(0.0) else float32(1.0)
-        return math.sqrt(noise_x) * inverse, math.sqrt(noise_y) * inverse
+        root_x, root_y = math.sqrt(noise_x), math.sqrt(noise_y)
+        both = root_x * root_y
+        return root_x * inverse, root_y * inverse, noise_xy / both if both > float32(0.0) else float32(0.0)
 
     return standard_errors

@@ -59,8 +59,11 @@ FEWEST_BLOCKS = 1 if simulated() else 128  # Numba warns of fewer; those without
 
 
 # Rows of the kernel's results (n_rows, n_frames, n_subapertures): float32, and int32.
-X, Y, FLUX, ERROR_X, ERROR_Y = range(5)
+X, Y, FLUX, ERROR_X, ERROR_Y, COVARIANCE = range(6)
 ITERATIONS, BAD_COUNT = range(2)
+
+LARGEST_ERROR_PX = 1e15
+"""Standard errors count as at most this in a covariance, which stays finite."""
 
 
 @device
@@ -98,7 +101,7 @@ def make_store(strips: Strips) -> Any:
         numbers: Any,
         flags: Any,
     ) -> None:
-        """`found`: flux, x, y; `errors`: of x and y."""
+        """`found`: flux, x, y; `errors`: of x and y, and their correlation."""
         total, x, y = found
         # A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
         illuminated = total > table[FLOOR, s] * brightest
@@ -116,6 +119,9 @@ def make_store(strips: Strips) -> Any:
         numbers[FLUX, f, s] = total
         numbers[ERROR_X, f, s] = scale * errors[0] if known else float32(math.inf)
         numbers[ERROR_Y, f, s] = scale * errors[1] if known else float32(math.inf)
+        limit = float32(LARGEST_ERROR_PX)
+        largest = min(numbers[ERROR_X, f, s], limit) * min(numbers[ERROR_Y, f, s], limit)
+        numbers[COVARIANCE, f, s] = within(errors[2], float32(1.0)) * largest if known else float32(0.0)
         flags[f, s] = bits
 
     return store
@@ -134,7 +140,7 @@ def make_locate(strips: Strips) -> Any:
     ) -> Any:
         """`tile`: the image before it was denoised; `away`: x and y of the thread's first pixel, px.
 
-        Return the largest magnitude, (flux, x, y), and the errors of x and y.
+        Return the largest magnitude, (flux, x, y), and the errors of x and y with their correlation.
         """
         low, high, total = extremes(image, present)
         threshold = table[LEVEL, s]
@@ -142,7 +148,7 @@ def make_locate(strips: Strips) -> Any:
             threshold = find_threshold(image, present, table[RANK, s], low, high, total)
         subtract(image, present, threshold, threshold * table[SUBTRACT, s])
         found = centroid(image, away[0], away[1])
-        errors = (float32(math.inf), float32(math.inf))
+        errors = (float32(math.inf), float32(math.inf), float32(0.0))
         if table[VARIANCE, s] >= float32(0.0):
             measured = cuda.local.array(rows, float32)
             recall(tile, top, column, present, measured)
@@ -168,7 +174,7 @@ def slopes_kernel(window: tuple[int, int], before: int, algorithm: bool | None, 
     frames (n_frames, h * w) uint16 or float32; w and places (n,), each window's first pixel, both int32;
     maps of dark and electrons per ADU (2, h * w), saturation, tables (n_variants, rows, n) and taps
     (n, 2, 1 + reach), inverse pivots (h * w,) for the denoising (`faintspot.kernels.flat_start`), all
-    float32; variants (n_frames,) int32; and writes numbers (5, n_frames, n) float32,
+    float32; variants (n_frames,) int32; and writes numbers (6, n_frames, n) float32,
     counts (2, n_frames, n) int32 and flags (n_frames, n) uint8.
 
     Raises

@@ -218,7 +218,7 @@ class Estimator(Options):
 
 
 class Positions(NamedTuple):
-    """Positions and, optionally, flux and standard errors returned by `locate`; each of shape (n,).
+    """Positions and, optionally, flux and errors returned by `locate`; each of shape (n,).
 
     Examples
     --------
@@ -236,6 +236,8 @@ class Positions(NamedTuple):
     standard_error_x: NDArray[Any] | None = None
     standard_error_y: NDArray[Any] | None = None
     valid: NDArray[np.bool_] | None = None
+    covariance_xy: NDArray[Any] | None = None
+    """Covariance of x and y [px^2]. Default: 0."""
 
 
 class EstimatorPlan:

@@ -171,3 +171,8 @@ class PythonPlan(EstimatorPlan):
         for error, result in zip(errors, (slopes.standard_error_x, slopes.standard_error_y), strict=True):
             known = False if error is None else valid & (error >= 0)
             result[frame] = np.where(known, scale * (0.0 if error is None else error), np.inf)
+        covariance = 0.0 if found.covariance_xy is None else found.covariance_xy
+        with np.errstate(invalid="ignore"):
+            limit = slopes.standard_error_x[frame].astype(np.float64) * slopes.standard_error_y[frame]
+            clipped = np.clip(scale**2 * covariance, -limit, limit)
+        slopes.covariance_xy[frame] = np.where(np.isfinite(limit) & np.isfinite(clipped), clipped, 0.0)

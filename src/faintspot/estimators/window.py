@@ -254,14 +254,14 @@ class _Plan(EstimatorPlan):
         table[window.HOME_X], table[window.HOME_Y] = (sensor.layout.offsets if fixed else sensor.zero).T
         photons = sensor.excess_noise * np.maximum(weights.mean_spot, 0.0)
         rows = zip(
-            (window.DARK_X, window.DARK_Y, window.DARK_FLUX),
-            (window.PHOTON_X, window.PHOTON_Y, window.PHOTON_FLUX),
-            (weights.x, weights.y, weights.flux),
+            (window.DARK_X, window.DARK_Y, window.DARK_FLUX, window.DARK_XY),
+            (window.PHOTON_X, window.PHOTON_Y, window.PHOTON_FLUX, window.PHOTON_XY),
+            (*map(np.square, (weights.x, weights.y, weights.flux)), weights.x * weights.y),
             strict=True,
         )
-        for dark, photon, maps in rows:
-            table[dark] = (self.pixel_variance * np.square(maps)[kinds]).sum(axis=(1, 2))
-            table[photon] = (photons * np.square(maps)).sum(axis=(1, 2))[kinds]
+        for dark, photon, products in rows:
+            table[dark] = (self.pixel_variance * products[kinds]).sum(axis=(1, 2))
+            table[photon] = (photons * products).sum(axis=(1, 2))[kinds]
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
         """See `EstimatorPlan`."""

@@ -1,7 +1,7 @@
 """Writing telemetry as a file of the Adaptive Optics Telemetry standard (AOT, FITS), with aotpy.
 
 Dimensions and units follow the documentation of aotpy 3 (https://pypi.org/project/aotpy/). AOT has fields for
-slopes, fluxes, frames and times. It has none for standard errors, flags, iterations, the interleaved
+slopes, fluxes, frames and times. It has none for errors of slopes, flags, iterations, the interleaved
 configurations and denoised images: these stay in the Zarr store.
 """
 

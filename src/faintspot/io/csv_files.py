@@ -9,7 +9,7 @@ import numpy as np
 
 from faintspot.base.files import check_file_size
 from faintspot.io.file_format import FileFormat
-from faintspot.io.slopes_format import UNITS, VARIABLES, StoredSlopes, most_slopes_bytes
+from faintspot.io.slopes_format import UNITS, VARIABLES, StoredSlopes, most_slopes_bytes, with_absent
 from faintspot.io.slopes_writer import ExistingOutput
 
 _LINES = 1 << 12
@@ -53,15 +53,18 @@ class Csv(FileFormat):
         unit = next((unit for unit in UNITS if column_name("x", unit) in names), "px")
         table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
         width = int(table[:, names.index("subaperture")].max()) + 1
-        variables = {
-            name: table[:, names.index(column_name(name, unit))].reshape(-1, width).astype(variable.dtype)
-            for name, variable in VARIABLES.items()
+        columns = {name: column_name(name, unit) for name in VARIABLES}
+        stored = {
+            name: table[:, names.index(column)].reshape(-1, width).astype(VARIABLES[name].dtype)
+            for name, column in columns.items()
+            if column in names
         }
+        variables = with_absent(stored)
         attributes = {} if unit == "px" else {"unit": unit}
         return StoredSlopes(variables, {}, attributes, True, len(variables["x"]))
 
 
 def column_name(name: str, unit: str) -> str:
     """Return the heading of a variable's column."""
-    column = VARIABLES[name].csv_name
-    return f"{column.removesuffix('_px')}_{unit}" if VARIABLES[name].units == "px" else column
+    variable = VARIABLES[name]
+    return variable.csv_name.replace("_px", f"_{unit}") if "px" in variable.units else variable.csv_name

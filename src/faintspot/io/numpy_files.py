@@ -15,7 +15,14 @@ from faintspot.base.npz import DAMAGE, Header, headers_of, open_archive, read_he
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import PREFERRED_NAME, StoredArray, choose_name, one_line
 from faintspot.io.raw import MOST_WHOLE_BYTES, MappedArray, RawArray, WholeArray, pieces
-from faintspot.io.slopes_format import REQUIRED, VARIABLES, StoredSlopes, check_stated, most_slopes_bytes
+from faintspot.io.slopes_format import (
+    REQUIRED,
+    VARIABLES,
+    StoredSlopes,
+    check_stated,
+    most_slopes_bytes,
+    with_absent,
+)
 
 
 class Npy(FileFormat):
@@ -97,7 +104,7 @@ class Npz(FileFormat):
         shapes.pop("attributes")
         check_stated(path, shapes)
         arrays = unpacked(path, "slopes", most=most_slopes_bytes())
-        variables = {name: arrays.pop(name) for name in VARIABLES}
+        variables = with_absent({name: arrays.pop(name) for name in VARIABLES if name in arrays})
         attributes = parse_json(str(arrays.pop("attributes")))
         return StoredSlopes(variables, arrays, attributes, True, len(variables["x"]))
 

@@ -15,7 +15,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import parse_json
 from faintspot.io.optional_packages import load_fits
 from faintspot.io.raw import open_plain_or_gzip, pieces
-from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, StoredSlopes, unit_of
+from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, StoredSlopes, unit_of, with_absent
 
 fits = load_fits()
 _BLOCK_BYTES = 2880
@@ -59,7 +59,8 @@ def read_fits(path: Path) -> StoredSlopes:
                     pass  # gzip verifies its checksum only at its end
         except Warning as warning:
             raise ValueError(str(warning)) from None
-    variables = {name: arrays.pop(name).astype(variable.dtype) for name, variable in VARIABLES.items()}
+    stored = {name: arrays.pop(name).astype(VARIABLES[name].dtype) for name in VARIABLES if name in arrays}
+    variables = with_absent(stored)
     attributes = parse_json(arrays.pop("attributes").tobytes())
     return StoredSlopes(variables, arrays, attributes, True, len(variables["x"]))
 

@@ -42,6 +42,9 @@ VARIABLES: Mapping[str, Variable] = {
     "standard_error_y": Variable(
         "float32", "px", "standard error of y, infinite where not known", "standard_error_y_px", np.inf
     ),
+    "covariance_xy": Variable(
+        "float32", "px^2", "covariance of the errors of x and y, 0 where not known", "covariance_xy_px2", 0.0
+    ),
 }
 
 REQUIRED = frozenset(name for name, variable in VARIABLES.items() if variable.if_absent is None)
@@ -62,7 +65,8 @@ class StoredSlopes:
     ----------
     variables : mapping
         x, y (px, or as attributes["unit"] says), flux (e-), valid, flags, iterations, bad_pixels,
-        standard_error_x, standard_error_y (as x), each (n_finished, n_subapertures).
+        standard_error_x, standard_error_y (as x), covariance_xy (its square), each
+        (n_finished, n_subapertures).
     coordinates : mapping
         Values per sub-aperture (n_subapertures,), such as centre_x and centre_y (px in the frame).
     attributes : mapping
@@ -113,8 +117,7 @@ def check_stated(path: Path, shapes: Mapping[str, tuple[int, ...]], n_frames: in
 
 def unit_of(name: str, attributes: Mapping[str, Any]) -> str:
     """Return the unit of a variable in a file with these attributes."""
-    units = VARIABLES[name].units
-    return str(attributes.get("unit", units)) if units == "px" else units
+    return VARIABLES[name].units.replace("px", str(attributes.get("unit", "px")))
 
 
 def pixels_in(unit: str, attributes: Mapping[str, Any]) -> float:
@@ -131,9 +134,12 @@ def pixels_in(unit: str, attributes: Mapping[str, Any]) -> float:
 
 
 def scaled_positions(variables: Mapping[str, NDArray[Any]], factor: float) -> dict[str, NDArray[Any]]:
-    """Return variables with positions and their errors multiplied by a factor."""
+    """Return variables with positions and their errors converted to pixels of another size."""
+    factors = {"px": np.float32(factor), "px^2": np.float32(factor**2)}
     return {
-        name: values * np.float32(factor) if factor != 1 and VARIABLES[name].units == "px" else values
+        name: values * factors[VARIABLES[name].units]
+        if factor != 1 and VARIABLES[name].units in factors
+        else values
         for name, values in variables.items()
     }
 
@@ -209,7 +215,7 @@ def checked_block(
     if not 0 < n <= run.n_frames - finished:
         raise InputError(f"slopes: expected 1 to {run.n_frames - finished} more frames, got {n}")
     arrays = {}
-    for name, values in _with_absent(block).items():
+    for name, values in with_absent(block).items():
         array = np.asarray(values)
         if array.shape != (n, run.n_subapertures):
             raise InputError(f"slopes: {name}: expected shape {(n, run.n_subapertures)}, got {array.shape}")
@@ -217,7 +223,7 @@ def checked_block(
     return arrays
 
 
-def _with_absent(found: Mapping[str, Any]) -> dict[str, Any]:
+def with_absent(found: Mapping[str, Any]) -> dict[str, Any]:
     """Return all variables in order, with defaults; raise KeyError when a required one is missing."""
     return {
         name: np.full(np.shape(found["x"]), variable.if_absent, variable.dtype)

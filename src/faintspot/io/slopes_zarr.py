@@ -28,6 +28,7 @@ from faintspot.io.slopes_format import (
     StoredSlopes,
     check_stated,
     unit_of,
+    with_absent,
 )
 from faintspot.io.slopes_writer import ExistingOutput
 from faintspot.io.zarr_store import (
@@ -177,7 +178,9 @@ def read_store(path: Path) -> StoredSlopes:
     stored = [name for name in (*VARIABLES, *coordinates) if name in group]
     check_stated(path, {name: group[name].shape for name in stored}, finished)
     return StoredSlopes(
-        variables={name: read_items(path, group[name], 0, finished) for name in VARIABLES},
+        variables=with_absent(
+            {name: read_items(path, group[name], 0, finished) for name in VARIABLES if name in group}
+        ),
         coordinates={name: read_items(path, group[name], 0, group[name].shape[0]) for name in coordinates},
         attributes=attributes,
         complete=complete,

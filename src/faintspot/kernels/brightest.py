@@ -28,8 +28,8 @@ THRESHOLD = 2  # out
 LARGEST = 3  # out: largest magnitude of the image
 SUM, X, Y = 4, 5, 6  # out: flux of what stays and its centre of gravity, px from the centre
 VARIANCE, EXCESS = 7, 8  # in: variance of a pixel that collects m electrons, VARIANCE + EXCESS m
-ERROR_X, ERROR_Y = 9, 10  # out: standard error of the centre of gravity, px
-LANE_ROWS = 11
+ERROR_X, ERROR_Y, COVARIANCE = 9, 10, 11  # out: standard errors of X and Y, px, and covariance, px^2
+LANE_ROWS = 12
 
 _COUNTING_PASSES = 24  # usually 5 to 8 are enough; outliers go on to the exact passes
 
@@ -245,7 +245,7 @@ def centre_of_gravity(lanes: Any, image: Any, ny: Any, nx: Any, lane_values: Any
 def centre_and_error(
     lanes: Any, measured: Any, variances: Any, place: Any, image: Any, ny: Any, nx: Any, lane_values: Any
 ) -> None:
-    """Write the centre of gravity and its standard error, the propagated noise of the remaining pixels.
+    """Write the centre of gravity and its errors: the propagated noise of the remaining pixels.
 
     That of a pixel is VARIANCE + EXCESS max(m, 0), with m as measured and, if given, `variances` in place of
     VARIANCE; `image` may be denoised.
@@ -256,7 +256,7 @@ def centre_and_error(
     offset = select(load(lanes, lane_values, SUBTRACT * width) > zero, threshold, zero)
     v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
     total, moment_x, moment_y = zero, zero, zero
-    noise, noise_x, noise_xx, noise_y, noise_yy = zero, zero, zero, zero, zero
+    noise, noise_x, noise_xx, noise_y, noise_yy, noise_xy = zero, zero, zero, zero, zero, zero
     for y in range(ny):
         row, row_x, part, part_x, part_xx = zero, zero, zero, zero, zero
         for x in range(nx):
@@ -272,11 +272,15 @@ def centre_and_error(
         line = _from_middle(lanes, y, ny)
         total, moment_x, moment_y = total + row, moment_x + row_x, multiply_add(row, line, moment_y)
         noise, noise_x, noise_xx = noise + part, noise_x + part_x, noise_xx + part_xx
+        noise_xy = multiply_add(part_x, line, noise_xy)
         away = part * line
         noise_y, noise_yy = noise_y + away, multiply_add(away, line, noise_yy)
     inverse = _store_centre(lanes, total, moment_x, moment_y, lane_values)
     _store_error(lanes, noise, noise_x, noise_xx, inverse, X, ERROR_X, lane_values)
     _store_error(lanes, noise, noise_y, noise_yy, inverse, Y, ERROR_Y, lane_values)
+    at_x, at_y = load(lanes, lane_values, X * width), load(lanes, lane_values, Y * width)
+    around = noise_xy - at_x * noise_y - at_y * (noise_x - at_x * noise)
+    store(lane_values, COVARIANCE * width, around * inverse * inverse)
 
 
 @compiled

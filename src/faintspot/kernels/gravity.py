@@ -12,6 +12,7 @@ from faintspot.kernels.compiling import compiled
 from faintspot.kernels.groups import (
     BACKGROUND,
     COMMON_ROWS,
+    COVARIANCE,
     DENOISED,
     ERROR_X,
     ERROR_Y,
@@ -106,6 +107,7 @@ def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
         (Y, brightest.Y),
         (ERROR_X, brightest.ERROR_X),
         (ERROR_Y, brightest.ERROR_Y),
+        (COVARIANCE, brightest.COVARIANCE),
     ):
         store(scratch.results, row * width, load(lanes, own.centroid, found * width))
     for lane in range(width):

@@ -37,9 +37,9 @@ ZERO_X, ZERO_Y, RANGE, MOST_BAD, VARIANCE, EXCESS, ERROR_SCALE = range(7)
 COMMON_ROWS = 7
 
 # Rows of a group's results (RESULT_ROWS, W): position (px from the window's middle), flux (e-), standard
-# errors.
-X, Y, FLUX, ERROR_X, ERROR_Y = range(5)
-RESULT_ROWS = 5
+# errors (px), covariance of x and y (px^2).
+X, Y, FLUX, ERROR_X, ERROR_Y, COVARIANCE = range(6)
+RESULT_ROWS = 6
 
 # Rows of explain's stages (n_rows, n_frames, n_subapertures, pixels).
 CALIBRATED, DENOISED, BACKGROUND = range(3)
@@ -128,6 +128,7 @@ class SlopeArrays(NamedTuple):
     bad_pixels: Any
     standard_error_x: Any
     standard_error_y: Any
+    covariance_xy: Any
 
 
 def new_scratch(lanes: Lanes, ny: int, nx: int, own: tuple[Any, ...] = ()) -> Scratch:
@@ -207,6 +208,15 @@ def store_slope(
 
 
 @compiled
+def store_covariance(f: Any, s: Any, settings: Any, covariance: Any, slopes: Any) -> None:
+    """Write the covariance of x and y, at most the product of the errors that `store_slope` wrote; or 0."""
+    largest = slopes.standard_error_x[f, s] * slopes.standard_error_y[f, s]
+    scale = settings[ERROR_SCALE, s]
+    clipped = min(max(-largest, scale * scale * covariance), largest)
+    slopes.covariance_xy[f, s] = clipped if largest < math.inf else 0.0
+
+
+@compiled
 def _store_group(width: Any, n: Any, group: Any, scratch: Any, slopes: Any) -> None:
     """Write the results of a group."""
     f, found = group.frame, scratch.results
@@ -226,6 +236,9 @@ def _store_group(width: Any, n: Any, group: Any, scratch: Any, slopes: Any) -> N
             scratch.flags[lane],
             slopes,
         )
+    # A loop of its own: together, they store too many arrays to be compiled to vectors.
+    for lane in range(min(width, n - group.first)):
+        store_covariance(f, group.first + lane, group.settings, found[COVARIANCE * width + lane], slopes)
 
 
 def locate(group: Any, tables: Any, scratch: Any, stages: Any) -> None:

@@ -28,6 +28,7 @@ from faintspot.kernels.simd import (
     width_of,
 )
 from faintspot.kernels.spot_rows import (
+    COVARIANCE,
     ERROR_X,
     ERROR_Y,
     EXCESS,
@@ -259,14 +260,15 @@ def _move(lanes: Any, lane_values: Any) -> None:
 
 @compiled
 def _store_errors(width: Any, lane: Any, flux: Any, lane_values: Any) -> None:
-    """Write what a lane's sums, made with light `flux`, say: the flux seen, and the standard errors.
+    """Write what a lane's sums, made with light `flux`, say: the flux seen, standard errors and covariance.
 
-    Those are the square roots of the diagonal of A^-1 (J + prior) A^-1, A = I + prior.
+    The covariance of x and y is A^-1 (J + prior) A^-1, A = I + prior.
     """
     prior = float(lane_values[PRIOR_WEIGHT * width + lane])
     iff = float(lane_values[I_FF * width + lane])
     lane_values[ERROR_X * width + lane] = math.inf
     lane_values[ERROR_Y * width + lane] = math.inf
+    lane_values[COVARIANCE * width + lane] = 0.0
     lane_values[SEEN * width + lane] = 0.0
     lane_values[SEEN_ERROR * width + lane] = math.inf
     if not iff > 0.0:
@@ -295,6 +297,8 @@ def _store_errors(width: Any, lane: Any, flux: Any, lane_values: Any) -> None:
     if vx > 0.0 and vy > 0.0:
         lane_values[ERROR_X * width + lane] = math.sqrt(vx)
         lane_values[ERROR_Y * width + lane] = math.sqrt(vy)
+        vxy = (axx * ayy + axy * axy) * bxy - axy * (ayy * bxx + axx * byy)
+        lane_values[COVARIANCE * width + lane] = vxy / (determinant * determinant)
 
 
 @compiled

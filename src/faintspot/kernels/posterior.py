@@ -25,6 +25,7 @@ from faintspot.kernels.spot_rows import (
     PRIOR_Y,
     SPACING,
     SPREAD_X,
+    SPREAD_XY,
     SPREAD_Y,
 )
 
@@ -73,7 +74,7 @@ def posterior_of_group(
     rows: Any,
     values: Any,
 ) -> None:
-    """Write mean and standard deviation of the posterior of the W spots of a group.
+    """Write mean, standard deviation and covariance of the posterior of the W spots of a group.
 
     Parameters
     ----------
@@ -119,7 +120,7 @@ def posterior_of_group(
                 value += constants[which[lane], i] - 0.5 * (away_x + away_y)
                 values[i] = value
                 largest = max(largest, value)
-        total, sum_x, sum_y, squares_x, squares_y = 0.0, 0.0, 0.0, 0.0, 0.0
+        total, sum_x, sum_y, squares_x, squares_y, products = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(n):
             if values[i] > largest - _NEGLIGIBLE:
                 x, y = float(grid[i, 0]), float(grid[i, 1])
@@ -130,6 +131,7 @@ def posterior_of_group(
                 sum_y += weight * y
                 squares_x += weight * x * x
                 squares_y += weight * y * y
+                products += weight * x * y
         known = total > 0.0 and total < math.inf
         inverse = 1.0 / total if known else 0.0
         # Without a point of the grid in reach, the prior is all there is: it is narrower than the grid.
@@ -140,4 +142,5 @@ def posterior_of_group(
         lane_values[MEAN_Y * width + lane] = min(max(low_y, y), high_y)
         lane_values[SPREAD_X * width + lane] = spread_x
         lane_values[SPREAD_Y * width + lane] = spread_y
+        lane_values[SPREAD_XY * width + lane] = products * inverse - x * y if known else 0.0
         lane_values[SPACING * width + lane] = spacing

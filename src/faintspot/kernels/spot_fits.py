@@ -375,6 +375,7 @@ def _sum_flux(group: Any, image: Any, lane_values: Any) -> None:
         s = min(first + lane, settings.shape[1] - 1)
         lane_values[spot_rows.ERROR_X * width + lane] = settings[TRAINED_ERROR_X, s]
         lane_values[spot_rows.ERROR_Y * width + lane] = settings[TRAINED_ERROR_Y, s]
+        lane_values[spot_rows.COVARIANCE * width + lane] = 0.0  # not trained
         variance = lane_values[spot_rows.VARIANCE * width + lane]
         excess = lane_values[spot_rows.EXCESS * width + lane]
         seen = lane_values[spot_rows.SEEN * width + lane]
@@ -409,16 +410,26 @@ def _begin_at_mean_or_peak(width: Any, lane_values: Any) -> None:
 
 @compiled
 def _keep_broad_posteriors(width: Any, lane_values: Any) -> None:
-    """Along an axis on which the posterior is broader than its grid, its mean and spread are the result."""
+    """Along an axis on which the posterior is broader than its grid, its mean and spread are the result.
+
+    If it is the only one, x and y stay as correlated as in the fit.
+    """
     for lane in range(width):
         fitted = lane_values[spot_rows.ERROR_X * width + lane] < math.inf
         broad = _BROAD * lane_values[spot_rows.SPACING * width + lane]
+        replaced, change = 0, np.float32(1.0)
         for axis in range(2):
             spread = lane_values[(spot_rows.SPREAD_X + axis) * width + lane]
             if spread > broad or not fitted:
                 mean = lane_values[(spot_rows.MEAN_X + axis) * width + lane]
+                change = spread / lane_values[(spot_rows.ERROR_X + axis) * width + lane]
                 lane_values[(spot_rows.X + axis) * width + lane] = mean
                 lane_values[(spot_rows.ERROR_X + axis) * width + lane] = spread
+                replaced += 1
+        covariance = change * lane_values[spot_rows.COVARIANCE * width + lane]
+        if replaced == 2:
+            covariance = lane_values[spot_rows.SPREAD_XY * width + lane]
+        lane_values[spot_rows.COVARIANCE * width + lane] = covariance
 
 
 @compiled
@@ -469,6 +480,7 @@ def _finish(group: Any, steps: Any, expects_flux: Any, scratch: Any) -> None:
         found[groups.Y * width + lane] = lane_values[spot_rows.Y * width + lane]
         found[groups.FLUX * width + lane] = flux if abs(flux) < math.inf else np.float32(0.0)
         found[groups.ERROR_X * width + lane], found[groups.ERROR_Y * width + lane] = error_x, error_y
+        found[groups.COVARIANCE * width + lane] = lane_values[spot_rows.COVARIANCE * width + lane]
 
 
 weighted_of_groups = driver_of(locate_weighted)

@@ -15,14 +15,16 @@ PRIOR_X, PRIOR_Y, PRIOR_WEIGHT = range(14, 17)
 SCORE_X, SCORE_Y, SCORE_F = range(17, 20)
 I_XX, I_YY, I_FF, I_XY, I_XF, I_YF = range(20, 26)
 J_XX, J_YY, J_FF, J_XY, J_XF, J_YF = range(26, 32)
-# Out: standard errors, px; flux that the image itself gives, whatever was expected, and its standard error.
-ERROR_X, ERROR_Y, SEEN, SEEN_ERROR = range(32, 36)
+# Out: standard errors, px, and covariance of x and y, px^2; flux that the image itself gives, whatever was
+# expected, and its standard error.
+ERROR_X, ERROR_Y, COVARIANCE, SEEN, SEEN_ERROR = range(32, 37)
 # In: what a spot's peak, smoothed, has of its flux; factor on the steps of the weighted centre of gravity.
-START_FLUX, GAIN_X, GAIN_Y = range(36, 39)
-# Of the posterior on a grid of positions: mean, standard deviation, px, and the grid's spacing.
-MEAN_X, MEAN_Y, SPREAD_X, SPREAD_Y, SPACING = range(39, 44)
+START_FLUX, GAIN_X, GAIN_Y = range(37, 40)
+# Of the posterior on a grid of positions: mean, standard deviation, px, covariance, px^2, and the grid's
+# spacing.
+MEAN_X, MEAN_Y, SPREAD_X, SPREAD_Y, SPREAD_XY, SPACING = range(40, 46)
 # Where the smoothed image peaks, and the flux that it shows there.
-PEAK_X, PEAK_Y, PEAK_FLUX = range(44, 47)
+PEAK_X, PEAK_Y, PEAK_FLUX = range(46, 49)
 # In: the largest move of one step, px. Out: the larger of the moves along x and y in the last two steps, px.
-LARGEST_MOVE, MOVE, MOVE_BEFORE = range(47, 50)
-LANE_ROWS = 50
+LARGEST_MOVE, MOVE, MOVE_BEFORE = range(49, 52)
+LANE_ROWS = 52

@@ -14,7 +14,7 @@ import numpy as np
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.gravity import FLOOR, LEVEL, gravity_of_groups, lightless
-from faintspot.kernels.groups import EXCESS, SATURATED, VARIANCE, store_slope
+from faintspot.kernels.groups import EXCESS, SATURATED, VARIANCE, store_covariance, store_slope
 from faintspot.kernels.pixel_noise import variance_of
 from faintspot.kernels.row_driver import rows_driver_of
 from faintspot.kernels.simd import (
@@ -62,7 +62,7 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
     one = splat(pixels, 1.0)
     spoilt, brightest, largest = zero, splat(pixels, -math.inf), zero
     total, moment_x, moment_y = zero, zero, zero
-    noise, noise_x, noise_xx, noise_y, noise_yy = zero, zero, zero, zero, zero
+    noise, noise_x, noise_xx, noise_y, noise_yy, noise_xy = zero, zero, zero, zero, zero, zero
     for x in range(0, nx, width):
         column = load(pixels, ramp, x)
         flux, flux_y, part, part_y, part_yy = zero, zero, zero, zero, zero
@@ -90,11 +90,12 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
         part_x = part * column
         noise_x = noise_x + part_x
         noise_xx = multiply_add(part_x, column, noise_xx)
+        noise_xy = multiply_add(part_y, column, noise_xy)
     good = select(spoilt >= zero, select(largest <= splat(pixels, LARGEST_FLOAT32), zero, one), one)
     if any_lane(good > zero):
         return False
     flux = sum_of(total)
-    position_x = position_y = deviation_x = deviation_y = np.float32(0.0)
+    position_x = position_y = deviation_x = deviation_y = covariance = np.float32(0.0)
     if flux > 0.0:
         scale = np.float32(1.0) / flux
         position_x, position_y = sum_of(moment_x) * scale, sum_of(moment_y) * scale
@@ -107,11 +108,16 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
         around = multiply_add(noise_y, here, noise_yy)
         around = multiply_add(noise, splat(pixels, position_y * position_y + _WITHIN), around)
         deviation_y = _root(sum_of(around)) * scale
+        around = multiply_add(noise_x, splat(pixels, -position_y), noise_xy)
+        around = multiply_add(noise_y, splat(pixels, -position_x), around)
+        around = multiply_add(noise, splat(pixels, position_x * position_y), around)
+        covariance = sum_of(around) * scale * scale
     bits = SATURATED if any_lane(brightest >= splat(pixels, source.saturation)) else 0
     bits |= lightless(ny, nx, bits, flux, settings[FLOOR, s] * largest_of(largest), position_x, position_y)
     slopes.iterations[f, s] = slopes.bad_pixels[f, s] = 0
     slopes.flux[f, s] = flux
     store_slope(f, s, settings, position_x, position_y, deviation_x, deviation_y, bits, slopes)
+    store_covariance(f, s, settings, covariance, slopes)
     return True
 
 

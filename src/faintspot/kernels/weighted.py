@@ -20,6 +20,7 @@ from faintspot.kernels.simd import (
     width_of,
 )
 from faintspot.kernels.spot_rows import (
+    COVARIANCE,
     ERROR_X,
     ERROR_Y,
     EXCESS,
@@ -94,7 +95,7 @@ def _store_errors(
     zero = splat(lanes, 0.0)
     v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
     x0, y0 = load(lanes, lane_values, X * width), load(lanes, lane_values, Y * width)
-    total, noise_x, noise_y, noise, dark_x, dark_y = zero, zero, zero, zero, zero, zero
+    total, noise_x, noise_y, noise_xy, noise, dark_x, dark_y = zero, zero, zero, zero, zero, zero, zero
     for y in range(ny):
         weight_y = load(lanes, profiles, (2 * padded + y) * width)
         away_y = splat(lanes, y - 0.5 * (ny - 1)) - y0
@@ -109,6 +110,7 @@ def _store_errors(
             noise = noise + variance
             noise_x = multiply_add(variance * away_x, away_x, noise_x)
             noise_y = multiply_add(variance * away_y, away_y, noise_y)
+            noise_xy = multiply_add(variance * away_x, away_y, noise_xy)
             dark = square * relative_variance(lanes, variances, place + at, v)
             dark_x = multiply_add(dark * away_x, away_x, dark_x)
             dark_y = multiply_add(dark * away_y, away_y, dark_y)
@@ -124,6 +126,7 @@ def _store_errors(
     error_y = gain_y * gain_y * inverse * inverse * noise_y
     store(lane_values, ERROR_X * width, select(illuminated, error_x, unknown))
     store(lane_values, ERROR_Y * width, select(illuminated, error_y, unknown))
+    store(lane_values, COVARIANCE * width, gain_x * gain_y * inverse * inverse * noise_xy)
     store(lane_values, SEEN * width, total)
     store(lane_values, SEEN_ERROR * width, maximum(noise, least))
     for lane in range(width):

@@ -21,6 +21,7 @@ from faintspot.kernels.groups import (
     SATURATED,
     TOO_MANY_BAD_PIXELS,
     driver_of,
+    store_covariance,
     store_slope,
 )
 from faintspot.kernels.row_driver import rows_driver_of
@@ -41,10 +42,12 @@ from faintspot.kernels.simd import (
 
 # Rows of the settings' table that follow the common ones: what the sums are divided by (0: the frame's own
 # flux; negative: not measurable); position of a sum of 0; what a flux of 1 e- at the reference adds to the
-# sums; variance of the sums in the dark and for a flux of 1 e-; the same of the flux under the weights.
+# sums; variance of the sums in the dark and for a flux of 1 e-; the same of the flux under the weights;
+# covariance of the sums.
 DIVISOR, HOME_X, HOME_Y, OFFSET_X, OFFSET_Y = range(COMMON_ROWS, COMMON_ROWS + 5)
 DARK_X, DARK_Y, PHOTON_X, PHOTON_Y, DARK_FLUX, PHOTON_FLUX = range(COMMON_ROWS + 5, COMMON_ROWS + 11)
-SETTING_ROWS = COMMON_ROWS + 11
+DARK_XY, PHOTON_XY = range(COMMON_ROWS + 11, COMMON_ROWS + 13)
+SETTING_ROWS = COMMON_ROWS + 13
 
 X, Y, FLUX = range(3)
 """Indices of the weights of a pixel."""
@@ -110,7 +113,7 @@ def locate_window(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     store(found, groups.FLUX * width, flux)
     for lane in range(width):
         s = min(group.first + lane, group.settings.shape[1] - 1)
-        x, y, seen, error_x, error_y, usable = _solved(
+        x, y, seen, error_x, error_y, covariance, usable = _solved(
             group.settings,
             s,
             found[groups.X * width + lane],
@@ -120,6 +123,7 @@ def locate_window(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
         found[groups.X * width + lane], found[groups.Y * width + lane] = x, y
         found[groups.FLUX * width + lane] = seen
         found[groups.ERROR_X * width + lane], found[groups.ERROR_Y * width + lane] = error_x, error_y
+        found[groups.COVARIANCE * width + lane] = covariance
         if not usable and not scratch.flags[lane] & TOO_MANY_BAD_PIXELS:
             scratch.flags[lane] |= NO_FLUX
         scratch.iterations[lane] = 0
@@ -127,7 +131,7 @@ def locate_window(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
 
 @compiled
 def _solved(settings: Any, s: Any, sum_x: Any, sum_y: Any, seen: Any) -> Any:
-    """Turn sums into position, flux, standard errors, and whether they are good for anything."""
+    """Return position, flux, standard errors, covariance, and whether they are good for anything."""
     divisor = settings[DIVISOR, s]
     flux = divisor
     usable = divisor > 0.0
@@ -142,8 +146,9 @@ def _solved(settings: Any, s: Any, sum_x: Any, sum_y: Any, seen: Any) -> Any:
     y = settings[HOME_Y, s] + (sum_y * inverse - settings[OFFSET_Y, s])
     error_x = math.sqrt(settings[DARK_X, s] + settings[PHOTON_X, s] * flux) * inverse
     error_y = math.sqrt(settings[DARK_Y, s] + settings[PHOTON_Y, s] * flux) * inverse
+    covariance = (settings[DARK_XY, s] + settings[PHOTON_XY, s] * flux) * (inverse * inverse)
     usable = usable and abs(x) + abs(y) + error_x + error_y < math.inf
-    return x, y, seen if abs(seen) < math.inf else np.float32(0.0), error_x, error_y, usable
+    return x, y, seen if abs(seen) < math.inf else np.float32(0.0), error_x, error_y, covariance, usable
 
 
 window_of_groups = driver_of(locate_window)
@@ -179,7 +184,7 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
     if any_lane(bad > zero):
         return False
     dark = tables.dark[s]
-    x, y, seen, error_x, error_y, usable = _solved(
+    x, y, seen, error_x, error_y, covariance, usable = _solved(
         settings, s, sum_of(sum_x) - dark[X], sum_of(sum_y) - dark[Y], sum_of(flux) - dark[FLUX]
     )
     bits = SATURATED if any_lane(brightest >= splat(pixels, source.saturation)) else 0
@@ -187,6 +192,7 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
     slopes.iterations[f, s] = slopes.bad_pixels[f, s] = 0
     slopes.flux[f, s] = seen
     store_slope(f, s, settings, x, y, error_x, error_y, bits, slopes)
+    store_covariance(f, s, settings, covariance, slopes)
     return True
 
 

@@ -13,6 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.cuda.flat_start import inverse_pivots
 from faintspot.cuda.fused import (
     BAD_COUNT,
+    COVARIANCE,
     ERROR_X,
     ERROR_Y,
     FEWEST_BLOCKS,
@@ -56,6 +57,7 @@ class DeviceSlopes:
     bad_pixels: Any
     standard_error_x: Any
     standard_error_y: Any
+    covariance_xy: Any
 
 
 @dataclass(frozen=True)
@@ -72,14 +74,14 @@ class Results:
     def within(cls, memory: Any, n_frames: int, n: int) -> Results:
         """Lay out memory of `size_of` bytes, on the host or on the GPU."""
         size = n_frames * n
-        numbers = memory[: 20 * size].view(np.float32).reshape(5, n_frames, n)
-        counts = memory[20 * size : 28 * size].view(np.int32).reshape(2, n_frames, n)
-        return cls(memory, numbers, counts, memory[28 * size : 29 * size].reshape(n_frames, n))
+        numbers = memory[: 24 * size].view(np.float32).reshape(6, n_frames, n)
+        counts = memory[24 * size : 32 * size].view(np.int32).reshape(2, n_frames, n)
+        return cls(memory, numbers, counts, memory[32 * size : 33 * size].reshape(n_frames, n))
 
     @staticmethod
     def size_of(n_frames: int, n: int) -> int:
         """Return the number of bytes for n_frames frames of n sub-apertures."""
-        return 29 * n_frames * n
+        return 33 * n_frames * n
 
     def slopes(self) -> DeviceSlopes:
         """Return the results by name, as views."""
@@ -93,6 +95,7 @@ class Results:
             counts[BAD_COUNT],
             numbers[ERROR_X],
             numbers[ERROR_Y],
+            numbers[COVARIANCE],
         )
 
 

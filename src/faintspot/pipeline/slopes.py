@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from faintspot.sensor.layout import Layout
 
-RESULT_TYPES = tuple(map(np.dtype, ("f4", "f4", "f4", "u1", "i4", "i4", "f4", "f4")))
+RESULT_TYPES = tuple(map(np.dtype, ("f4", "f4", "f4", "u1", "i4", "i4", "f4", "f4", "f4")))
 
 
 @dataclass(frozen=True, repr=False)
@@ -56,6 +56,9 @@ class Slopes:
     standard_error_x: NDArray[np.float32]
     """Standard error of x [px]; infinite where invalid, and where the read noise is unknown."""
     standard_error_y: NDArray[np.float32]
+    covariance_xy: NDArray[np.float32]
+    """Covariance of the errors of x and y [px^2]; 0 where a standard error is infinite, and for an estimator
+    that does not know it (`trained`)."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:

@@ -197,5 +197,7 @@ def _slopes(telemetry: Telemetry) -> dict[str, Slopes]:
     found = {}
     for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
         own = {of: getattr(telemetry, of)[telemetry.method == method] for of in names}
-        found[name] = Slopes(**own, bad_pixels=np.zeros(own["x"].shape, np.int32))
+        shape = own["x"].shape
+        absent = {"bad_pixels": np.zeros(shape, np.int32), "covariance_xy": np.zeros(shape, np.float32)}
+        found[name] = Slopes(**own, **absent)
     return found

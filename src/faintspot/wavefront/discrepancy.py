@@ -81,9 +81,13 @@ def slope_discrepancy(slopes: Slopes, layout: Layout) -> Discrepancy:
     errors = np.concatenate(
         [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
     )[:, used].astype(np.float64)
+    covariance = np.atleast_2d(slopes.covariance_xy)[:, used[: len(used) // 2]].astype(np.float64)
     degrees = others.shape[1]
     with np.errstate(invalid="ignore"):
-        expected = np.sqrt((errors**2) @ (others**2).sum(axis=1) / degrees)
+        squares = (errors**2) @ (others**2).sum(axis=1)
+        x, y = np.split(others, 2)
+        squares += 2 * covariance @ (x * y).sum(axis=1)
+        expected = np.sqrt(squares / degrees)
     found = vector[:, used] @ others
     rms = np.sqrt((found**2).sum(axis=1) / degrees)
     return Discrepancy(rms, np.where(np.isfinite(expected), expected, np.nan), degrees)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,8 +163,9 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     )
     used = np.tile(valid, 2)
     known = bool(np.isfinite(errors[used]).all())
+    noise = np.square(errors, dtype=np.float64), np.atleast_2d(slopes.covariance_xy).astype(np.float64)
     measured = np.concatenate([x, y], axis=1).astype(np.float64)
-    coefficients, standard_errors, residual = _fit(measured, used, gradients, errors if known else None)
+    coefficients, standard_errors, residual = _fit(measured, used, gradients, noise if known else None)
     return Wavefront(
         np.arange(2, 2 + gradients.shape[1]),
         scale * coefficients,
@@ -217,12 +217,12 @@ def _condition(gradients: Floats) -> float:
 
 
 def _fit(
-    slopes: Floats, valid: NDArray[np.bool_], gradients: Floats, errors: NDArray[Any] | None
+    slopes: Floats, valid: NDArray[np.bool_], gradients: Floats, noise: tuple[Floats, Floats] | None
 ) -> tuple[Floats, Floats, Floats]:
     """Return coefficients, their standard errors and the residuals' rms, for a radius and px of 1.
 
-    Frames with the same valid sub-apertures share one pseudo-inverse. Without standard errors of the slopes,
-    they are estimated from the residuals.
+    Frames with the same valid sub-apertures share one pseudo-inverse. `noise` are the slopes' variances, all
+    x, then all y, and the covariances of x and y; without it, it is estimated from the residuals.
     """
     frames, k = len(slopes), gradients.shape[1]
     coefficients, standard_errors = np.full((frames, k), np.nan), np.full((frames, k), np.nan)
@@ -240,11 +240,15 @@ def _fit(
         coefficients[which] = fitted
         residual[which] = np.sqrt(np.mean(left**2, axis=1))
         freedom = measured.shape[1] - k
-        if errors is not None:
-            variance = errors[np.ix_(which, used)].astype(np.float64) ** 2
+        if noise is not None:
+            along, across = np.split(inverse, 2, axis=1)
+            variance = noise[0][np.ix_(which, used)] @ (inverse**2).T
+            both = noise[1][np.ix_(which, used[: len(used) // 2])]
+            variance = variance + 2 * both @ (along * across).T
         elif freedom > 0:
-            variance = np.broadcast_to(np.sum(left**2, axis=1, keepdims=True) / freedom, measured.shape)
+            of_slopes = np.sum(left**2, axis=1, keepdims=True) / freedom
+            variance = of_slopes * np.sum(inverse**2, axis=1)
         else:
             continue
-        standard_errors[which] = np.sqrt(variance @ (inverse**2).T)
+        standard_errors[which] = np.sqrt(variance)
     return coefficients, standard_errors, residual

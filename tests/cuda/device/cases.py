@@ -58,6 +58,9 @@ def assert_near(case: Case, found: fs.Slopes, expected: fs.Slopes) -> None:
                 left, right = getattr(found, name)[s], getattr(expected, name)[s]
                 # A pixel at the threshold may be left or not; it then counts with its own noise.
                 assert left == right or abs(left - right) <= 0.02 * right
+            largest = expected.standard_error_x[s] * expected.standard_error_y[s]
+            assert abs(found.covariance_xy[s] - expected.covariance_xy[s]) <= 0.04 * min(largest, 1e9)
     for name in ("x", "y", "flux"):
         assert np.all(np.isfinite(getattr(found, name)))
     assert not np.any(np.isnan(found.standard_error_x) | np.isnan(found.standard_error_y))
+    assert np.all(np.isfinite(found.covariance_xy))
