@@ -96,7 +96,9 @@ class Rival:
         """See `Controller`."""
         self._predictor.reset()
 
-    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
         """See `Controller`."""
         line, modes = self._line, self._plant.reconstructor.modes
         open_loop = slopes_px - self._plant.interaction @ line.acting

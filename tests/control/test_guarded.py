@@ -26,7 +26,7 @@ class Runaway:
     def expected(self) -> Expected:
         return Expected(np.zeros(18), None)
 
-    def update(self, slopes_px: np.ndarray, standard_error_px: np.ndarray) -> None:
+    def update(self, slopes_px: np.ndarray, standard_error_px: np.ndarray, covariance: object = None) -> None:
         self._line.put(0.9 * self._line.latest + 0.4 * (PLANT.reconstructor(slopes_px)))
 
 

@@ -253,8 +253,11 @@ class _Loop:
         self._observe(frame, time, after)
         slopes = self._measure(frame, seen)
         error = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
-        vector = slopes.vector.astype(np.float64) / self.divisors[number]
-        self.controllers[number].update(vector, error.astype(np.float64) / self.divisors[number])
+        per_px = 1 / self.divisors[number]
+        vector, covariance = (each.astype(np.float64) for each in (slopes.vector, slopes.covariance_xy))
+        self.controllers[number].update(
+            vector * per_px, error.astype(np.float64) * per_px, covariance * per_px**2
+        )
         self.slopes[frame], self.errors[frame] = slopes.vector, error
         self.valid[frame], self.commands[frame] = slopes.valid, commands
 

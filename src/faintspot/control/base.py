@@ -28,7 +28,7 @@ class Controller(Protocol):
 
     In every frame first `expected`, for those who want to know, then `update`. Slopes are residual ones, in
     true pixels from the reference, all x, then all y; a standard error that is infinite means that a slope
-    was not measured.
+    was not measured. Covariances of x and y of the sub-apertures, (n,), count where a controller says so.
     """
 
     @property
@@ -41,5 +41,7 @@ class Controller(Protocol):
     def begin(self) -> None:
         """Restart from the commands on the delay line, without the memory of earlier frames."""
 
-    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
         """Compute a command from this frame's slopes and send it."""

@@ -179,8 +179,10 @@ class CompiledIntegrator:
     def begin(self) -> None:
         """See `Controller`; the delay line is the only state."""
 
-    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
-        """See `Controller`; invalid slopes are 0."""
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
+        """See `Controller`; invalid slopes are 0, and all count the same."""
         line = self._line
         numbers = self.gain, self._keep, line.largest
         line.sent(_INTEGRATE(slopes_px, self._columns, *numbers, line.rows, line.place))

@@ -148,8 +148,10 @@ class CompiledKalman:
         self._memory.guard[FRAMES:] = 0.0
         self._is_behind, self._held_at = False, -1
 
-    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
-        """See `Controller`.
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
+        """See `Controller`; noise of x and y is taken to be independent.
 
         Raises
         ------

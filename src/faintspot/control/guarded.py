@@ -86,17 +86,22 @@ class Guarded:
             controller.begin()
         self._difference[:], self._frames = 0.0, 0
 
-    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
         """See `Controller`."""
         expected = self.expected().mean_px
         alone, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
         open_loop = alone - self._interaction @ self._line.acting
         error = np.sqrt(self._noise_factor * variance)
+        covariance = None  # of an estimator with a prior, that of the frame alone is not known
+        if covariance_xy_px2 is not None and self.prior_std_px is None:
+            covariance = self._noise_factor * covariance_xy_px2
         left = []
         for controller, line in zip(self.controllers, self._lines, strict=True):
             residual = open_loop + self._interaction @ line.acting
             left.append(float(np.square(self._phase @ (trust * residual)).sum()))
-            controller.update(as_estimated(residual, trust, controller), error)
+            controller.update(as_estimated(residual, trust, controller), error, covariance)
         self._line.put(self._lines[self.chosen].latest)
         self._choose((left[0] - left[1]) / max(left[0] + left[1], 1e-30))
 

@@ -26,7 +26,7 @@ class Integrator:
     leak : float
         Part of the command that is forgotten in every frame, so that a loop that has lost the star returns.
     weighted : bool
-        Whether slopes count by their standard errors.
+        Whether slopes count by their standard errors and covariances.
     sees_mirror : bool
         Whether the sensor is behind the mirror. If not (open loop), the command follows the running mean of
         the wavefront.
@@ -58,10 +58,12 @@ class Integrator:
     def begin(self) -> None:
         """See `Controller`; the delay line is the only state."""
 
-    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
         """See `Controller`."""
         if self._weighted:
-            wavefront = self._reconstructor.weighted(slopes_px, standard_error_px)
+            wavefront = self._reconstructor.weighted(slopes_px, standard_error_px, covariance_xy_px2)
         else:
             wavefront = self._reconstructor(slopes_px)
         self.follow(wavefront)

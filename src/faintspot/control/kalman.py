@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.models import SlopeModel
+from faintspot.control.noise import add_noise
 
 Floats = NDArray[np.float64]
 
@@ -79,8 +80,13 @@ class SlopePredictor:
         """Restart from constant open-loop slopes."""
         self._of_layers[:] = shares(self.model)[:, None, None] * slopes_px
 
-    def correct(self, slopes_px: Floats, variance_px2: Floats) -> None:
-        """Update with the measured open-loop slopes of this frame; infinite variance: invalid."""
+    def correct(
+        self, slopes_px: Floats, variance_px2: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
+        """Update with the measured open-loop slopes of this frame; infinite variance: invalid.
+
+        `covariance_xy_px2` (m / 2,) are covariances of the noise of x and y; a steady filter has none.
+        """
         surprise = slopes_px - self.mean_px
         if self._steady:
             surprise[~np.isfinite(variance_px2)] = 0.0
@@ -89,7 +95,7 @@ class SlopePredictor:
             variance = np.minimum(variance_px2, LARGEST_VARIANCE_PX2)
             surprise[variance >= LARGEST_VARIANCE_PX2] = 0.0
             total = self.predicted_px2.copy()
-            total[np.diag_indices(len(total))] += variance
+            add_noise(total, variance, covariance_xy_px2)
             np.matmul(self.with_slopes, np.linalg.solve(total, surprise), out=self._correction)
         self.state += self._correction
 

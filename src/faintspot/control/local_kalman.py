@@ -64,8 +64,13 @@ class LocalPredictor:
         of_each = slopes_px.reshape(2, -1).T
         self._state[:-1] = self._shares[:, None] * of_each[:, None, None, :]
 
-    def correct(self, slopes_px: Floats, variance_px2: Floats) -> None:
-        """Update with the measured open-loop slopes of this frame; infinite variance: invalid."""
+    def correct(
+        self, slopes_px: Floats, variance_px2: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
+        """Update with the measured open-loop slopes of this frame; infinite variance: invalid.
+
+        Noise of x and y is taken to be independent.
+        """
         measured = variance_px2 < LARGEST_VARIANCE_PX2
         surprise = np.where(measured, slopes_px - self.mean_px, 0.0)
         self._surprise[:-1] = surprise.reshape(2, -1).T

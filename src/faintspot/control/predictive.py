@@ -9,6 +9,7 @@ from faintspot.control.base import Expected
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.kalman import LARGEST_VARIANCE_PX2, SlopePredictor
 from faintspot.control.local_kalman import LocalPredictor
+from faintspot.control.noise import add_noise
 
 Floats = NDArray[np.float64]
 
@@ -16,8 +17,9 @@ Floats = NDArray[np.float64]
 class PseudoOpenLoop:
     """Pseudo-open-loop control: maximum a posteriori wavefront from open-loop slopes.
 
-    Gilles 2005, Appl. Opt. 44, 993. Slopes count by their variance in each frame. As a gain g averages over
-    frames, the reconstructor is that for their noise in the mean, g / (2 - g) of a frame's.
+    Gilles 2005, Appl. Opt. 44, 993. Slopes count by their noise in each frame, x and y by their
+    covariance. As a gain g averages over frames, the reconstructor is that for their noise in the mean,
+    g / (2 - g) of a frame's.
 
     Parameters
     ----------
@@ -54,12 +56,15 @@ class PseudoOpenLoop:
     def begin(self) -> None:
         """See `Controller`; the delay line is the only state."""
 
-    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
         """See `Controller`."""
         line, gain = self._line, self._gain
         variance = np.minimum(np.square(standard_error_px), LARGEST_VARIANCE_PX2)
         noisy = self._now.copy()
-        noisy[np.diag_indices(len(noisy))] += variance * gain / (2 - gain)
+        share = gain / (2 - gain)
+        add_noise(noisy, share * variance, None if covariance_xy_px2 is None else share * covariance_xy_px2)
         wavefront = self._ahead @ np.linalg.solve(noisy, slopes_px - self._interaction @ line.acting)
         line.put((1 - gain) * line.latest - gain * wavefront)
 
@@ -97,9 +102,11 @@ class Predictive:
         """See `Controller`; open-loop slopes are assumed to equal the mirror's correction."""
         self.predictor.begin(-(self._interaction @ self._line.latest))
 
-    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
         """See `Controller`."""
         open_loop = slopes_px - self._interaction @ self._line.acting
-        self.predictor.correct(open_loop, np.square(standard_error_px))
+        self.predictor.correct(open_loop, np.square(standard_error_px), covariance_xy_px2)
         self._line.put(-self._reconstruct @ self.predictor.ahead(self._line.delay_frames))
         self.predictor.advance()

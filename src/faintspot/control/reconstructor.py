@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
+from faintspot.control.noise import weighted_slopes
 
 Floats = NDArray[np.float64]
 
@@ -35,18 +36,25 @@ class Reconstructor:
         """Return the commands in the unit of the interaction matrix."""
         return self.matrix @ slopes
 
-    def weighted(self, slopes: Floats, standard_error: Floats) -> Floats:
-        """Return the commands by weighted least squares, with inverse variances as weights.
+    def weighted(self, slopes: Floats, standard_error: Floats, covariance_xy: Floats | None = None) -> Floats:
+        """Return the commands by weighted least squares, weighted with the inverse covariance of the noise.
 
         Regularised like `matrix`, which it is where all errors are the same.
+
+        Parameters
+        ----------
+        slopes, standard_error : (2 n,) array
+            All x, then all y; a slope whose error is not finite or 0 does not count.
+        covariance_xy : (n,) array, optional
+            Covariance of x and y of each sub-aperture. Default: 0.
         """
-        variance = np.square(np.where(np.isfinite(standard_error), standard_error, np.inf))
+        variance = np.square(standard_error)
         usable = np.isfinite(variance) & (variance > 0)
         if not usable.any():
             return np.zeros(len(self.modes))
-        weight = np.where(usable, 1 / np.where(usable, variance, 1.0), 0.0)
-        weight /= weight.mean()  # as many slopes as without weights
-        return self.modes @ (_estimator(self.slopes_of_modes, weight) @ slopes)
+        weighted = weighted_slopes(self.slopes_of_modes, variance, covariance_xy)
+        weighted *= usable.size / np.sum(1 / variance[usable])  # as many slopes as without weights
+        return self.modes @ (_estimator(self.slopes_of_modes, weighted) @ slopes)
 
 
 def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) -> Reconstructor:
@@ -83,17 +91,15 @@ def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) 
     left, size, right = np.linalg.svd(matrix, full_matrices=False)
     driven = size * limit >= size[0]
     modes, seen = right[driven].T, left[:, driven] * size[driven]
-    equal = np.ones(slopes)
-    plain, clean = (modes @ _estimator(seen, equal, ridge) for ridge in (_RIDGE, _RIDGE_CLEAN))
+    plain, clean = (modes @ _estimator(seen, seen, ridge) for ridge in (_RIDGE, _RIDGE_CLEAN))
     return Reconstructor(plain, modes, seen, clean)
 
 
-def _estimator(slopes_of_modes: Floats, weight: Floats, ridge: float = _RIDGE) -> Floats:
-    """Return (modes, 2 n): modes from slopes, by weighted least squares with a ridge."""
-    weighted = slopes_of_modes.T * weight
-    normal = weighted @ slopes_of_modes
+def _estimator(slopes_of_modes: Floats, weighted: Floats, ridge: float = _RIDGE) -> Floats:
+    """Return (modes, 2 n): modes from slopes, by least squares with a ridge; `weighted_slopes` or equal."""
+    normal = weighted.T @ slopes_of_modes
     normal[np.diag_indices_from(normal)] += ridge * np.trace(normal) / len(normal)
-    return np.asarray(np.linalg.solve(normal, weighted))
+    return np.asarray(np.linalg.solve(normal, weighted.T))
 
 
 def check_controllable(commands: int, slopes: int) -> None:

@@ -1,0 +1,227 @@
+"""What does the 2 x 2 covariance of a laser guide star's slopes gain, and do its ellipses hold 95 %?
+
+Prints Markdown tables for an 8 m telescope with 20 x 20 sub-apertures, open loop: residual wavefront of the
+minimum-variance reconstructor and noise of weighted least squares, with equal weights, with the variances of
+x and y, and with their covariance; then the share of true positions within the stated ellipses. The slopes
+are those of `ml` with the known profile. Errors: standard error over wavefronts.
+
+    python examples/laser_guide_star_noise.py
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import laser_guide_stars as laser
+import numpy as np
+from numpy.typing import NDArray
+
+import faintspot as fs
+from faintspot.cli.progress import progress_bar
+from faintspot.control.noise import add_noise, weighted_slopes
+from faintspot.turbulence.slope_covariance import phase_covariance_rad2
+
+Floats = NDArray[np.float64]
+
+R0_M, OUTER_SCALE_M, NM_PER_RAD = 0.15, 25.0, 500.0 / (2 * np.pi)
+FWHM_ARCSEC = 1.2
+SUBAPERTURE_M = laser.DIAMETER_M / laser.LENSLETS
+FLUXES = (60.0, 200.0, 600.0)
+COVERAGE_FLUXES = (15.0, 30.0, 60.0, 120.0, 250.0, 500.0, 1000.0)
+OF_95_PERCENT = 5.991  # squared Mahalanobis distance, of two dimensions
+WEIGHTS = ("equal", "variances", "covariances")
+
+
+class Launch(NamedTuple):
+    """Place of the launch telescope, and windows."""
+
+    distance_m: float
+    angle_deg: float
+    side: int
+
+    @property
+    def text(self) -> str:
+        """Place and window as in the tables."""
+        return f"{self.distance_m:g} m, {self.angle_deg:g}°, {self.side} px"
+
+
+LAUNCHES = tuple(
+    Launch(*place, side) for place in ((5.0, 0.0), (5.0, 45.0), (20.0, 45.0)) for side in (10, 16)
+)
+
+
+class Atmosphere(NamedTuple):
+    """Wavefronts on points, four to a sub-aperture's area, and their slopes."""
+
+    root: Floats
+    """(points, points): from normal numbers to wavefronts [nm]."""
+    gradients: Floats
+    """(2 n, points): from wavefronts to mean slopes [px]."""
+    slopes: Floats
+    """(2 n, 2 n): covariance of slopes [px^2]."""
+    crossed: Floats
+    """(points, 2 n): covariance of wavefronts and slopes [nm px]."""
+    unseen: Floats
+    """(points, 3): piston, tip and tilt, orthonormal."""
+
+
+def atmosphere() -> Atmosphere:
+    """Return von Karman turbulence over the lit sub-apertures."""
+    half = 0.5 * SUBAPERTURE_M
+    steps = np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2)  # rows of y, then x
+    places = np.rint((laser.PLACES[:, None] + half * steps) / half).astype(int)
+    points, which = np.unique(places.reshape(-1, 2), axis=0, return_inverse=True)
+    which = which.reshape(laser.N, 9)
+    simpson = np.array([1.0, 4.0, 1.0]) / 6  # mean along an edge
+    ends = np.array([-1.0, 0.0, 1.0])
+    weights = np.outer(simpson, ends).ravel(), np.outer(ends, simpson).ravel()
+    px_per_nm = 1e-9 * 180 * 3600 / np.pi / laser.PIXEL_ARCSEC / SUBAPERTURE_M
+    gradients = np.zeros((2 * laser.N, len(points)))
+    for axis in range(2):
+        rows = np.arange(laser.N)[:, None] + axis * laser.N
+        gradients[rows, which] = px_per_nm * weights[axis]
+    phase = phase_covariance_rad2(half * points, R0_M, OUTER_SCALE_M) * NM_PER_RAD**2
+    phase[np.diag_indices_from(phase)] *= 1 + 1e-9
+    crossed = phase @ gradients.T
+    unseen = np.linalg.qr(np.column_stack([np.ones(len(points)), points]))[0]
+    return Atmosphere(np.linalg.cholesky(phase), gradients, gradients @ crossed, crossed, unseen)
+
+
+def spots_of(launch: Launch) -> fs.PSF:
+    """Return the spots of every sub-aperture: one layer, 1.2 arcsec."""
+    angle = np.radians(launch.angle_deg)
+    place = -launch.distance_m * np.array([np.cos(angle), np.sin(angle)])
+    star = replace(laser.star_of(FWHM_ARCSEC), launch_m=place)
+    return star.psf(star.focused(laser.SINGLE), radius_px=launch.side / 2 + 4)
+
+
+def measured(launch: Launch, psf: fs.PSF, flux: float, positions: Floats, seed: int) -> fs.Slopes:
+    """Return slopes of spots at positions (frames, n, 2) px."""
+    layout = laser.layout_of(launch.side)
+    frames, _ = fs.simulate.sensor_frames(
+        layout.corners, layout.window, layout.frame_shape, len(positions), flux_e=flux, psf=psf,
+        detector=laser.DETECTOR, rng=np.random.default_rng(seed), positions=positions,
+    )  # fmt: skip
+    settings = fs.Settings("ml", search_range_px=3.0)
+    return fs.SlopePipeline(layout, settings, laser.CALIBRATION, psf=psf)(frames)
+
+
+def noise_of(slopes: fs.Slopes, frame: int, weights: str) -> tuple[Floats, Floats | None]:
+    """Return variances (2 n,) and covariances (n,) of a frame's slopes [px^2]."""
+    errors = np.concatenate([slopes.standard_error_x[frame], slopes.standard_error_y[frame]])
+    variance = np.square(np.minimum(errors.astype(np.float64), 1e3))
+    if weights == "equal":
+        return np.full(len(variance), 1 / np.mean(1 / variance)), None
+    covariance = slopes.covariance_xy[frame].astype(np.float64)
+    return variance, covariance if weights == "covariances" else None
+
+
+def residuals(air: Atmosphere, launch: Launch, flux: float, frames: int, seed: int) -> dict[str, Floats]:
+    """Return residual wavefronts of minimum variance and noise of least squares [nm rms], by weights."""
+    psf = spots_of(launch)
+    waves = np.random.default_rng(seed).normal(size=(frames, len(air.root))) @ air.root.T
+    waves -= waves @ air.unseen @ air.unseen.T
+    true = waves @ air.gradients.T
+    positions = np.stack(np.split(true, 2, axis=1), axis=-1)
+    slopes = measured(launch, psf, flux, positions, seed + 1)
+    tilts = air.gradients @ air.unseen[:, 1:]
+    tilts = 1e3 * tilts @ tilts.T / np.square(tilts).mean()  # a laser does not see them: infinite noise
+    found: dict[str, Floats] = {}
+    modes = np.linalg.pinv(laser.MATRIX)
+    for weights in WEIGHTS:
+        left, noise = np.empty(frames), np.empty(frames)
+        for frame in range(frames):
+            variance, covariance = noise_of(slopes, frame, weights)
+            seen = slopes.vector[frame].astype(np.float64)
+            total = air.slopes + tilts
+            add_noise(total, variance, covariance)
+            rest = waves[frame] - air.crossed @ np.linalg.solve(total, seen)
+            rest -= air.unseen @ (air.unseen.T @ rest)
+            left[frame] = np.sqrt(np.mean(np.square(rest)))
+            weighted = weighted_slopes(modes, variance, covariance)
+            error = np.linalg.solve(weighted.T @ modes, weighted.T @ (seen - true[frame]))
+            noise[frame] = np.sqrt(np.square(error[laser.MODES > 3]).sum())
+        found[f"minimum variance, {weights}"], found[f"least squares, {weights}"] = left, noise
+    return found
+
+
+def gain_tables(frames: int, advance: Any) -> None:
+    """Print residual wavefronts, and what variances and covariances gain [nm]."""
+    air = atmosphere()
+    names = "minimum variance", "least squares"
+    print("\n| launch, window | flux |", end="")
+    for name in names:
+        print(f" {name}: {' | '.join(WEIGHTS)} | gain of covariances |", end="")
+    print("\n" + "|---" * 10 + "|")
+    for launch in LAUNCHES:
+        for flux in FLUXES:
+            found = residuals(air, launch, flux, frames, seed=int(flux))
+            cells = []
+            for name in names:
+                rms = [found[f"{name}, {weights}"] for weights in WEIGHTS]
+                gain = rms[1] - rms[2]
+                cells += [f"{each.mean():.1f}" for each in rms]
+                cells.append(f"{gain.mean():.1f} ± {gain.std(ddof=1) / np.sqrt(frames):.1f}")
+            print(f"| {launch.text} | {flux:g} e- | " + " | ".join(cells) + " |", flush=True)
+            advance(1)
+
+
+def coverage_table(frames: int, advance: Any) -> None:
+    """Print the share of true positions within the stated ellipses of 95 %, for motions as in a loop."""
+    print("\n| launch, window | " + " | ".join(f"{flux:g} e-" for flux in COVERAGE_FLUXES) + " |")
+    print("|---" * (1 + len(COVERAGE_FLUXES)) + "|")
+    for launch in LAUNCHES:
+        psf = spots_of(launch)
+        rows: dict[str, list[str]] = {"covariance": [], "variances alone": []}
+        for flux in COVERAGE_FLUXES:
+            rng = np.random.default_rng(int(flux))
+            truth = rng.normal(0.0, laser.MOTION_PX, (frames, laser.N, 2))
+            slopes = measured(launch, psf, flux, truth, seed=int(flux) + 1)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                x, y = slopes.x - truth[..., 0], slopes.y - truth[..., 1]
+                xx, yy = (
+                    np.square(e.astype(float)) for e in (slopes.standard_error_x, slopes.standard_error_y)
+                )
+                for name, xy in (
+                    ("covariance", slopes.covariance_xy.astype(float)),
+                    ("variances alone", 0.0),
+                ):
+                    squares = (yy * x**2 - 2 * xy * x * y + xx * y**2) / (xx * yy - xy**2)
+                    inside = np.where(slopes.valid, squares < OF_95_PERCENT, np.nan)
+                    rows[name].append(f"{100 * np.nanmean(inside):.1f} %")
+            advance(1)
+        for name, cells in rows.items():
+            print(
+                f"| {launch.text}, {name} | " + " | ".join(cells) + " |",
+                flush=True,
+            )
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description="Measure what covariances of slopes gain.")
+    parser.add_argument("--wavefronts", type=int, default=40, help="Wavefronts for each flux. [default: 40]")
+    parser.add_argument("--frames", type=int, default=300, help="Frames for the ellipses. [default: 300]")
+    parser.add_argument("--parts", nargs="*", default=["gain", "coverage"], help="Tables.")
+    chosen = parser.parse_args()
+    steps = {"gain": len(LAUNCHES) * len(FLUXES), "coverage": len(LAUNCHES) * len(COVERAGE_FLUXES)}
+    total, done = sum(steps[part] for part in chosen.parts), 0
+    with progress_bar("Covariances of slopes", "steps") as show:
+
+        def advance(count: int) -> None:
+            nonlocal done
+            done += count
+            show(done, total)
+
+        if "gain" in chosen.parts:
+            print("\n## Residual wavefront [nm rms]")
+            gain_tables(chosen.wavefronts, advance)
+        if "coverage" in chosen.parts:
+            print("\n## Positions within the ellipses of 95 %")
+            coverage_table(chosen.frames, advance)
+
+
+if __name__ == "__main__":
+    main()
