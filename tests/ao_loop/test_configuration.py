@@ -21,6 +21,7 @@ REGIMES = {
     "elongated_10e",
     "open_loop",
     "eight_metre",
+    "lgs_eight_metre",
 }
 
 

@@ -69,6 +69,8 @@ def reference_slopes(
 ) -> NDArray[np.float32]:
     """Return the slopes that a method measures for a flat wavefront, all x, then all y, (2 n,) px.
 
+    With a laser they are those of the spots that the method knows.
+
     References are measured with bright frames without noise, and without what is for faint flux:
     at its strength of denoising they would be denoised to nothing.
     """
@@ -80,7 +82,12 @@ def reference_slopes(
         score=method.score,
         threads=1,
     )
-    flat = sensor.spots(np.zeros((sensor.points, sensor.points), np.float32))
+    if configuration.laser is not None and method.psf is not None:  # the true spots change with time
+        n = len(sensor.layout)
+        known = method.psf.images(np.zeros((n, 2)), sensor.layout.window, which=method.psf.index_of(n))
+        flat = known.astype(np.float32)
+    else:
+        flat = sensor.spots(np.zeros((sensor.points, sensor.points), np.float32))
     return bright(sensor.frame(flat) * _BRIGHT_E).vector
 
 
@@ -123,6 +130,12 @@ def interaction_matrix(sensor: ShackHartmann, mirror: DeformableMirror) -> Float
         shape = mirror.wavefront_nm(poke)
         columns.append((slopes(shape) - slopes(-shape)) / (2 * _POKE_NM))
     return np.stack(columns, axis=1) / gain[:, None]
+
+
+def true_interaction_matrix(sensor: ShackHartmann, mirror: DeformableMirror) -> Floats:
+    """Return the mean gradients for a command of 1 nm of each actuator, (2 n, commands) px."""
+    pokes = np.eye(mirror.commands)
+    return np.stack([sensor.mean_slopes_px(mirror.wavefront_nm(poke)) for poke in pokes], axis=1)
 
 
 def typical_spots(

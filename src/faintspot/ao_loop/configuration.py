@@ -13,6 +13,7 @@ import numpy as np
 import tomlkit
 
 from faintspot.ao_loop.checked_fields import LIST, NUMBER_OR_LIST, checked_section, number
+from faintspot.ao_loop.laser_section import Laser, NaturalStar
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError
 from faintspot.base.sizes import check_size
@@ -28,6 +29,7 @@ ARCSEC = math.pi / 180 / 3600
 CLOSED, OPEN = "closed", "open"
 SPOT_FWHM = 0.886  # full width at half maximum of sinc^2, in lambda / d
 _MOST_POINTS = 4096**2  # of a wavefront
+_POINT_FIELD = 0.9  # of a window that holds a laser guide star
 _POSITION_RANGE_PX = {CLOSED: 2.0, OPEN: 5.0}
 
 
@@ -183,12 +185,17 @@ class LoopConfiguration:
     control: ControlParameters = field(default_factory=ControlParameters)
     science: Science = field(default_factory=Science)
     run: RunLength = field(default_factory=RunLength)
+    laser: Laser | None = None
+    natural_star: NaturalStar | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise InputError(f"name: expected a text, got {self.name!r}")
         for name in SECTIONS:
-            object.__setattr__(self, name, checked_section(name, getattr(self, name), SECTIONS[name]))
+            if name not in _OPTIONAL or getattr(self, name) is not None:
+                object.__setattr__(self, name, checked_section(name, getattr(self, name), SECTIONS[name]))
+        if self.laser is not None:
+            object.__setattr__(self, "laser", self.laser.checked())
         _check_layers(self.atmosphere)
         _check_flux(self.camera)
         _check_sampling(self)
@@ -203,7 +210,7 @@ class LoopConfiguration:
         """
         check_known("", section, SECTIONS, "section")
         check_keys(f"{section}.", values, _keys(section))
-        changed = dataclasses.replace(getattr(self, section), **values)
+        changed = dataclasses.replace(getattr(self, section) or SECTIONS[section](), **values)
         return dataclasses.replace(self, **{section: changed})
 
     def slowed_to(self, rate_hz: float) -> LoopConfiguration:
@@ -255,12 +262,13 @@ class LoopConfiguration:
     @property
     def scene(self) -> Scene:
         """Knowledge that estimators have when their options are chosen."""
-        camera, elongation = self.camera, self.sensor.spot_elongation
+        camera = self.camera
+        width, elongation = self._spot_fwhm_and_elongation
         return Scene(
             flux_e=self.photons,
             read_noise_e=camera.read_noise_e / camera.em_gain,
             window=(self.sensor.pixels,) * 2,
-            spot_fwhm_px=SPOT_FWHM * self.spot_width_px * math.sqrt(elongation),
+            spot_fwhm_px=width * math.sqrt(elongation),
             position_range_px=self.position_range_px(),
             elongation=elongation,
             excess_noise=2.0 if camera.em_gain > 1 else 1.0,
@@ -268,6 +276,15 @@ class LoopConfiguration:
             d_over_r0=self.d_over_r0,
             diffraction_px=self.spot_width_px,
         )
+
+    @property
+    def _spot_fwhm_and_elongation(self) -> tuple[float, float]:
+        """Width of a spot's short axis [px], and its elongation, which a laser adds itself."""
+        width = SPOT_FWHM * self.spot_width_px
+        if self.laser is None:
+            return width, self.sensor.spot_elongation
+        pixel_arcsec = self.pixel_scale_rad / ARCSEC
+        return math.hypot(width, self.laser.spot_fwhm_arcsec / pixel_arcsec), 1.0
 
     @property
     def photons(self) -> float:
@@ -294,11 +311,13 @@ class LoopConfiguration:
         document = tomlkit.document()
         document["name"] = self.name
         for name in SECTIONS:
+            if getattr(self, name) is None:
+                continue
             table = tomlkit.table()
             for item in fields(SECTIONS[name]):
                 value = getattr(getattr(self, name), item.name)
                 if value is not None:  # TOML has no word for nothing
-                    table[item.name] = list(value) if isinstance(value, tuple) else value
+                    table[item.name] = np.array(value).tolist() if isinstance(value, tuple) else value
             document[name] = table
         return tomlkit.dumps(document)
 
@@ -337,7 +356,10 @@ SECTIONS: dict[str, type[Any]] = {
     "control": ControlParameters,
     "science": Science,
     "run": RunLength,
+    "laser": Laser,
+    "natural_star": NaturalStar,
 }
+_OPTIONAL = ("laser", "natural_star")
 
 
 def load_loop(path: str | Path) -> LoopConfiguration:
@@ -423,6 +445,10 @@ def _check_flux(camera: Camera) -> None:
 
 def _check_sampling(whole: LoopConfiguration) -> None:
     """Refuse a sensor that is sampled too coarsely, and inconsistent control."""
+    if whole.natural_star is not None and whole.laser is None:
+        raise InputError("natural_star: expected a table laser beside it, got none")
+    if whole.laser is not None and whole.sensor.spot_elongation > 1:
+        raise InputError("sensor.spot_elongation: expected 1 with a laser, which elongates the spots itself")
     one_of("control.mode", whole.control.mode, (CLOSED, OPEN))
     one_of("control.winds", whole.control.winds, WINDS)
     if not isinstance(whole.mirror.tip_tilt, bool):
@@ -462,6 +488,8 @@ def _check_sampling(whole: LoopConfiguration) -> None:
 
 def field_of_view(whole: LoopConfiguration) -> float:
     """Return the width of the lenslet images that must not alias [px]."""
+    if whole.laser is not None:  # images of a point; the sodium layer is added afterwards
+        return whole.sensor.pixels * _POINT_FIELD
     return whole.sensor.pixels * 1.125 + 2 * 3 * blur_px(whole)
 
 

@@ -15,6 +15,7 @@ from faintspot.ao_loop.control import learnt_control
 from faintspot.ao_loop.methods import PRIOR, Method
 from faintspot.ao_loop.simulation import measure_gains, simulate_loop
 from faintspot.ao_loop.telescope_model import prepare
+from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
 from faintspot.config.tables import read_tables
 from faintspot.control import configuration as control_file
@@ -64,6 +65,8 @@ def write_engine_files(
     MissingExtraError
         When HCIPy is not installed.
     """
+    if configuration.laser is not None:
+        raise InputError("laser: expected none, as the engine takes tip and tilt from no second sensor")
     folder = Path(folder)
     with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)

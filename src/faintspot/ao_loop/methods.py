@@ -43,8 +43,14 @@ class Method:
         learn from telemetry of a loop with the integrator, in other turbulence.
     noise_scale : float
         What control multiplies the variance of the slopes' noise by that telemetry shows.
+    matched_weights : bool
+        Whether the fixed weights of `window` are the linear matched filter of a laser guide star's spots.
+    follows_profile : bool
+        Whether spots of a laser guide star are those of a sodium profile that is followed, not of the one
+        learnt before the run.
     psf, score : PSF, Score, optional
-        For the estimators that need them. Default PSF: that of a flat wavefront.
+        For the estimators that need them. Default PSF: that of a flat wavefront, or with a laser that of the
+        profile learnt.
 
     Raises
     ------
@@ -70,6 +76,8 @@ class Method:
     true_slopes: bool = False
     control: str = INTEGRATOR
     noise_scale: float = 1.0
+    matched_weights: bool = False
+    follows_profile: bool = False
     psf: PSF | None = None
     score: Score | None = None
 

@@ -17,6 +17,7 @@ class LoopRecord(Stored):
     """One run of `simulate_loop`, n sub-apertures and m commands."""
 
     WHAT: ClassVar[str] = "a record of a loop"
+    FORMAT: ClassVar[int] = 2
 
     slopes_px: NDArray[np.float32]
     """(frames, 2 n): all x, then all y, from the reference, before division by the centroid gain."""
@@ -30,6 +31,8 @@ class LoopRecord(Stored):
     """(frames,): Strehl ratio of each frame at the science wavelength, on axis."""
     residual_nm: NDArray[np.float64]
     """(frames,): rms of the residual wavefront."""
+    zernike_nm: NDArray[np.float32]
+    """(frames, 10): Zernike modes 2 to 11 (Noll) of the residual wavefront."""
     r0_m: NDArray[np.float64]
     """(frames,): true Fried parameter at 500 nm."""
     method: NDArray[np.int8]

@@ -17,11 +17,19 @@ from faintspot.ao_loop.calibration import (
     typical_spots,
 )
 from faintspot.ao_loop.camera import Exposing, make_detector
-from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
+from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration, RunLength
 from faintspot.ao_loop.control import learnt_control, make_controller
 from faintspot.ao_loop.methods import Method
+from faintspot.ao_loop.natural_star import LowOrders
 from faintspot.ao_loop.record import LoopRecord
-from faintspot.ao_loop.telescope_model import TelescopeModel, atmosphere_of, prepare, without_flux
+from faintspot.ao_loop.sodium import FollowedSodium, KnownSodium, learn_sodium
+from faintspot.ao_loop.telescope_model import (
+    TelescopeModel,
+    atmosphere_of,
+    laser_source,
+    prepare,
+    without_flux,
+)
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.control.commands import CommandDelayLine
@@ -180,7 +188,8 @@ class _Loop:
         gains: NDArray[np.float64] | None = None,
     ) -> None:
         self.configuration = configuration = disabled_errors.configuration(configuration)
-        self.methods = methods = tuple(method for method, _ in ready)
+        self.known = _known_sodium(configuration, seed, realisation)
+        self.methods = methods = tuple(self._with_spots(method) for method, _ in ready)
         self.which, self.disabled_errors = which, disabled_errors
         self.seed, self.realisation = seed, realisation
         self.telescope_model = TelescopeModel(
@@ -198,12 +207,23 @@ class _Loop:
         self.gains, self.divisors = self._gains_and_divisors(gains)
         self.line = CommandDelayLine(optics.mirror.commands, configuration.control.delay_frames)
         self.controllers = [make_controller(configuration, optics, *each, self.line) for each in ready]
+        self.low_orders = None
+        self.followed: list[FollowedSodium | None] = [None] * len(methods)
+        if self.known is not None:
+            self.low_orders = LowOrders(configuration, optics.sensor, seed, realisation)
+            self.followed = [
+                FollowedSodium(configuration, optics.sensor.layout, self.known)
+                if method.follows_profile
+                else None
+                for method in methods
+            ]
         frames, n = len(which), len(optics.sensor.layout)
         self.slopes = np.zeros((frames, 2 * n), np.float32)
         self.valid = np.zeros((frames, n), np.bool_)
         self.errors = np.zeros((frames, 2 * n), np.float32)
         self.commands = np.zeros((frames, optics.mirror.commands), np.float32)
         self.truth = np.zeros((3, frames))
+        self.zernike = np.zeros((frames, 10), np.float32)
         self.regression = np.zeros((2, len(methods)))
 
     def _first_flux(self, pipeline: SlopePipeline) -> MeanFlux | None:
@@ -255,9 +275,10 @@ class _Loop:
         error = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
         per_px = 1 / self.divisors[number]
         vector, covariance = (each.astype(np.float64) for each in (slopes.vector, slopes.covariance_xy))
-        self.controllers[number].update(
-            vector * per_px, error.astype(np.float64) * per_px, covariance * per_px**2
-        )
+        vector *= per_px
+        if self.low_orders is not None:
+            vector = self.low_orders.merged(frame, seen, vector, slopes.flags)
+        self.controllers[number].update(vector, error.astype(np.float64) * per_px, covariance * per_px**2)
         self.slopes[frame], self.errors[frame] = slopes.vector, error
         self.valid[frame], self.commands[frame] = slopes.valid, commands
 
@@ -265,6 +286,7 @@ class _Loop:
         """Record the true values."""
         truth = self.telescope_model.truth(time, wavefront)
         self.truth[:, frame] = truth.strehl, truth.rms_nm, truth.r0_m
+        self.zernike[frame] = self.optics.pupil.zernike(wavefront)
 
     def _measure(self, frame: int, wavefront: NDArray[np.float32]) -> Slopes:
         """Measure the slopes of the camera's frame."""
@@ -274,7 +296,9 @@ class _Loop:
         prior = None
         if self.methods[number].predict_prior:
             prior = self.controllers[number].expected().mean_px
-        slopes = self.pipelines[number](self.telescope_model.frame(frame, wavefront), prior)
+        pixels = self.telescope_model.frame(frame, wavefront)
+        slopes = self.pipelines[number](pixels, prior)
+        self._follow_profile(number, pixels, slopes)
         known = self.fluxes[number]
         if known is not None:
             self.fluxes[number] = known.updated(slopes.flux)
@@ -284,6 +308,21 @@ class _Loop:
             true = sensor.mean_slopes_px(wavefront)
             self.regression[:, number] += slopes.vector.astype(np.float64) @ true, true @ true
         return slopes
+
+    def _with_spots(self, method: Method) -> Method:
+        """Return a method that knows the spots of a laser guide star as they were before the run."""
+        if self.known is None or method.psf is not None:
+            return method
+        return self.known.method(self.configuration, method)
+
+    def _follow_profile(self, number: int, pixels: NDArray[np.generic], slopes: Slopes) -> None:
+        """Take a frame for the sodium profile; make the method's pipeline anew when it changes."""
+        followed = self.followed[number]
+        if followed is None or not followed.take(pixels, slopes.vector.astype(np.float64)):
+            return
+        method = followed.known.method(self.configuration, self.methods[number])
+        self.pipelines[number] = make_pipeline(self.configuration, self.optics.sensor, method)
+        self._follow_flux(number)
 
     def gains_in_run(self) -> NDArray[np.float64]:
         """Return the regression of each method's measured slopes on the true ones."""
@@ -300,6 +339,7 @@ class _Loop:
             self.commands,
             strehl,
             residual,
+            self.zernike,
             r0,
             self.which.astype(np.int8),
             self.optics.interaction,
@@ -349,4 +389,19 @@ def _typical_spots(
     configuration: LoopConfiguration, seed: int, realisation: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     optics, atmosphere = prepare(configuration), atmosphere_of(configuration, seed, realisation)
-    return typical_spots(configuration, optics.sensor, optics.mirror, atmosphere, optics.reconstructor.matrix)
+    laser = laser_source(configuration)
+    sensor = optics.sensor if laser is None else laser.sensor(0)
+    return typical_spots(configuration, sensor, optics.mirror, atmosphere, optics.reconstructor.matrix)
+
+
+def _known_sodium(configuration: LoopConfiguration, seed: int, realisation: int) -> KnownSodium | None:
+    """Return what is known of the sodium layer before a run; None without a laser."""
+    if configuration.laser is None:
+        return None
+    return _learnt_sodium(replace(configuration, name="-", run=RunLength()), seed, realisation)
+
+
+@lru_cache(maxsize=4)
+def _learnt_sodium(configuration: LoopConfiguration, seed: int, realisation: int) -> KnownSodium:
+    spots = np.concatenate(_typical_spots(without_flux(configuration), seed, realisation))
+    return learn_sodium(configuration, prepare(configuration).sensor.layout, spots, seed)

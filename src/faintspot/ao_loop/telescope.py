@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from types import ModuleType
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.base.errors import MissingExtraError
+from faintspot.wavefront.zernike import zernike
 
 _SUPERSAMPLING = 8
 
@@ -38,6 +40,22 @@ class PupilAmplitude:
         weights = self.amplitude / self.amplitude.sum()
         mean = float(np.vdot(weights, wavefront))
         return float(np.sqrt(max(0.0, float(np.vdot(weights, wavefront * wavefront)) - mean**2)))
+
+    def zernike(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return Zernike modes 2 to 11 (Noll) of a wavefront (n, n) over the pupil, in its unit: (10,)."""
+        found: NDArray[np.float32] = self._to_zernike @ wavefront.ravel()
+        return found
+
+    @cached_property
+    def _to_zernike(self) -> NDArray[np.float32]:
+        """Weighted least-squares fit of piston and the modes, without the row of piston."""
+        line = (np.arange(self.points) + 0.5) / self.points - 0.5
+        lit = self.amplitude.ravel() > 0.5
+        x, y = (each.ravel() for each in np.meshgrid(line, line))
+        radius = float(np.hypot(x, y)[lit].max())
+        modes = np.stack([zernike(mode, x / radius, y / radius) for mode in range(1, 12)])
+        weighted = modes * self.amplitude.ravel()
+        return np.linalg.solve(weighted @ modes.T, weighted)[1:].astype(np.float32)
 
     def field(self, wavefront_nm: NDArray[np.floating], wavelength_m: float) -> NDArray[np.complex64]:
         """Return the complex amplitude (n, n) of a wavefront at a wavelength."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.ao_loop.atmosphere import MovingLayers, make_atmosphere
-from faintspot.ao_loop.calibration import interaction_matrix
+from faintspot.ao_loop.calibration import interaction_matrix, true_interaction_matrix
 from faintspot.ao_loop.camera import Exposing, NoiselessDetector, make_detector
 from faintspot.ao_loop.configuration import (
     CLOSED,
@@ -19,6 +19,7 @@ from faintspot.ao_loop.configuration import (
     LoopConfiguration,
     RunLength,
 )
+from faintspot.ao_loop.laser import LaserSource
 from faintspot.ao_loop.mirror import BestFit, DeformableMirror, make_mirror
 from faintspot.ao_loop.telescope import PupilAmplitude, make_pupil
 from faintspot.ao_loop.wavefront_sensor import ShackHartmann, make_sensor
@@ -93,6 +94,7 @@ class TelescopeModel:
         camera = make_detector(configuration)
         self.detector: Exposing = NoiselessDetector(camera) if noiseless else camera
         self._best_fit = BestFit.of(optics.mirror, optics.pupil, piston=False) if correctable else None
+        self._laser = laser_source(configuration)
         self._sees_mirror = configuration.control.mode == CLOSED
         self._science_wavelength_m = configuration.science.wavelength_m
         self._seed, self._realisation = seed, realisation
@@ -115,9 +117,12 @@ class TelescopeModel:
 
     def frame(self, number: int, wavefront_nm: NDArray[np.float32]) -> NDArray[np.generic]:
         """Return the camera frame [ADU] of a wavefront; the number seeds its noise."""
-        sensor = self.optics.sensor
+        sensor, known = self.optics.sensor, (self._seed, self._realisation, number)
+        if self._laser is not None:
+            sensor = self._laser.sensor(number)
+            wavefront_nm = self._laser.jittered(wavefront_nm, known)
         flux = sensor.frame(sensor.spots(wavefront_nm)) * self.photons
-        rng = np.random.default_rng([self._seed, self._realisation, number, 2])
+        rng = np.random.default_rng([*known, 2])
         return self.detector.expose(flux, rng)
 
 
@@ -131,12 +136,23 @@ def prepare(configuration: LoopConfiguration) -> LoopOptics:
     MissingExtraError
         When HCIPy is not installed.
     """
-    control = ControlParameters(largest_condition=configuration.control.largest_condition)
-    camera = Camera(photons_per_subaperture=1.0)
-    return _prepared(
-        replace(
-            configuration, name="-", atmosphere=Atmosphere(), camera=camera, control=control, run=RunLength()
-        )
+    return _prepared(of_optics(configuration))
+
+
+def of_optics(configuration: LoopConfiguration) -> LoopConfiguration:
+    """Return the configuration without values that do not affect the optics, so that these are kept."""
+    control, camera = configuration.control, Camera(photons_per_subaperture=1.0)
+    kept = ControlParameters(largest_condition=control.largest_condition)
+    if configuration.laser is not None:  # which changes with time
+        kept = replace(kept, frame_rate_hz=control.frame_rate_hz)
+    return replace(
+        configuration,
+        name="-",
+        atmosphere=Atmosphere(),
+        camera=camera,
+        control=kept,
+        run=RunLength(),
+        natural_star=None,
     )
 
 
@@ -145,6 +161,16 @@ def without_flux(configuration: LoopConfiguration) -> LoopConfiguration:
     control = ControlParameters(**{name: getattr(configuration.control, name) for name in _OF_AIR})
     camera = Camera(photons_per_subaperture=1.0)
     return replace(configuration, name="-", camera=camera, control=control, run=RunLength())
+
+
+def laser_source(configuration: LoopConfiguration) -> LaserSource | None:
+    """Return the laser guide star of a configuration, None without (cached)."""
+    return None if configuration.laser is None else _laser_source(of_optics(configuration))
+
+
+@lru_cache(maxsize=2)
+def _laser_source(configuration: LoopConfiguration) -> LaserSource:
+    return LaserSource(configuration, _prepared(configuration).sensor)
 
 
 @lru_cache(maxsize=2)
@@ -158,6 +184,8 @@ def _prepared(configuration: LoopConfiguration) -> LoopOptics:
     pupil = make_pupil(configuration)
     sensor, mirror = make_sensor(configuration, pupil), make_mirror(configuration, pupil)
     check_controllable(mirror.commands, 2 * len(sensor.layout))
-    interaction = interaction_matrix(sensor, mirror)
+    # Calibrated with a point source, whose images in windows for a laser are too coarse: true gradients.
+    measure = interaction_matrix if configuration.laser is None else true_interaction_matrix
+    interaction = measure(sensor, mirror)
     reconstructor = make_reconstructor(interaction, configuration.control.largest_condition)
     return LoopOptics(pupil, sensor, mirror, interaction, reconstructor)

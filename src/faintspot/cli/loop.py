@@ -92,9 +92,10 @@ def magnitude(configuration: str, methods: str | None, flux_e: str | None, **opt
 
     Each method is tuned at each flux, its settings and the loop gain together, on other turbulence. Methods:
     every estimator by its name (`faintspot estimators` lists them); after the name may follow
-    _predicted (its prior is what the loop predicts), _weighted (slopes count by their standard errors) and
-    _uncorrected (slopes are not divided by the centroid gain), and then the control: +modal, +polc or +kalman
-    in place of the integrator.
+    _predicted (its prior is what the loop predicts), _weighted (slopes count by their standard errors),
+    _uncorrected (slopes are not divided by the centroid gain), with a laser guide star _filter (weights of
+    `window` are the linear matched filter) and _followed (the sodium profile is followed), and then the
+    control: +modal, +polc or +kalman in place of the integrator.
 
     \b
     Examples:

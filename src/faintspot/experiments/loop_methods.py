@@ -18,6 +18,7 @@ from faintspot.base.errors import InputError
 from faintspot.config.options import AUTO, Option
 from faintspot.control.learning import CONTROLS, INTEGRATOR, KALMAN, MODAL
 from faintspot.estimators.base import Estimator, Need
+from faintspot.estimators.correlation import Correlation
 from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.estimators.registry import estimator_named, estimators
 from faintspot.estimators.window import Window
@@ -40,6 +41,14 @@ _TELEMETRY_GAINS = (0.05, 0.1, 0.2, 0.3, 0.4)
 _FIRST_TELEMETRY_GAINS = (0.2,)
 # How far spots are from where a prior expects them is the loop's to say: parts of their range.
 _PRIORS = (0.1, 0.175, 0.25, 0.35, 0.5, 0.75)
+_METHODS_OF_LASER = (
+    "window",
+    "correlation",
+    "window_filter",
+    "window_filter_followed",
+    "ml_followed",
+    "map_predicted_followed",
+)
 _STEPS_BEYOND = 2  # in the ratio of an end to its neighbour
 _FEWEST_TO_WIDEN = 4
 _FIRST_VALUES = (3, 2)  # of a method's first option, and of each further one
@@ -85,9 +94,18 @@ VARIANTS = {
     "_uncorrected": Variant(
         "gain not corrected", "slopes are not divided by the centroid gain", {"correct_gain": False}
     ),
+    "_filter": Variant(
+        "matched filter",
+        "its weights are the linear matched filter of a laser guide star's spots",
+        {"matched_weights": True},
+    ),
+    "_followed": Variant(
+        "profile followed", "the sodium profile of a laser guide star is followed", {"follows_profile": True}
+    ),
 }
 """By what follows the estimator's name in that of a method: "map_predicted_weighted"."""
 _PREDICTED = "_predicted"
+_OF_LASER = _FILTER, _FOLLOWED = "_filter", "_followed"
 CONTROL_SIGN = "+"
 """Between a method's slopes and its control: "map+kalman"."""
 
@@ -133,6 +151,8 @@ class MethodKind:
             options[PRIOR] = [part * reach for part in _PRIORS]
         if self.control == KALMAN:
             options.pop(PRIOR, None)  # the filter knows it
+        if _FILTER in self.variants:
+            options = {}  # the spots determine it
         tuned = {LOOP_GAIN: Tunable(_LOOP_GAINS, _FIRST_LOOP_GAINS)}
         if self.control != INTEGRATOR:
             tuned[LOOP_GAIN] = Tunable(_TELEMETRY_GAINS, _FIRST_TELEMETRY_GAINS)
@@ -159,14 +179,19 @@ class MethodKind:
         of_loop = (LOOP_GAIN, NOISE_SCALE)
         options = {name: value for name, value in choice.items() if name not in of_loop}
         estimator = self._untuned(configuration).replaced(options)
+        laser, needs_psf = configuration.laser is not None, Need.PSF in estimator.required
+        if not laser and any(each in self.variants for each in _OF_LASER):
+            raise InputError(f"method = {self.name!r}: expected a configuration with a laser")
         changes = {key: value for name in self.variants for key, value in VARIANTS[name].changes.items()}
         return Method(
             self.label,
-            Settings(estimator),
+            Settings(
+                estimator, search_range_px=configuration.position_range_px() if laser and needs_psf else None
+            ),
             float(choice[LOOP_GAIN]),
             control=self.control,
             noise_scale=float(choice.get(NOISE_SCALE, 1.0)),
-            psf=_flat_psf(configuration) if Need.PSF in estimator.required else None,
+            psf=_flat_psf(configuration) if needs_psf and not laser else None,
             score=_trained_score(_without_runs(configuration)) if Need.SCORE in estimator.required else None,
             **changes,
         )
@@ -189,22 +214,29 @@ def method_kind(name: str) -> MethodKind:
     slopes, _, control = name.partition(CONTROL_SIGN)
     control = one_of("control of the method", control or INTEGRATOR, list(CONTROLS))
     base, variants = slopes, set()
-    while base not in estimators():
+    while base not in _estimators():
         ending = next((ending for ending in VARIANTS if base.endswith(ending)), None)
         if ending is None:
             break
         base = base.removesuffix(ending)
         variants.add(ending)
     try:
-        estimator = estimator_named(base)
+        estimator = _estimators().get(base) or estimator_named(base)
     except InputError as error:
         text = str(error).removeprefix("estimator")
         raise InputError(f"method{text}; after it may follow {', '.join(VARIANTS)}") from None
     if _PREDICTED in variants and not estimator.takes_prior:
         raise InputError(f"method = {name!r}: expected an estimator that takes a prior, {base!r} takes none")
+    if _FILTER in variants and estimator is not Window:
+        raise InputError(f"method = {name!r}: expected estimator {Window.name!r} for {_FILTER!r}")
     if control == KALMAN and estimator.takes_prior:
         variants.add(_PREDICTED)
     return MethodKind(estimator, tuple(variant for variant in VARIANTS if variant in variants), control)
+
+
+def _estimators() -> dict[str, type[Estimator]]:
+    """Return all estimators by name, with the one that is compared for laser guide stars only."""
+    return {**estimators(), Correlation.name: Correlation}
 
 
 def default_methods(configuration: LoopConfiguration) -> list[str]:
@@ -215,7 +247,10 @@ def default_methods(configuration: LoopConfiguration) -> list[str]:
     turbulence speckles: not where the source is elongated. In closed loop, the strongest usual estimator and
     the one that gains most from a prior also with the Kalman filter. In open loop, where an error of the
     centroid gain is not fed back, those that know nothing of the spot also without its correction.
+    With a laser guide star, those that suit elongated spots, with the profile learnt before and followed.
     """
+    if configuration.laser is not None:
+        return list(_METHODS_OF_LASER)
     names = []
     for name, kind in estimators().items():
         if Need.SCORE in kind.needs and configuration.sensor.spot_elongation > 1:

@@ -1,0 +1,168 @@
+"""What does a followed sodium profile gain in a closed loop, and what does a profile leave that changes?
+
+Prints Markdown tables for the configuration `lgs_eight_metre`: Strehl ratio and wavefront error against flux,
+and the low Zernike modes that are left after a second peak of the sodium layer has appeared. Every method has
+the same turbulence and noise. Window widths are chosen in other turbulence than is scored.
+
+    python examples/laser_guide_star_loop.py
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import faintspot as fs
+from faintspot.ao_loop import LoopConfiguration, LoopRecord, Method, load_loop, simulate_loop
+from faintspot.cli.progress import progress_bar
+from faintspot.estimators.correlation import Correlation
+from faintspot.experiments.search import FIRST_TUNING_REALISATION
+
+FLUXES = (60.0, 200.0)
+FRAMES, SETTLE = 240, 60
+WIDTHS_PX = (2.5, 3.5, 5.0, 7.0)
+TUNING_FRAMES = 120
+REALISATIONS = 3
+LARGEST_PX = 2.0  # search range
+
+# A layer of 8 km at 88 km; later 45 % of the flux in a peak of 3 km at 96 km.
+ALTITUDES = np.arange(78e3, 103e3, 1e3)
+BEFORE = fs.SodiumProfile.gaussian(88e3, 8e3).at(ALTITUDES).density
+PEAK = fs.SodiumProfile.gaussian(96e3, 3e3).at(ALTITUDES).density
+CHANGE_FRAMES, CHANGED_FROM_S, CHANGED_TO_S = 700, 0.2, 0.8
+CHANGE_FLUX_E = 200.0
+SCORED_FROM = 550  # 0.3 s after the end of the change
+LOW = slice(3, 10)  # Zernike modes 5 to 11 of a record
+
+Advance = Callable[[int], None]
+
+
+def window(width_px: float) -> Method:
+    """Return a weighted centre of gravity."""
+    return Method("weighted centre of gravity", fs.Settings("window", window_fwhm_px=width_px))
+
+
+def others() -> list[Method]:
+    """Return the methods without a tuned option."""
+    linear, ml = fs.Settings("window"), fs.Settings("ml", search_range_px=LARGEST_PX)
+    correlation = fs.Settings(Correlation(), search_range_px=LARGEST_PX)
+    known: dict[str, Any] = {"matched_weights": True}
+    return [
+        Method("correlation", correlation),
+        Method("linear matched filter, static", linear, **known),
+        Method("linear matched filter, followed", linear, follows_profile=True, **known),
+        Method("ml, followed", ml, follows_profile=True),
+    ]
+
+
+def run(
+    loop: LoopConfiguration, method: Method, realisation: int, frames: int, advance: Advance
+) -> LoopRecord:
+    """Simulate a loop of so many frames."""
+    short = loop.replace("run", frames=frames, settle_frames=min(SETTLE, frames - 1))
+    record = simulate_loop(short, [method], realisation=realisation)
+    advance(frames)
+    return record
+
+
+def tuned(loop: LoopConfiguration, advance: Advance) -> Method:
+    """Return the weighted centre of gravity with the best width in other turbulence."""
+    found = {
+        width: run(loop, window(width), FIRST_TUNING_REALISATION, TUNING_FRAMES, advance).mean_strehl()
+        for width in WIDTHS_PX
+    }
+    return window(max(found, key=lambda width: found[width]))
+
+
+def flux_tables(loop: LoopConfiguration, advance: Advance) -> None:
+    """Print Strehl ratio and wavefront error against flux; differences are paired."""
+    strehl: dict[str, list[str]] = {}
+    error: dict[str, list[str]] = {}
+    for flux in FLUXES:
+        star = loop.replace("camera", photons_per_subaperture=flux)
+        first = None
+        for method in [tuned(star, advance), *others()]:
+            runs = [run(star, method, each, FRAMES, advance) for each in range(REALISATIONS)]
+            values = np.array([each.mean_strehl() for each in runs])
+            nm = np.array([np.sqrt(np.square(each.residual_nm[each.scored]).mean()) for each in runs])
+            first = values if first is None else first
+            change = values - first
+            text = f"{values.mean():.3f}"
+            if method.label != "weighted centre of gravity":
+                text += f" ({change.mean():+.3f} ± {change.std(ddof=1) / np.sqrt(len(change)):.3f})"
+            strehl.setdefault(method.label, []).append(text)
+            spread = nm.std(ddof=1) / np.sqrt(len(nm))
+            error.setdefault(method.label, []).append(f"{nm.mean():.0f} ± {spread:.0f}")
+    for title, rows in (("Strehl ratio", strehl), ("wavefront error [nm rms]", error)):
+        print(f"\n| {title} | " + " | ".join(f"{flux:g} e-" for flux in FLUXES) + " |")
+        print("|---" * (1 + len(FLUXES)) + "|")
+        for label, cells in rows.items():
+            print(f"| {label} | " + " | ".join(cells) + " |", flush=True)
+
+
+def change_table(loop: LoopConfiguration, advance: Advance) -> None:
+    """Print what the change of the profile adds to the low modes: against the same run without it."""
+    after = 0.55 * BEFORE + 0.45 * PEAK
+    star = loop.replace("camera", photons_per_subaperture=CHANGE_FLUX_E)
+    layer: dict[str, Any] = {
+        "altitude_m": tuple(ALTITUDES),
+        "follow_every_frames": 50,
+        "follow_time_constant_frames": 100.0,
+    }
+    constant = star.replace("laser", **layer, time_s=(0.0,), density=(tuple(BEFORE),))
+    times = 0.0, CHANGED_FROM_S, CHANGED_TO_S
+    densities = tuple(map(tuple, (BEFORE, BEFORE, after)))
+    changing = star.replace("laser", **layer, time_s=times, density=densities)
+    static, followed = others()[1:3]
+    compared = window(5.0), static, followed
+    print("\n| method | Zernike modes 5 to 11 [nm rms] | focus [nm rms] | Strehl ratio, without change |")
+    print("|---|---|---|---|")
+    for method in compared:
+        low, focus, strehl = [], [], []
+        for realisation in range(REALISATIONS):
+            records = [
+                run(each, method, realisation, CHANGE_FRAMES, advance) for each in (changing, constant)
+            ]
+            change = np.subtract(*(each.zernike_nm[SCORED_FROM:].mean(axis=0) for each in records))
+            low.append(np.sqrt(np.square(change[LOW]).sum()))
+            focus.append(abs(change[2]))
+            strehl.append([each.strehl[SCORED_FROM:].mean() for each in records])
+        with_change, without = np.mean(strehl, axis=0)
+        cells = [method.label, _with_error(low), _with_error(focus), f"{with_change:.3f}, {without:.3f}"]
+        print("| " + " | ".join(cells) + " |", flush=True)
+
+
+def _with_error(values: list[Any]) -> str:
+    """Return mean and standard error of realisations."""
+    return f"{np.mean(values):.1f} ± {np.std(values, ddof=1) / np.sqrt(len(values)):.1f}"
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description="Measure what a followed sodium profile gains in a loop.")
+    parser.add_argument("--parts", nargs="*", default=["flux", "change"], help="Tables.")
+    chosen = parser.parse_args()
+    loop, methods = load_loop("lgs_eight_metre"), 1 + len(others())
+    steps = {
+        "flux": len(FLUXES) * (len(WIDTHS_PX) * TUNING_FRAMES + methods * REALISATIONS * FRAMES),
+        "change": 3 * 2 * REALISATIONS * CHANGE_FRAMES,
+    }
+    total, done = sum(steps[part] for part in chosen.parts), 0
+    with progress_bar("Laser guide star", "frames") as show:
+
+        def advance(count: int) -> None:
+            nonlocal done
+            done += count
+            show(done, total)
+
+        if "flux" in chosen.parts:
+            flux_tables(loop, advance)
+        if "change" in chosen.parts:
+            change_table(loop, advance)
+
+
+if __name__ == "__main__":
+    main()
