@@ -28,10 +28,14 @@ TUNING_FRAMES = 120
 REALISATIONS = 3
 LARGEST_PX = 2.0  # search range
 
-# A layer of 8 km at 88 km; later 45 % of the flux in a peak of 3 km at 96 km.
-ALTITUDES = np.arange(78e3, 103e3, 1e3)
+# A layer of 8 km; later 45 % of the flux in a peak of 3 km, 8 km above. The mean altitude stays: it is focus.
+ALTITUDES = np.arange(74e3, 103e3, 1e3)
+SHARE, ABOVE_M = 0.45, 8e3
 BEFORE = fs.SodiumProfile.gaussian(88e3, 8e3).at(ALTITUDES).density
-PEAK = fs.SodiumProfile.gaussian(96e3, 3e3).at(ALTITUDES).density
+LOWER, PEAK = (
+    fs.SodiumProfile.gaussian(88e3 - SHARE * ABOVE_M + above, width).at(ALTITUDES).density
+    for above, width in ((0.0, 8e3), (ABOVE_M, 3e3))
+)
 CHANGE_FRAMES, CHANGED_FROM_S, CHANGED_TO_S = 700, 0.2, 0.8
 CHANGE_FLUX_E = 200.0
 SCORED_FROM = 550  # 0.3 s after the end of the change
@@ -105,7 +109,7 @@ def flux_tables(loop: LoopConfiguration, advance: Advance) -> None:
 
 def change_table(loop: LoopConfiguration, advance: Advance) -> None:
     """Print what the change of the profile adds to the low modes: against the same run without it."""
-    after = 0.55 * BEFORE + 0.45 * PEAK
+    after = (1 - SHARE) * LOWER + SHARE * PEAK
     star = loop.replace("camera", photons_per_subaperture=CHANGE_FLUX_E)
     layer: dict[str, Any] = {
         "altitude_m": tuple(ALTITUDES),
