@@ -10,19 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.integrate import quad
-from scipy.stats import norm, poisson
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.simulate import Detector, spots, subapertures
-from faintspot.spots.bounds import (
-    MEAN_ABSOLUTE,
-    cramer_rao,
-    cramer_rao_covariance,
-    photon_efficiency,
-    poisson_gaussian_information,
-)
+from faintspot.spots.bounds import MEAN_ABSOLUTE, cramer_rao, cramer_rao_covariance, photon_efficiency
 from faintspot.spots.psf import PSF
 
 PIXEL_VARIANCE = 1 / 12  # of a position within a pixel: widens a well-sampled spot
@@ -82,46 +74,6 @@ def test_derivatives_equal_the_differences_at_pixel_edges() -> None:
     assert along_x.sum() == pytest.approx(1)
     # The 1001 px stand for an infinite column: 1e-3 of the flux is beyond, the same in every column.
     np.testing.assert_allclose(bound[0], expected, rtol=2e-3)
-
-
-@pytest.mark.parametrize(("read_noise", "mean"), [(0.3, 0.2), (0.7, 0.5), (1.0, 0.05), (2.0, 3.0)])
-def test_information_of_a_pixel_by_brute_force(read_noise: float, mean: float) -> None:
-    electrons = np.arange(60)
-
-    def density(value: float, offset: float = 0.0) -> float:
-        terms = poisson.pmf(electrons, mean + offset) * norm.pdf(value - electrons, scale=read_noise)
-        return float(terms.sum())
-
-    def integrand(value: float) -> float:
-        step = 1e-4
-        change = (density(value, step) - density(value, -step)) / (2 * step)
-        return change**2 / density(value)
-
-    expected = quad(integrand, -6 * read_noise, mean + 12, limit=300)[0]
-    found = poisson_gaussian_information(np.array([mean]), read_noise)[0]
-    assert found == pytest.approx(expected, rel=2e-3)
-
-
-def test_information_of_a_pixel_in_its_limits() -> None:
-    # Without flux it is exp(1 / read_noise^2) - 1, that of a shift by one electron.
-    for read_noise in (0.6, 1.0, 3.0):
-        found = poisson_gaussian_information(np.array([0.0]), read_noise)[0]
-        assert found == pytest.approx(math.expm1(1 / read_noise**2), rel=1e-3)
-    # Counting: 1 / mean. At 0.1 e- neighbouring numbers of electrons overlap by 3e-7.
-    mean = np.array([1e-3, 0.1, 1.0, 10.0, 39.0, 41.0])
-    for read_noise in (0.0, 0.02, 0.1):
-        np.testing.assert_allclose(poisson_gaussian_information(mean, read_noise) * mean, 1, rtol=5e-4)
-    # Much light: the variance alone counts.
-    mean = np.array([200.0, 1e4])
-    np.testing.assert_allclose(poisson_gaussian_information(mean, 2.0) * (mean + 4), 1, rtol=1e-4)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.floats(0, 100), st.sampled_from([0.1, 0.25, 0.5, 1.0, 3.0, 6.0, 9.0]))
-def test_information_lies_between_gaussian_and_counting(mean: float, read_noise: float) -> None:
-    found = poisson_gaussian_information(np.array([mean]), read_noise)[0]
-    assert found >= (1 - 5e-4) / (max(mean, 1e-6) + read_noise**2)
-    assert found <= (1 + 5e-4) / max(mean, 1e-6)
 
 
 def test_exact_and_gaussian_noise_agree_with_much_flux_only() -> None:

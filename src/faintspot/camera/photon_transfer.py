@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import spline_filter1d
 from scipy.stats import chi2
 
-from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
 from faintspot.camera.dark_frames import DarkPixels, dark_pixels
+from faintspot.camera.transfer_curve import Curve, Line, fit_line, halves_of, photon_transfer, within
 from faintspot.sensor.layout import Layout
 
 Floats = NDArray[np.float64]
 
 _BY_DARKS = "read noise and dark level: dark frames, median pixel"
-_TILE = 16  # side of the parts of a frame that are assumed to move together, px
-_GROUPS = 16  # of pixels, for standard errors
-_ITERATIONS = 20
-_LARGEST_EXCESS = 10.0  # times the expected variance: pixels above it are ignored as flickering
 _LARGEST_SCATTER = 3.0  # mean square of bright pixels' variances about the line, over the expected one
 _LARGEST_SECOND_ORDER = 0.15  # largest relative change of the slope by second derivatives
 _LARGEST_CURVATURE = 0.25  # relative difference of the gains from faint and bright pixels
@@ -85,22 +80,6 @@ class _Value(NamedTuple):
 
     value: float
     error: float
-
-
-class _Curve(NamedTuple):
-    """Photon-transfer curve, one point per pixel: expected variance = intercept * share + slope * flux."""
-
-    variance: Floats
-    share: Floats  # fraction of its own variance left after common changes are removed
-    flux: Floats  # mean above the dark level, weighted likewise
-    mean: Floats  # plain mean above the dark level
-    degrees: float  # degrees of freedom of each variance
-
-
-class _Line(NamedTuple):
-    slope: float
-    slope_error: float
-    scatter: float  # mean square of bright pixels about the line, 1 for normal noise
 
 
 def measure_detector(
@@ -174,13 +153,13 @@ def measure_detector(
         notes = [_BY_DARKS]
         if np.shape(dark.level) != stack.shape[1:]:
             raise InputError(f"darks: expected frames of {stack.shape[1:]}, got {np.shape(dark.level)}")
-    everything = _photon_transfer(stack, dark.level, layout)
-    curve = _within(everything, range_adu)
-    line = _fit(curve)
+    everything = photon_transfer(stack, dark.level, layout)
+    curve = within(everything, range_adu)
+    line = fit_line(curve)
     if darks is None:
         read_noise = _read_noise_without_darks(everything, line)
-    coarse = _fit(_within(_photon_transfer(stack, dark.level, layout, order=1), range_adu))
-    halves = tuple(_fit(half) for half in _halves(curve))
+    coarse = fit_line(within(photon_transfer(stack, dark.level, layout, order=1), range_adu))
+    halves = tuple(fit_line(half) for half in halves_of(curve))
     notes.append("gain: slope of variance against mean")
     problem = _problem(line, coarse, halves)
     return _result(dark, read_noise, line, halves, multiplication, notes, problem)
@@ -219,7 +198,7 @@ def _dark_without_darks(frames: Floats, dark_level_adu: float | None) -> tuple[_
     return _Dark(level, level, noise), "dark level: darkest percent of the frames, with stray light"
 
 
-def _read_noise_without_darks(curve: _Curve, line: _Line | None) -> _Value:
+def _read_noise_without_darks(curve: Curve, line: Line | None) -> _Value:
     """Estimate the read noise from the darkest pixels, less the photon noise that the line gives."""
     darkest = curve.mean <= np.quantile(curve.mean, _DARKEST_FOR_NOISE)
     # The median of a chi-squared distribution lies below its mean.
@@ -233,121 +212,11 @@ def _read_noise_without_darks(curve: _Curve, line: _Line | None) -> _Value:
     return _Value(read_noise, 0.5 * relative * total / read_noise if read_noise else 0.0)
 
 
-def _photon_transfer(frames: Floats, dark_level: Any, layout: Layout | None, order: int = 2) -> _Curve:
-    """Return the variance of each pixel after removal of the common changes of its tile.
-
-    The residual of a fit with orthonormal modes Q has the variance sum_j (1 - Q Q')_ij^2 v_j, which is
-    computed for v = 1 (`share`) and v = flux.
-    """
-    mean = frames.mean(axis=0)
-    flux = np.broadcast_to(mean - dark_level, mean.shape)
-    slope_y, slope_x = _derivative(mean, 0), _derivative(mean, 1)
-    seconds = [_derivative(slope_y, 0), _derivative(slope_y, 1), _derivative(slope_x, 1)]
-    maps = np.stack([flux, slope_x, slope_y, *seconds][: 3 * order], axis=-1)
-    differences = np.diff(frames, axis=0)
-    parts = []
-    for tile in _tiles(mean.shape, layout):
-        here = flux[tile].ravel()
-        left, size, _ = np.linalg.svd(maps[tile].reshape(len(here), -1), full_matrices=False)
-        modes = left[:, size > 1e-9 * max(float(size[0]), 1e-300)]
-        change = differences[(slice(None), *tile)].reshape(len(differences), -1)
-        residual = change - (change @ modes) @ modes.T
-        leverage = np.sum(np.square(modes), axis=1)
-        spread = np.sum((modes @ (modes.T @ (here[:, None] * modes))) * modes, axis=1)
-        variance = 0.5 * np.mean(np.square(residual), axis=0)
-        parts.append((variance, 1 - leverage, here * (1 - 2 * leverage) + spread, here))
-    n = len(differences)
-    # Successive differences share a frame: their squares are correlated by 1/4.
-    variance, share, weighted, plain = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return _Curve(variance, share, weighted, plain, n**2 / (1.5 * n - 0.5))
-
-
-def _derivative(image: Floats, axis: int) -> Floats:
-    """Return the derivative per pixel of a quintic spline, which suits critically sampled spots."""
-    coefficients = np.moveaxis(spline_filter1d(image, 5, axis=axis, mode="mirror"), axis, 0)
-    c = np.pad(coefficients, ((2, 2), (0, 0)), mode="reflect")
-    slope: Floats = (10 * (c[3:-1] - c[1:-3]) + c[4:] - c[:-4]) / 24
-    return np.moveaxis(slope, 0, axis)
-
-
-def _tiles(shape: tuple[int, ...], layout: Layout | None) -> list[tuple[slice, slice]]:
-    """Return the windows of the layout, or tiles that cover the frame."""
-    if layout is not None:
-        if layout.frame_shape != shape:
-            raise InputError(f"frames: expected the layout's shape {layout.frame_shape}, got {shape}")
-        height, width = layout.window
-        return [(slice(r, r + height), slice(c, c + width)) for r, c in layout.corners]
-    rows, columns = (np.linspace(0, side, max(1, side // _TILE) + 1).astype(int) for side in shape)
-    return [
-        (slice(top, bottom), slice(start, stop))
-        for top, bottom in pairwise(rows)
-        for start, stop in pairwise(columns)
-    ]
-
-
-def _within(curve: _Curve, range_adu: tuple[float, float] | None) -> _Curve:
-    if range_adu is None:
-        return curve
-    limits = numbers_between("range_adu", range_adu)
-    if limits.shape != (2,) or limits[0] >= limits[1]:
-        raise InputError(f"range_adu: expected (lowest, highest), got {range_adu!r}")
-    inside = (curve.mean >= limits[0]) & (curve.mean <= limits[1])
-    if np.count_nonzero(inside) < 2 * _GROUPS:
-        raise InputError(f"range_adu = {range_adu!r}: expected at least {2 * _GROUPS} pixels in it")
-    return _chosen(curve, inside)
-
-
-def _chosen(curve: _Curve, pixels: NDArray[np.bool_]) -> _Curve:
-    variance, share, flux, mean = (values[pixels] for values in curve[:4])
-    return _Curve(variance, share, flux, mean, curve.degrees)
-
-
-def _halves(curve: _Curve) -> tuple[_Curve, _Curve]:
-    """Split the pixels so that the fainter ones have half of the flux."""
-    order = np.argsort(curve.mean)
-    collected = np.cumsum(np.maximum(curve.mean[order], 0.0))
-    split = curve.mean[order][np.searchsorted(collected, 0.5 * collected[-1])]
-    return _chosen(curve, curve.mean < split), _chosen(curve, curve.mean >= split)
-
-
-def _fit(curve: _Curve) -> _Line | None:
-    """Fit variance = intercept * share + slope * flux; standard errors by jackknife over groups of pixels."""
-    terms = np.stack([curve.share, curve.flux], axis=1)
-    n = len(terms)
-    if n < 2 * _GROUPS or np.ptp(curve.mean) == 0:
-        return None
-    # Weights must not follow the noise of faint pixels: below the typical flux they are equal.
-    bright = max(float(np.sum(np.square(curve.mean)) / max(np.sum(np.abs(curve.mean)), 1e-300)), 0.0)
-    typical = np.maximum(curve.mean, bright)
-    model: Any = np.full(n, np.inf)
-    scale: Any = np.ones(n)
-    for _ in range(_ITERATIONS):
-        good = (curve.variance > 0) & (curve.variance < _LARGEST_EXCESS * model)
-        weight = good / np.square(scale)
-        solution = _solve(terms * weight[:, None], terms, curve.variance)
-        smallest = 0.1 * float(np.median(curve.variance)) + 1e-300
-        model = np.maximum(terms @ solution, smallest)
-        scale = np.maximum(solution[0] + solution[1] * typical, smallest)
-    weighted = terms * weight[:, None]
-    group = np.arange(n) * _GROUPS // n
-    others = [group != left_out for left_out in range(_GROUPS)]
-    without = np.array([_solve(weighted[k], terms[k], curve.variance[k]) for k in others])
-    error = math.sqrt((_GROUPS - 1) * float(np.var(without[:, 1])))
-    counted = good & (curve.mean >= bright)
-    scatter = np.mean(np.square(curve.variance / model - 1)[counted]) if counted.any() else 0.0
-    return _Line(float(solution[1]), error, float(scatter) * curve.degrees / 2)
-
-
-def _solve(weighted: Floats, terms: Floats, variance: Floats) -> Floats:
-    solution = np.linalg.lstsq(weighted.T @ terms, weighted.T @ variance, rcond=None)[0]
-    return np.asarray(solution, dtype=np.float64)
-
-
 def _result(
     dark: _Dark,
     read_noise: _Value,
-    line: _Line | None,
-    halves: tuple[_Line | None, ...],
+    line: Line | None,
+    halves: tuple[Line | None, ...],
     em_gain: float,
     notes: list[str],
     problem: str | None = None,
@@ -376,7 +245,7 @@ def _result(
     )
 
 
-def _gain(line: _Line | None, em_gain: float) -> _Value | None:
+def _gain(line: Line | None, em_gain: float) -> _Value | None:
     """Return electrons per ADU and its error: the variance in ADU is excess * em_gain * flux / gain."""
     if line is None or line.slope <= 0:
         return None
@@ -384,7 +253,7 @@ def _gain(line: _Line | None, em_gain: float) -> _Value | None:
     return _Value(gain, gain * line.slope_error / line.slope)
 
 
-def _problem(line: _Line | None, coarse: _Line | None, halves: tuple[_Line | None, ...]) -> str | None:
+def _problem(line: Line | None, coarse: Line | None, halves: tuple[Line | None, ...]) -> str | None:
     """Return the reason why the gain is not reliable, or None.
 
     If second derivatives of the image affect the residuals of movements, third ones may do so, too.

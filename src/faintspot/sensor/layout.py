@@ -22,6 +22,7 @@ from faintspot.config.tables import (
     save_tables,
     table_of,
 )
+from faintspot.sensor.window_checks import check_centres, check_inside, check_overlap, chosen_index
 from faintspot.sensor.window_size import pair_of_numbers, window_size
 
 if TYPE_CHECKING:
@@ -115,9 +116,9 @@ class Layout:
             if (value := getattr(self, name)) is not None:
                 put(self, name, number_between(f"layout.{name}", value, 0.0, _LARGEST_PX, low_open=True))
         put(self, "angle_deg", number_between("layout.angle_deg", self.angle_deg, -360, 360))
-        _check_inside(corners, self.window, self.frame_shape)
-        _check_centres(centres - middle, self.window)
-        _check_overlap(corners, self.window)
+        check_inside(corners, self.window, self.frame_shape)
+        check_centres(centres - middle, self.window)
+        check_overlap(corners, self.window)
         for name, array in (("corners", corners), ("centres", centres.astype(np.float64)), ("cells", cells)):
             array = array.copy()
             array.flags.writeable = False
@@ -161,7 +162,7 @@ class Layout:
         InputError
             If a mask has the wrong length, a number is out of range or repeated, or none is selected.
         """
-        index = _index(chosen, len(self))
+        index = chosen_index(chosen, len(self))
         return replace(
             self, corners=self.corners[index], centres=self.centres[index], cells=self.cells[index]
         )
@@ -387,78 +388,8 @@ class Layout:
         return rows, self.corners[:, 1, None, None] + np.arange(self.window[1])
 
 
-def _index(chosen: Any, length: int) -> NDArray[np.int64]:
-    """Return the numbers of the selected sub-apertures."""
-    if isinstance(chosen, slice):
-        index = np.arange(length)[chosen]
-    else:
-        try:
-            array = np.asarray(chosen)
-        except ValueError:  # rows of different lengths
-            array = np.empty((0, 0))
-        if array.ndim != 1:
-            raise InputError("layout[...]: expected a mask, a slice or a list of numbers")
-        if array.dtype == np.bool_:
-            if len(array) != length:
-                raise InputError(f"layout[mask]: expected a mask of {length}, got {len(array)}")
-            index = np.flatnonzero(array)
-        else:
-            index = numbers_between("layout[...]", array, -length, length - 1, integer=True) % length
-            if len(np.unique(index)) < len(index):
-                raise InputError("layout[...]: expected each sub-aperture once, got one twice")
-    if len(index) == 0:
-        raise InputError("layout[...]: expected at least one sub-aperture, got none")
-    return np.asarray(index)
-
-
 def _rows_of_two(name: str, value: Any) -> NDArray[Any]:
     array = finite_array(name, value)
     if array.ndim != 2 or array.shape[1] != 2:
         raise InputError(f"{name}: expected shape (n, 2), got {array.shape}")
     return array
-
-
-def _check_inside(corners: NDArray[np.int64], window: tuple[int, int], frame_shape: tuple[int, int]) -> None:
-    outside = np.any((corners < 0) | (corners + np.array(window) > np.array(frame_shape)), axis=1)
-    if outside.any():
-        first = int(np.argmax(outside))
-        row, column = corners[first]
-        raise InputError(
-            f"layout: sub-aperture {first} (rows {row} to {row + window[0] - 1}, columns {column} to "
-            f"{column + window[1] - 1}) leaves the frame of {frame_shape[0]} x {frame_shape[1]} pixels"
-        )
-
-
-def _check_centres(offsets: NDArray[np.float64], window: tuple[int, int]) -> None:
-    """Raise an error for implausible centres; aberrations may move spots by a pitch."""
-    away = np.abs(offsets).max(axis=1)
-    if away.max() > 3 * max(window):
-        raise InputError(
-            f"layout.centres: expected centres up to {3 * max(window)} px from their windows' middles, "
-            f"got one {away.max():g} px away (sub-aperture {np.argmax(away)})"
-        )
-
-
-def _check_overlap(corners: NDArray[np.int64], window: tuple[int, int]) -> None:
-    """Raise an error if windows share a pixel: corners less than a window apart on both axes."""
-    if _on_a_grid(corners, window):
-        return
-    from scipy.spatial import KDTree  # takes 0.2 s and is not needed for a regular grid
-
-    apart, nearest = KDTree(corners / np.array(window)).query(corners / np.array(window), 2, p=np.inf)
-    overlapping = np.flatnonzero(apart[:, 1] < 1 - 1e-9)
-    if overlapping.size:
-        index = int(overlapping[0])
-        other = int(nearest[index][nearest[index] != index][0])
-        raise InputError(
-            f"layout: sub-apertures {min(index, other)} and {max(index, other)} overlap; use smaller windows "
-            f"than {window}"
-        )
-
-
-def _on_a_grid(corners: NDArray[np.int64], window: tuple[int, int]) -> bool:
-    """Return whether these are distinct cells of a grid whose lines are a window apart."""
-    for axis, size in enumerate(window):
-        if np.diff(np.unique(corners[:, axis])).min(initial=size) < size:
-            return False
-    return len(np.unique(corners, axis=0)) == len(corners)

@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between, numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.camera.detector import Detector
+from faintspot.spots.derivatives import STEP_PX, images_with_derivatives
+from faintspot.spots.pixel_information import SMALLEST_MEAN_E, poisson_gaussian_information
 from faintspot.spots.psf import PSF
 from faintspot.spots.shapes import image_shape, per_spot, position_array, spots
 
@@ -25,9 +27,6 @@ MEAN_ABSOLUTE = math.sqrt(2 / math.pi)
 """Mean absolute value of a standard normal distribution: slope error of an estimator at a bound of 1 px."""
 
 _NOISES = ("exact", "gaussian")
-_SMALLEST_MEAN_E = 1e-6  # pixels with less flux carry no information on the position
-_LARGEST_TABLED_VARIANCE = 40.0  # above it, the expansion of the information is accurate to 5e-4
-_SMALLEST_TABLED_NOISE_E = 0.05  # below it, electrons are counted without error
 _BRACKET = 1e12  # largest and, inverted, smallest flux tried by photon_efficiency, e-
 _FLUX_STEPS_PER_DECADE = 12
 
@@ -144,7 +143,7 @@ def cramer_rao(
         step = 0.01 * number_between("size", size, 0.0, low_open=True)
     else:
         render = functools.partial(psf.images, shape=(ny, nx))
-        step = 0.01
+        step = STEP_PX
     spot = _with_derivatives(render, where, step)
     blur = _noise(detector, (ny, nx), exact)
     bound = np.empty((*flux.shape, 2))
@@ -204,7 +203,7 @@ def cramer_rao_covariance(
     bound = np.empty((count, 2, 2))
     for plane in range(count):
         render = functools.partial(psf.images, shape=size, which=plane)
-        spot = _with_derivatives(render, np.zeros((1, 2)), 0.01)
+        spot = _with_derivatives(render, np.zeros((1, 2)), STEP_PX)
         bound[plane] = _covariances(float(flux[plane]), spot, blur, True, False, math.inf)[0]
     return bound
 
@@ -291,19 +290,12 @@ def _positions(positions: Any, position_range_px: float | None) -> Floats:
 
 
 def _with_derivatives(render: Any, positions: Floats, step: float) -> _Spot:
-    """Return images and their derivatives by four-point differences, accurate to 1e-7 at this step."""
+    """Return images and their derivatives, for a flux of 1 e- in the window of a centred spot."""
     centred = float(np.sum(render(np.zeros((1, 2)))))
     if not centred > 0:
         raise InputError("psf: expected images with flux, got none")
-
-    def flat(shift: Floats) -> Floats:
-        return np.reshape(render(positions + shift), (len(positions), -1)) / centred
-
-    along_x, along_y = (
-        (8 * (flat(axis) - flat(-axis)) - (flat(2 * axis) - flat(-2 * axis))) / (12 * step)
-        for axis in np.eye(2) * step
-    )
-    image = flat(np.zeros(2))
+    found = images_with_derivatives(render, positions, step)
+    image, along_x, along_y = (np.reshape(each, (len(positions), -1)) / centred for each in found)
     # The wings of a learnt PSF scatter around zero; their slope carries no information there.
     illuminated = image > 0
     return _Spot(np.where(illuminated, image, 0.0), along_x * illuminated, along_y * illuminated)
@@ -354,63 +346,9 @@ def _pixel_information(mean_e: Floats, noise: _Noise) -> Floats:
     if not noise.exact:
         # The floor avoids division by zero for noise-free pixels.
         variance = noise.excess * mean_e + np.square(noise.read_noise_e)
-        return 1 / np.maximum(variance, _SMALLEST_MEAN_E)
+        return 1 / np.maximum(variance, SMALLEST_MEAN_E)
     information = np.empty_like(mean_e)
     for read_noise in np.unique(noise.read_noise_e):
         pixels = noise.read_noise_e == read_noise
         information[:, pixels] = poisson_gaussian_information(mean_e[:, pixels], float(read_noise))
     return information
-
-
-def poisson_gaussian_information(mean_e: Floats, read_noise_e: float) -> Floats:
-    """Return the Fisher information about the mean of Poisson electrons with Gaussian read noise [1 / e-^2].
-
-    With v = mean + read_noise^2 it tends to 1 / v + (read_noise^2 / v)^2 / (2 v^2) at large v, where the
-    second term is the information in the variance, and to 1 / mean at low read noise. It is tabulated in
-    between, and accurate to 5e-4.
-
-    Parameters
-    ----------
-    mean_e : (...) array
-        Mean electrons, from 0.
-    read_noise_e : float
-        Standard deviation of the read noise, from 0.
-    """
-    mean = np.maximum(mean_e, _SMALLEST_MEAN_E)
-    if read_noise_e < _SMALLEST_TABLED_NOISE_E:
-        return 1 / mean
-    variance = mean + read_noise_e**2
-    information: Floats = 1 / variance + np.square(read_noise_e**2 / variance) / (2 * variance**2)
-    low = variance < _LARGEST_TABLED_VARIANCE
-    if low.any():
-        spline = _information_table(read_noise_e)
-        information[low] = np.exp(spline(np.log(mean[low])))
-    return information
-
-
-@functools.lru_cache(maxsize=64)
-def _information_table(read_noise_e: float) -> Any:
-    """Return a spline of the logarithm of the information against the logarithm of the mean.
-
-    p(g) is a sum over electrons k of Poisson(k) Normal(g - k). Since d Poisson(k) / d mean is
-    Poisson(k - 1) - Poisson(k), dp/dmean = p(g - 1) - p(g), and the information, the integral of its square
-    over p, is the integral of p(g - 1)^2 / p(g), minus 1.
-    """
-    from scipy.interpolate import CubicSpline
-    from scipy.special import gammaln
-
-    log_mean = np.linspace(math.log(_SMALLEST_MEAN_E), math.log(_LARGEST_TABLED_VARIANCE), 160)
-    mean = np.exp(log_mean)
-    per_electron = math.ceil(8 / min(read_noise_e, 1.0))  # samples: the integrand is smooth at this step
-    highest = _LARGEST_TABLED_VARIANCE + 10 * math.sqrt(_LARGEST_TABLED_VARIANCE) + 10 * read_noise_e
-    lowest = -math.ceil(10 * read_noise_e) - 1
-    values = np.arange(lowest * per_electron, math.ceil(highest) * per_electron) / per_electron
-    # More electrons than the largest value, so that p does not end before the range of integration.
-    electrons = np.arange(math.ceil(highest + 10 * read_noise_e) + 3)
-    poisson = np.exp(electrons * log_mean[:, None] - mean[:, None] - gammaln(electrons + 1))
-    normal = np.exp(-0.5 * np.square((values - electrons[:, None]) / read_noise_e))
-    density = poisson @ normal / (read_noise_e * math.sqrt(2 * math.pi))
-    before, here = density[:, :-per_electron], density[:, per_electron:]
-    ratio = np.divide(before, here, out=np.zeros_like(before), where=here > 1e-280)
-    information = np.sum(np.square(ratio - 1) * here, axis=1) / per_electron
-    return CubicSpline(log_mean, np.log(information))

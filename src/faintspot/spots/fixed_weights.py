@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import finite_array, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.npz import NpzFile
+from faintspot.spots.derivatives import images_with_derivatives
 from faintspot.spots.psf import PSF
 
 Floats = NDArray[np.float64]
@@ -21,8 +23,6 @@ _LEAST_WEIGHT = 1e-4  # of the largest: less counts nothing, and need not be rea
 _SAME = 1e-6  # relative to the largest weight; smaller weights are ignored and not read
 _RIDGE = 1e-6  # relative to the largest weight: indistinguishable in float32 sums
 # relative to the mean variance of a pixel: keeps the solution finite without noise
-
-_STEP_PX = 0.05  # for derivatives of spots
 
 
 class WeightedCentre(NamedTuple):
@@ -330,13 +330,8 @@ class FixedWeights(NpzFile):
 def _spot_and_gradients(psf: PSF, shape: tuple[int, int]) -> tuple[Floats, Floats, Floats]:
     """Return images (n_psfs, ny, nx) of spots at 0 and their derivatives in the position."""
     which = np.arange(len(psf.samples))
-
-    def images(x: float, y: float) -> Floats:
-        return psf.images(np.tile([x, y], (len(which), 1)), shape, which=which)
-
-    along_x = (images(_STEP_PX, 0.0) - images(-_STEP_PX, 0.0)) / (2 * _STEP_PX)
-    along_y = (images(0.0, _STEP_PX) - images(0.0, -_STEP_PX)) / (2 * _STEP_PX)
-    spot = images(0.0, 0.0)
+    render = partial(psf.images, shape=shape, which=which)
+    spot, along_x, along_y = images_with_derivatives(render, np.zeros((len(which), 2)))
     if not np.all(spot.max(axis=(1, 2)) > 0):
         raise InputError("psf: expected spots with flux in their windows, got none")
     return spot, along_x, along_y
