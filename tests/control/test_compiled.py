@@ -25,10 +25,10 @@ def test_it_is_the_plain_integrator() -> None:
     rng = np.random.default_rng(3)
     for _ in range(20):
         slopes = rng.standard_normal(2 * N)
-        np.testing.assert_allclose(compiled.expected().mean_px, plain.expected().mean_px, atol=1e-12)
+        np.testing.assert_allclose(compiled.expected().mean_px, plain.expected().mean_px, atol=1e-6)
         for each in (plain, compiled):
             each.update(slopes, ERRORS)
-        np.testing.assert_allclose(lines[1].latest, lines[0].latest, atol=1e-12)
+        np.testing.assert_allclose(lines[1].latest, lines[0].latest, atol=1e-6)  # float32
 
 
 def test_nothing_winds_up() -> None:

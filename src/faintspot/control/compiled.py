@@ -61,10 +61,11 @@ def add_products(columns: Any, vectors: Any, out: Any) -> None:
 
     Parameters
     ----------
-    columns : (m, c) float64 array
+    columns : (m, c) array
         The matrix, transposed, so that results are what the processor works on side by side.
-    vectors : (k, m) float64 array
-    out : (k, c) float64 array
+    vectors : (k, m) array
+    out : (k, c) array
+        All three float32, or all float64.
     """
     m, c = columns.shape
     whole = m - m % 4  # four rows at once: results are read and written a quarter as often
@@ -115,7 +116,9 @@ def displaced_flux(commands: Any, flux: Any, columns: Any, displaced: Any, said:
 
 
 @_compiled
-def integrate(slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, place: Any) -> float:
+def integrate(
+    slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, place: Any, work: Any
+) -> float:
     """Write the next command: `keep` times the latest minus `gain` times the wavefront, clipped.
 
     Return the command's sum before it was clipped.
@@ -124,21 +127,25 @@ def integrate(slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, row
     ----------
     slopes : (m,) float64 array
         Finite.
-    columns : (m, commands) float64 array, contiguous
-        The reconstructor, transposed, see `add_products`.
+    columns : (m, commands) float32 array, contiguous
+        The reconstructor, transposed, see `add_products`. Reading it takes most of the time of large sensors.
     gain, keep, largest : float
     rows : (delay + 1, commands) float64 array
         Of a `CommandDelayLine`.
     place : int
         Which row to write; the latest command is in the one before.
+    work : tuple of (1, m) and (1, commands) float32 arrays
+        Slopes, and the wavefront.
     """
     latest, out = rows[(place or rows.shape[0]) - 1], rows[place]
-    for c in range(out.shape[0]):
-        out[c] = 0.0
-    add_products(columns, slopes.reshape(1, slopes.shape[0]), rows[place : place + 1])
+    seen, wavefront = work
+    for s in range(slopes.shape[0]):
+        seen[0, s] = slopes[s]
+    wavefront[:] = 0.0
+    add_products(columns, seen, wavefront)
     total = 0.0
     for c in range(out.shape[0]):
-        wanted = keep * latest[c] - gain * out[c]
+        wanted = keep * latest[c] - gain * wavefront[0, c]
         total += wanted
         out[c] = min(max(wanted, -largest), largest)
     return total
@@ -169,7 +176,8 @@ class CompiledIntegrator:
         self, line: CommandDelayLine, interaction: Floats, reconstruct: Floats, gain: float, leak: float
     ) -> None:
         self._line, self._interaction = line, interaction
-        self._columns = np.ascontiguousarray(reconstruct.T, np.float64)
+        self._columns = np.ascontiguousarray(reconstruct.T, np.float32)
+        self._work = tuple(np.zeros((1, side), np.float32) for side in self._columns.shape)
         self.gain, self._keep = float(gain), 1.0 - leak
 
     def expected(self) -> Expected:
@@ -185,4 +193,4 @@ class CompiledIntegrator:
         """See `Controller`; invalid slopes are 0, and all count the same."""
         line = self._line
         numbers = self.gain, self._keep, line.largest
-        line.sent(_INTEGRATE(slopes_px, self._columns, *numbers, line.rows, line.place))
+        line.sent(_INTEGRATE(slopes_px, self._columns, *numbers, line.rows, line.place, self._work))

@@ -21,6 +21,7 @@ from faintspot.control.guarded import Guarded
 from faintspot.control.identification import Identified
 from faintspot.control.integrator import Integrator
 from faintspot.control.kalman import SlopePredictor, steady_covariance
+from faintspot.control.large_guarded import LargeGuarded
 from faintspot.control.local_kalman import LocalPredictor, local_shapes
 from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
@@ -306,13 +307,16 @@ class Learnt:
         plant, model = self.plant, self.model
         if model.kind == KALMAN and not model.is_local:
             return model.compiled(plant, line, model.phase, prior_std_px=prior_std_px)
-        return Guarded(
-            line,
-            plant.interaction,
-            model.phase,
-            partial(model.controller, plant),
-            partial(plant.integrator, model.plain_gain),
-            prior_std_px=prior_std_px,
-            noise_factor=model.noise_factor,
-            prefers_plain=model.left[1] < model.left[0],
-        )
+        options: dict[str, Any] = {
+            "prior_std_px": prior_std_px,
+            "noise_factor": model.noise_factor,
+            "prefers_plain": model.left[1] < model.left[0],
+        }
+        interaction, phase, gain = plant.interaction, model.phase, model.plain_gain
+        if model.is_local:
+            predictor, reconstructor = LocalPredictor(model.arrays), plant.reconstructor
+            return LargeGuarded(
+                line, interaction, reconstructor, phase, predictor, gain, plant.leak, **options
+            )
+        plain = partial(plant.integrator, gain)
+        return Guarded(line, interaction, phase, partial(model.controller, plant), plain, **options)

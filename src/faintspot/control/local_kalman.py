@@ -39,7 +39,9 @@ class LocalPredictor:
     """
 
     def __init__(self, arrays: Mapping[str, Any]) -> None:
-        self._near, self._around = (np.asarray(arrays[name], np.int32) for name in ("near", "around"))
+        self._near, self._around = (
+            np.ascontiguousarray(arrays[name], np.int32) for name in ("near", "around")
+        )
         n = len(self._near)
         weights = np.asarray(arrays["weights"], np.float32)
         self._weights = np.ascontiguousarray(weights.transpose(1, 5, 3, 0, 2, 4))

@@ -62,7 +62,7 @@ def neighbours_within(positions_m: Floats, distance_m: float) -> Indices:
     apart = np.hypot(*(positions_m[:, None] - positions_m).transpose(2, 0, 1))
     order = np.argsort(apart, axis=1, kind="stable").astype(np.int32)
     within = np.take_along_axis(apart, order, axis=1) <= distance_m * (1 + 1e-9)
-    return np.where(within, order, np.int32(n))[:, : int(within.sum(axis=1).max())]
+    return np.ascontiguousarray(np.where(within, order, np.int32(n))[:, : int(within.sum(axis=1).max())])
 
 
 def both_axes(neighbours: Indices, n: int) -> Indices:

@@ -16,6 +16,7 @@ from faintspot.control.compiled import CompiledIntegrator, true_slopes
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.configuration import CONTROLLER, Control
 from faintspot.control.guarded import Guarded
+from faintspot.control.large_guarded import LargeGuarded
 from faintspot.control.learnt import Model
 from faintspot.kernels.compiling import Direct
 from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
@@ -41,6 +42,8 @@ class _Ready(NamedTuple):
     """Whether its prediction goes to the estimators as a prior."""
     takes_prior: bool
     """Whether it uses the width of the prior of the slopes."""
+    completes: bool
+    """Whether a part of each frame's work, which need not delay the command, waits for `expected`."""
 
     @classmethod
     def of(cls, control: Control, line: CommandDelayLine) -> Self:
@@ -50,6 +53,7 @@ class _Ready(NamedTuple):
             controller,
             control.prediction == CONTROLLER,
             isinstance(controller, (Guarded, CompiledKalman)),
+            isinstance(controller, (LargeGuarded, CompiledKalman)),
         )
 
 
@@ -192,9 +196,11 @@ class ControlLoop:
         try:
             if begins:
                 on.controller.begin()
-            if prior is not None and on.predicts and self.closed and not self._begins:
-                prior.expect(*on.controller.expected())
-                return
+            if self.closed and not self._begins and (on.predicts or on.completes):
+                expected = on.controller.expected()
+                if prior is not None and on.predicts:
+                    prior.expect(*expected)
+                    return
         except Exception as error:  # nothing raises in the frame path
             self._fail(error)
         if prior is not None:
