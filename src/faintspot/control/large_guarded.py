@@ -90,8 +90,10 @@ class LargeGuarded(Guarded):
         super().begin()
         self._rest, self._held_at = None, -1
 
-    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
-        """See `Controller`."""
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
+        """See `Controller`; noise of x and y is taken to be independent."""
         expected = self.expected().mean_px
         alone, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
         held, of_learnt, of_plain, latest = self._held
