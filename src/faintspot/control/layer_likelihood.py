@@ -37,6 +37,9 @@ overestimated as much."""
 _REFINEMENTS = 40
 _SPEED_UNIT = 2.0  # m/s, in which winds have about the same effect as logarithms of strengths
 _NOISE = 1e-3, 1e3
+_UNMODELLED = 0.01
+"""Part of the turbulence's spectra that is not as in the model, in each slope independently: centroid gains,
+speckles. Bright stars, whose noise does not hide it, would have false layers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +91,22 @@ class LayerLikelihood:
             total += spectrum.real[:, None, None] * np.outer(shape, shape)
         return total
 
+    def _matrices(self, distinct: Complex) -> Complex:
+        """Return the cross-spectra of turbulence with what is not modelled of it."""
+        full, diagonal = self._spectra.matrices(distinct), np.arange(len(self._noise_px2))
+        full[:, diagonal, diagonal] *= 1 + _UNMODELLED
+        return full
+
+    def _summed(self, gradient: Complex) -> Complex:
+        """Return `SlopeSpectra.summed` for `_matrices`."""
+        diagonal = np.arange(len(self._noise_px2))
+        scaled = gradient.copy()
+        scaled[:, diagonal, diagonal] *= 1 + _UNMODELLED
+        return self._spectra.summed(scaled)
+
     def _residual(self, distinct: Complex, noise: float) -> tuple[Complex, Complex]:
         """Return the model's cross-spectra and their inverse."""
-        model = self._spectra.matrices(distinct) + self._vibrating
+        model = self._matrices(distinct) + self._vibrating
         diagonal = np.arange(len(self._noise_px2))
         model[:, diagonal, diagonal] += noise * self._noise_px2
         return model, np.asarray(np.linalg.inv(model), np.complex128)
@@ -103,7 +119,7 @@ class LayerLikelihood:
         value = self._weight * float(logarithm.sum() + np.trace(explained, axis1=1, axis2=2).real.sum())
         gradient = self._weight * (inverse - explained @ inverse)
         of_noise = float((np.diagonal(gradient, axis1=1, axis2=2).real @ self._noise_px2).sum())
-        return value, self._spectra.summed(gradient), of_noise
+        return value, self._summed(gradient), of_noise
 
     def strengths(self, spectra: Complex, start: float, noise: float = 1.0) -> tuple[Floats, float]:
         """Return strengths of given spectra (components, frequencies, distinct), and the noise.
@@ -119,7 +135,7 @@ class LayerLikelihood:
             _, inverse = self._residual(distinct, noise)
             explained = inverse @ self._measured @ inverse
             seen, expected = (
-                (flat @ self._spectra.summed(each).ravel().astype(np.complex64)).real.astype(np.float64)
+                (flat @ self._summed(each).ravel().astype(np.complex64)).real.astype(np.float64)
                 for each in (explained, inverse)
             )
             strength *= (np.maximum(seen, 0.0) / np.maximum(expected, 1e-30)) ** power
@@ -232,7 +248,7 @@ class LayerLikelihood:
         noise = np.zeros_like(inverse)
         diagonal = np.arange(len(self._noise_px2))
         noise[:, diagonal, diagonal] = layers.noise * self._noise_px2
-        changes = np.array([inverse @ each for each in (*map(self._spectra.matrices, derivatives), noise)])
+        changes = np.array([inverse @ each for each in (*map(self._matrices, derivatives), noise)])
         flat = changes.reshape(len(changes), -1)
         information = self._weight * (flat @ changes.swapaxes(2, 3).reshape(len(changes), -1).T).real
         information[-2, -2] += OUTER_SCALE_SPREAD**-2
@@ -246,7 +262,7 @@ class LayerLikelihood:
 
     def _start(self) -> float:
         """Return a strength r0^(-5/3) from the total variance."""
-        still = self._spectra.matrices(self._spectra.of_wind(np.array([10.0, 0.0]), self._tables))
+        still = self._matrices(self._spectra.of_wind(np.array([10.0, 0.0]), self._tables))
         measured, theory = (np.trace(each, axis1=1, axis2=2).real.sum() for each in (self._measured, still))
         return float(0.5 * measured / theory)
 
