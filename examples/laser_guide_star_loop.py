@@ -22,9 +22,9 @@ from faintspot.estimators.correlation import Correlation
 from faintspot.experiments.search import FIRST_TUNING_REALISATION
 
 FLUXES = (60.0, 200.0)
-FRAMES, SETTLE = 240, 60
-WIDTHS_PX = (2.5, 3.5, 5.0, 7.0)
-TUNING_FRAMES = 120
+FRAMES, SETTLE = 160, 50
+WIDTHS_PX = (2.5, 4.0, 6.3)
+TUNING_FRAMES = 100
 REALISATIONS = 3
 LARGEST_PX = 2.0  # search range
 
@@ -36,9 +36,9 @@ LOWER, PEAK = (
     fs.SodiumProfile.gaussian(88e3 - SHARE * ABOVE_M + above, width).at(ALTITUDES).density
     for above, width in ((0.0, 8e3), (ABOVE_M, 3e3))
 )
-CHANGE_FRAMES, CHANGED_FROM_S, CHANGED_TO_S = 700, 0.2, 0.8
+CHANGE_FRAMES, CHANGED_FROM_S, CHANGED_TO_S = 360, 0.1, 0.3
 CHANGE_FLUX_E = 200.0
-SCORED_FROM = 550  # 0.3 s after the end of the change
+SCORED_FROM = 280  # 0.26 s after the end of the change
 LOW = slice(3, 10)  # Zernike modes 5 to 11 of a record
 
 Advance = Callable[[int], None]
@@ -114,29 +114,32 @@ def change_table(loop: LoopConfiguration, advance: Advance) -> None:
     layer: dict[str, Any] = {
         "altitude_m": tuple(ALTITUDES),
         "follow_every_frames": 50,
-        "follow_time_constant_frames": 100.0,
+        "follow_time_constant_frames": 50.0,
     }
     constant = star.replace("laser", **layer, time_s=(0.0,), density=(tuple(BEFORE),))
     times = 0.0, CHANGED_FROM_S, CHANGED_TO_S
     densities = tuple(map(tuple, (BEFORE, BEFORE, after)))
     changing = star.replace("laser", **layer, time_s=times, density=densities)
     static, followed = others()[1:3]
-    compared = window(5.0), static, followed
-    print("\n| method | Zernike modes 5 to 11 [nm rms] | focus [nm rms] | Strehl ratio, without change |")
-    print("|---|---|---|---|")
-    for method in compared:
-        low, focus, strehl = [], [], []
-        for realisation in range(REALISATIONS):
+    compared = static, followed, window(5.0)
+    low: dict[str, list[Any]] = {method.label: [] for method in compared}
+    focus: dict[str, list[Any]] = {label: [] for label in low}
+    strehl: dict[str, list[Any]] = {label: [] for label in low}
+    for realisation in range(REALISATIONS):  # what is learnt before a run is kept from one method to the next
+        for method in compared:
             records = [
                 run(each, method, realisation, CHANGE_FRAMES, advance) for each in (changing, constant)
             ]
             change = np.subtract(*(each.zernike_nm[SCORED_FROM:].mean(axis=0) for each in records))
-            low.append(np.sqrt(np.square(change[LOW]).sum()))
-            focus.append(abs(change[2]))
-            strehl.append([each.strehl[SCORED_FROM:].mean() for each in records])
-        with_change, without = np.mean(strehl, axis=0)
-        cells = [method.label, _with_error(low), _with_error(focus), f"{with_change:.3f}, {without:.3f}"]
-        print("| " + " | ".join(cells) + " |", flush=True)
+            low[method.label].append(np.sqrt(np.square(change[LOW]).sum()))
+            focus[method.label].append(abs(change[2]))
+            strehl[method.label].append([each.strehl[SCORED_FROM:].mean() for each in records])
+    print("\n| method | Zernike modes 5 to 11 [nm rms] | focus [nm] | Strehl ratio, without change |")
+    print("|---|---|---|---|")
+    for label in low:
+        with_change, without = np.mean(strehl[label], axis=0)
+        cells = [label, _with_error(low[label]), _with_error(focus[label])]
+        print("| " + " | ".join([*cells, f"{with_change:.3f}, {without:.3f}"]) + " |", flush=True)
 
 
 def _with_error(values: list[Any]) -> str:

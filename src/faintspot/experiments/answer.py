@@ -15,12 +15,14 @@ from faintspot.base.notebook import table
 from faintspot.camera.calibration import Calibration
 from faintspot.config.tables import save_tables
 from faintspot.experiments.curves import Curve
+from faintspot.experiments.laser_spots import places_m
 from faintspot.experiments.methods import Knowledge
 from faintspot.experiments.promise import Promise
 from faintspot.experiments.question import Question
 from faintspot.experiments.statistics import Estimate, SlopeStatistics
 from faintspot.pipeline import configuration
 from faintspot.pipeline.settings import Settings
+from faintspot.spots.psf import PSF
 
 Floats = NDArray[np.float64]
 
@@ -157,11 +159,22 @@ class Answer:
             raise InputError(f"estimator {name!r}: expected one that was tried: {', '.join(results)}")
         return found
 
+    @property
+    def _psf(self) -> PSF | None:
+        """PSF for the configuration; with a laser that of every sub-aperture, if their places are known."""
+        question = self.question
+        if question.laser is None:
+            return self.best.method.psf
+        if question.layout is None or question.subaperture_m is None:
+            return None
+        places = places_m(question.layout, question.subaperture_m)
+        return question.laser.psf(places, question.pixel_scale_arcsec, question.shape)
+
     def save(self, path: str | Path) -> None:
         """Write the recommended settings as a configuration file; what else it holds stays.
 
-        PSF and score lie beside it; the table [promise] says what the recording made of it, if any. Without a
-        layout the file holds the other tables only.
+        PSF and score lie beside it, with a laser the PSF of every sub-aperture; the table [promise] says what
+        the recording made of it, if any. Without a layout the file holds the other tables only.
 
         Raises
         ------
@@ -173,7 +186,7 @@ class Answer:
             self.question.layout,
             best.settings,
             self.calibration,
-            best.method.psf,
+            self._psf,
             best.method.score,
         ):
             if item is not None:

@@ -9,6 +9,7 @@ from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.experiments.answer import Answer, MethodResult, settings_in_words
 from faintspot.experiments.methods import Knowledge
+from faintspot.experiments.question import Question
 from faintspot.experiments.statistics import Estimate
 from faintspot.experiments.words import plain_number, with_error
 from faintspot.report.texts import Texts
@@ -33,6 +34,8 @@ def situation(answer: Answer) -> str:
     if question.photometry is not None:
         star = f"{question.photometry.band} = {_magnitude(answer, question.star_flux_e):.2f}, {star}"
     kind = f"{question.profile} spots" if question.psf is None else "spots as learnt"
+    if question.laser is not None:
+        kind = "spots of a laser guide star"
     if question.d_over_r0:
         kind = f"speckled spots (sub-aperture {question.d_over_r0:.2g} r0)"
     return _TEXT("answer.situation", star=star, kind=kind, question=question)
@@ -99,9 +102,11 @@ def foundations(answer: Answer) -> list[str]:
     question = answer.question
     spots = f"{answer.realisations} simulated spots at each of {len(answer.flux_e)} fluxes"
     lines = list(question.facts)
+    if question.laser is not None:
+        lines.append(question.laser.in_words(question.pixel_scale_arcsec, question.shape))
     lines.append(
         _TEXT(
-            "answer.assumed_profile" if question.psf is None else "answer.learnt_psf",
+            _shape(question),
             spots=spots,
             profile=question.profile,
         )
@@ -113,6 +118,13 @@ def foundations(answer: Answer) -> list[str]:
         lines.append(_TEXT["answer.bound"])
     lines += [f"{name} was not tried: {reason}" for name, reason in answer.left_out.items()]
     return lines
+
+
+def _shape(question: Question) -> str:
+    """Return the name of the text on the spots' shape."""
+    if question.laser is not None:
+        return "answer.laser_psf"
+    return "answer.assumed_profile" if question.psf is None else "answer.learnt_psf"
 
 
 def gain_in_words(answer: Answer, gain: Estimate) -> str:

@@ -17,6 +17,7 @@ from faintspot.base.toml_files import check_keys, checked_table, parse_file
 from faintspot.camera.calibration import Calibration
 from faintspot.camera.detector import Detector
 from faintspot.estimators.scene import PIXEL_BLUR_PX2, Scene
+from faintspot.experiments.laser_spots import LaserSpots
 from faintspot.sensor.layout import GRID_KEYS, Layout
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.simulate.photometry import (
@@ -90,6 +91,8 @@ class Question:
         at the sensor's wavelength.
     psf : PSF, optional
         The spot itself, as learnt from frames; then no profile is assumed.
+    laser : LaserSpots, optional
+        Laser guide star instead of a profile; needs `pixel_scale_arcsec`.
     flux_e : float, optional
         Flux of the star: detected photons (photo-electrons) per sub-aperture and frame.
     magnitude : float, optional
@@ -141,6 +144,7 @@ class Question:
     pixel_scale_arcsec: Any = None
     r0_m: Any = None
     psf: PSF | None = None
+    laser: LaserSpots | None = None
     flux_e: Any = None
     magnitude: Any = None
     band: str = DEFAULT_BAND
@@ -217,7 +221,7 @@ class Question:
             d_over_r0=self.d_over_r0,
             diffraction_px=2 * self.size,
             profile=self.profile,
-            learnt=self.psf is not None,
+            learnt=self.psf is not None and self.laser is None,
         )
 
     @property
@@ -245,7 +249,7 @@ class Question:
     @property
     def flux_is_known(self) -> bool:
         """Whether estimators know the star's flux, because it is assumed and not that of a recording."""
-        return self.relative_flux is None and self.psf is None
+        return self.relative_flux is None and (self.psf is None or self.laser is not None)
 
     @property
     def budget_px(self) -> float | None:
@@ -292,6 +296,13 @@ class Question:
         check_not_quad_cells(self.shape)
 
     def _check_spot(self) -> None:
+        if self.laser is not None:
+            if self.psf is not None or self.r0_m is not None:
+                raise InputError("laser: expected it without psf and r0_m, as it describes the spots itself")
+            scale = self._needed("pixel_scale_arcsec", "the side of a pixel on the sky with a laser")
+            psf = self.laser.psf([self.laser.at_m], scale, self.shape)
+            self._put("psf", PSF(psf.samples, psf.oversampling))  # one for all spots that are simulated
+            self._put("fwhm_px", None)
         if self.psf is not None and self.fwhm_px is None:
             widths = self.psf.fwhm_px.mean(axis=0)
             # The PSF includes the pixel, which widens it; exact for Gaussian spots.
@@ -361,7 +372,7 @@ class Question:
         return value
 
 
-_LAYOUT = "layout"
+_LAYOUT, _LASER = "layout", "laser"
 
 TABLES = {
     "camera": ("read_noise_e", "gain_e_per_adu", "em_gain", "background_e", "pixels"),
@@ -383,7 +394,7 @@ TABLES = {
 def read_camera(path: str | Path) -> dict[str, Any]:
     """Return the values of a camera file by the names of `faintspot.experiments.Question`.
 
-    A table [layout.grid], as in a configuration, gives `layout`.
+    A table [layout.grid], as in a configuration, gives `layout`; [laser] gives `laser`.
 
     Raises
     ------
@@ -391,12 +402,15 @@ def read_camera(path: str | Path) -> dict[str, Any]:
         When the file cannot be read or is not TOML, or has an unknown table or key.
     """
     document = parse_file(path)
-    check_keys(f"{path}: ", document, [*TABLES, _LAYOUT], what="table")
+    check_keys(f"{path}: ", document, [*TABLES, _LAYOUT, _LASER], what="table")
     values: dict[str, Any] = {}
     for table, content in document.items():
         found = checked_table(f"{path}: {table}", content)
         if table == _LAYOUT:
             values[_LAYOUT] = _layout(path, found)
+            continue
+        if table == _LASER:
+            values[_LASER] = LaserSpots.from_table(path, found)
             continue
         check_keys(f"{path}: {table}.", found, TABLES[table])
         values |= found
