@@ -150,7 +150,7 @@ def test_summary_counts_flags() -> None:
     assert summary.measured == 480
     assert set(expected(frames).variables) == {
         *("x", "y", "flux", "valid", "flags", "iterations", "bad_pixels"),
-        *("standard_error_x", "standard_error_y"),
+        *("standard_error_x", "standard_error_y", "covariance_xy"),
     }
 
 
