@@ -48,6 +48,11 @@ def assert_close(found: fs.Slopes, expected: fs.Slopes) -> None:
         np.testing.assert_allclose(
             getattr(found, name), getattr(expected, name), rtol=rounding, atol=rounding, err_msg=name
         )
+    known = np.isfinite(expected.standard_error_x)
+    largest = (expected.standard_error_x * expected.standard_error_y)[known]
+    away = np.abs(found.covariance_xy - expected.covariance_xy)
+    assert np.all(away[known] <= 10 * ROUNDING * (1 + largest))
+    assert np.all(away[~known] == 0)
 
 
 @pytest.mark.parametrize("window", WINDOWS)
