@@ -1,10 +1,8 @@
 """Control: microseconds a frame, from slopes to commands.
 
 Of the 4.2 m telescope, 72 slopes, every controller as it is; for more slopes the compiled Kalman filter with
-its guard, as the engine and the simulation run it. Of an extremely large telescope, 9,232 slopes and 4,600
-commands, the products that a Kalman filter with a constant gain consists of: whole matrices, and sparse ones
-of which each slope knows its neighbours within four sub-apertures. They are filled with random numbers: what
-they hold does not change the time.
+its guard, as the engine and the simulation run it. For 7 x 7 to 80 x 80 sub-apertures the integrator and the
+filter for large sensors, with the bytes that a command needs and the time of reading as many.
 
 Learning the Kalman filter from telemetry of the 4.2 m telescope: seconds of processor time, from nothing, and
 again from the turbulence known before, which is then judged on frames not learnt from.
@@ -18,7 +16,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy import sparse
+from numpy.typing import NDArray
 
 from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
 from benchmarks.prediction import TELEMETRY_GAIN, Case
@@ -27,19 +25,25 @@ from faintspot.ao_loop.control import slope_turbulence
 from faintspot.ao_loop.telescope_model import prepare
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandDelayLine
+from faintspot.control.compiled import CompiledIntegrator
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.guarded import Guarded
 from faintspot.control.kalman import SlopePredictor
+from faintspot.control.large_guarded import LargeGuarded
 from faintspot.control.learning import KALMAN, Plant, learn
+from faintspot.control.local_kalman import LocalPredictor, local_shapes
+from faintspot.control.local_model import neighbours_within
 from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
+from faintspot.control.reconstructor import Reconstructor
 from faintspot.control.relearning import relearn
 
 _NOISE_PX = 0.5
 _SIZES = (72, 54), (160, 97), (640, 400)
 _PHOTONS, _LEARNING, _LEARNT = 20.0, (2010, 8100), 4000
 """Realisation and frames of the telemetry to learn from; frames learnt from at first."""
-_LARGE, _LARGE_COMMANDS, _ACROSS, _REACH = 9232, 4600, 68, 4
+_ACROSS, _LAYERS = (7, 20, 40, 80), 3
+_FEWEST_TIMES, _SECONDS = 40, 3.0
 
 
 def small_table() -> Table:
@@ -124,36 +128,75 @@ def sizes_table() -> Table:
 
 
 def large_table() -> Table:
-    """Time the products of a predictive filter of an extremely large telescope."""
-    rng = np.random.default_rng(1)
-    whole = rng.standard_normal((_LARGE, _LARGE), np.float32)
-    near = sparse.kron(np.ones((2, 2)), _neighbours(), format="csr").astype(np.float32)
-    commands = near[rng.integers(0, near.shape[0], _LARGE_COMMANDS)]
-    vector, local = (rng.standard_normal(size).astype(np.float32) for size in (_LARGE, near.shape[1]))
-
-    def of(matrix: Any, slopes: np.ndarray[Any, Any], times: int) -> None:
-        for _ in range(times):
-            matrix @ slopes
-
-    # Correction 2, onward 2, and what the mirror added and its command 3 halves of a square matrix.
-    def of_neighbours() -> None:
-        of(near, local, 4)
-        of(commands, local, 3)
-
-    candidates: dict[str, Candidate] = {
-        "whole matrices, float32": partial(of, whole, vector, 6),
-        "neighbours within 4": of_neighbours,
-    }
+    """Time commands of large sensors, from their slopes, against reading the bytes that they need."""
     with pinned():
-        times = interleaved(candidates, fewest=3)
-    rows = [Row(name, {"ms a frame": best(times, name) * 1e3}) for name in candidates]
-    return Table("control-elt", f"Constant-gain Kalman filter, {_LARGE} slopes, one core", rows)
+        rows = [row for across in _ACROSS for row in _of_size(across)]
+    notes = [
+        "time from slopes to the command; what follows it until the next frame in its own column",
+        "bound: a sum over as many bytes; best times",
+    ]
+    return Table("control-large", "Large sensors: from slopes to commands, one core", rows, notes)
 
 
-def _neighbours() -> Any:
-    """Return a sparse matrix (n, n) with ones for neighbours of each sub-aperture in a square array."""
-    band = sparse.diags([1.0] * (2 * _REACH + 1), range(-_REACH, _REACH + 1), shape=(_ACROSS, _ACROSS))
-    return sparse.kron(band, band)
+def _of_size(across: int) -> list[Row]:
+    """Return the rows of a sensor; matrices are random, which does not change the time."""
+    rng = np.random.default_rng(1)
+    place = np.argwhere(np.ones((across, across))) - 0.5 * (across - 1)
+    cells = place[np.hypot(*place.T) <= 0.5 * across]
+    n, commands = len(cells), int(1.04 * len(cells))
+    interaction = rng.standard_normal((2 * n, commands), np.float32).astype(np.float64) / n
+    line = CommandDelayLine(commands, 2, 1.0)
+    integrator = CompiledIntegrator(line, interaction, interaction.T, 0.3, 0.01)
+    rows = [_timed(f"{across} x {across}, integrator", integrator, 4 * interaction.size, 2 * n)]
+    del integrator
+    none = np.zeros((0, 0))
+    reconstructor = Reconstructor(interaction.T, none, none, interaction.T)
+    arrays = _random_filter(cells, rng)
+    predictor = LocalPredictor(arrays)
+    line = CommandDelayLine(commands, 2, 1.0)
+    guarded = LargeGuarded(line, interaction, reconstructor, interaction.T, predictor, 0.3, 0.01)
+    of_filter = line.delay_frames * arrays["weights"].nbytes + arrays["corrections"][0].nbytes
+    read = 4 * interaction.size + of_filter
+    return [*rows, _timed(f"{across} x {across}, prediction", guarded, read, 2 * n)]
+
+
+def _random_filter(cells: NDArray[np.float64], rng: np.random.Generator) -> dict[str, Any]:
+    """Return arrays as of a filter of three layers, with weights that let its state fade."""
+    near, around = neighbours_within(cells, 1.5), neighbours_within(cells, 5.0)
+    shapes = {"near": near, "around": around, "share": np.full(_LAYERS, 1 / _LAYERS)}
+    wanted = local_shapes(shapes, 2 * len(cells))
+    filled = {
+        name: 1e-2 * rng.standard_normal(wanted[name], np.float32) for name in ("weights", "corrections")
+    }
+    return {
+        **shapes,
+        **filled,
+        "variance_px2": np.ones(2 * len(cells)),
+        "predicted_px2": np.ones(2 * len(cells)),
+    }
+
+
+def _timed(name: str, controller: Controller, bytes_read: int, slopes: int) -> Row:
+    """Return the times of a controller's updates, and of reading as many bytes, in turn."""
+    data = np.ones(max(bytes_read // 8, 1), np.int64)
+    seen, errors = np.random.default_rng(2).standard_normal(slopes), np.ones(slopes)
+    times: list[NDArray[np.float64]] = []
+    begun = time.perf_counter()
+    while len(times) < _FEWEST_TIMES or time.perf_counter() - begun < _SECONDS:
+        marks = [time.perf_counter()]
+        for each in (controller.expected, partial(controller.update, seen, errors), data.sum):
+            each()
+            marks.append(time.perf_counter())
+        times.append(np.diff(marks))
+    rest, update, reading = np.array(times[2:]).T * 1e6
+    p50, p99, p99_9 = np.percentile(update, (50, 99, 99.9))
+    values = {"MB": bytes_read / 1e6, "best us": update.min(), "p50": p50, "p99": p99, "p99.9": p99_9}
+    values |= {
+        "after it": rest.min(),
+        "bound us": reading.min(),
+        "best / bound": update.min() / reading.min(),
+    }
+    return Row(name, {key: float(value) for key, value in values.items()})
 
 
 def learning_table() -> Table:
