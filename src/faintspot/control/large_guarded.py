@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 
 from faintspot.control.base import Expected
 from faintspot.control.commands import CommandDelayLine
+from faintspot.control.compiled import add_products
 from faintspot.control.guarded import Guarded
 from faintspot.control.integrator import Integrator
 from faintspot.control.local_kalman import LocalPredictor
 from faintspot.control.predictive import Predictive
 from faintspot.control.reconstructor import Reconstructor
 from faintspot.control.telemetry import without_prior
+from faintspot.kernels.compiling import Direct
 
 Floats = NDArray[np.float64]
 
@@ -131,12 +133,16 @@ class LargeGuarded(Guarded):
 
 
 class _Product:
-    """Product of a matrix, in float32, with a few vectors."""
+    """Product of a matrix with a few vectors, in float32; the matrix is read once."""
 
     def __init__(self, matrix: Floats) -> None:
-        self._matrix = np.ascontiguousarray(matrix, np.float32)
+        self._columns = np.ascontiguousarray(matrix.T, np.float32)
 
     def __call__(self, *vectors: Floats) -> Floats:
         """Return the products, (vectors, rows)."""
-        several = np.stack(vectors).astype(np.float32)
-        return np.asarray((self._matrix @ several.T).T, np.float64)
+        out = np.zeros((len(vectors), self._columns.shape[1]), np.float32)
+        _ADD_PRODUCTS(self._columns, np.array(vectors, np.float32), out)
+        return out.astype(np.float64)
+
+
+_ADD_PRODUCTS = Direct(add_products)
