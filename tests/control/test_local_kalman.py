@@ -19,7 +19,7 @@ from faintspot.control.kalman import steady_covariance as dense_covariance
 from faintspot.control.learning import KALMAN, Learnt, learn
 from faintspot.control.learnt import Model
 from faintspot.control.local_kalman import LocalPredictor, local_filter
-from faintspot.control.local_model import LocalModel, neighbours_within, solve_locally
+from faintspot.control.local_model import LocalModel, at_most, neighbours_within, solve_locally
 from faintspot.control.models import SlopeModel
 
 SIDE_M = TURBULENCE.subaperture_m
@@ -51,6 +51,18 @@ def test_small_equations_are_solved_among_neighbours() -> None:
         expected = np.linalg.solve(local, right[own][:, there].T).T
         np.testing.assert_allclose(solved[own][:, index < 6], expected, atol=1e-12)
         assert not solved[own][:, index == 6].any()
+
+
+def test_weak_layers_join_those_of_similar_wind(monkeypatch: pytest.MonkeyPatch) -> None:
+    winds = np.array([[10.0, 0.0], [0.0, 8.0], [9.0, 1.0]])
+    air = replace(TURBULENCE, fraction=np.array([0.5, 0.3, 0.2]), wind_m_per_s=winds)
+    two = at_most(air.layers(), 2)
+    np.testing.assert_allclose(two[0].wind_m_per_s, [(5 * winds[0] + 2 * winds[2]) / 7])
+    np.testing.assert_array_equal(two[1].wind_m_per_s, winds[[1]])
+    strength = sum(each.r0_m ** (-5 / 3) for each in two)
+    assert strength == pytest.approx(air.r0_m ** (-5 / 3))
+    monkeypatch.setattr(local_kalman, "_MOST_STATES", 4 * 18)
+    assert len(local_filter(air.layers(), FRAME_S, NOISE_PX2)["share"]) == 2
 
 
 def _transition(model: LocalModel) -> np.ndarray:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from faintspot.control.kalman import LARGEST_VARIANCE_PX2
 from faintspot.control.local_covariance import local_gains, of_slopes, steady_covariance
-from faintspot.control.local_model import neighbours_within
+from faintspot.control.local_model import at_most, neighbours_within
 from faintspot.kernels.compiling import Direct, compiled_with
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 _REACH = 5.0  # sub-apertures, from which corrections come
 NOISE_STEP = 2.0
 _LEVELS = range(-3, 4)
+_MOST_STATES = 22_000  # whose covariances take 8 GB while they are computed
 _compiled = partial(compiled_with, source=__file__)
 
 
@@ -108,6 +109,8 @@ def local_filter(
 ) -> dict[str, Floats]:
     """Return the arrays of a `LocalPredictor` for frozen layers.
 
+    Where memory is too small for all layers, weak ones join others: more than four of 40 x 40 sub-apertures.
+
     Parameters
     ----------
     layers : sequence of SlopeTurbulence
@@ -125,6 +128,7 @@ def local_filter(
         (layers, n, 2, 2, 2, k), corrections (levels, n, 4 layers, 2 c): see `LocalModel`, `local_gains`.
         variance_px2, predicted_px2 (m,): of noise and of the prediction's error. share (layers,).
     """
+    layers = at_most(layers, max(1, _MOST_STATES // (2 * len(variance_px2))))
     model, covariance = steady_covariance(layers, frame_s, variance_px2, progress)
     with_slopes, predicted = of_slopes(covariance, model.layers)
     del covariance

@@ -8,7 +8,7 @@ frame is proportional to the number of slopes, that of `models.SlopeModel` to it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -54,6 +54,23 @@ class LocalModel:
     def slopes(self) -> int:
         """Number of slopes, 2 n."""
         return 2 * len(self.neighbours)
+
+
+def at_most(layers: Sequence[SlopeTurbulence], count: int) -> list[SlopeTurbulence]:
+    """Return as many layers or fewer: the weakest joins that with the nearest wind, until they are few."""
+    kept = list(layers)
+    while len(kept) > count:
+        weakest = kept.pop(int(np.argmax([each.r0_m for each in kept])))
+        apart = [np.hypot(*(each.wind_m_per_s - weakest.wind_m_per_s)[0]) for each in kept]
+        nearest = int(np.argmin(apart))
+        strength = np.array([each.r0_m ** (-5 / 3) for each in (kept[nearest], weakest)])
+        winds = np.concatenate([kept[nearest].wind_m_per_s, weakest.wind_m_per_s])
+        kept[nearest] = replace(
+            kept[nearest],
+            r0_m=float(strength.sum() ** (-3 / 5)),
+            wind_m_per_s=(strength @ winds / strength.sum())[None],
+        )
+    return kept
 
 
 def neighbours_within(positions_m: Floats, distance_m: float) -> Indices:
