@@ -203,7 +203,7 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description="Measure what covariances of slopes gain.")
     parser.add_argument("--wavefronts", type=int, default=40, help="Wavefronts for each flux. [default: 40]")
-    parser.add_argument("--frames", type=int, default=300, help="Frames for the ellipses. [default: 300]")
+    parser.add_argument("--frames", type=int, default=100, help="Frames for the ellipses. [default: 100]")
     parser.add_argument("--parts", nargs="*", default=["gain", "coverage"], help="Tables.")
     chosen = parser.parse_args()
     steps = {"gain": len(LAUNCHES) * len(FLUXES), "coverage": len(LAUNCHES) * len(COVERAGE_FLUXES)}
