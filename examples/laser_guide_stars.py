@@ -1,8 +1,8 @@
 """What does the profile of the sodium layer gain, learnt from frames and followed?
 
 Prints Markdown tables for an 8 m telescope with 20 x 20 sub-apertures and a laser launched from its side:
-flux needed for equal wavefront errors, the modes that a changing layer leaves, and the photon efficiency of
-every sub-aperture. Errors: jackknife over frames.
+flux needed for equal wavefront errors, and the photon efficiency of every sub-aperture. Errors: jackknife
+over frames. `laser_guide_star_change.py` prints the modes that a changing layer leaves.
 
     python examples/laser_guide_stars.py
 """
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import faintspot as fs
 from faintspot.cli.progress import progress_bar
 from faintspot.estimators.correlation import Correlation
-from faintspot.training import MeanImages, fit_sodium_profile, fit_spot
+from faintspot.training import MeanImages, fit_spot
 from faintspot.wavefront.zernike import mean_gradients
 
 DIAMETER_M, LENSLETS, OBSTRUCTION_M = 8.0, 20, 1.2
@@ -229,107 +229,6 @@ def flux_table(case: Case, n: int, advance: Advance) -> None:
         print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
 
 
-# A layer that changes --------------------------------------------------------------------------------
-
-CHANGE_FLUX_E, RATE_HZ, SECONDS, STEP_S = 200.0, 1000, 70, 2
-APPEARS_S = (10.0, 40.0)
-TIME_CONSTANT_S = 4.0
-CHANGE_SIDE = 10
-CORRECTED = 36  # highest Zernike mode that the loop corrects
-
-
-def layer_at(star: fs.LaserGuideStar, time_s: float) -> fs.SodiumProfile:
-    """Return a layer in which a second peak appears above the first within half a minute."""
-    part = float(np.interp(time_s, APPEARS_S, (0.0, 0.45)))
-    layers = [(1 - part) * fs.SodiumProfile.gaussian(88e3, 8e3).at(ALTITUDES).density]
-    layers.append(part * fs.SodiumProfile.gaussian(96e3, 3e3).at(ALTITUDES).density)
-    return star.focused(fs.SodiumProfile(ALTITUDES, layers[0] + layers[1]))
-
-
-def corrected_modes(slopes: Floats) -> Floats:
-    """Return what the loop sees of mean slopes (N, 2): Zernike modes 2 to `CORRECTED` [nm]."""
-    return (MATRIX @ slopes.T.ravel())[: CORRECTED - 1]
-
-
-SLOPES_OF_MODES = np.linalg.pinv(MATRIX)[:, : CORRECTED - 1]
-
-
-def change_table(advance: Advance) -> None:
-    """Print the modes that a changing layer leaves, with the loop closed on each method's slopes."""
-    star, side, window = star_of(1.2), CHANGE_SIDE, (CHANGE_SIDE, CHANGE_SIDE)
-    first = layer_at(star, 0.0)
-    mean = mean_of(star, first, side, CHANGE_FLUX_E, 10 * RATE_HZ, seed=1)
-    begun = SINGLE.at(ALTITUDES)
-    sensor, fit = fit_spot(mean, star_of(NARROWEST_ARCSEC), begun, dark_variance_e2=READ_NOISE_E**2)
-    psf = sensor.psf(fit.profile, radius_px=side / 2 + 3)
-    noise = {"flux_e": CHANGE_FLUX_E, "read_noise_e": READ_NOISE_E}
-    layout = layout_of(side)
-
-    def linear(own: fs.PSF) -> fs.SlopePipeline:
-        weights = fs.FixedWeights.matched(own, window, **noise)
-        settings = fs.Settings("window", flux_e=CHANGE_FLUX_E)
-        return fs.SlopePipeline(layout, settings, CALIBRATION, score=weights)
-
-    def fitted(own: fs.PSF) -> fs.SlopePipeline:
-        settings = fs.Settings("ml", search_range_px=2.0)
-        return fs.SlopePipeline(layout, settings, CALIBRATION, psf=own)
-
-    gaussian = fs.Settings("window", flux_e=CHANGE_FLUX_E, window_fwhm_px=5.0)
-    correlation = fs.Settings(Correlation(step_px=0.5), search_range_px=2.0)
-    makers: dict[str, tuple[Any, bool]] = {
-        "weighted centre of gravity, static": (
-            lambda own: fs.SlopePipeline(layout, gaussian, CALIBRATION, psf=own),
-            False,
-        ),
-        "correlation, static": (
-            lambda own: fs.SlopePipeline(layout, correlation, CALIBRATION, psf=own),
-            False,
-        ),
-        "matched filter, static": (linear, False),
-        "matched filter, followed": (linear, True),
-        "ml, static": (fitted, False),
-        "ml, followed": (fitted, True),
-    }
-    print("\n| method | " + " | ".join(f"{t} s" for t in range(0, SECONDS + 1, 10)), end=" | ")
-    print("largest, 5 to 11 | largest defocus |")
-    print("|---" * (4 + SECONDS // 10) + "|")
-    for name, (maker, follows) in makers.items():
-        history = _followed(star, sensor, fit.profile, maker, maker(psf), follows, side, mean)
-        advance(1)
-        away = np.sqrt(np.square(history[:, 3:10]).sum(axis=1))
-        cells = [f"{value:.1f}" for value in away[:: 10 // STEP_S]]
-        largest = f"{away.max():.1f} | {np.abs(history[:, 2]).max():.1f}"
-        print(f"| {name} | " + " | ".join(cells) + f" | {largest} |", flush=True)
-
-
-def _followed(
-    star: fs.LaserGuideStar, sensor: fs.LaserGuideStar, profile: fs.SodiumProfile, maker: Any,
-    pipeline: fs.SlopePipeline, follows: bool, side: int, mean: MeanImages,
-) -> Floats:  # fmt: skip
-    """Return Zernike modes 2 to `CORRECTED` of the wavefront [nm] against time, of a method's loop."""
-    mean = replace(mean, time_constant_frames=TIME_CONSTANT_S * RATE_HZ)
-    moving = replace(star, spot=star.spot.blurred(MOTION_PX))
-    modes = np.zeros(CORRECTED - 1)
-    history, zero = [], np.zeros((N, 2))
-    for step in range(SECONDS // STEP_S + 1):
-        layer = layer_at(star, step * STEP_S)
-        for _ in range(2):  # the loop settles in far less than a step
-            positions = (SLOPES_OF_MODES @ modes).reshape(2, N).T
-            images = CHANGE_FLUX_E * moving.images(layer, (side, side), positions)
-            slopes = pipeline(images.swapaxes(0, 1).reshape(side, -1))
-            seen = np.stack([slopes.x, slopes.y], axis=1)
-            if step == 0:  # references calibrated on the first layer
-                zero = seen - positions
-            modes = modes - corrected_modes(seen - zero)
-        history.append(modes)
-        if follows:
-            drawn = mean_of(star, layer, side, CHANGE_FLUX_E, STEP_S * RATE_HZ, 100 + step, positions)
-            mean = mean.updated(drawn.images_e, drawn.slopes_px, frames=drawn.frames)
-            profile = fit_sodium_profile(mean, sensor, profile, dark_variance_e2=READ_NOISE_E**2).profile
-            pipeline, zero = maker(sensor.psf(profile, radius_px=side / 2 + 3)), np.zeros((N, 2))
-    return np.array(history)
-
-
 # Photon efficiency of every sub-aperture -------------------------------------------------------------
 
 EFFICIENCY_FLUXES = (120.0, 240.0, 480.0)
@@ -385,9 +284,9 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description="Measure what a followed sodium profile gains.")
     parser.add_argument("--frames", type=int, default=200, help="Frames that are scored. [default: 200]")
-    parser.add_argument("--parts", nargs="*", default=["change", "efficiency", "flux"], help="Tables.")
+    parser.add_argument("--parts", nargs="*", default=["efficiency", "flux"], help="Tables.")
     chosen = parser.parse_args()
-    steps = {"change": 6, "efficiency": 3 * len(CASES[:-1]), "flux": len(CASES) * len(FLUXES)}
+    steps = {"efficiency": 3 * len(CASES[:-1]), "flux": len(CASES) * len(FLUXES)}
     total, done = sum(steps[part] for part in chosen.parts), 0
     with progress_bar("Laser guide stars", "steps") as show:
 
@@ -396,9 +295,6 @@ def main() -> None:
             done += count
             show(done, total)
 
-        if "change" in chosen.parts:
-            print("\n## A layer that changes: wavefront error of Zernike modes 5 to 11 [nm rms]")
-            change_table(advance)
         if "efficiency" in chosen.parts:
             print("\n## Photon efficiency of ml with the learnt profile, of all sub-apertures")
             for case in CASES[:-1]:  # windows of 10 px
