@@ -66,15 +66,21 @@ class Processes:
 
 @contextmanager
 def engine_and_camera(
-    values: dict[str, Any], camera: Sequence[str], engine: Sequence[str] = ()
+    values: dict[str, Any], camera: Sequence[str], engine: Sequence[str] = (), priority: int = 0
 ) -> Iterator[Processes]:
-    """Start both with a configuration of these values; end them."""
+    """Start both with a configuration of these values, perhaps with real-time priority; end them."""
     name = f"faintspot_benchmark_{uuid4().hex[:8]}"
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "faintspot.toml").write_text(CONFIGURATION.format(**values))
+        first = ["chrt", "-f", str(priority)] if priority else []
         started = [
-            subprocess.Popen([*_COMMAND, *arguments, "--name", name], cwd=folder, stdout=subprocess.DEVNULL)
-            for arguments in (["run", *engine], ["camera", "--seed", "1", *camera])
+            subprocess.Popen(
+                [*first, *_COMMAND, *arguments, "--name", name], cwd=folder, stdout=subprocess.DEVNULL
+            )
+            for arguments in (
+                ["run", "--priority", str(priority), *engine],
+                ["camera", "--seed", "1", *camera],
+            )
         ]
         try:
             yield Processes(name, *started)

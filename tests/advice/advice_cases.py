@@ -66,6 +66,7 @@ def recording(
         "standard_error_y": each + 0.1,
         "iterations": each.astype(np.int32),
         "flags": each.astype(np.uint8),
+        "late": np.zeros(frames, np.int64),
         "loop": np.full(frames, 2),
         "commands": commands,
         "image_frame": np.zeros(0, np.int64),

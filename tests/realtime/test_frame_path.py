@@ -14,6 +14,14 @@ from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.kernels.ordered import store
+from faintspot.kernels.streaming import (
+    MARGIN,
+    SHORTEST_NS,
+    WOKEN_LATE,
+    Arrival,
+    sleep_until_due,
+    wait_for_group,
+)
 from faintspot.realtime.frame_path import FramePath, Progress, last_rows_of_groups
 from faintspot.realtime.workers import Workers
 
@@ -136,3 +144,45 @@ def test_flux_must_be_known_beforehand() -> None:
     automatic = fs.Settings(noise_std="auto", keep_brightest="auto", spot_fwhm_px=2.0)
     with pytest.raises(fs.InputError, match=r"settings\.flux_e"):
         FramePath(fs.SlopePipeline(LAYOUT, automatic, NOISE), source.slots, source.progress)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_threads_that_sleep_until_rows_are_due_give_the_same_slopes(threads: int) -> None:
+    data, source, sensor = frames(12), Source(), pipeline("tv")
+    expected = sensor(data)
+    with ExitStack() as stack:
+        workers = stack.enter_context(closing(Workers(threads - 1))) if threads > 1 else None
+        path = FramePath(sensor, source.slots, source.progress, workers=workers)
+        path.warm_up()
+        last_row = 0
+        for number, frame in enumerate(data):
+            writer = threading.Thread(target=source.write, args=(number, frame, 12, 0.02))
+            writer.start()
+            assert path.measure(number, after_ns=last_row)
+            last_row = time.monotonic_ns()
+            writer.join()
+            path.flag_doubtful()
+            assert_same(path.slopes, expected, number)
+
+
+@pytest.mark.portable
+def test_a_pause_of_the_camera_delays_no_later_frame() -> None:
+    """After a frame that came 2 s late a thread sleeps hardly longer than before."""
+    cells, control, due = np.zeros(2, np.int64), np.zeros(1, np.int64), np.full(1, 3_000_000)
+    pace = np.array([time.monotonic_ns() - 2 * 10**9, SHORTEST_NS, 0])
+    threading.Timer(0.05, store, (cells, 1, 1)).start()
+    assert wait_for_group(Arrival(cells, 0, 1, control, 0, pace, due), 0, 1, 0)
+    assert 3_000_000 < due[0] < 4_000_000
+
+
+@pytest.mark.portable
+def test_a_thread_that_woke_up_late_wakes_up_earlier_next_time() -> None:
+    cells, control, due = np.zeros(2, np.int64), np.zeros(1, np.int64), np.full(1, 200_000_000)
+    pace = np.array([time.monotonic_ns(), SHORTEST_NS, 0])
+    arrival = Arrival(cells, 0, 1, control, 0, pace, due)
+    threading.Timer(0.02, store, (cells, 1, 1)).start()
+    assert not sleep_until_due(arrival, 0, 1, 0)
+    assert pace[WOKEN_LATE] == 1
+    assert pace[MARGIN] > SHORTEST_NS
+    assert due[0] < 200_000_000
+    assert wait_for_group(arrival, 0, 1, 0)

@@ -47,7 +47,7 @@ def is_stale(reader: TelemetryReader) -> bool:
 def test_commands_and_the_loops_state(name: str) -> None:
     with TelemetryRing.create(name, LAYOUT, commands=3, reference=np.arange(2.0), records=4) as ring:
         for frame in range(6):
-            ring.write(frame, 0, 0, 0, 0, slopes_of(frame), frame % 3, np.arange(3.0) + frame)
+            ring.write(frame, 0, 0, 0, 0, slopes_of(frame), loop=frame % 3, commands=np.arange(3.0) + frame)
         reader = TelemetryReader.attach(name)
         assert reader.description["reference"] == [0.0, 1.0]
         records, _, _ = reader.records.since(2)

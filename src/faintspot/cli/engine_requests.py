@@ -66,6 +66,9 @@ def summary(reply: dict[str, Any]) -> str:
     lines = [
         f"{reply['name']}: {counters['processed']} frames measured, {lost} lost, {counters['late']} late"
     ]
+    if reply["late_because"]:
+        causes = ", ".join(f"{cause} {count}" for cause, count in reply["late_because"].items())
+        lines.append(f"late because: {causes}")
     lines += [f"{title}: {text}" for title, text in notes(reply).items()]
     if reply["loop"]["state"] != "none":
         lines.append(loop_in_words(reply["loop"]))

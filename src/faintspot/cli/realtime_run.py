@@ -34,6 +34,12 @@ from faintspot.realtime.private_socket import socket_path
     show_default="the ordinary scheduler",
 )
 @option(
+    "--poll",
+    "polls",
+    is_flag=True,
+    help="Poll for rows all the time, on processors that nobody else uses; see the guide.",
+)
+@option(
     "--interleave",
     metavar="METHODS",
     help="Alternate between settings, and controllers, such as none,tv or ml+integrator,map+kalman.",

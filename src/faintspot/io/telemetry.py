@@ -48,11 +48,12 @@ _DIMENSIONS = {
     "image_frame": ("image",),
     "commands": ("frame", "command"),
 }
-_NO_LOOP: dict[str, NDArray[Any]] = {
+_NOT_IN_ALL: dict[str, NDArray[Any]] = {
+    "late": np.zeros((0,), np.int64),
     "loop": np.zeros((0,), np.int64),
     "commands": np.zeros((0, 0), np.float32),
 }
-"""Loop state and commands of a frame in recordings without commands."""
+"""What some recordings do not have, e.g. those of an engine without commands: zeros stand for it."""
 _NOT_STORED = "sequence"  # used by the rings only
 
 
@@ -92,6 +93,8 @@ class Telemetry:
     iterations: NDArray[np.int32]
     flags: NDArray[np.uint8]
     """Bits of `faintspot.SubapertureFlag`."""
+    late: NDArray[np.int64]
+    """Cause of a frame that was late (`faintspot.realtime.lateness.CAUSES`); 0: in time."""
     loop: NDArray[np.int64]
     """State of the loop: 0 no loop, 1 open, 2 closed."""
     commands: NDArray[np.float32]
@@ -243,8 +246,10 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
         )
         check_bytes(store, total, memory_bytes() // 2, "telemetry")
         for name in _ARRAYS:
-            if name in _NO_LOOP and name not in group:
-                arrays[name] = np.zeros((finished["frame"], *_NO_LOOP[name].shape[1:]), _NO_LOOP[name].dtype)
+            if name in _NOT_IN_ALL and name not in group:
+                arrays[name] = np.zeros(
+                    (finished["frame"], *_NOT_IN_ALL[name].shape[1:]), _NOT_IN_ALL[name].dtype
+                )
                 continue
             array = group[name]
             count = finished[_dimensions(name, array.ndim)[0]]

@@ -2,6 +2,10 @@
 
 The camera's process writes rows into shared memory and then says how many are there. Waiting for them happens
 inside the compiled code, without Python: nothing lies between the arrival of a row and the work on it.
+
+A thread sleeps until shortly before the rows of its next group are due, then polls. The kernel takes the
+processor away from real-time threads that never sleep, for 5 % of each second where others want it. When rows
+are due is learnt from the frames, as a time after the last row of the frame before.
 """
 
 from __future__ import annotations
@@ -13,12 +17,21 @@ import llvmlite.binding as llvm
 from llvmlite import ir
 from numba.core import types
 
+from faintspot.kernels.clock import now_ns, sleep_ns
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.groups import copied
 from faintspot.kernels.ordered import look_at
 from faintspot.kernels.simd import intrinsic
 
 LOOKS_BETWEEN_STOPS = 1024  # at the progress, between two looks at whether to give up
+
+LAST_ROW, MARGIN, WOKEN_LATE, PACE_CELLS = range(4)
+"""Cells of `Arrival.pace`: time of the last row of the frame before (0: not known, do not sleep), how long
+before rows are due a thread wakes up, and how often rows were there before it woke up; their number. ns."""
+SHORTEST_NS = 60_000
+_LONGEST_NS = 20_000_000  # so that a stop is noticed
+_GROWTH, _LATE = 4, 200  # a late waking adds 1/4 to the margin; it settles where that is one waking in 200
+_SLOWNESS = 8  # rows that come twice as late are believed after some 6 frames
 
 
 class Arrival(NamedTuple):
@@ -33,6 +46,10 @@ class Arrival(NamedTuple):
     control: Any
     """int64 array: waiting ends when the number at `stop_cell` is not 0."""
     stop_cell: Any
+    pace: Any
+    """(PACE_CELLS,) int64, of one thread."""
+    due: Any
+    """(n_groups,) int64: learnt time from the last row of the frame before to the group's last row, ns."""
 
 
 @intrinsic
@@ -74,6 +91,42 @@ def wait_for_rows(
             return False
 
 
+@compiled
+def sleep_until_due(arrival: Any, frame: Any, rows: Any, item: Any) -> Any:
+    """Sleep until shortly before a group's rows are due; return whether they are still to come after it."""
+    pace, due = arrival.pace, arrival.due
+    cells = arrival.cells, arrival.frame_cell, arrival.rows_cell
+    if pace[LAST_ROW] == 0 or rows_are_there(*cells, frame, rows):
+        return False
+    left = pace[LAST_ROW] + due[item] - pace[MARGIN] - now_ns()
+    if left <= SHORTEST_NS:
+        return False
+    while left > 0 and look_at(arrival.control, arrival.stop_cell) == 0:
+        sleep_ns(min(left, _LONGEST_NS))
+        left = pace[LAST_ROW] + due[item] - pace[MARGIN] - now_ns()
+    if rows_are_there(*cells, frame, rows):
+        pace[WOKEN_LATE] += 1
+        pace[MARGIN] = min(pace[MARGIN] + pace[MARGIN] // _GROWTH, max(due[item] // 2, SHORTEST_NS))
+        due[item] -= due[item] // _SLOWNESS
+        return False
+    pace[MARGIN] = max(pace[MARGIN] - pace[MARGIN] // (_GROWTH * _LATE), SHORTEST_NS)
+    return True
+
+
+@compiled
+def wait_for_group(arrival: Any, frame: Any, rows: Any, item: Any) -> Any:
+    """Wait for a group's rows, and learn when they come; return whether they are there."""
+    cells = arrival.cells, arrival.frame_cell, arrival.rows_cell
+    if rows_are_there(*cells, frame, rows):
+        return True
+    there = wait_for_rows(*cells, frame, rows, arrival.control, arrival.stop_cell)
+    if arrival.pace[LAST_ROW] != 0:
+        took = now_ns() - arrival.pace[LAST_ROW]
+        # Slowly upwards, so that nobody sleeps through the first frames after a pause.
+        arrival.due[item] = min(took, arrival.due[item] + arrival.due[item] // _SLOWNESS + SHORTEST_NS)
+    return there
+
+
 def measure(source: Any, task: Any, start: Any, stop: Any, scratch: Any, slopes: Any, stages: Any) -> None:
     """Stand for the compiled function that measures groups, which `streamed` puts in its place."""
 
@@ -108,15 +161,8 @@ def stream_groups(
         First group that was not measured: `stop` unless waiting was ended.
     """
     for item in range(start, stop):
-        if not wait_for_rows(
-            arrival.cells,
-            arrival.frame_cell,
-            arrival.rows_cell,
-            frame,
-            last_rows[item],
-            arrival.control,
-            arrival.stop_cell,
-        ):
+        sleep_until_due(arrival, frame, last_rows[item], item)
+        if not wait_for_group(arrival, frame, last_rows[item], item):
             return item
         measure(source, task, item, item + 1, scratch, slopes, stages)
     return stop

@@ -21,6 +21,7 @@ from faintspot.realtime.engine_plan import EnginePlan, SettingsPreparer
 from faintspot.realtime.flux_following import FluxFollower
 from faintspot.realtime.frame_path import FramePath
 from faintspot.realtime.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
+from faintspot.realtime.lateness import CAUSES, Lateness
 from faintspot.realtime.live import Change, LiveSettings
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.prediction_stream import PredictionStream
@@ -78,6 +79,8 @@ class Engine:
     mean_flux : float, optional
         Number of frames over which the flux of each sub-aperture is averaged, for estimators that use it.
         Default: they keep `flux_e`.
+    polls : bool
+        Whether threads poll for rows all the time. Default: they sleep until shortly before rows are due.
 
     Attributes
     ----------
@@ -103,10 +106,14 @@ class Engine:
         images_every: int = IMAGES_EVERY,
         control: Control | None = None,
         mean_flux: float | None = None,
+        polls: bool = False,
     ) -> None:
         self.name, self._deadline_ns, self._images_every = name, round(deadline_s * 1e9), images_every
         interleaving = Interleaving() if interleaving is None else interleaving
         self.counters, self.latencies = Counters(), Latencies()
+        self._lateness = Lateness()
+        self.late_because: dict[str, int] = {}
+        """Number of late frames by cause; see `faintspot.realtime.lateness`."""
         self.refused: list[str] = []
         """Parts of the real-time scheduling that were not permitted."""
         self.advice: list[str] = []
@@ -117,6 +124,7 @@ class Engine:
         self._path: FramePath | None = None
         self._waiting = False
         self._arrival, self._number = 0, -1  # of the last measured frame
+        self._polls, self._last_row_ns = polls, 0
         self._measured: dict[int, int] = {}  # frames, by configuration
         self._stopping = threading.Event()
         self._workers = Workers(threads - 1, cpus) if threads > 1 else None
@@ -171,6 +179,7 @@ class Engine:
             "source_refused": self._incompatible or None,
             "preparing": self.live.preparing,
             "counters": self.counters.as_dict(),
+            "late_because": dict(self.late_because),
             "latency": self.latencies.as_dict(),
             "estimator": self.live.settings.estimator.name,
             "subapertures": len(self.live.running.layout),
@@ -323,9 +332,12 @@ class Engine:
         arrival = self._arrival + 1
         explain = self._images_every > 0 and self._measured.get(method, 0) % self._images_every == 0
         if self._prediction is not None:
-            path.await_start(arrival)
+            path.await_start(arrival, self._last_row_ns)
             self._prediction.fill(self._number + 1)
-        whole = path.measure(arrival, (self._number + 1) % ring.slots, explain=explain)
+        slot, last_row = (self._number + 1) % ring.slots, self._last_row_ns
+        whole = path.measure(
+            arrival, slot, explain=explain, after_ns=last_row, rehearse=self._rehearse if last_row else None
+        )
         number = ring.number_of(arrival)
         if whole and number >= 0 and number != self._number + 1:  # the frame is in another slot than expected
             whole = path.measure(arrival, number % ring.slots, explain=explain)
@@ -334,6 +346,14 @@ class Engine:
             return False
         self._end_frame(ring, path, method, arrival, number if whole else -1, explain)
         return True
+
+    def _rehearse(self) -> None:
+        """Do what comes between a frame's last row and its slopes, without effect."""
+        ring, number = self.preparer.ring, self._number
+        if ring is not None and self._path is not None:
+            ring.last_row_time_ns(ring.number_of(self._arrival), self._arrival)
+            self._streams.rehearse(self._path.slopes, number)
+            time.monotonic_ns()
 
     def _take(self, ring: PixelRing) -> tuple[FramePath, int]:
         """Return the next frame's path and configuration; changes of settings take effect here."""
@@ -372,7 +392,11 @@ class Engine:
         change = self.live.change_number
         self._streams.publish_marks((number, method, change, moment, published))
         invalid, limited, iterations = self._streams.publish_details(slopes, number)
-        self._telemetry.write(number, method, change, moment, published, slopes, state, commands)
+        late = latency > self._deadline_ns
+        cause = self._lateness.cause(late, self.live.preparing is not None, path.woken_late)
+        self._telemetry.write(
+            number, method, change, moment, published, slopes, late=cause, loop=state, commands=commands
+        )
         if self._flux is not None:
             self._flux.take(slopes.flux)
         if self._streams.commands_lost:
@@ -386,7 +410,9 @@ class Engine:
         counters.invalid_subapertures += invalid
         counters.at_iteration_limit += limited
         counters.iterations += iterations
-        counters.late += latency > self._deadline_ns
+        counters.late += late
+        if late:
+            self.late_because[CAUSES[cause]] = self.late_because.get(CAUSES[cause], 0) + 1
         counters.estimator_failures += path.failed
         if self._arrival and number != self._number + 1:
             skipped = left_out(self._number, number)
@@ -395,13 +421,14 @@ class Engine:
             counters.source_restarts += skipped < 0 and number > self._number
         self._measured[method] = self._measured.get(method, 0) + 1
         self._arrival, self._number = arrival, number
+        self._last_row_ns = 0 if self._polls else moment
 
     def _lose(self, ring: PixelRing, arrival: int, number: int) -> None:
         """Count a frame that cannot be published, and find the next one."""
         counters = self.counters
         counters.frames_in += 1
         counters.dropped += 1
-        self._arrival = arrival
+        self._arrival, self._last_row_ns = arrival, 0
         if number >= 0 and ring.intact(number, arrival):  # the next one began before its last row arrived
             counters.short += 1
             self._number = number

@@ -6,7 +6,7 @@ prepared while the engine runs, and taken between two frames.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,13 +18,24 @@ from faintspot.control.configuration import prior_std_px
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.groups import DENOISED, STAGE_ROWS, SlopeArrays, new_scratch
 from faintspot.kernels.host import WIDTHS, lanes_for
-from faintspot.kernels.streaming import Arrival, streamed, wait_for_rows
+from faintspot.kernels.streaming import (
+    LAST_ROW,
+    MARGIN,
+    PACE_CELLS,
+    SHORTEST_NS,
+    WOKEN_LATE,
+    Arrival,
+    sleep_until_due,
+    streamed,
+    wait_for_group,
+)
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.realtime.prior import Prior
 from faintspot.realtime.workers import Workers
 
 STOP_CELL = 0
+Rehearsal = Callable[[], object]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +84,10 @@ class _Groups:
         """Settings of every sub-aperture for the kernel: rows as in `faintspot.kernels.groups`."""
         self._work = [(pipeline.source(slot[None], slot.dtype), task) for slot in slots]
         self._kernel = Direct(streamed(pipeline.plan.prepared.kernel))
+        self._sleep = Direct(sleep_until_due)
         lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
         own_scratch = pipeline.plan.own_scratch
+        self._due = np.zeros(len(self._last_rows), np.int64)
         self._scratch = [new_scratch(lanes, *window, own_scratch(lanes, *window)) for _ in range(shares)]
 
     def measure(
@@ -82,19 +95,33 @@ class _Groups:
         share: int,
         frame: tuple[int, int],
         progress: Progress,
-        control: NDArray[np.int64],
+        waiting: tuple[NDArray[np.int64], NDArray[np.int64]],
         after: tuple[Any, ...],
+        rehearse: Rehearsal | None = None,
     ) -> bool:
-        """Measure one share of a frame (number, slot); return whether it was completed."""
+        """Measure one share of a frame (number, slot); return whether it was completed.
+
+        `waiting` has the cell that ends waiting, and the share's `Arrival.pace`. See `FramePath.measure` for
+        `rehearse`.
+        """
         number, slot = frame
         first, last = self._groups
         start = first + (last - first) * share // self._shares
         stop = first + (last - first) * (share + 1) // self._shares
-        arrival = Arrival(progress.cells, progress.frame_cell, progress.rows_cell, control, STOP_CELL)
-        scratch = self._scratch[share]
-        done: int = self._kernel(
-            arrival, number, self._last_rows, *self._work[slot], start, stop, scratch, *after
-        )
+        control, pace = waiting
+        cells = progress.cells, progress.frame_cell, progress.rows_cell
+        arrival = Arrival(*cells, control, STOP_CELL, pace, self._due)
+        rest = self._scratch[share], *after
+        if rehearse is not None:
+            last = start + int(np.argmax(self._last_rows[start:stop])) if start < stop else stop
+            if self._kernel(arrival, number, self._last_rows, *self._work[slot], start, last, *rest) < last:
+                return False
+            if last < stop and self._sleep(arrival, number, self._last_rows[last], last):
+                # A frame that has passed is not waited for: only code and data come into the cache again.
+                self._kernel(arrival, -1, self._last_rows, *self._work[slot], last, last + 1, *rest)
+                rehearse()
+            start = last
+        done: int = self._kernel(arrival, number, self._last_rows, *self._work[slot], start, stop, *rest)
         return done == stop
 
 
@@ -142,6 +169,10 @@ class FramePath:
         self.failed = False
         """Whether the estimator failed in the last frame."""
         self._control = np.zeros(1, np.int64)
+        self._pace = np.zeros((self._shares, PACE_CELLS), np.int64)
+        self._pace[:, MARGIN] = SHORTEST_NS
+        self._start_due = np.zeros(1, np.int64)
+        self._wait_for_group = Direct(wait_for_group)
         wide, rest = pipeline.width, n % pipeline.width
         full = n // wide
         # The remainder is measured in a narrower group if that is faster; it has the last rows.
@@ -171,6 +202,11 @@ class FramePath:
         """Whether `stop` has ended the wait for rows."""
         return bool(self._control[STOP_CELL])
 
+    @property
+    def woken_late(self) -> int:
+        """How often a thread has woken up after the rows that it waits for were there."""
+        return int(self._pace[:, WOKEN_LATE].sum())
+
     def warm_up(self) -> None:
         """Measure the present content of the first slot, to compile everything and fill the caches."""
         progress = self._progress
@@ -178,12 +214,20 @@ class FramePath:
         cells.flat[progress.frame_cell] = 1
         there = Progress(cells, progress.frame_cell, progress.rows_cell)
         if self._prior is not None:
-            wait_for_rows(cells, progress.frame_cell, progress.rows_cell, 0, 1, self._control, STOP_CELL)
+            self._await_row(there, 0)
         for share in range(self._shares):
-            self._work(share, (0, 0), there, self._explaining)
+            self._work(share, (0, 0), there, self._explaining, lambda: None)
         self.flag_doubtful()
 
-    def measure(self, number: int, slot: int | None = None, *, explain: bool = False) -> bool:
+    def measure(
+        self,
+        number: int,
+        slot: int | None = None,
+        *,
+        explain: bool = False,
+        after_ns: int = 0,
+        rehearse: Rehearsal | None = None,
+    ) -> bool:
         """Measure a frame, waiting for its rows; return whether it was completed.
 
         It is not completed if `stop` was called meanwhile or a worker died.
@@ -196,26 +240,32 @@ class FramePath:
             Slot of the frame. Default: number % slots.
         explain : bool
             Whether to keep its denoised images.
+        after_ns : int
+            Time of the last row of the frame before (CLOCK_MONOTONIC), from which it is known when rows are
+            due: the threads sleep until shortly before. Default: they poll.
+        rehearse : function, optional
+            Called after the last sleep, before the last rows are there. Other programs may have used the
+            processor: it brings into the cache what the caller will use after the frame.
         """
+        self._pace[:, LAST_ROW] = after_ns
         if self._prior is not None and self._prior.changes != self._prior_changes:
             self._widen(self._prior)
         frame = number, number % self._slots if slot is None else slot
         after = self._explaining if explain else self._plain
         if self._workers is None:
-            return self._work(0, frame, self._progress, after)
+            return self._work(0, frame, self._progress, after, rehearse)
         self._workers.post(lambda share: self._work(share, frame, self._progress, after))
-        whole = self._work(0, frame, self._progress, after)
+        whole = self._work(0, frame, self._progress, after, rehearse)
         return self._workers.wait() and whole
 
     def flag_doubtful(self) -> None:
         """Set the flags of the last frame that depend on all its slopes; see `SlopePipeline`."""
         self.pipeline.flag_doubtful(self._results)
 
-    def await_start(self, number: int) -> None:
-        """Wait for the first row of a frame, or until `stop` is called."""
-        progress = self._progress
-        cells = progress.cells, progress.frame_cell, progress.rows_cell
-        wait_for_rows(*cells, number, 1, self._control, STOP_CELL)
+    def await_start(self, number: int, after_ns: int = 0) -> None:
+        """Wait for the first row of a frame, or until `stop` is called; `after_ns` as for `measure`."""
+        self._pace[0, LAST_ROW] = after_ns
+        self._await_row(self._progress, number)
 
     def stop(self) -> None:
         """End all waiting for rows, now and in future; callable from any thread."""
@@ -225,12 +275,28 @@ class FramePath:
         """Allow waiting for rows again."""
         self._control[STOP_CELL] = 0
 
-    def _work(self, share: int, frame: tuple[int, int], progress: Progress, after: tuple[Any, ...]) -> bool:
+    def _await_row(self, progress: Progress, number: int) -> None:
+        """Wait for the first row of a frame."""
+        cells = progress.cells, progress.frame_cell, progress.rows_cell
+        arrival = Arrival(*cells, self._control, STOP_CELL, self._pace[0], self._start_due)
+        self._wait_for_group(arrival, number, 1, 0)
+
+    def _work(
+        self,
+        share: int,
+        frame: tuple[int, int],
+        progress: Progress,
+        after: tuple[Any, ...],
+        rehearse: Rehearsal | None = None,
+    ) -> bool:
         """Measure one share of a frame's groups; the last share includes the narrow group."""
-        whole = self._wide.measure(share, frame, progress, self._control, after)
-        if self._narrow is None or share < self._shares - 1:
+        waiting = self._control, self._pace[share]
+        narrow = self._narrow if share == self._shares - 1 else None
+        first = None if narrow is not None else rehearse
+        whole = self._wide.measure(share, frame, progress, waiting, after, first)
+        if narrow is None:
             return whole
-        return whole and self._narrow.measure(0, frame, progress, self._control, after)
+        return whole and narrow.measure(0, frame, progress, waiting, after, rehearse)
 
     def _widen(self, prior: Prior) -> None:
         """Set the width of the estimator's prior to the uncertainty of the prediction, where known."""

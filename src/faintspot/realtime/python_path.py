@@ -71,9 +71,9 @@ class PythonPath(FramePath):
         self._thread.start()
         weakref.finalize(self, self._requests.put, None)  # ends the thread
 
-    def measure(self, number: int, slot: int | None = None, *, explain: bool = False) -> bool:
+    def measure(self, number: int, slot: int | None = None, *, explain: bool = False, **waiting: Any) -> bool:
         """Measure a frame, waiting for its rows; see `FramePath.measure`."""
-        if not super().measure(number, slot, explain=True):
+        if not super().measure(number, slot, explain=True, **waiting):
             return False
         found = self._find_positions() if self.fault is None else self.fault
         self.failed = isinstance(found, str)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,8 @@ class SlopeStreams:
         with ExitStack() as undo:
             self._slopes = create_stream(f"{name}_slopes", (2 * n,))
             undo.callback(self._slopes.unlink)
+            self._rehearsal = create_stream(f"{name}_rehearsal", (2 * n,))
+            undo.callback(self._rehearsal.unlink)
             self._details = create_stream(f"{name}_details", (len(DETAILS), n))
             undo.callback(self._details.unlink)
             self._marks = create_stream(f"{name}_marks", (len(MARKS),), np.int64)
@@ -83,14 +86,21 @@ class SlopeStreams:
     @contextmanager
     def held(self) -> Iterator[None]:
         """Hold the streams' locks while publishing; see `shared_streams.held`."""
-        with held(self._slopes, self._details, self._marks), self._commands_lock:
+        with held(self._slopes, self._rehearsal, self._details, self._marks), self._commands_lock:
             if self._commands is not None:
                 self._commands_lock.enter_context(held(self._commands))
             yield
 
     def publish_slopes(self, slopes: Slopes, frame: int) -> None:
         """Publish the vector of slopes; for the thread that holds the streams."""
-        with self._slopes.write_view_locked(frame_id=frame) as vector:
+        self._write_slopes(self._slopes, slopes, frame)
+
+    def rehearse(self, slopes: Slopes, frame: int) -> None:
+        """Write slopes where nobody reads them, so that code and data are in the processor's cache."""
+        self._write_slopes(self._rehearsal, slopes, frame)
+
+    def _write_slopes(self, stream: Any, slopes: Slopes, frame: int) -> None:
+        with stream.write_view_locked(frame_id=frame) as vector:
             vector[: self._n] = slopes.x
             vector[self._n :] = slopes.y
 
@@ -166,7 +176,7 @@ class SlopeStreams:
     def close(self) -> None:
         """Remove all streams."""
         self._closed = True
-        for stream in (self._slopes, self._details, self._marks, self._commands):
+        for stream in (self._slopes, self._rehearsal, self._details, self._marks, self._commands):
             if stream is not None:
                 stream.unlink()
 

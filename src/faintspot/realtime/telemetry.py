@@ -55,7 +55,7 @@ __all__ = ["TelemetryReader", "TelemetryRing"]
 
 _MAGIC = b"fstelem1"
 _START = struct.Struct("<8sII")
-_HEAD = struct.Struct("<7q")
+_HEAD = struct.Struct("<8q")
 _BYTE = np.dtype(np.uint8)
 _RECORD_BYTES, _IMAGE_BYTES = 1 << 25, 1 << 24  # small enough for a container's 64 MiB of shared memory
 
@@ -157,6 +157,8 @@ class TelemetryRing(Closing):
         last_row_ns: int,
         published_ns: int,
         slopes: Slopes,
+        *,
+        late: int = 0,
         loop: int = 0,
         commands: NDArray[np.float64] | None = None,
     ) -> None:
@@ -172,6 +174,8 @@ class TelemetryRing(Closing):
             Times of CLOCK_MONOTONIC, ns.
         slopes : Slopes
             Slopes of one frame; copied.
+        late : int
+            Cause of lateness, as in `record_type`.
         loop : int
             State of the loop, as in `record_type`.
         commands : (commands,) array, optional
@@ -189,6 +193,7 @@ class TelemetryRing(Closing):
             last_row_ns,
             published_ns,
             time.time_ns() - time.monotonic_ns(),
+            late,
         )
         self._x[place], self._y[place], self._flux[place] = slopes.x, slopes.y, slopes.flux
         self._error_x[place], self._error_y[place] = slopes.standard_error_x, slopes.standard_error_y
