@@ -48,7 +48,9 @@ class Launch(NamedTuple):
 
 
 LAUNCHES = tuple(
-    Launch(*place, side) for place in ((5.0, 0.0), (5.0, 45.0), (20.0, 45.0)) for side in (10, 16)
+    Launch(*place, side)
+    for place in ((5.0, 0.0), (5.0, 45.0), (20.0, 0.0), (20.0, 45.0))
+    for side in (10, 16)
 )
 
 
