@@ -23,7 +23,7 @@ from faintspot.control.learning import KALMAN
 from faintspot.pipeline.settings import Settings
 
 FRAMES, REALISATIONS = 3000, (40, 41)
-RANDOM_LOOPS, RANDOM_SEED = 14, 2024
+RANDOM_LOOPS, RANDOM_SEED = 14, 7
 """Realisations and a seed on which nothing was chosen."""
 _GAINS = {20.0: (0.17, 0.1), 200.0: (0.4, 0.25)}
 """Gain of the recorded loop and of the other one, by photons per sub-aperture and frame."""
