@@ -36,9 +36,9 @@ LOWER, PEAK = (
     fs.SodiumProfile.gaussian(88e3 - SHARE * ABOVE_M + above, width).at(ALTITUDES).density
     for above, width in ((0.0, 8e3), (ABOVE_M, 3e3))
 )
-CHANGE_FRAMES, CHANGED_FROM_S, CHANGED_TO_S = 360, 0.1, 0.3
+CHANGE_FRAMES, CHANGED_FROM_S, CHANGED_TO_S = 440, 0.1, 0.3
 CHANGE_FLUX_E = 200.0
-SCORED_FROM = 280  # 0.26 s after the end of the change
+SCORED_FROM = 360  # 0.42 s after the end of the change
 LOW = slice(3, 10)  # Zernike modes 5 to 11 of a record
 
 Advance = Callable[[int], None]
@@ -120,8 +120,7 @@ def change_table(loop: LoopConfiguration, advance: Advance) -> None:
     times = 0.0, CHANGED_FROM_S, CHANGED_TO_S
     densities = tuple(map(tuple, (BEFORE, BEFORE, after)))
     changing = star.replace("laser", **layer, time_s=times, density=densities)
-    static, followed = others()[1:3]
-    compared = static, followed, window(5.0)
+    compared = others()[1:3]
     low: dict[str, list[Any]] = {method.label: [] for method in compared}
     focus: dict[str, list[Any]] = {label: [] for label in low}
     strehl: dict[str, list[Any]] = {label: [] for label in low}
@@ -155,7 +154,7 @@ def main() -> None:
     loop, methods = load_loop("lgs_eight_metre"), 1 + len(others())
     steps = {
         "flux": len(FLUXES) * (len(WIDTHS_PX) * TUNING_FRAMES + methods * REALISATIONS * FRAMES),
-        "change": 3 * 2 * REALISATIONS * CHANGE_FRAMES,
+        "change": 2 * 2 * REALISATIONS * CHANGE_FRAMES,
     }
     total, done = sum(steps[part] for part in chosen.parts), 0
     with progress_bar("Laser guide star", "frames") as show:
