@@ -6,7 +6,7 @@ import numpy as np
 
 import faintspot as fs
 from faintspot.ao_loop import LoopConfiguration, Method
-from faintspot.ao_loop.configuration import Camera
+from faintspot.ao_loop.sections import Camera
 
 PLAIN = fs.Settings("brightest", keep_brightest=80)
 

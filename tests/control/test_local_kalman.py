@@ -207,7 +207,9 @@ def test_large_sensors_learn_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     """Learnt, saved and read again it sends the same commands, and leaves less than the integrator."""
     monkeypatch.setattr(learning, "_MOST_SLOPES", 10)
     frames = telemetry(600, 0.3, model=LAYERS)
-    learnt = learn(KALMAN, PLANT, frames, TURBULENCE, 1 / FRAME_S)
+    shown: list[tuple[int, int]] = []
+    learnt = learn(KALMAN, PLANT, frames, TURBULENCE, 1 / FRAME_S, progress=lambda *each: shown.append(each))
+    assert shown[-1][0] == shown[-1][1] == len(shown)
     assert learnt.model.is_local
     assert learnt.model.left[0] < learnt.model.left[1]
     path = tmp_path / "model.npz"

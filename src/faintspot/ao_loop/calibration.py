@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from faintspot.ao_loop.atmosphere import MovingLayers
 from faintspot.ao_loop.camera import Exposing, camera_calibration
-from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
+from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.methods import Method
 from faintspot.ao_loop.mirror import DeformableMirror
+from faintspot.ao_loop.sections import CLOSED
 from faintspot.ao_loop.wavefront_sensor import ShackHartmann
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration

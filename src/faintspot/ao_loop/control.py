@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.ao_loop.configuration import CLOSED, ControlParameters, LoopConfiguration, RunLength
+from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.methods import PRIOR, Method
 from faintspot.ao_loop.record import LoopRecord
+from faintspot.ao_loop.sections import CLOSED, ControlParameters, RunLength
 from faintspot.base.errors import InputError
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandDelayLine

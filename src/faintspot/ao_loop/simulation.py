@@ -17,11 +17,12 @@ from faintspot.ao_loop.calibration import (
     typical_spots,
 )
 from faintspot.ao_loop.camera import Exposing, make_detector
-from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration, RunLength
+from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.control import learnt_control, make_controller
 from faintspot.ao_loop.methods import Method
 from faintspot.ao_loop.natural_star import LowOrders
 from faintspot.ao_loop.record import LoopRecord
+from faintspot.ao_loop.sections import CLOSED, RunLength
 from faintspot.ao_loop.sodium import FollowedSodium, KnownSodium, learn_sodium
 from faintspot.ao_loop.telescope_model import (
     TelescopeModel,

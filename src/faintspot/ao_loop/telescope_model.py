@@ -11,16 +11,10 @@ from numpy.typing import NDArray
 from faintspot.ao_loop.atmosphere import MovingLayers, make_atmosphere
 from faintspot.ao_loop.calibration import interaction_matrix, true_interaction_matrix
 from faintspot.ao_loop.camera import Exposing, NoiselessDetector, make_detector
-from faintspot.ao_loop.configuration import (
-    CLOSED,
-    Atmosphere,
-    Camera,
-    ControlParameters,
-    LoopConfiguration,
-    RunLength,
-)
+from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.laser import LaserSource
 from faintspot.ao_loop.mirror import BestFit, DeformableMirror, make_mirror
+from faintspot.ao_loop.sections import CLOSED, Atmosphere, Camera, ControlParameters, RunLength
 from faintspot.ao_loop.telescope import PupilAmplitude, make_pupil
 from faintspot.ao_loop.wavefront_sensor import ShackHartmann, make_sensor
 from faintspot.control.reconstructor import Reconstructor, check_controllable, make_reconstructor

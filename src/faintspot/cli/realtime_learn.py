@@ -11,6 +11,7 @@ from faintspot.base.extras import require_linux
 from faintspot.base.files import derived
 from faintspot.cli.commands import option
 from faintspot.cli.needs import needs
+from faintspot.cli.progress import progress_bar
 from faintspot.cli.shared_options import ENGINE_NAME, configuration_option
 
 
@@ -107,7 +108,8 @@ def _learn_from(
     prior = prior_std_px(Settings.load(config), layout)
     telemetry, rate_hz = telemetry_of_recording(night, control, prior)
     known = site_of(layout, layers), rate_hz, ASSUMED if layers else winds
-    learnt = learnt_by(kind, control.plant, telemetry, *known)
+    with progress_bar("Filter", "steps") as show:
+        learnt = learnt_by(kind, control.plant, telemetry, *known, progress=show)
     path = derived(config, ".model.npz")
     learnt.model.save(path)
     save_control(config, controller=kind, model=path.name)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +23,7 @@ from faintspot.control.learnt import (
     Model,
     Plant,
 )
+from faintspot.control.local_covariance import STEPS
 from faintspot.control.local_kalman import local_filter
 from faintspot.control.modal_gains import largest_stable_gain, modal_gains
 from faintspot.control.phase import residual_phase
@@ -48,6 +52,7 @@ def learn(
     winds: str = LEARNT,
     noise_scale: float = 1.0,
     start: Identified | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Learnt:
     """Return a controller of the given kind, learnt from telemetry.
 
@@ -67,6 +72,8 @@ def learn(
         Factor on the noise variance that telemetry shows.
     start : Identified, optional
         Earlier turbulence of the same site, from which winds are learnt faster.
+    progress : callable, optional
+        Called with the steps done and their number while filters of many slopes are computed.
     """
     cells = np.rint(site.positions_m[:, ::-1] / site.subaperture_m).astype(np.int64)
     phase = residual_phase(plant.reconstructor.matrix, plant.interaction, cells)
@@ -85,7 +92,15 @@ def learn(
         tried.append(identification.layers(known))
     elif winds == ASSUMED:
         tried.append(identification.of_winds(site.wind_m_per_s))
-    make, made = _pseudo_open_loop if kind == POLC else _kalman, []
+    made = []
+    total = len(tried) * sum(steps for _, steps in STEPS)
+    done = itertools.count(1)
+
+    def advance() -> None:
+        if progress is not None:
+            progress(next(done), total)
+
+    make = _pseudo_open_loop if kind == POLC else partial(_kalman, advance)
     for found in tried:
         text = f"{found.summary()}, noise variance x {found.noise_factor:.2f}"
         model = replace(plain, noise_factor=found.noise_factor, description=text)
@@ -94,11 +109,13 @@ def learn(
     return Learnt(plant, model.with_noise(noise_scale) if kind == KALMAN else model, found)
 
 
-def _kalman(model: Model, plant: Plant, telemetry: OpenLoopTelemetry, found: Identified) -> Model:
+def _kalman(
+    advance: Callable[[], None], model: Model, plant: Plant, telemetry: OpenLoopTelemetry, found: Identified
+) -> Model:
     """Return the model with its Kalman filter and residual."""
     variance = usual_variance(telemetry.scaled(found.noise_factor))
     if len(variance) > _MOST_SLOPES:
-        arrays = local_filter(found.layers, 1 / found.rate_hz, variance)
+        arrays = local_filter(found.layers, 1 / found.rate_hz, variance, advance)
     else:
         slopes = found.slope_model()
         arrays = {

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
+from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.files import BUDGET_FILE
+from faintspot.ao_loop.sections import CLOSED
 from faintspot.ao_loop.simulation import DisabledErrors, simulate_loop
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from faintspot.ao_loop.camera import make_detector
-from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration, RunLength
+from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.methods import PRIOR, Method
+from faintspot.ao_loop.sections import CLOSED, RunLength
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError
 from faintspot.config.options import AUTO, Option

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
+from faintspot.ao_loop.configuration import LoopConfiguration
+from faintspot.ao_loop.sections import CLOSED
 from faintspot.base.checks import number_between, numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.control.learning import INTEGRATOR, KALMAN
