@@ -104,13 +104,7 @@ def foundations(answer: Answer) -> list[str]:
     lines = list(question.facts)
     if question.laser is not None:
         lines.append(question.laser.in_words(question.pixel_scale_arcsec, question.shape))
-    lines.append(
-        _TEXT(
-            _shape(question),
-            spots=spots,
-            profile=question.profile,
-        )
-    )
+    lines.append(_shape(question, spots))
     lines.append(_TEXT["answer.positions"])
     if question.photometry is not None:
         lines.append(_TEXT("answer.photometry", flux=question.photometry))
@@ -120,11 +114,13 @@ def foundations(answer: Answer) -> list[str]:
     return lines
 
 
-def _shape(question: Question) -> str:
-    """Return the name of the text on the spots' shape."""
+def _shape(question: Question, spots: str) -> str:
+    """Describe the shape of the spots, and who knows it."""
     if question.laser is not None:
-        return "answer.laser_psf"
-    return "answer.assumed_profile" if question.psf is None else "answer.learnt_psf"
+        return _TEXT("answer.laser_psf", spots=spots)
+    if question.psf is not None:
+        return _TEXT("answer.learnt_psf", spots=spots)
+    return _TEXT("answer.assumed_profile", spots=spots, profile=question.profile)
 
 
 def gain_in_words(answer: Answer, gain: Estimate) -> str:
