@@ -124,7 +124,8 @@ class Engine:
         self._path: FramePath | None = None
         self._waiting = False
         self._arrival, self._number = 0, -1  # of the last measured frame
-        self._polls, self._last_row_ns = polls, 0
+        # Frames of an own source are complete when they are measured: there is nothing to sleep for.
+        self._sleeps, self._last_row_ns = source is None and not polls, 0
         self._measured: dict[int, int] = {}  # frames, by configuration
         self._stopping = threading.Event()
         self._workers = Workers(threads - 1, cpus) if threads > 1 else None
@@ -421,7 +422,7 @@ class Engine:
             counters.source_restarts += skipped < 0 and number > self._number
         self._measured[method] = self._measured.get(method, 0) + 1
         self._arrival, self._number = arrival, number
-        self._last_row_ns = 0 if self._polls else moment
+        self._last_row_ns = moment if self._sleeps else 0
 
     def _lose(self, ring: PixelRing, arrival: int, number: int) -> None:
         """Count a frame that cannot be published, and find the next one."""

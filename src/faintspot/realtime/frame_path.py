@@ -6,6 +6,7 @@ prepared while the engine runs, and taken between two frames.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -76,8 +77,10 @@ class _Groups:
         shares: int,
         prior: Prior | None,
     ) -> None:
-        self._groups, self._shares = groups, shares
         self._last_rows = last_rows_of_groups(pipeline, pipeline.width)
+        first, count = groups[0], groups[1] - groups[0]
+        starts = [first + count * share // shares for share in range(shares + 1)]
+        self._ranges = [self._range(*ends) for ends in itertools.pairwise(starts)]
         task = pipeline.plan.task(np.zeros(1, np.int64), None if prior is None else prior.mean_px)
         task = task._replace(settings=task.settings.copy())
         self.settings: NDArray[np.float32] = task.settings[0]
@@ -105,15 +108,12 @@ class _Groups:
         `rehearse`.
         """
         number, slot = frame
-        first, last = self._groups
-        start = first + (last - first) * share // self._shares
-        stop = first + (last - first) * (share + 1) // self._shares
+        start, last, stop = self._ranges[share]
         control, pace = waiting
         cells = progress.cells, progress.frame_cell, progress.rows_cell
         arrival = Arrival(*cells, control, STOP_CELL, pace, self._due)
         rest = self._scratch[share], *after
         if rehearse is not None:
-            last = start + int(np.argmax(self._last_rows[start:stop])) if start < stop else stop
             if self._kernel(arrival, number, self._last_rows, *self._work[slot], start, last, *rest) < last:
                 return False
             if last < stop and self._sleep(arrival, number, self._last_rows[last], last):
@@ -123,6 +123,10 @@ class _Groups:
             start = last
         done: int = self._kernel(arrival, number, self._last_rows, *self._work[slot], start, stop, *rest)
         return done == stop
+
+    def _range(self, start: int, stop: int) -> tuple[int, int, int]:
+        """Return a share's first group, the first that needs its last rows, and the one after the last."""
+        return start, start + int(np.argmax(self._last_rows[start:stop])) if start < stop else stop, stop
 
 
 class FramePath:
