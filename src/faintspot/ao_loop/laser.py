@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.ao_loop.configuration import ARCSEC, LoopConfiguration
 from faintspot.ao_loop.wavefront_sensor import ShackHartmann
-from faintspot.spots.laser import LaserGuideStar
+from faintspot.spots.laser import LaserGuideStar, gaussian_spot
 from faintspot.spots.psf import PSF
 
 Floats = NDArray[np.float32]
@@ -32,12 +32,11 @@ def laser_guide_star(
     laser = configuration.laser
     assert laser is not None
     pixel_arcsec = configuration.pixel_scale_rad / ARCSEC
-    size = spot_fwhm_arcsec / pixel_arcsec / 2
     return LaserGuideStar(
         subaperture_centres_m(configuration, cells),
         laser.launch_m,
         pixel_arcsec,
-        PSF.analytic("gaussian", size=size, radius_px=max(4.0, 6.0 * size)),
+        gaussian_spot(spot_fwhm_arcsec / pixel_arcsec),
         laser.zenith_distance_deg,
         laser.site_altitude_m,
         laser.focus_altitude_m,

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from faintspot.ao_loop.configuration import ARCSEC, LoopConfiguration
 from faintspot.ao_loop.wavefront_sensor import ShackHartmann
 from faintspot.control.removed_modes import TIP_TILT, RemovedModes
+from faintspot.spots.shapes import FWHM_TO_STD
 
 Floats = NDArray[np.float64]
 
-_FWHM_TO_STD = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 _OF_NOISE = 6  # of a frame's random numbers
 
 
@@ -50,7 +50,7 @@ class LowOrders:
         if self._star is not None:
             pixel = configuration.pixel_scale_rad / ARCSEC
             quadrant_e = 0.25 * self._star.photons
-            self._noise_px = self._star.fwhm_arcsec * _FWHM_TO_STD / pixel / math.sqrt(quadrant_e)
+            self._noise_px = self._star.fwhm_arcsec * FWHM_TO_STD / pixel / math.sqrt(quadrant_e)
 
     def merged(
         self, frame: int, wavefront_nm: NDArray[np.floating], slopes_px: Floats, flags: NDArray[np.uint8]

@@ -14,10 +14,10 @@ from faintspot.kernels.pixel_noise import SMALLEST_VARIANCE
 from faintspot.kernels.profiles import MARGIN, PHASES
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import TrainedScore
+from faintspot.spots.shapes import FWHM_TO_STD
 
 Floats = NDArray[np.float64]
 
-FWHM_TO_STD = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 START_SMOOTHING = (
     0.73  # standard deviation of the smoothing in units of the spot's FWHM: about a matched filter
 )

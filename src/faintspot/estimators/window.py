@@ -16,10 +16,11 @@ from faintspot.estimators.base import Estimator, EstimatorPlan, Need, Style
 from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
-from faintspot.estimators.spot_tables import FWHM_TO_STD, gaussian_psf
+from faintspot.estimators.spot_tables import gaussian_psf
 from faintspot.kernels import window
 from faintspot.kernels.host import WIDTHS, lanes_for
 from faintspot.spots.fixed_weights import FixedWeights
+from faintspot.spots.shapes import FWHM_TO_STD
 
 Floats = NDArray[np.float64]
 

@@ -13,10 +13,11 @@ from faintspot.algorithms.noise import pixel_noise
 from faintspot.algorithms.spot_width import SeenSpots, seen_spots
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
-from faintspot.estimators.spot_tables import FWHM_TO_STD, gaussian_psf
+from faintspot.estimators.spot_tables import gaussian_psf
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.sensor.layout import Layout
+from faintspot.spots.shapes import FWHM_TO_STD
 
 Floats = NDArray[np.float64]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,7 +14,7 @@ from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys
 from faintspot.sensor.layout import Layout
-from faintspot.spots.laser import LaserGuideStar
+from faintspot.spots.laser import LaserGuideStar, gaussian_spot
 from faintspot.spots.psf import PSF
 from faintspot.spots.sodium import SodiumProfile
 
@@ -48,7 +48,7 @@ class LaserSpots:
     launch_m: Any
     at_m: Any
     spot_fwhm_arcsec: float
-    profile: SodiumProfile | None = None
+    profile: SodiumProfile = field(default_factory=SodiumProfile.gaussian)
     zenith_distance_deg: float = 0.0
     site_altitude_m: float = 0.0
 
@@ -80,21 +80,20 @@ class LaserSpots:
 
     def star(self, places_m: ArrayLike, pixel_arcsec: float) -> LaserGuideStar:
         """Return the star as sub-apertures at these places see it."""
-        size = self.spot_fwhm_arcsec / pixel_arcsec / 2
-        spot = PSF.analytic("gaussian", size=size, radius_px=max(4.0, 6.0 * size))
+        spot = gaussian_spot(self.spot_fwhm_arcsec / pixel_arcsec)
         known = self.zenith_distance_deg, self.site_altitude_m
         return LaserGuideStar(places_m, self.launch_m, pixel_arcsec, spot, *known)
 
     def psf(self, places_m: ArrayLike, pixel_arcsec: float, window: tuple[int, int]) -> PSF:
         """Return the PSF of sub-apertures at places (n, 2) m, with the layer at the focus."""
         star = self.star(places_m, pixel_arcsec)
-        profile = star.focused(self.profile or SodiumProfile.gaussian())
+        profile = star.focused(self.profile)
         return star.psf(profile, radius_px=0.5 * max(window) + _BEYOND_PX)
 
     def in_words(self, pixel_arcsec: float, window: tuple[int, int]) -> str:
         """Describe the spot: its elongation, and the part of its flux that the window cuts off."""
         star = self.star([self.at_m], pixel_arcsec)
-        profile = star.focused(self.profile or SodiumProfile.gaussian())
+        profile = star.focused(self.profile)
         x, y = star.elongation_px(profile)[0]
         lost = 1.0 - float(star.images(profile, window).sum())
         place, angle = "{:g}, {:g} m".format(*self.at_m), math.degrees(math.atan2(y, x))

@@ -279,6 +279,12 @@ class LaserGuideStar:
         return [slice(start, start + size) for start in range(0, len(self), size)]
 
 
+def gaussian_spot(fwhm_px: float) -> PSF:
+    """Return the round Gaussian spot of a width [px] that the light of a single altitude makes."""
+    size = fwhm_px / 2
+    return PSF.analytic("gaussian", size=size, radius_px=max(4.0, 6.0 * size))
+
+
 def _profiles(spot: PSF, centres: Floats, columns: Floats, rows: Floats) -> tuple[Floats, Floats]:
     """Return the separable terms of spots at centres (n, k, 2): (rank, n, k, columns or rows)."""
     from scipy.interpolate import CubicSpline  # imported here: it takes longer than the first slopes

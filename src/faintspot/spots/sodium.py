@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.npz import NpzFile
+from faintspot.spots.shapes import FWHM_TO_STD
 
 Floats = NDArray[np.float64]
 
 _HIGHEST_M = 1e6
 _MOST_BINS = 4096
 _STEPS = 4  # points between two altitudes, for moments
-_FWHM_TO_STD = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 _REACH = 1.5  # FWHM from the middle of a layer to the end of its table
 
 
@@ -106,7 +106,7 @@ class SodiumProfile(NpzFile):
             )
         low, high = (means - _REACH * widths).min(), (means + _REACH * widths).max()
         altitudes = np.linspace(max(low, 0.0), high, count)
-        std = _FWHM_TO_STD * widths
+        std = FWHM_TO_STD * widths
         layers = flux / std * np.exp(-0.5 * ((altitudes[:, None] - means) / std) ** 2)
         return cls(altitudes, layers.sum(axis=1))
 
