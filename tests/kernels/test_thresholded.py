@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import threading
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ def in_lanes(pipeline: fs.SlopePipeline, frame: np.ndarray) -> fs.Slopes:
     changed.kernel, changed.tables = gravity_of_groups, prepared.tables.gathered
     other.plan.prepared = changed
     other.plan._made, other.plan._kernels = None, {}
+    other._small = threading.local()
     return other(frame)
 
 

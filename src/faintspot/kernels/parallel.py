@@ -34,7 +34,7 @@ OwnScratch = Callable[[Lanes, int, int], tuple[Any, ...]]
 """Makes the own memory of an estimator's kernel, for lanes and a window of ny x nx pixels."""
 
 
-def _thread_scratch(lanes: Lanes, window: tuple[int, int], own: OwnScratch) -> Scratch:
+def thread_scratch(lanes: Lanes, window: tuple[int, int], own: OwnScratch) -> Scratch:
     """Return the scratch of the calling thread, made anew only when the shape of the work changes.
 
     Two shapes are remembered: a pipeline may look at the flux of a frame before it measures it.
@@ -46,6 +46,12 @@ def _thread_scratch(lanes: Lanes, window: tuple[int, int], own: OwnScratch) -> S
             known.pop(next(iter(known)))
         known[key] = new_scratch(lanes, *window, own(lanes, *window))
     return known[key]
+
+
+def most_threads(n_groups: int, lanes: Lanes, window: tuple[int, int], cost: float) -> int:
+    """Return the number of threads above which each would have too little to do."""
+    work_us = n_groups * lanes.width * cost * _US_OF_COST * window[0] * window[1] / 256
+    return min(int(work_us / _FEWEST_US), n_groups)
 
 
 def run_groups(
@@ -61,18 +67,16 @@ def run_groups(
 
     `cost`: of a sub-aperture, as `Estimator.cost`. Threads that would have too little to do are not woken.
     """
-    ny, nx = window
-    work_us = n_groups * lanes.width * cost * _US_OF_COST * ny * nx / 256
-    most = min(int(work_us / _FEWEST_US), n_groups)
+    most = most_threads(n_groups, lanes, window, cost)
     if most < 2 or threads == 1:
-        job(0, n_groups, _thread_scratch(lanes, window, own_scratch))
+        job(0, n_groups, thread_scratch(lanes, window, own_scratch))
         return
     wanted = available_cpus() if threads is None else threads
     shares = min(wanted, most)
 
     def work(share: int) -> None:
         start, stop = n_groups * share // shares, n_groups * (share + 1) // shares
-        job(start, stop, _thread_scratch(lanes, window, own_scratch))
+        job(start, stop, thread_scratch(lanes, window, own_scratch))
 
     others = [_pool(os.getpid(), wanted).submit(work, share) for share in range(1, shares)]
     work(0)  # the caller is awake already

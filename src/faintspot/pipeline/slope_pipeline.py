@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import math
+import threading
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,15 +17,17 @@ from faintspot.base.checks import number_between, numbers_between, one_of, real_
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
 from faintspot.estimators.base import Estimator
+from faintspot.kernels.compiling import Direct
 from faintspot.kernels.doubtful import flag_doubtful
 from faintspot.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
 from faintspot.kernels.host import lanes_for
-from faintspot.kernels.parallel import run_groups
+from faintspot.kernels.parallel import most_threads, run_groups, thread_scratch
 from faintspot.pipeline import configuration
 from faintspot.pipeline.mean_flux import MeanFlux
 from faintspot.pipeline.plan import Plan, packed_calibration
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slopes import RESULT_TYPES, Slopes, Stages
+from faintspot.pipeline.small_frames import NO_STAGES, SmallFrames
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score
@@ -33,7 +36,8 @@ if TYPE_CHECKING:
     from faintspot.pipeline.device import DevicePipeline
 
 _KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
-_NO_STAGES = np.empty((0, 0, 0, 0), np.float32)
+_SMALL_TYPES = (np.dtype(np.uint8), *_KERNEL_TYPES)
+_flag_doubtful = Direct(flag_doubtful)
 _FLUX_COST = 0.1  # of summing the pixels of a sub-aperture, in units of `Estimator.cost`
 
 
@@ -119,7 +123,8 @@ class SlopePipeline:
         return cls(layout, settings, calibration, psf=psf, score=score, **options)
 
     def _prepared(self) -> Plan:
-        """Compute the tables for the current SIMD width."""
+        """Compute the tables for the current SIMD width; forget what was prepared for small frames."""
+        self._small = threading.local()
         return Plan(self.layout, self.settings, self.calibration, *self._parts, self._lanes.width)
 
     def _device_pipeline(self) -> DevicePipeline:
@@ -272,7 +277,26 @@ class SlopePipeline:
         InputError
             If a frame is not real or does not have the layout's shape, or the prior has the wrong shape.
         """
+        if prior is None and type(frame) is np.ndarray and frame.shape == self.layout.frame_shape:
+            small = vars(self._small)
+            if frame.dtype not in small:
+                small[frame.dtype] = self._small_frames(frame.dtype)
+            measure: SmallFrames | None = small[frame.dtype]
+            if measure is not None:
+                return measure(frame)
         return self._run(self._checked(frame), _camera_type(frame), prior, explain=False)[0]
+
+    def _small_frames(self, dtype: np.dtype[Any]) -> SmallFrames | None:
+        """Return the calling thread's own way to measure frames of a small sensor; None if it is not one."""
+        plan, lanes, window = self.plan, self._lanes, self.layout.window
+        groups = -(-len(self.layout) // lanes.width)
+        simple = dtype in _SMALL_TYPES and self.on_device is None
+        simple = simple and not (plan.needs_flux or plan.prepared.in_python)
+        if not simple or most_threads(groups, lanes, window, plan.estimator.cost) > 1:
+            return None
+        frames = np.empty((1, *self.layout.frame_shape), np.float32 if dtype.kind == "f" else np.uint16)
+        scratch = thread_scratch(lanes, window, plan.own_scratch)
+        return SmallFrames(plan, self.source(frames, dtype), scratch, self.flag_doubtful)
 
     def explain(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Stages:
         """Return the sub-aperture images after every step, for figures and for debugging.
@@ -305,7 +329,7 @@ class SlopePipeline:
         n_frames, n = len(frames), len(self.layout)
         results = SlopeArrays(*[np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES])
         prepared = self.plan.prepared
-        stages = _NO_STAGES
+        stages = NO_STAGES
         if explain or prepared.in_python:
             stages = np.empty((STAGE_ROWS, n_frames, n, self.layout.pixels), np.float32)
         source = self.source(frames, dtype)
@@ -339,7 +363,7 @@ class SlopePipeline:
         The flags need the slopes of whole frames; slopes can be used before they are set.
         """
         scratch = np.empty(len(self.layout), np.float32)
-        flag_doubtful(results.x, results.y, results.flags, self.plan.expected, scratch)
+        _flag_doubtful(results.x, results.y, results.flags, self.plan.expected, scratch)
 
     def source(self, frames: NDArray[Any], dtype: DTypeLike) -> Source:
         """Return the frames in the form that kernels read.
