@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize
-from scipy.stats import gamma
+from scipy.stats import chi2, gamma
 
 from faintspot.control.models import SlopeModel
 
@@ -20,10 +21,11 @@ MODES = ("tip", "tilt", "focus")
 _SEGMENT_S = 2.0
 _FEWEST_SEGMENTS = 5
 _LOWEST_HZ = 4.0  # below, turbulence is steep, and predicted well without
-_FALSE_ALARM = 1e-4  # of a whole spectrum
+_FALSE_ALARM = 0.01  # of a whole spectrum
 _BACKGROUND_BINS = 41
 _LINE_BINS = 12  # on each side of a peak, to which a line is fitted
-_MOST_PER_MODE = 2
+_SMOOTH_ORDER = 3  # of the polynomial that is the logarithm of the spectrum without the line
+_MOST_TRIED, _MOST_PER_MODE = 6, 2
 _DAMPING = 1e-6, 0.1
 _LEAST_DAMPING = 1e-3  # of a model: the phase of no vibration is certain for ever
 _START_DAMPING = 3e-3
@@ -95,7 +97,7 @@ def find_vibrations(amplitudes: Floats, rate_hz: float, slopes: int) -> tuple[Vi
     found = []
     for mode, spectrum in zip(MODES, spectra, strict=True):
         lines = _Lines(spectrum, window, len(segments), rate_hz, slopes)
-        found += [lines.fitted(mode, peak) for peak in lines.peaks()]
+        found += list(itertools.islice(lines.found(mode), _MOST_PER_MODE))
     return tuple(found)
 
 
@@ -137,24 +139,34 @@ class _Lines:
         self._background = np.maximum(background, 1e-12 * spectrum.max() + 1e-300)
         self._correlation = np.correlate(window, window, "full")[len(window) - 1 :]
 
-    def peaks(self) -> list[int]:
-        """Return the bins of the significant highest peaks."""
+    def found(self, mode: str) -> Iterator[Vibration]:
+        """Yield the significant lines, that of the highest peak first."""
+        yield from filter(None, (self._fitted(mode, peak) for peak in self._peaks()))
+
+    def _peaks(self) -> Iterator[int]:
+        """Yield the bins of peaks that stand out of the background, the highest first."""
         ratio = self._spectrum / self._background
         first = max(3, math.ceil(_LOWEST_HZ / self._bin_hz))
         ratio[:first] = ratio[-3:] = 0.0
         limit = gamma(self._segments, scale=1 / self._segments).isf(_FALSE_ALARM / len(ratio))
-        found: list[int] = []
-        while len(found) < _MOST_PER_MODE and ratio.max() > limit:
-            found.append(int(np.argmax(ratio)))
-            ratio[max(0, found[-1] - _LINE_BINS) : found[-1] + _LINE_BINS + 1] = 0.0
-        return found
+        for _ in range(_MOST_TRIED):
+            peak = int(np.argmax(ratio))
+            if ratio[peak] <= limit:
+                return
+            yield peak
+            ratio[max(0, peak - _LINE_BINS) : peak + _LINE_BINS + 1] = 0.0
 
-    def fitted(self, mode: str, peak: int) -> Vibration:
-        """Fit frequency, damping and strength near a peak by Whittle's likelihood."""
+    def _fitted(self, mode: str, peak: int) -> Vibration | None:
+        """Fit frequency, damping and strength near a peak by Whittle's likelihood.
+
+        None unless a smooth spectrum with the line is significantly more likely than one without.
+        Turbulence has broad maxima, for example where the sub-apertures' grid passes over it.
+        """
         bins = np.arange(max(1, peak - _LINE_BINS), min(len(self._spectrum), peak + _LINE_BINS + 1))
         near, lags = self._spectrum[bins], np.arange(len(self._correlation))
         transform = np.cos(2 * np.pi / len(lags) * np.outer(bins, lags)) * self._correlation
         transform[:, 1:] *= 2
+        powers = ((bins - peak) / _LINE_BINS)[:, None] ** np.arange(_SMOOTH_ORDER + 1)
 
         def line(x: Floats) -> Vibration:
             damping = float(np.exp(np.clip(x[1], *np.log(_DAMPING))))
@@ -162,26 +174,30 @@ class _Lines:
             rms = math.exp(0.5 * float(np.clip(x[2], -80, 80))) / math.sqrt(self._slopes)
             return Vibration(mode, frequency, damping, rms, math.nan, math.nan)
 
-        def misfit(x: Floats) -> float:
-            vibration = line(x)
-            shape = transform @ vibration.correlation(self._rate_hz, len(lags))
-            level = self._background[peak] * math.exp(float(np.clip(x[3], -2, 2)))
-            expected = level + vibration.rms_px**2 * self._slopes * np.maximum(shape, 0.0)
+        def misfit(smooth: Floats, of_line: Floats | float = 0.0) -> float:
+            logarithm = np.clip(powers[:, : len(smooth)] @ smooth, -60, 60)
+            expected = self._background[peak] * np.exp(logarithm) + of_line
             return self._segments * float(np.sum(np.log(expected) + near / expected)) / 2
 
+        def misfit_with(x: Floats) -> float:
+            vibration = line(x)
+            shape = transform @ vibration.correlation(self._rate_hz, len(lags))
+            return misfit(x[3:], vibration.rms_px**2 * self._slopes * np.maximum(shape, 0.0))
+
+        without = minimize(misfit, np.zeros(_SMOOTH_ORDER + 1)).fun
         strength = 4 * max(near.sum() - len(near) * self._background[peak], 1e-30) / len(lags)
-        start = np.array([0.0, math.log(_START_DAMPING), math.log(strength), 0.0])
-        best = minimize(misfit, start, method="Nelder-Mead", options={"maxiter": 400, "xatol": 1e-3}).x
-        errors = _errors(misfit, best)
-        found = line(best)
-        return Vibration(
-            mode,
-            found.frequency_hz,
-            found.damping,
-            found.rms_px,
-            float(errors[0] * self._bin_hz),
-            float(0.5 * errors[2] * found.rms_px),
-        )
+        best = np.array([0.0, math.log(_START_DAMPING), math.log(strength)])
+        for more in (1, _SMOOTH_ORDER):
+            start, options = np.append(best, np.zeros(more)), {"maxiter": 2000, "xatol": 1e-3, "fatol": 1e-3}
+            fit = minimize(misfit_with, start, method="Nelder-Mead", options=options)
+            best = fit.x
+        if without - fit.fun < chi2(3).isf(_FALSE_ALARM / len(self._spectrum)) / 2:
+            return None
+        errors, found = _errors(misfit_with, best), line(best)
+        frequency, rms = errors[0] * self._bin_hz, 0.5 * errors[2] * found.rms_px
+        if not math.isfinite(frequency + rms):
+            return None
+        return replace(found, frequency_error_hz=float(frequency), rms_error_px=float(rms))
 
 
 def _errors(misfit: Callable[[Floats], float], best: Floats, step: float = 0.05) -> Floats:
