@@ -47,6 +47,40 @@ def test_nonsense_is_replaced() -> None:
     assert guarded.chosen == 1
 
 
+class Still:
+    """A controller whose command is always the same."""
+
+    undoes_prior = True
+
+    def __init__(self, line: CommandDelayLine, value: float) -> None:
+        self._line, self._command = line, np.full(12, value)
+
+    def expected(self) -> Expected:
+        return Expected(np.zeros(18), None)
+
+    def begin(self) -> None: ...
+
+    def update(self, slopes_px: np.ndarray, standard_error_px: np.ndarray, covariance: object = None) -> None:
+        self._line.put(self._command)
+
+
+def test_commands_go_over_from_one_controller_to_another_in_equal_steps() -> None:
+    """From 0.5 of another one to the 1 of the first controller, then to the 0 of the second."""
+    line, sent = CommandDelayLine(12, 2), []
+    makers = partial(Still, value=1.0), partial(Still, value=0.0)
+    guarded = Guarded(line, INTERACTION, PHASE, *makers)
+    line.hold(np.full(12, 0.5))
+    guarded.begin()
+    guarded.hand_over()
+    for number in range(30):
+        if number == 15:
+            guarded.fall_back()
+        guarded.update(np.zeros(18), np.full(18, 0.2))
+        sent.append(line.latest[0])
+    wanted = [*np.linspace(0.55, 1.0, 10), *[1.0] * 5, *np.linspace(0.9, 0.0, 10), *[0.0] * 5]
+    np.testing.assert_allclose(sent, wanted, atol=1e-12)
+
+
 @pytest.mark.parametrize("prior", [None, np.full(18, 0.5)])
 def test_alike_nothing_changes(prior: np.ndarray | None) -> None:
     """Two integrators that differ by nothing; posteriors are drawn to what each expects."""

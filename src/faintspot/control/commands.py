@@ -80,6 +80,11 @@ class CommandDelayLine:
             raise ArithmeticError("its commands were not finite")
         self.place = (self.place + 1) % len(self._rows)
 
+    def copy_from(self, other: CommandDelayLine, *, without_latest: bool = False) -> None:
+        """Take the commands of a line of the same length, perhaps as they were before its latest."""
+        self.rows[:] = other.rows
+        self.place = (other.place - without_latest) % len(self._rows)
+
     def hold(self, command: Floats) -> None:
         """Restart with a mirror that holds a command, and no delayed commands."""
         for row in self._rows:

@@ -14,10 +14,12 @@ from faintspot.control.kalman_kernels import (
     FOLLOW,
     FRAMES,
     GO_ON,
+    GUARD_NUMBERS,
     HELD,
     HOLD,
     LATEST_PLAIN,
     PREDICTED,
+    SENT,
     SLOPE_ROWS,
     Lines,
     Matrices,
@@ -106,11 +108,11 @@ class CompiledKalman:
         self._lines = Lines(line.rows, self._learnt.rows, self._plain.rows)
         self._memory = Memory(
             np.zeros((predictor.model.layers, 2, slopes)),
-            np.zeros(4),
+            np.zeros(GUARD_NUMBERS),
             np.zeros((SLOPE_ROWS, slopes)),
             np.zeros((COMMAND_ROWS, commands)),
         )
-        self._memory.guard[CHOSEN] = prefers_plain
+        self._memory.guard[[CHOSEN, SENT]] = prefers_plain
         self._noise_factor = float(noise_factor)
         self._numbers = float(plain_gain), 1.0 - leak, float(line.largest), steps
         self._std_px, self._shares = predictor.std_px, shares(predictor.model)
@@ -146,7 +148,12 @@ class CompiledKalman:
         self._memory.state[:] = self._shares[:, None, None] * open_loop
         self._memory.slopes[PREDICTED] = open_loop
         self._memory.guard[FRAMES:] = 0.0
+        self._memory.guard[SENT] = self._memory.guard[CHOSEN]
         self._is_behind, self._held_at = False, -1
+
+    def hand_over(self) -> None:
+        """See `Guarded`."""
+        self._memory.guard[SENT] = -1.0
 
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None

@@ -17,6 +17,7 @@ MEMORY_FRAMES = 100
 CORRELATED_FRAMES = 5  # over which residuals are alike
 FEWEST_FRAMES = 50  # before the first change
 STANDARD_ERRORS = 1.0  # by which one must leave less than the other
+HANDOVER_FRAMES = 10  # after which a controller's own commands are sent
 
 
 class Guarded:
@@ -25,7 +26,8 @@ class Guarded:
     Both send commands in every frame, each to a mirror of its own that exists only in numbers; the slopes
     that each would have had follow from the open-loop slopes. So what they leave can be compared in the same
     frames, and either can take over without a jump in its own state. As long as the difference is within its
-    error, nothing changes.
+    error, nothing changes. When another controller takes over, the commands sent differ from its own by an
+    offset, which falls from the whole difference to zero in `HANDOVER_FRAMES` equal steps.
 
     Parameters
     ----------
@@ -66,6 +68,8 @@ class Guarded:
         self.prior_std_px, self._noise_factor = prior_std_px, noise_factor
         self.chosen = int(prefers_plain)
         """0: the learnt controller; 1: the plain one."""
+        self._sent: int | None = self.chosen  # whose commands the last frame's were
+        self._offset, self._blended = np.zeros(interaction.shape[1]), 0
         self._difference = np.zeros(2)
         self._frames = 0
 
@@ -85,6 +89,11 @@ class Guarded:
             line.hold(self._line.latest)
             controller.begin()
         self._difference[:], self._frames = 0.0, 0
+        self._sent, self._blended = self.chosen, 0
+
+    def hand_over(self) -> None:
+        """Let the next commands follow on from the latest, which another filter has sent."""
+        self._sent = None
 
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
@@ -102,8 +111,17 @@ class Guarded:
             residual = open_loop + self._interaction @ line.acting
             left.append(float(np.square(self._phase @ (trust * residual)).sum()))
             controller.update(as_estimated(residual, trust, controller), error, covariance)
-        self._line.put(self._lines[self.chosen].latest)
+        self._send()
         self._choose((left[0] - left[1]) / max(left[0] + left[1], 1e-30))
+
+    def _send(self) -> None:
+        """Send the chosen controller's command, with what is left of the offset."""
+        own = self._lines[self.chosen].latest
+        if self._sent != self.chosen:
+            self._sent, self._blended = self.chosen, HANDOVER_FRAMES
+            self._offset = self._line.latest - own
+        self._blended = max(0, self._blended - 1)
+        self._line.put(own + self._blended / HANDOVER_FRAMES * self._offset)
 
     def _choose(self, difference: float) -> None:
         """Switch from the next frame on if the recent mean difference exceeds its error."""

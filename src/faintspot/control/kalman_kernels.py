@@ -13,7 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from faintspot.control.compiled import add_products
-from faintspot.control.guarded import CORRELATED_FRAMES, FEWEST_FRAMES, MEMORY_FRAMES, STANDARD_ERRORS
+from faintspot.control.guarded import (
+    CORRELATED_FRAMES,
+    FEWEST_FRAMES,
+    HANDOVER_FRAMES,
+    MEMORY_FRAMES,
+    STANDARD_ERRORS,
+)
 from faintspot.control.kalman import LARGEST_VARIANCE_PX2
 from faintspot.control.telemetry import LEAST_SHARE, LEAST_VARIANCE_PX2
 from faintspot.kernels.compiling import Direct, compiled_with
@@ -24,10 +30,12 @@ _compiled = partial(compiled_with, source=__file__)
 HELD, HELD_LEARNT, HELD_PLAIN, LATEST_PLAIN, _LEFT_LEARNT, _LEFT_PLAIN, _FOR_PLAIN = range(7)
 _VARIANCE, _SCALE, _SURPRISE, _SOLUTION, _DIRECTION, _IMAGE, _SPARE, PREDICTED = range(7, 15)
 SLOPE_ROWS = 15
-_MADE, _LEFT = 4, 5
-COMMAND_ROWS = 7
-# Of the guard: 1 where the plain one's commands go out; frames; mean difference of late, and its mean square.
-CHOSEN, FRAMES, _MEAN, _SQUARE = range(4)
+_MADE, _LEFT, _OFFSET = 4, 5, 7
+COMMAND_ROWS = 8
+# Of the guard: 1 where the plain one's commands go out; the same of the frame before, or another number;
+# frames, mean difference of late, and its mean square; frames of the handover that are left.
+CHOSEN, SENT, FRAMES, _MEAN, _SQUARE, _BLENDED = range(6)
+GUARD_NUMBERS = 6
 
 
 class Matrices(NamedTuple):
@@ -68,7 +76,7 @@ class Memory(NamedTuple):
     state: Any
     """(layers, 2, m): predicted state of the next frame."""
     guard: Any
-    """(4,)"""
+    """(GUARD_NUMBERS,)"""
     slopes: Any
     """(SLOPE_ROWS, m)"""
     commands: Any
@@ -178,6 +186,20 @@ def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, c
 
 
 @_compiled
+def _send(own: Any, true: Any, here: Any, memory: Any, largest: Any) -> None:
+    """Write the mirror's command; see `Guarded`."""
+    guard, offset = memory.guard, memory.commands[_OFFSET]
+    if guard[SENT] != guard[CHOSEN]:
+        guard[SENT], guard[_BLENDED] = guard[CHOSEN], HANDOVER_FRAMES
+        for c in range(own.shape[0]):
+            offset[c] = true[here - 1, c] - own[c]
+    guard[_BLENDED] = max(0.0, guard[_BLENDED] - 1.0)
+    share = guard[_BLENDED] / HANDOVER_FRAMES
+    for c in range(own.shape[0]):
+        true[here, c] = min(max(own[c] + share * offset[c], -largest), largest)
+
+
+@_compiled
 def _advance(matrices: Any, memory: Any) -> None:
     """Predict the filter's state of the next frame."""
     state, rows = memory.state, memory.slopes
@@ -266,8 +288,7 @@ def follow(
         total: float = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
     else:
         total = _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
-    for c in range(lines.true.shape[1]):
-        lines.true[here, c] = lines.plain[of_plain, c] if plainly else lines.learnt[of_learnt, c]
+    _send(lines.plain[of_plain] if plainly else lines.learnt[of_learnt], lines.true, here, memory, largest)
     return total
 
 

@@ -104,7 +104,7 @@ class LargeGuarded(Guarded):
         expects = of_plain - latest
         for_plain = expects + trust * (open_loop + of_plain - expects)
         self._follow(self.chosen, open_loop, self._noise_factor * variance, for_plain)
-        self._line.put(self._lines[self.chosen].latest)
+        self._send()
         self._rest = open_loop, self._noise_factor * variance, for_plain, *left
 
     def _follow(self, which: int, open_loop: Floats, variance: Floats, for_plain: Floats) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,14 @@ from faintspot.control.base import Controller
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled import CompiledIntegrator, true_slopes
 from faintspot.control.compiled_kalman import CompiledKalman
-from faintspot.control.configuration import CONTROLLER, Control
+from faintspot.control.configuration import Control
 from faintspot.control.guarded import Guarded
-from faintspot.control.large_guarded import LargeGuarded
 from faintspot.control.learnt import Model
 from faintspot.kernels.compiling import Direct
 from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.realtime.guard import Guard
 from faintspot.realtime.prior import Prior
+from faintspot.realtime.successor import Ready, Successor
 from faintspot.realtime.timing import Latencies
 from faintspot.sensor.layout import Layout
 
@@ -31,30 +31,6 @@ STATES = (NONE, OPEN, CLOSED)
 _AT_START = "not closed since the engine began"
 BY_REQUEST = "asked to"
 """Reason given when a user has opened the loop."""
-
-
-class _Ready(NamedTuple):
-    """A controller that has been prepared."""
-
-    kind: str
-    controller: Any
-    predicts: bool
-    """Whether its prediction goes to the estimators as a prior."""
-    takes_prior: bool
-    """Whether it uses the width of the prior of the slopes."""
-    completes: bool
-    """Whether a part of each frame's work, which need not delay the command, waits for `expected`."""
-
-    @classmethod
-    def of(cls, control: Control, line: CommandDelayLine) -> Self:
-        controller = control.controller(line)
-        return cls(
-            control.options.controller,
-            controller,
-            control.prediction == CONTROLLER,
-            isinstance(controller, (Guarded, CompiledKalman)),
-            isinstance(controller, (LargeGuarded, CompiledKalman)),
-        )
 
 
 class ControlLoop:
@@ -88,13 +64,13 @@ class ControlLoop:
         prior: Prior | None = None,
     ) -> None:
         self.control, self.latencies = control, Latencies()
-        self._line = control.line()
-        if held is not None:
-            self._line.hold(held.astype(np.float64))
         self._prior = prior
-        self._ready: dict[str, _Ready] = {}
+        self._ready: dict[str, Ready] = {}
+        self._successor: Successor | None = None
         self.make_ready(control.options.controller)
         self._on = self._ready[control.options.controller]
+        if held is not None:
+            self._line.hold(held.astype(np.float64))
         self._slopes, self._errors = np.zeros((2, 2 * len(layout)))
         self._said = np.zeros(2)
         self._true_slopes = Direct(true_slopes)
@@ -106,6 +82,11 @@ class ControlLoop:
         """Reason for which the guard had opened the loop before it closed it again; "" without."""
         self._flattened, self._begins, self._number = False, False, -1
         self._warm_up(len(layout))
+
+    @property
+    def _line(self) -> CommandDelayLine:
+        """Delay line to the mirror."""
+        return self._on.line
 
     # The engine's thread ----------------------------------------------------------------------------
 
@@ -169,7 +150,26 @@ class ControlLoop:
         elif reason := guard.objection(*frame, line.latest):
             self.closed, self.opened_because = False, reason
             self._flattened = guard.flattens
+        if self._successor is not None:
+            self._follow_beside(self._successor)
         self._expect()
+
+    def _follow_beside(self, successor: Successor) -> None:
+        """Let a new controller follow the last frame, or take over if it has settled or the loop is open."""
+        on, prior = self._on, self._prior
+        if self.closed and not self._begins and successor.is_settling:
+            std = on.controller.prior_std_px if prior is not None and on.takes_prior else None
+            mean = self._slopes if prior is None else prior.mean_px.reshape(-1).astype(np.float64)
+            successor.follow(self._line, self._slopes, self._errors, mean, std)
+            return
+        if self._successor is successor:  # else a newer one has come
+            self._successor = None
+        if successor.has_failed:
+            return
+        kind = successor.ready.kind
+        if self.closed and on is self._ready[kind]:
+            self._on = successor.take_over(self._line)
+        self._ready[kind] = successor.ready
 
     def _close_again(self) -> None:
         """Close a loop that the guard has opened; a learnt controller leaves the mirror to its integrator."""
@@ -187,6 +187,7 @@ class ControlLoop:
         new = self._ready[self.control.options.controller if kind is None else kind]
         if new is self._on:
             return
+        new.line.copy_from(self._line)
         self._on = new
         self._expect(begins=self.closed and not self._begins)
 
@@ -206,7 +207,7 @@ class ControlLoop:
         if prior is not None:
             prior.forget()
 
-    def _update(self, on: _Ready) -> None:
+    def _update(self, on: Ready) -> None:
         """Let a controller compute its command from the slopes."""
         try:
             if self._begins:
@@ -236,12 +237,12 @@ class ControlLoop:
             return
         control = self.control.with_controller(kind)
         control.rehearse()
-        self._ready[kind] = _Ready.of(control, self._line)
+        self._ready[kind] = Ready.of(control)
 
     def renew(self, model: Model) -> None:
-        """Replace the model of a learnt controller from the next frame on.
+        """Replace the model of a learnt controller.
 
-        The new controller starts from the mirror's present commands.
+        While the loop is closed, a new filter first follows it, see `Successor`.
 
         Raises
         ------
@@ -250,7 +251,11 @@ class ControlLoop:
         """
         control = self.control.with_model(model)
         control.rehearse()
-        self._ready[model.kind] = _Ready.of(control, self._line)
+        ready = Ready.of(control)
+        if ready.takes_prior:
+            self._successor = Successor(ready)
+        else:
+            self._ready[model.kind] = ready
         self.control = replace(self.control, model=model)
 
     @property
