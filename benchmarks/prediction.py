@@ -5,6 +5,8 @@ vibration are learnt from the telemetry of an integrator. The rivals (`pip insta
 the same telemetry; their options and gain are those that leave the least phase on other telemetry, as the
 integrator's gain is. All are scored on other turbulence; the rivals with brighter stars as well, so that the
 gain in magnitudes shows.
+
+In winds that drift, the filter is learnt again and handed over as beside a running engine.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +30,17 @@ from faintspot.ao_loop.simulation import measure_gains
 from faintspot.ao_loop.telescope_model import TelescopeModel, prepare
 from faintspot.control.base import Controller, Expected
 from faintspot.control.commands import CommandDelayLine
+from faintspot.control.guarded import HANDOVER_FRAMES
 from faintspot.control.learning import GAINS, KALMAN, Plant, learn
+from faintspot.control.learnt import Learnt
 from faintspot.control.phase import residual_phase
+from faintspot.control.relearning import Relearnt, relearn
 from faintspot.control.telemetry import OpenLoopTelemetry, make_telemetry
 from faintspot.control.vibrations import Vibration
 from faintspot.experiments.statistics import paired_mean
 from faintspot.pipeline.settings import Settings
+from faintspot.realtime.successor import Ready, Successor
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 Make = Callable[[CommandDelayLine], Controller]
@@ -46,6 +53,8 @@ LEARNING, TUNING = (2000, 2000), (2001, 1000)
 VIBRATION_NM, WIDTH_PX, TELEMETRY_GAIN = 120.0, 2.2, 0.2
 OURS, TARGET = "learnt", 0.3
 VIBRATION = Vibration("tip", 45.0, 0.005, 1.0, 0.0, 0.0)
+DRIFT, DRIFT_DEG, DRIFT_S, DRIFTING, DRIFT_TARGET = 0.2, 20.0, 60.0, 5, 0.66
+LEARN_EVERY_S, LEARNING_TAKES_S = 10.0, 2.0
 _GRIDS: dict[str, dict[str, tuple[Any, ...]]] = {
     "least_squares": {"order": (4, 8, 16, 32), "regularization": (1e-3, 1e-2, 1e-1, 1.0)},
     "ar_kalman": {"noise_band": (0.05, 0.1, 0.2, 0.4)},
@@ -125,31 +134,27 @@ class Case:
         optics, control = prepare(self.configuration), self.configuration.control
         return Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
 
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second."""
+        return self.configuration.control.frame_rate_hz
+
+    @property
+    def site(self) -> SlopeTurbulence:
+        """Theory of the slopes, of which learning uses the geometry."""
+        return slope_turbulence(self.configuration, prepare(self.configuration).sensor.layout.cells)
+
     def observed(self, make: Make, realisation: int, frames: int) -> tuple[float, OpenLoopTelemetry]:
         """Run the loop; return its mean Strehl ratio and its telemetry."""
-        configuration, rate = self.configuration, self.configuration.control.frame_rate_hz
-        model = TelescopeModel(configuration, 1, realisation)
-        sensor, plant = model.optics.sensor, self.plant
-        if self.vibration_nm:
-            shaken: Any = Shaken(model.atmosphere, self.vibration_nm, rate, realisation)
-            model.atmosphere = shaken
-        flux_e = self.photons * sensor.illumination
-        settings = Settings("window", window_fwhm_px=WIDTH_PX, flux_e=flux_e)
-        pipeline = make_pipeline(configuration, sensor, Method("window", settings))
-        centroid_gain = measure_gains(configuration, [pipeline], seed=1)[0]
-        line = CommandDelayLine(model.optics.mirror.commands, plant.delay_frames)
-        controller, strehl = make(line), np.zeros(frames)
-        slopes, errors, held = np.zeros((3, frames, len(plant.interaction)))
-        for frame in range(frames):
-            time_s, held[frame] = (frame + 0.5) / rate, plant.interaction @ line.acting
-            after, seen = model.wavefronts(time_s, line.acting)
-            strehl[frame] = model.truth(time_s, after).strehl
-            found = pipeline(model.frame(frame, seen))
-            slopes[frame] = found.vector / centroid_gain
-            errors[frame] = np.r_[found.standard_error_x, found.standard_error_y] / centroid_gain
-            controller.update(slopes[frame], errors[frame])
-        telemetry = make_telemetry(slopes, errors, held, np.zeros_like(held), None)
-        return float(strehl[SETTLE:].mean()), telemetry.part(SETTLE, frames)
+        run = Run(self, realisation, frames)
+        controller = make(run.line)
+        for _ in range(frames):
+            run.step(controller)
+        return float(run.strehl[SETTLE:].mean()), run.telemetry(SETTLE, frames)
+
+    def learnt(self, telemetry: OpenLoopTelemetry) -> Learnt:
+        """Return our filter."""
+        return learn(KALMAN, self.plant, telemetry, self.site, self.rate_hz)
 
     def controllers(self, *, ours: bool) -> dict[str, Make]:
         """Return controllers that have learnt: the rivals, tuned, and the integrator and ours."""
@@ -162,11 +167,66 @@ class Case:
             for name in _GRIDS
         }
         if ours:
-            rate_hz = self.configuration.control.frame_rate_hz
-            learnt = learn(KALMAN, plant, learning, slope_turbulence(self.configuration, cells), rate_hz)
             gain = min(GAINS, key=lambda each: plant.left(partial(plant.integrator, each), tuning, phase))
-            found |= {"integrator": partial(plant.integrator, gain), OURS: learnt.controller}
+            found |= {"integrator": partial(plant.integrator, gain), OURS: self.learnt(learning).controller}
         return found
+
+
+class Run:
+    """A run of the loop, and what it has recorded.
+
+    Parameters
+    ----------
+    case : Case
+    realisation, frames : int
+
+    Attributes
+    ----------
+    line : CommandDelayLine
+        To the mirror.
+    model : TelescopeModel
+    frame : int
+        Number of frames done.
+    strehl : (frames,) array
+    slopes, errors : (frames, 2 n) array
+    """
+
+    def __init__(self, case: Case, realisation: int, frames: int) -> None:
+        configuration, self._plant, self._rate_hz = case.configuration, case.plant, case.rate_hz
+        self.model = TelescopeModel(configuration, 1, realisation)
+        sensor = self.model.optics.sensor
+        if case.vibration_nm:
+            shaken: Any = Shaken(self.model.atmosphere, case.vibration_nm, self._rate_hz, realisation)
+            self.model.atmosphere = shaken
+        flux_e = case.photons * sensor.illumination
+        settings = Settings("window", window_fwhm_px=WIDTH_PX, flux_e=flux_e)
+        self._pipeline = make_pipeline(configuration, sensor, Method("window", settings))
+        self._centroid_gain = measure_gains(configuration, [self._pipeline], seed=1)[0]
+        self.line = CommandDelayLine(self.model.optics.mirror.commands, self._plant.delay_frames)
+        self.frame, self.strehl = 0, np.zeros(frames)
+        self.slopes, self.errors, self._held = np.zeros((3, frames, len(self._plant.interaction)))
+
+    @property
+    def time_s(self) -> float:
+        """Middle of the next frame."""
+        return (self.frame + 0.5) / self._rate_hz
+
+    def step(self, controller: Controller) -> None:
+        """Simulate a frame."""
+        frame, time_s, model, acting = self.frame, self.time_s, self.model, self.line.acting
+        self._held[frame] = self._plant.interaction @ acting
+        after, seen = model.wavefronts(time_s, acting)
+        self.strehl[frame] = model.truth(time_s, after).strehl
+        found = self._pipeline(model.frame(frame, seen))
+        self.slopes[frame] = found.vector / self._centroid_gain
+        self.errors[frame] = np.r_[found.standard_error_x, found.standard_error_y] / self._centroid_gain
+        controller.update(self.slopes[frame], self.errors[frame])
+        self.frame += 1
+
+    def telemetry(self, first: int, last: int) -> OpenLoopTelemetry:
+        """Return the telemetry of some frames."""
+        slopes, errors, held = (each[first:last] for each in (self.slopes, self.errors, self._held))
+        return make_telemetry(slopes, errors, held, np.zeros_like(held), None)
 
 
 def rivals(name: str, plant: Plant, telemetry: OpenLoopTelemetry) -> Iterator[Make]:
@@ -185,10 +245,82 @@ def rivals(name: str, plant: Plant, telemetry: OpenLoopTelemetry) -> Iterator[Ma
 
 
 def run() -> list[Table]:
-    """Compare them with and without a vibration."""
+    """Compare them with and without a vibration, and let the winds drift."""
+    found = drift_table()
     if importlib.util.find_spec("pyrtc") is None:
-        return [Table("prediction", "Prediction", [], ["pyrtcao is not installed: nothing to compare with"])]
-    return [table for vibration_nm in (0.0, VIBRATION_NM) for table in _tables(vibration_nm)]
+        return [Table("prediction", "Prediction", [], ["pyrtcao is not installed: no rivals"]), found]
+    return [*(table for vibration_nm in (0.0, VIBRATION_NM) for table in _tables(vibration_nm)), found]
+
+
+def drift_table() -> Table:
+    """Measure the filter in winds that drift; it is learnt again as beside an engine."""
+    case = Case(FLUXES[0], 0.0)
+    telemetry = case.observed(partial(case.plant.integrator, TELEMETRY_GAIN), *LEARNING)[1]
+    learnt = case.learnt(telemetry)
+    runs = [drifting(case, learnt, realisation) for realisation in range(DRIFTING)]
+    rows = []
+    for period, each in enumerate(np.transpose([run.strehl for run in runs])):
+        mean = paired_mean(each)
+        values = {"Strehl": mean.value, "error": mean.standard_error, "lowest": each.min()}
+        times = f"{period * LEARN_EVERY_S:g} to {(period + 1) * LEARN_EVERY_S:g} s"
+        rows.append(Row(times, values, f">= {DRIFT_TARGET:g}", bool(each.min() >= DRIFT_TARGET)))
+    about = f"Winds that drift by {DRIFT:.0%} and {DRIFT_DEG:g} degrees in {DRIFT_S:g} s"
+    at, other = np.max([run.changes_nm for run in runs], axis=0)
+    notes = [
+        f"{DRIFTING} realisations; filters handed over: {[run.handed_over for run in runs]}",
+        f"largest rms change of commands in a frame: {at:.0f} nm at a handover, {other:.0f} nm otherwise",
+    ]
+    return Table("prediction-drift", about, rows, notes)
+
+
+class Drifted(NamedTuple):
+    """What came out in winds that drift."""
+
+    strehl: Floats
+    """(periods,): means between learnings."""
+    handed_over: int
+    """Number of filters."""
+    changes_nm: tuple[float, float]
+    """Largest rms change of commands from frame to frame: at a handover, and otherwise."""
+
+
+def drifting(case: Case, learnt: Learnt, realisation: int) -> Drifted:
+    """Simulate a run; filters are learnt and handed over as beside an engine."""
+    every, later = (round(each * case.rate_hz) for each in (LEARN_EVERY_S, LEARNING_TAKES_S))
+    run = Run(case, realisation, round(DRIFT_S * case.rate_hz))
+    controller, running = learnt.controller(run.line), learnt.model
+    change, at_handover = np.zeros((2, len(run.strehl)))
+    wind, successor = run.model.atmosphere.velocity, None
+    found: Relearnt | None = None
+    while run.frame < len(run.strehl):
+        part = run.frame / len(run.strehl)
+        now = (1 + DRIFT * part) * wind @ _rotation(DRIFT_DEG * part)
+        run.model.atmosphere = run.model.atmosphere.blown(now, run.time_s)
+        last, before = run.frame, run.line.latest.copy()
+        run.step(controller)
+        change[last] = np.sqrt(np.mean(np.square(run.line.latest - before)))
+        if successor is not None and successor.is_settling:
+            successor.follow(run.line, run.slopes[last], run.errors[last], run.slopes[last], None)
+        elif successor is not None:
+            controller, run.line = successor.take_over(run.line)[1:3]
+            successor, at_handover[run.frame : run.frame + HANDOVER_FRAMES] = None, 1.0
+        if run.frame % every == 0 and run.frame < len(run.strehl):
+            telemetry = run.telemetry(run.frame - every, run.frame)
+            start = None if found is None else found.learnt.found
+            found = relearn(case.plant, running, telemetry, case.site, case.rate_hz, start)
+        if run.frame % every == later and found is not None and found.is_better:
+            running, line = found.learnt.model, CommandDelayLine(len(run.line.latest), run.line.delay_frames)
+            successor = Successor(Ready(KALMAN, found.learnt.controller(line), line, False, True, True))
+    run.strehl[:SETTLE], change[:SETTLE] = np.nan, 0.0
+    largest = float((at_handover * change).max()), float((change - at_handover * change).max())
+    count = round(at_handover.sum() / HANDOVER_FRAMES)
+    return Drifted(np.nanmean(run.strehl.reshape(-1, every), axis=1), count, largest)
+
+
+def _rotation(degrees: float) -> Floats:
+    """Return the matrix that turns rows of two numbers."""
+    cos, sin = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return np.array([[cos, sin], [-sin, cos]])
 
 
 def _tables(vibration_nm: float) -> tuple[Table, Table]:
