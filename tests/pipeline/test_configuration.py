@@ -365,3 +365,51 @@ def test_files_that_cannot_be_used(tmp_path: Path) -> None:
     assert binary.read_bytes() == b"\xff\xfe\x00[settings]"
     with refused("nowhere", "cannot be written"):
         fs.Settings(noise_std=1.0).save(tmp_path / "nowhere" / "faintspot.toml")
+
+
+# Laser guide star ------------------------------------------------------------------------------------
+
+SENSOR = (
+    "[layout]\npixel_scale_arcsec = 0.5\nsubaperture_m = 1.3\n[layout.grid]\nshape = [3, 4]\npixels = 10\n"
+)
+WINDOW = '[estimator]\nname = "window"\n[settings]\nflux_e = 200.0\n[calibration]\nread_noise_e = 1.0\n'
+LASER = "[laser]\nlaunch_m = [-5.0, 0.0]\nspot_fwhm_arcsec = 1.2\nmatched_filter = true\n"
+
+
+def test_spots_of_a_laser_guide_star(tmp_path: Path) -> None:
+    """Places are from the middle of the pupil; a PSF or weights of their own go before."""
+    path = written(tmp_path, SENSOR + WINDOW + LASER)
+    _, _, _, psf, weights = configuration.load_all(path)
+    x, y = np.meshgrid(1.3 * (np.arange(4) - 1.5), 1.3 * (np.arange(3) - 1.0))
+    places = np.stack([x.ravel(), y.ravel()], axis=1)
+    star = fs.LaserGuideStar(places, [-5.0, 0.0], 0.5, fs.PSF.analytic("gaussian", size=1.2))
+    expected = star.psf(star.focused(fs.SodiumProfile.gaussian()), radius_px=8.0)
+    assert psf is not None
+    np.testing.assert_allclose(psf.samples, expected.samples, atol=1e-6 * expected.samples.max())
+    matched = fs.FixedWeights.matched(psf, (10, 10), flux_e=200.0, read_noise_e=1.0)
+    assert isinstance(weights, fs.FixedWeights)
+    np.testing.assert_allclose(weights.x, matched.x)
+    own = written(tmp_path, SENSOR + WINDOW + LASER + '[psf]\nprofile = "gaussian"\n')
+    psf = configuration.load_all(own).psf
+    assert psf is not None
+    assert len(psf.samples) == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("launch_m = [-5.0, 0.0]", "launch_m = [-5.0]"),
+        ("spot_fwhm_arcsec = 1.2", ""),
+        ("spot_fwhm_arcsec = 1.2", "spot_fwhm_arcsec = 1.2\nfollow_every_s = -1"),
+        ("spot_fwhm_arcsec = 1.2", 'spot_fwhm_arcsec = 1.2\nprofile = "none.npz"'),
+        ("spot_fwhm_arcsec = 1.2", "spot_fwhm_arcsec = 1.2\nzenith_distance_deg = 90"),
+        ("matched_filter = true", "matched_filter = 1"),
+        ("flux_e = 200.0", ""),
+        ("read_noise_e = 1.0", ""),
+        ("pixel_scale_arcsec = 0.5", ""),
+    ],
+)
+def test_a_laser_guide_star_that_is_refused(tmp_path: Path, old: str, new: str) -> None:
+    path = written(tmp_path, (SENSOR + WINDOW + LASER).replace(old, new))
+    with refused("none.npz" if "none.npz" in new else f"{path}"):
+        configuration.load_all(path)

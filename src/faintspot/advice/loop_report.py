@@ -20,7 +20,7 @@ from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
 from faintspot.control.identification import Identification, Identified
 from faintspot.control.loop_delay import LoopDelay, loop_delay
-from faintspot.control.recording import subapertures_across
+from faintspot.sensor.pupil import subapertures_across
 from faintspot.turbulence.strength import turbulence_strength
 
 Floats = NDArray[np.float64]

@@ -14,8 +14,9 @@ from faintspot.advice.loop_telemetry import LoopTelemetry
 from faintspot.algorithms.noise import pixel_noise
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
-from faintspot.control.recording import side_m, site_of
+from faintspot.control.recording import site_of
 from faintspot.sensor.layout import Layout
+from faintspot.sensor.pupil import side_m
 from faintspot.training.psf_learning import learn_psf_from_images
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 from faintspot.turbulence.strength import OUTER_SCALE_M, Strength, turbulence_strength

@@ -15,10 +15,11 @@ from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays
 from faintspot.base.toml_files import check_keys, parse_file
 from faintspot.control.configuration import load_control
-from faintspot.control.recording import CLOSED, side_m
+from faintspot.control.recording import CLOSED
 from faintspot.io.frames import read_array
 from faintspot.io.telemetry import read_telemetry
 from faintspot.io.zarr_store import holds_telemetry
+from faintspot.sensor.pupil import side_m
 
 Floats = NDArray[np.float64]
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.ao_loop.configuration import ARCSEC, LoopConfiguration
+from faintspot.ao_loop.laser import subaperture_centres_m
 from faintspot.ao_loop.wavefront_sensor import ShackHartmann
 from faintspot.control.removed_modes import TIP_TILT, RemovedModes
 from faintspot.spots.shapes import FWHM_TO_STD
@@ -39,8 +40,7 @@ class LowOrders:
         self._star, self._sensor = configuration.natural_star, sensor
         self._seed = seed, realisation
         self._tip_tilt = RemovedModes(TIP_TILT)
-        cells = sensor.layout.cells[:, ::-1].astype(np.float64)
-        places = cells - 0.5 * (configuration.sensor.subapertures - 1)
+        places = subaperture_centres_m(configuration, sensor.layout.cells)
         sides = places > 0
         self._quadrant = sides[:, 0] + 2 * sides[:, 1]
         self._focus = places.T.ravel()

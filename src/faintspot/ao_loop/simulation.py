@@ -23,7 +23,7 @@ from faintspot.ao_loop.methods import Method
 from faintspot.ao_loop.natural_star import LowOrders
 from faintspot.ao_loop.record import LoopRecord
 from faintspot.ao_loop.sections import CLOSED, RunLength
-from faintspot.ao_loop.sodium import FollowedSodium, KnownSodium, learn_sodium
+from faintspot.ao_loop.sodium import FollowedSodium, learn_sodium, with_spots
 from faintspot.ao_loop.telescope_model import (
     TelescopeModel,
     atmosphere_of,
@@ -39,6 +39,7 @@ from faintspot.pipeline import configuration as configuration_file
 from faintspot.pipeline.mean_flux import MeanFlux
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.pipeline.slopes import Slopes
+from faintspot.training.known_sodium import KnownSodium
 
 _MOST_METHODS = 127
 _FLUX_FRAMES = 20
@@ -314,14 +315,14 @@ class _Loop:
         """Return a method that knows the spots of a laser guide star as they were before the run."""
         if self.known is None or method.psf is not None:
             return method
-        return self.known.method(self.configuration, method)
+        return with_spots(self.known, self.configuration, method)
 
     def _follow_profile(self, number: int, pixels: NDArray[np.generic], slopes: Slopes) -> None:
         """Take a frame for the sodium profile; make the method's pipeline anew when it changes."""
         followed = self.followed[number]
         if followed is None or not followed.take(pixels, slopes.vector.astype(np.float64)):
             return
-        method = followed.known.method(self.configuration, self.methods[number])
+        method = with_spots(followed.known, self.configuration, self.methods[number])
         self.pipelines[number] = make_pipeline(self.configuration, self.optics.sensor, method)
         self._follow_flux(number)
 

@@ -2,63 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.ao_loop.configuration import ARCSEC, LoopConfiguration
+from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.laser import laser_guide_star
 from faintspot.ao_loop.methods import Method
 from faintspot.sensor.layout import Layout
 from faintspot.spots.fixed_weights import FixedWeights
-from faintspot.spots.laser import LaserGuideStar
-from faintspot.spots.psf import PSF
 from faintspot.spots.sodium import SodiumProfile
-from faintspot.training.sodium import MeanImages, SodiumFit, fit_sodium_profile, fit_spot
+from faintspot.training.known_sodium import KnownSodium
+from faintspot.training.sodium import MeanImages
 
 Floats = NDArray[np.float64]
 
 _ALTITUDES = 41  # of the profile that is fitted
 _FIRST_FWHM = 0.35  # of the range of altitudes: single layer from which the fit begins
-_NARROWEST_PX = 1.2  # spot from which the fit begins
-_BEYOND_PX = 3.0  # of the window, to which PSFs reach
 _OF_LEARNING = 8  # random numbers
 
 
-@dataclass(frozen=True, eq=False)
-class KnownSodium:
-    """Profile, spot and fluxes that mean images have shown."""
-
-    star: LaserGuideStar
-    """Whose spot includes turbulence and the motion of the spots."""
-    fit: SodiumFit
-    dark_variance_e2: float
-
-    def psf(self, pixels: int) -> PSF:
-        """Return the PSF of every sub-aperture, for windows of some pixels."""
-        return self.star.psf(self.fit.profile, radius_px=0.5 * pixels + _BEYOND_PX)
-
-    def updated(self, mean: MeanImages) -> KnownSodium:
-        """Return it with the profile of newer mean images."""
-        fit = fit_sodium_profile(mean, self.star, self.fit.profile, dark_variance_e2=self.dark_variance_e2)
-        return replace(self, fit=fit)
-
-    def method(self, configuration: LoopConfiguration, method: Method) -> Method:
-        """Return a method that knows these spots."""
-        pixels = method.window_pixels or configuration.sensor.pixels
-        psf, scene = self.psf(pixels), configuration.scene
-        if not method.matched_weights:
-            return replace(method, psf=psf)
-        weights = FixedWeights.matched(
-            psf,
-            (pixels, pixels),
-            flux_e=np.maximum(self.fit.flux_e, 1.0),
-            read_noise_e=scene.read_noise_e,
-            excess_noise=scene.excess_noise,
-            background_e=scene.background_e,
-        )
-        return replace(method, psf=psf, score=weights)
+def with_spots(known: KnownSodium, configuration: LoopConfiguration, method: Method) -> Method:
+    """Return a method that knows the spots."""
+    pixels = method.window_pixels or configuration.sensor.pixels
+    psf, scene = known.psf((pixels, pixels)), configuration.scene
+    if not method.matched_weights:
+        return replace(method, psf=psf)
+    weights = FixedWeights.matched(
+        psf,
+        (pixels, pixels),
+        flux_e=np.maximum(known.fit.flux_e, 1.0),
+        read_noise_e=scene.read_noise_e,
+        excess_noise=scene.excess_noise,
+        background_e=scene.background_e,
+    )
+    return replace(method, psf=psf, score=weights)
 
 
 def learn_sodium(
@@ -85,12 +64,10 @@ def learn_sodium(
     images = mean_e + noise * rng.standard_normal(mean_e.shape)
     mean = MeanImages(images, np.zeros((len(layout), 2)), frames=laser.learn_frames)
     low, high = laser.altitude_m[0], laser.altitude_m[-1]
-    narrow = laser_guide_star(
-        configuration, layout.cells, _NARROWEST_PX * configuration.pixel_scale_rad / ARCSEC
-    )
+    star = laser_guide_star(configuration, layout.cells, laser.spot_fwhm_arcsec)
     layer = SodiumProfile.gaussian(laser.focus_altitude_m, _FIRST_FWHM * (high - low))
-    start = narrow.focused(layer).at(np.linspace(low, high, _ALTITUDES))
-    return KnownSodium(*fit_spot(mean, narrow, start, dark_variance_e2=dark), dark)
+    start = star.focused(layer).at(np.linspace(low, high, _ALTITUDES))
+    return KnownSodium.learnt(mean, star, start, dark)
 
 
 class FollowedSodium:

@@ -25,6 +25,7 @@ _COMMANDS = {
     "realtime": "Measure frames as they arrive and publish slopes and commands.",
     "report": "Write a web page of pictures and tables from slopes, studies or telemetry.",
     "slopes": "Measure slopes from recorded frames.",
+    "sodium": "Learn the sodium profile of a laser guide star from frames.",
     "study": "Measure the slope error by Monte-Carlo simulation.",
     "telemetry": "Report noise, turbulence, vibrations and control of a recorded loop.",
     "tune": "Recommend an estimator and settings for a camera and a star.",

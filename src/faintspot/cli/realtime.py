@@ -14,6 +14,7 @@ from faintspot.cli.realtime_camera import camera
 from faintspot.cli.realtime_control import control, get, interleave, set_settings, status, stop_engine, top
 from faintspot.cli.realtime_demo import demo
 from faintspot.cli.realtime_estimators import load, swap, unload
+from faintspot.cli.realtime_follow import follow
 from faintspot.cli.realtime_learn import learn
 from faintspot.cli.realtime_record import export, record
 from faintspot.cli.realtime_run import run
@@ -24,7 +25,7 @@ _SECTIONS = {
     "Engine": (run, status, top, get, set_settings, interleave, control, stop_engine),
     "Estimators": (load, swap, unload),
     "Sources of frames": (camera, replay, bridge, telescope, demo),
-    "Calibration and control": (calibrate, learn),
+    "Calibration and control": (calibrate, learn, follow),
     "Telemetry": (record, export, advise),
 }
 _OF_RECORDINGS = (learn, advise, export)

@@ -105,6 +105,7 @@ def run(
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.engine import Engine
     from faintspot.realtime.interleaving import Interleaving
+    from faintspot.realtime.pipeline_maker import PipelineMaker
     from faintspot.realtime.scheduling import real_time
 
     layout, settings, calibration, psf, score = configuration.load_all(config)
@@ -114,7 +115,7 @@ def run(
     processors = parse_subapertures(cpus) if cpus else None
     engine = Engine(
         name,
-        partial(_pipeline, layout, calibration, psf, score, None if control is None else control.reference),
+        PipelineMaker(layout, calibration, psf, score, None if control is None else control.reference),
         settings,
         cpus=processors,
         source=None if stream is None else _followed(stream, name),
@@ -135,17 +136,11 @@ def run(
             "Ctrl-C stops"
         )
         learns = nullcontext() if interleave else _learning(engine, config)
-        with stop_on_signal() as stop, learns, page_beside(name) if live else nullcontext():
+        page = page_beside(name) if live else nullcontext()
+        with stop_on_signal() as stop, learns, _following(engine, config), page:
             threading.Thread(target=_stop_when_set, args=(stop, engine), daemon=True).start()
             engine.run(frames)
     click.echo(summary(engine.status()))
-
-
-def _pipeline(layout: Any, calibration: Any, psf: Any, score: Any, reference: Any, settings: Any) -> Any:
-    """The pipeline of the configuration with other settings; a function that other processes can be given."""
-    from faintspot.pipeline.slope_pipeline import SlopePipeline
-
-    return SlopePipeline(layout, settings, calibration, reference, psf=psf, score=score)
 
 
 def _learning(engine: Any, config: str) -> Any:
@@ -157,6 +152,17 @@ def _learning(engine: Any, config: str) -> Any:
     if options is None or options.controller != KALMAN or not options.learn_every_s:
         return nullcontext()
     return learning_beside(engine, config, options.learn_every_s, partial(click.echo, err=True))
+
+
+def _following(engine: Any, config: str) -> Any:
+    """The process that follows a laser guide star's profile, as a context, if the configuration wants it."""
+    from faintspot.realtime.sodium import following_beside
+    from faintspot.spots.laser_spots import load_laser
+
+    laser = load_laser(config)
+    if laser is None or not laser.follow_every_s:
+        return nullcontext()
+    return following_beside(engine, config, partial(click.echo, err=True))
 
 
 def _followed(stream: str, name: str) -> Any:

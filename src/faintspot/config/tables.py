@@ -15,7 +15,18 @@ from faintspot.base.files import write_atomically
 from faintspot.base.toml_files import check_keys, checked_table, parse_file, read_text
 from faintspot.config.options import PerSubaperture
 
-TABLES = ("layout", "calibration", "estimator", "settings", "psf", "score", "promise", "loop", "control")
+TABLES = (
+    "layout",
+    "calibration",
+    "estimator",
+    "settings",
+    "psf",
+    "score",
+    "laser",
+    "promise",
+    "loop",
+    "control",
+)
 
 
 def read_tables(path: str | Path) -> dict[str, dict[str, Any]]:

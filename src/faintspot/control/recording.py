@@ -15,6 +15,7 @@ from faintspot.control.configuration import NONE, STREAM, Control
 from faintspot.control.learnt import INTEGRATOR, KALMAN, MODAL
 from faintspot.control.telemetry import OpenLoopTelemetry, make_telemetry
 from faintspot.sensor.layout import Layout
+from faintspot.sensor.pupil import side_m
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 from faintspot.turbulence.strength import OUTER_SCALE_M
 
@@ -126,18 +127,6 @@ def recorded_slopes(
     )
     expected = held - latest if predicted else np.zeros_like(held)  # what acts less the latest command
     return slopes, error / gain, held, expected
-
-
-def subapertures_across(cells: NDArray[np.int64]) -> int:
-    """Return the number of sub-apertures across an array, from their rows and columns (n, 2)."""
-    return int(np.ptp(cells, axis=0).max()) + 1
-
-
-def side_m(cells: NDArray[np.int64], subaperture_m: float | None, diameter_m: float | None) -> float | None:
-    """Return the side of a sub-aperture, given or from the diameter of the pupil; None without either."""
-    if subaperture_m is None and diameter_m is not None:
-        return diameter_m / subapertures_across(cells)
-    return subaperture_m
 
 
 def site_of(layout: Layout, layers: Sequence[tuple[float, float, float]] = ()) -> SlopeTurbulence:

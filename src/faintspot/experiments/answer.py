@@ -15,7 +15,6 @@ from faintspot.base.notebook import table
 from faintspot.camera.calibration import Calibration
 from faintspot.config.tables import save_tables
 from faintspot.experiments.curves import Curve
-from faintspot.experiments.laser_spots import places_m
 from faintspot.experiments.methods import Knowledge
 from faintspot.experiments.promise import Promise
 from faintspot.experiments.question import Question
@@ -167,8 +166,8 @@ class Answer:
             return self.best.method.psf
         if question.layout is None or question.subaperture_m is None:
             return None
-        places = places_m(question.layout, question.subaperture_m)
-        return question.laser.psf(places, question.pixel_scale_arcsec, question.shape)
+        optics = {name: getattr(question, name) for name in ("pixel_scale_arcsec", "subaperture_m")}
+        return question.laser.psf(question.laser.star_of(replace(question.layout, **optics)), question.shape)
 
     def save(self, path: str | Path) -> None:
         """Write the recommended settings as a configuration file; what else it holds stays.

@@ -17,7 +17,6 @@ from faintspot.base.toml_files import check_keys, checked_table, parse_file
 from faintspot.camera.calibration import Calibration
 from faintspot.camera.detector import Detector
 from faintspot.estimators.scene import PIXEL_BLUR_PX2, Scene
-from faintspot.experiments.laser_spots import LaserSpots
 from faintspot.sensor.layout import GRID_KEYS, Layout
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.simulate.photometry import (
@@ -27,6 +26,7 @@ from faintspot.simulate.photometry import (
     ZERO_POINTS,
     Photometry,
 )
+from faintspot.spots.laser_spots import LaserSpots
 from faintspot.spots.psf import PSF
 from faintspot.spots.shapes import FWHM_OF_SIZE_1_PX
 from faintspot.spots.speckled import LARGEST_D_OVER_R0
@@ -300,7 +300,9 @@ class Question:
             if self.psf is not None or self.r0_m is not None:
                 raise InputError("laser: expected it without psf and r0_m, as it describes the spots itself")
             scale = self._needed("pixel_scale_arcsec", "the side of a pixel on the sky with a laser")
-            psf = self.laser.psf([self.laser.at_m], scale, self.shape)
+            if self.laser.at_m is None:
+                raise InputError("laser.at_m: expected x and y of the sub-aperture to simulate [m]")
+            psf = self.laser.psf(self.laser.star([self.laser.at_m], scale), self.shape)
             self._put("psf", PSF(psf.samples, psf.oversampling))  # one for all spots that are simulated
             self._put("fwhm_px", None)
         if self.psf is not None and self.fwhm_px is None:

@@ -18,6 +18,7 @@ from faintspot.camera.calibration import Calibration
 from faintspot.config.tables import errors_of_table, read_tables, save_tables, tables_as_text
 from faintspot.pipeline.settings import Settings
 from faintspot.sensor.layout import Layout
+from faintspot.spots.laser_spots import laser_of, matched_filter
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score, load_score
 
@@ -159,9 +160,12 @@ def to_text(*items: Layout | Calibration | Settings) -> str:
 
 
 def psf_of(path: Path, document: Mapping[str, dict[str, Any]]) -> PSF | None:
-    """Return the PSF that a configuration file describes or names, or None."""
+    """Return the PSF that a configuration file describes or names, or None.
+
+    Without a table [psf] it is that of the laser guide star, one for each sub-aperture.
+    """
     if "psf" not in document:
-        return None
+        return _laser_psf(path, document)
     values = document["psf"]
     with errors_of_table(path, "psf"):
         if "profile" in values:
@@ -170,10 +174,36 @@ def psf_of(path: Path, document: Mapping[str, dict[str, Any]]) -> PSF | None:
         return PSF.load(_named_file(path, "psf", values, ("file", "profile")))
 
 
-def score_of(path: Path, document: Mapping[str, dict[str, Any]]) -> Score | None:
-    """Return the score that a configuration file names, or None."""
-    if "score" not in document:
+def _laser_psf(path: Path, document: Mapping[str, dict[str, Any]]) -> PSF | None:
+    """Return the PSF of each sub-aperture that sees the laser guide star of a configuration, or None."""
+    laser = laser_of(path, document)
+    if laser is None or "layout" not in document:
         return None
+    layout = Layout.from_tables(path, document)
+    with errors_of_table(path, "laser"):
+        return laser.psf(laser.star_of(layout), layout.window)
+
+
+def _laser_score(path: Path, document: Mapping[str, dict[str, Any]]) -> Score | None:
+    """Return the linear matched filter of a laser guide star, if the configuration wants it."""
+    laser, psf = laser_of(path, document), psf_of(path, document)
+    if laser is None or psf is None or not laser.matched_filter:
+        return None
+    layout, settings = Layout.from_tables(path, document), Settings.from_tables(path, document)
+    if settings.flux_e is None:
+        raise InputError(f"{path}: laser.matched_filter: expected flux_e in [settings], got none")
+    flux = settings.values("flux_e", len(layout), layout.pixels)
+    with errors_of_table(path, "laser"):
+        return matched_filter(psf, layout, Calibration.from_tables(path, document), flux)
+
+
+def score_of(path: Path, document: Mapping[str, dict[str, Any]]) -> Score | None:
+    """Return the score that a configuration file names, or None.
+
+    Without a table [score] it is the linear matched filter of a laser guide star, if [laser] wants it.
+    """
+    if "score" not in document:
+        return _laser_score(path, document)
     with errors_of_table(path, "score"):
         return load_score(_named_file(path, "score", document["score"], ("file",)))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,8 +13,12 @@ from faintspot.base.errors import InputError
 from faintspot.control.learnt import Model
 from faintspot.realtime.control import EFFECT_TIMEOUT_S, Handler, changes_of
 from faintspot.realtime.engine import Engine
+from faintspot.realtime.pipeline_maker import PipelineMaker
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import load_score
+from faintspot.training.known_sodium import SODIUM
 
-LENGTHY = ("set", "interleave", "load", "swap", "unload", "learnt")
+LENGTHY = ("set", "interleave", "load", "swap", "unload", "learnt", "spots")
 """Commands that prepare something new and may compile; other commands are answered meanwhile."""
 _USUAL_TURN = 50  # frames
 _MOST_LINES, _LONGEST_LINE = 40, 400  # of advice
@@ -21,7 +26,7 @@ LOOP_ACTIONS = ("status", "open", "close", "gain", "flat")
 
 
 def commands_of(engine: Engine) -> dict[str, Handler]:
-    """Return the commands: status, get, set, interleave, loop, advice, learnt, stop, load, swap, unload."""
+    """Return the commands of the control channel by name."""
     estimators = engine.estimators
     return {
         "status": lambda fields: engine.status(),
@@ -31,6 +36,7 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
         "loop": partial(loop_command, engine),
         "advice": partial(_advise, engine),
         "learnt": partial(_take_learnt, engine),
+        "spots": partial(_take_spots, engine),
         "stop": partial(_stop, engine),
         "load": lambda fields: estimators.load(_text(fields, "source")),
         "swap": lambda fields: estimators.load(_text(fields, "source"), swap=True),
@@ -81,6 +87,21 @@ def _take_learnt(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
         raise
     engine.learning = {**known, "taken": True}
     return {}
+
+
+def _take_spots(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+    """Measure with the PSF and the fixed weights of a sodium profile from the next frame on."""
+    known = fields.get("sodium")
+    if not isinstance(known, Mapping):
+        raise InputError(f"sodium = {known!r:.80}: expected a profile")
+    if not isinstance(maker := engine.preparer.make_pipeline, PipelineMaker):
+        raise InputError("spots: this engine does not know how its pipelines are made")
+    changes: dict[str, Any] = {"psf": PSF.load(_text(fields, "psf"))}
+    if fields.get("score") is not None:
+        changes["score"] = load_score(_text(fields, "score"))
+    change = engine.renew_spots(replace(maker, **changes), {SODIUM: known})
+    engine.sodium = {**known, "unix_time_s": time.time()}
+    return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
 
 
 def _text(fields: dict[str, Any], name: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -120,6 +120,8 @@ class Engine:
         """Latest advice, shown in the status."""
         self.learning: dict[str, Any] | None = None
         """Result of the latest learning beside the engine, or the fault that ended it, for the status."""
+        self.sodium: dict[str, Any] | None = None
+        """Sodium profile fitted beside the engine, or the fault that ended it, for the status."""
         self._source, self._incompatible = source, ""
         self._path: FramePath | None = None
         self._waiting = False
@@ -192,6 +194,7 @@ class Engine:
             "advice": self.advice,
             "loop": self.loop_status(),
             "learning": self.learning,
+            "sodium": self.sodium,
             "prediction": None if self._prediction is None else self._prediction.status(),
         }
 
@@ -217,6 +220,24 @@ class Engine:
             return self.live.renew({METHODS: new.labels, FIRST_METHOD: new.first, EVERY: new.every})
         except BaseException:
             self.preparer.interleaving = before
+            raise
+
+    def renew_spots(
+        self, make_pipeline: Callable[[Settings], SlopePipeline], changes: Mapping[str, Any]
+    ) -> Change:
+        """Replace what pipelines know of the spots; `changes` names it. For one thread at a time.
+
+        Raises
+        ------
+        InputError
+            When the settings do not fit; nothing changes then.
+        """
+        before = self.preparer.make_pipeline
+        self.preparer.make_pipeline = make_pipeline
+        try:
+            return self.live.renew(changes)
+        except BaseException:
+            self.preparer.make_pipeline = before
             raise
 
     def _make_ready(self, interleaving: Interleaving) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import signal
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,20 +25,16 @@ from faintspot.control.recording import CLOSED, site_of, telemetry_of_recording
 from faintspot.control.relearning import FEWEST_FRAMES, Relearnt, relearn
 from faintspot.io.telemetry import Telemetry, stored_names
 from faintspot.pipeline.settings import Settings
-from faintspot.realtime.child_processes import ChildProcesses
+from faintspot.realtime.beside import NICEST, process_beside
 from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
 from faintspot.realtime.engine import Engine
 from faintspot.realtime.private_socket import socket_path
 from faintspot.realtime.telemetry import TelemetryReader
 from faintspot.sensor.layout import Layout
 
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _LOOK_S = 0.5  # the ring keeps some seconds
-_WATCH_S = 1.0
-_NICEST = 19
 _PATIENCE_S = 300.0
 _FROM_NOTHING_EVERY = 6  # learnings, as a search from known layers finds no new one
-_NAME = "learn"
 
 
 class LearningBeside:
@@ -165,7 +160,7 @@ def learn_repeatedly(name: str, config: str | Path, every_s: float, say: Callabl
         See `LearningBeside`.
     """
     learning = LearningBeside(name, config, every_s)
-    os.nice(_NICEST)
+    os.nice(NICEST)
     try:
         while not learning.ended:
             time.sleep(_LOOK_S)
@@ -188,31 +183,11 @@ def learning_beside(
     engine: Engine, config: str | Path, every_s: float, say: Callable[[str], None]
 ) -> Iterator[None]:
     """Run the process that learns for an engine within a context; `say` takes a line if it ends."""
-    done = threading.Event()
+
+    def fault(text: str) -> None:
+        engine.learning = {"fault": text}
+        say(f"winds are not learnt again, the loop goes on: {text}")
+
     known = "--config", f"{config}", "--name", engine.name, "--every", f"{every_s:g}"
-    with (
-        tempfile.TemporaryDirectory(prefix="faintspot-learn-") as folder,
-        ChildProcesses(Path(folder)) as children,
-    ):
-        children.start(_NAME, ["realtime", "learn", *known], ONE_THREAD)
-        watcher = threading.Thread(target=_watch, args=(engine, children, done, say), daemon=True)
-        watcher.start()
-        try:
-            yield
-        finally:
-            done.set()
-            watcher.join()
-
-
-def _watch(
-    engine: Engine, children: ChildProcesses, done: threading.Event, say: Callable[[str], None]
-) -> None:
-    """Wait for the end of the process that learns, which the engine's status then shows."""
-    while not done.wait(_WATCH_S):
-        try:
-            children.check()
-        except InputError as error:
-            if not done.wait(_WATCH_S):  # else the engine has ended, too
-                engine.learning = {"fault": f"{error}"}
-                say(f"winds are not learnt again, the loop goes on: {error}")
-            return
+    with process_beside("learn", known, fault):
+        yield

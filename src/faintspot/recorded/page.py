@@ -16,7 +16,7 @@ from faintspot.recorded.advice import warnings_in_words
 from faintspot.recorded.sections import all_sections, make_run
 from faintspot.recorded.statistics import MeasuredSlopes
 from faintspot.recorded.wavefront_section import wavefront_sections
-from faintspot.report.page import POSITIONS, Page, configuration_section, html_of
+from faintspot.report.page import POSITIONS, Page, Section, configuration_section, html_of
 from faintspot.sensor.layout import Layout
 
 
@@ -34,6 +34,7 @@ def slopes_report(
     why_no_stages: str = "Not drawn: no frame was given.",
     steps: Sequence[Step] = TotalVariation.steps_shown,
     slopes: Mapping[str, Slopes] | None = None,
+    sections: Sequence[Section] = (),
 ) -> str:
     """Return the report page of a slopes run as HTML: self-contained, without scripts.
 
@@ -62,6 +63,8 @@ def slopes_report(
         Which pictures of the frame are drawn.
     slopes : mapping of Slopes, optional
         Slopes by method, whose wavefronts are shown. Default: no wavefronts.
+    sections : sequence of Section
+        Further sections, before the configurations.
 
     Raises
     ------
@@ -84,6 +87,7 @@ def slopes_report(
             sections=[
                 *all_sections(run),
                 *wavefront_sections(slopes or {}, layout),
+                *sections,
                 *(configuration_section(text, name) for name, text in configurations.items()),
             ],
             warnings=[*warnings, *run.comparison.warnings(), *warnings_in_words(run.methods, run.summaries)],

@@ -12,16 +12,20 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.io import open_frames
+from faintspot.io.frames import FrameSource
 from faintspot.pipeline.slopes import Slopes, Stages
 from faintspot.recorded.page import slopes_report
+from faintspot.recorded.sodium_section import sodium_section_of_frames
 from faintspot.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.recorded.stored_run import StoredRun, open_run
+from faintspot.report.page import Section
 from faintspot.report.texts import Texts
 
 _TEXT = Texts("faintspot.recorded")
 _SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
 _SAME_POSITION_PX = 0.02
 """Recomputed positions differ by less, whatever processor computed the stored ones."""
+_FRAMES_OF_PROFILE = 500
 _SAID_FIRST = ("calibration", "PSF", "score")
 """Reasons for not drawing the frame that also stand at the top of the page."""
 
@@ -74,7 +78,20 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
             method.name: Slopes.from_variables(store.stored.variables, method.n_frames)
             for store, method in zip(stores, methods, strict=True)
         },
+        sections=_sodium(first, frames),
     )
+
+
+def _sodium(store: StoredRun, frames: Sequence[str | Path] | None) -> list[Section]:
+    """Return the section of the sodium profile, for a laser guide star whose frames are there."""
+    if store.laser is None or store.layout is None or store.calibration is None:
+        return []
+    try:
+        with _source(store, frames) as source:
+            known = store.layout, store.calibration, store.laser
+            return [sodium_section_of_frames(source, *known, _FRAMES_OF_PROFILE)]
+    except InputError as error:
+        return [Section("sodium", "Sodium profile", missing=f"Not fitted: {error}.")]
 
 
 def _configurations(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
@@ -170,11 +187,16 @@ def _example(
     return stages, ""
 
 
-def _frame(store: StoredRun, number: int, frames: Sequence[str | Path] | None) -> NDArray[Any]:
+def _source(store: StoredRun, frames: Sequence[str | Path] | None) -> FrameSource:
+    """Open the frames of a run."""
     places = list(frames) if frames is not None else store.sources
     if not places:
         raise InputError(f"{store.path.name} does not say where its frames came from")
-    with open_frames(places, key=store.stored.attributes.get("source_key") or None) as source:
+    return open_frames(places, key=store.stored.attributes.get("source_key") or None)
+
+
+def _frame(store: StoredRun, number: int, frames: Sequence[str | Path] | None) -> NDArray[Any]:
+    with _source(store, frames) as source:
         frame: NDArray[Any] = source.block(number, number + 1)[0]
     return frame
 

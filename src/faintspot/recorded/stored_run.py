@@ -21,10 +21,11 @@ from faintspot.pipeline import configuration
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.sensor.layout import Layout
+from faintspot.spots.laser_spots import LaserSpots, laser_of, load_laser
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score, load_score
 
-_Part = TypeVar("_Part", PSF, Score)
+_Part = TypeVar("_Part")
 
 
 @dataclass
@@ -39,6 +40,7 @@ class StoredRun:
     calibration: Calibration | None = None
     psf: PSF | None = None
     score: Score | None = None
+    laser: LaserSpots | None = None
     lost: list[str] = field(default_factory=list)
     """Optional parts of a pipeline: a PSF or a score, whose file may be missing."""
 
@@ -127,6 +129,7 @@ def _rebuild(store: StoredRun) -> None:
         store.calibration = _original_calibration(store, tables["calibration"])
     store.psf = _of_the_spot(store, "psf", PSF.load, configuration.psf_of)
     store.score = _of_the_spot(store, "score", load_score, configuration.score_of)
+    store.laser = _of_the_spot(store, "laser", load_laser, laser_of)
 
 
 def _of_the_spot(
@@ -144,7 +147,7 @@ def _of_the_spot(
         if file or Path(original).is_file():
             return load_named(Path(original), read_tables(original))
     except InputError as error:
-        words = {"psf": "PSF", "score": "trained score"}[name]
+        words = {"psf": "PSF", "score": "trained score", "laser": "laser guide star"}[name]
         store.lost.append(f"the {words} of {store.path.name} is gone ({error})")
     return None
 

@@ -15,6 +15,7 @@ from faintspot.io.telemetry import Telemetry
 Floats = NDArray[np.float64]
 
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)
+_LONGEST = 80  # text of a changed value
 _TURNS_TOGETHER = 10  # neighbouring turns of the bootstrap's blocks: the turbulence changes slowly
 
 
@@ -158,8 +159,12 @@ def change_rows(telemetry: Telemetry) -> Sequence[tuple[int, float, str, str]]:
         place = int(np.searchsorted(telemetry.frame, change["frame"]))
         inside = place < len(telemetry.frame) and change["frame"] >= telemetry.frame[0]
         seconds = float(telemetry.last_row_time_ns[place] - start) / 1e9 if inside else np.nan
-        what = ", ".join(f"{name} = {value}" for name, value in change["changes"].items())
+        what = ", ".join(f"{name} = {_shortened(f'{value}')}" for name, value in change["changes"].items())
         where = change["where"]
         shown = "all" if where is None else where if isinstance(where, str) else ", ".join(map(str, where))
         rows.append((int(change["frame"]), seconds, what, shown))
     return rows
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."

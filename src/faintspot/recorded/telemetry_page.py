@@ -12,6 +12,7 @@ from faintspot.io.telemetry import Telemetry, read_telemetry
 from faintspot.pipeline.slopes import Slopes
 from faintspot.recorded.advice import warnings_in_words
 from faintspot.recorded.sections import all_sections, make_run
+from faintspot.recorded.sodium_section import sodium_sections_of_changes
 from faintspot.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.recorded.telemetry_figures import latency_figure, methods_figure
 from faintspot.recorded.telemetry_numbers import (
@@ -51,7 +52,8 @@ def report_of_telemetry(path: str | Path) -> str:
     sections = [_timing(telemetry), _lost(telemetry)]
     if len(method_names(telemetry)) > 1:
         sections.append(_methods(telemetry))
-    sections += [_changes(telemetry), *all_sections(run), *wavefront_sections(_slopes(telemetry), layout)]
+    sections += [_changes(telemetry), *sodium_sections_of_changes(telemetry.changes)]
+    sections += [*all_sections(run), *wavefront_sections(_slopes(telemetry), layout)]
     settings = str(telemetry.attributes.get("settings", ""))
     return html_of(
         Page(

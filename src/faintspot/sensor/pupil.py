@@ -87,3 +87,15 @@ def lenslet_outlines(layout: Layout, part: float = 1.0) -> Floats:
     ring = radius * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
     outlines: Floats = layout.centres[:, None, :] + ring
     return outlines
+
+
+def subapertures_across(cells: NDArray[np.int64]) -> int:
+    """Return the number of sub-apertures across an array, from their rows and columns (n, 2)."""
+    return int(np.ptp(cells, axis=0).max()) + 1
+
+
+def side_m(cells: NDArray[np.int64], subaperture_m: float | None, diameter_m: float | None) -> float | None:
+    """Return the side of a sub-aperture, given or from the diameter of the pupil; None without either."""
+    if subaperture_m is None and diameter_m is not None:
+        return diameter_m / subapertures_across(cells)
+    return subaperture_m

@@ -1,7 +1,7 @@
 // The page: keep the newest message of each kind, and draw it with the next screen refresh.
 
 import { Connection } from "./connection.js";
-import { drawBars, drawHistogram, drawStrip } from "./charts.js";
+import { drawBars, drawHistogram, drawProfile, drawStrip } from "./charts.js";
 import { Controls, element } from "./controls.js";
 import { COLOURS, cleared, ink } from "./drawing.js";
 import { drawArrows, drawFrame, drawMap, drawSpots, drawValidity, drawWindows, verdict } from "./maps.js";
@@ -259,9 +259,15 @@ function showFigures() {
   const changes = values.changes || [];
   byId("changes-section").hidden = changes.length === 0;
   byId("changes").replaceChildren(...changes.slice(-8).reverse().map(({ frame, changes: what, where }) => {
-    const text = Object.entries(what).map(([name, value]) => `${name} = ${JSON.stringify(value)}`).join(", ");
+    const text = Object.entries(what).map(([name, value]) => `${name} = ${shortened(JSON.stringify(value))}`).join(", ");
     return element("li", { textContent: `from frame ${frame}: ${text}${where === null ? "" : `, sub-apertures ${where}`}` });
   }));
+}
+
+const LONGEST = 80;
+
+function shortened(text) {
+  return text.length > LONGEST ? `${text.slice(0, LONGEST)}…` : text;
 }
 
 function showMethods(methods) {
@@ -315,6 +321,15 @@ function showTiles() {
   ]);
 }
 
+function showSodium(sodium) {
+  byId("sodium-figure").hidden = !sodium;
+  if (!sodium) return;
+  const { altitude_km: altitudes, flux_per_km: now, before_per_km: before, spot_fwhm_arcsec: width, fault } = sodium;
+  if (altitudes) drawProfile(byId("sodium"), altitudes, [{ values: before, colour: "soft", dash: true }, { values: now, colour: "first" }]);
+  const shown = altitudes ? `flux per km against km; dashed: before; spot ${inWords(width)} arcsec` : "";
+  say("sodium-caption", fault ? `no longer followed: ${fault}` : shown);
+}
+
 function showStatus() {
   const { values } = known.status;
   say("estimator", values.estimator || "");
@@ -322,6 +337,7 @@ function showStatus() {
   const advice = values.advice || [];
   byId("advice-section").hidden = !advice.length;
   say("advice", advice.join("\n"));
+  showSodium(values.sodium);
   const counters = { ...values.counters };
   if (values.subapertures && counters.processed) {
     counters["iterations per sub-aperture"] = counters.iterations / (counters.processed * values.subapertures);

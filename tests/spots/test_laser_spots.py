@@ -12,8 +12,8 @@ import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.experiments import Question
 from faintspot.experiments.answer_text import foundations
-from faintspot.experiments.laser_spots import LaserSpots
 from faintspot.experiments.question import read_camera
+from faintspot.spots.laser_spots import LaserSpots
 
 FILE = """
 [camera]
@@ -85,7 +85,7 @@ def test_what_is_refused(tmp_path: Path, old: str, new: str) -> None:
 
 
 def test_not_with_other_spots() -> None:
-    spots = LaserSpots([-5.0, 0.0], [0.0, 0.0], 1.0)
+    spots = LaserSpots([-5.0, 0.0], 1.0, [0.0, 0.0])
     known: dict[str, Any] = {"read_noise_e": 1.0, "pixels": 8, "flux_e": 100.0, "pixel_scale_arcsec": 0.5}
     with pytest.raises(InputError, match="laser"):
         Question(**known, laser=spots, psf=fs.PSF.analytic())

@@ -1,0 +1,87 @@
+"""faintspot sodium: the profile of a laser guide star's light from recorded frames."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import click
+import numpy as np
+
+from faintspot.base.errors import InputError
+from faintspot.base.files import derived
+from faintspot.camera.calibration import Calibration
+from faintspot.cli.commands import option
+from faintspot.cli.output import picture_file, write_picture
+from faintspot.cli.progress import progress_bar
+from faintspot.cli.shared_options import KEY, configuration_option
+from faintspot.config.tables import read_tables, save_tables
+from faintspot.io.frames import open_frames
+from faintspot.recorded.sodium import MOST_FRAMES, sodium_of_frames
+from faintspot.sensor.layout import Layout
+from faintspot.spots.laser_spots import LaserSpots, laser_of
+
+
+@click.command(short_help="Learn the sodium profile of a laser guide star from frames.")
+@click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
+@configuration_option("Configuration with [layout] and [laser].")
+@option("--launch-m", type=(float, float), metavar="X Y", help="Launch telescope, for a new [laser].")
+@option(
+    "--frames",
+    "most",
+    type=click.IntRange(1),
+    default=MOST_FRAMES,
+    metavar="N",
+    help="Number of frames to read.",
+)
+@option("--picture", metavar="PNG", help="Picture to write.", show_default="beside the configuration")
+@KEY
+def command(
+    frames: tuple[str, ...],
+    config: str,
+    launch_m: tuple[float, float] | None,
+    most: int,
+    picture: str | None,
+    key: str | None,
+) -> None:
+    """Learn the sodium profile of a laser guide star, and the width of its spots, from frames.
+
+    All sub-apertures see the same profile, each stretched along its own direction: one profile is fitted to
+    the mean image of FRAMES. The spots may move by about their width, as in a closed loop. The layout must
+    know pixel_scale_arcsec, and subaperture_m or diameter_m. Writes TOML's name with .sodium.npz, and
+    profile and spot_fwhm_arcsec of [laser]. `faintspot slopes` and the engine then know the shape of every
+    spot; other keys of [laser] stay.
+
+    \b
+    Examples:
+      faintspot layout frames.fits --pixel-scale-arcsec 0.5 --diameter-m 8
+      faintspot sodium frames.fits --launch-m -5 0
+    """
+    document = read_tables(config)
+    laser = laser_of(config, document)
+    if launch_m is not None:
+        document["laser"] = {"spot_fwhm_arcsec": 1.0, **document.get("laser", {}), "launch_m": list(launch_m)}
+        laser = LaserSpots.from_table(config, document["laser"])
+    if laser is None:
+        raise InputError(f"{config}: expected a table [laser], or --launch-m")
+    layout, calibration = Layout.from_tables(config, document), Calibration.from_tables(config, document)
+    drawing = picture_file(Path(config), picture, ".sodium.png")
+    with open_frames(frames, key=key) as source, progress_bar("sodium", "frames") as show:
+        known = sodium_of_frames(source, layout, calibration, laser, most_frames=most, progress=show)
+    path, profile = derived(config, ".sodium.npz"), known.fit.profile
+    profile.save(path)
+    found = {"profile": path.name, "spot_fwhm_arcsec": float(f"{known.spot_fwhm_arcsec:.4g}")}
+    save_tables(config, {"laser": {**document["laser"], **found}})
+    longest = np.hypot(*known.star.elongation_px(profile).T)
+    click.echo(
+        f"{path}: mean {profile.mean_m / 1e3:.1f} km, standard deviation {profile.std_m / 1e3:.1f} km; spots "
+        f"of a single altitude {known.spot_fwhm_arcsec:.2f} arcsec wide, elongations {longest.min():.1f} to "
+        f"{longest.max():.1f} px, mean flux {np.median(known.fit.flux_e):.3g} e-"
+    )
+    click.echo(f"  {config}: profile and spot_fwhm_arcsec of [laser] written")
+    if drawing is not None:
+        from faintspot.recorded.sodium_section import profile_figure
+
+        before = {"before": known.star.focused(laser.profile)}
+        write_picture(profile_figure({**before, "now": profile}).figure, drawing)
+    click.echo(f"Next: faintspot slopes {shlex.join([*frames, '--config', config])}")
