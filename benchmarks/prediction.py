@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -63,19 +63,28 @@ _GAINS = (0.3, 0.5, 0.7, 1.0)
 
 
 class Shaken:
-    """Turbulence and a vibration of the telescope in tip."""
+    """Turbulence and a vibration of the telescope in tip or tilt."""
 
-    def __init__(self, layers: MovingLayers, amplitude_nm: float, rate_hz: float, realisation: int) -> None:
+    def __init__(
+        self,
+        layers: MovingLayers,
+        vibration: Vibration,
+        amplitude_nm: float,
+        rate_hz: float,
+        seed: Sequence[int],
+        frames: int,
+    ) -> None:
         self.layers, self._rate_hz = layers, rate_hz
-        one, two = VIBRATION.recursion(rate_hz)
-        driving = np.sqrt(VIBRATION.driving_variance(rate_hz))
-        rng = np.random.default_rng([realisation, 45])
+        one, two = vibration.recursion(rate_hz)
+        driving = np.sqrt(vibration.driving_variance(rate_hz))
         values = [0.0, 0.0]
-        for noise in rng.standard_normal(LEARNING[1] + 2000):
+        for noise in np.random.default_rng(seed).standard_normal(frames + 2000):
             values.append(one * values[-1] + two * values[-2] + driving * noise)
-        self._values = amplitude_nm * np.array(values[2000:], np.float32)
+        self.values_nm = amplitude_nm * np.array(values[2000:], np.float32)
+        """Rms over the square around the pupil in each frame, with its sign."""
         tip = np.broadcast_to(np.linspace(-1, 1, layers.points, dtype=np.float32), (layers.points,) * 2)
-        self._tip: NDArray[np.float32] = tip / np.sqrt(np.mean(tip**2))
+        shape = tip if vibration.mode == "tip" else tip.T
+        self._shape: NDArray[np.float32] = shape / np.sqrt(np.mean(shape**2))
 
     def r0_m(self, time_s: float) -> float:
         """See `MovingLayers`."""
@@ -83,8 +92,8 @@ class Shaken:
 
     def wavefront_nm(self, time_s: float) -> NDArray[np.float32]:
         """See `MovingLayers`."""
-        value = np.float32(self._values[int(time_s * self._rate_hz)])
-        return self.layers.wavefront_nm(time_s) + value * self._tip
+        value = np.float32(self.values_nm[int(time_s * self._rate_hz)])
+        return self.layers.wavefront_nm(time_s) + value * self._shape
 
 
 class Rival:
@@ -196,7 +205,8 @@ class Run:
         self.model = TelescopeModel(configuration, 1, realisation)
         sensor = self.model.optics.sensor
         if case.vibration_nm:
-            shaken: Any = Shaken(self.model.atmosphere, case.vibration_nm, self._rate_hz, realisation)
+            known = VIBRATION, case.vibration_nm, self._rate_hz, [realisation, 45]
+            shaken: Any = Shaken(self.model.atmosphere, *known, frames)
             self.model.atmosphere = shaken
         flux_e = case.photons * sensor.illumination
         settings = Settings("window", window_fwhm_px=WIDTH_PX, flux_e=flux_e)

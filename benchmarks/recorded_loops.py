@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.prediction import Shaken
 from faintspot.advice.recorded_loop import RecordedLoop
 from faintspot.ao_loop import LoopConfiguration, Method, load_loop
 from faintspot.ao_loop.calibration import make_pipeline
@@ -17,6 +18,7 @@ from faintspot.ao_loop.simulation import measure_gains
 from faintspot.ao_loop.telescope_model import TelescopeModel
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.integrator import Integrator
+from faintspot.control.vibrations import Vibration
 from faintspot.pipeline.settings import Settings
 
 Floats = NDArray[np.float64]
@@ -40,6 +42,9 @@ class Case:
     wind_turn_deg: float
     from_hcipy: bool
     """Whether the turbulence is that of HCIPy's layers, which are extended row by row."""
+    vibration: Vibration | None = None
+    vibration_nm: float = 0.0
+    """Rms over the square around the pupil."""
     frames: int = 3000
 
     def configuration(self) -> LoopConfiguration:
@@ -58,16 +63,24 @@ class Case:
 class Truth:
     """Values that the recording does not hold."""
 
+    delay_frames: float
     noise_px: float
     """Rms of the slopes' standard errors, at the calibrated centroid gain."""
-    residual_nm: Floats
-    """(frames,): rms of the residual wavefront, fitting error included."""
+    r0_m: float
+    outer_scale_m: float
+    residual_nm: float
+    """Rms residual wavefront in the second half, fitting error included."""
     winds_m_per_s: Floats
     """(layers, 2)"""
+    shares: Floats
+    """(layers,)"""
+    vibration: Vibration | None = None
+    vibration_nm: float = 0.0
+    """Rms over a circle as wide as the pupil, in this recording."""
 
 
 def drawn_cases(number: int, seed: int) -> list[Case]:
-    """Return random cases, every second one with HCIPy's turbulence."""
+    """Return random cases, every second one with HCIPy's turbulence, the others with a vibration."""
     rng = np.random.default_rng(seed)
     cases = []
     for place in range(number):
@@ -86,7 +99,14 @@ def drawn_cases(number: int, seed: int) -> list[Case]:
                 place % 2 == 1,
             )
         )
-    return cases
+    rng = np.random.default_rng([seed, 45])
+    return [case if case.from_hcipy else _with_vibration(case, rng) for case in cases]
+
+
+def _with_vibration(case: Case, rng: np.random.Generator) -> Case:
+    damping, rms_nm = (math.exp(rng.uniform(*np.log(each))) for each in ((0.002, 0.01), (30, 150)))
+    vibration = Vibration(str(rng.choice(["tip", "tilt"])), rng.uniform(12, 110), damping, 1.0, 0.0, 0.0)
+    return replace(case, vibration=vibration, vibration_nm=rms_nm)
 
 
 def recorded(case: Case) -> tuple[RecordedLoop, Truth]:
@@ -96,6 +116,13 @@ def recorded(case: Case) -> tuple[RecordedLoop, Truth]:
     if case.from_hcipy:
         telescope.atmosphere = HcipyLayers(configuration, case.seed)  # type: ignore[assignment]
     optics, rate = telescope.optics, configuration.control.frame_rate_hz
+    shaken_nm = 0.0
+    if case.vibration is not None:
+        known = case.vibration, case.vibration_nm, rate, [case.seed, 45], case.frames
+        shaken = Shaken(telescope.atmosphere, *known)
+        telescope.atmosphere = shaken  # type: ignore[assignment]
+        # From a square to a circle of the same width.
+        shaken_nm = math.sqrt(3) / 2 * float(shaken.values_nm[SETTLE_FRAMES : case.frames].std())
     pipeline = make_pipeline(configuration, optics.sensor, method)
     gain = float(measure_gains(configuration, [pipeline], seed=case.seed)[0])
     line = CommandDelayLine(optics.mirror.commands, case.delay_frames)
@@ -125,8 +152,19 @@ def recorded(case: Case) -> tuple[RecordedLoop, Truth]:
         configuration.subaperture_m,
         configuration.pixel_scale_rad / ARCSEC,
     )
-    noise = float(np.sqrt(kept[np.isfinite(kept)].mean()))
-    return loop, Truth(noise, np.array(residual)[SETTLE_FRAMES:], winds_of(configuration))
+    air = configuration.atmosphere
+    truth = Truth(
+        case.delay_frames,
+        float(np.sqrt(kept[np.isfinite(kept)].mean())),
+        case.r0_m,
+        case.outer_scale_m,
+        float(np.sqrt(np.square(residual[SETTLE_FRAMES + len(kept) // 2 :]).mean())),
+        winds_of(configuration),
+        np.array(air.fraction) / sum(air.fraction),
+        case.vibration,
+        shaken_nm,
+    )
+    return loop, truth
 
 
 def winds_of(configuration: LoopConfiguration) -> Floats:
