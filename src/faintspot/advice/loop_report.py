@@ -19,7 +19,7 @@ from faintspot.advice.slope_discrepancy import recorded_discrepancy
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
 from faintspot.control.identification import Identification, Identified
-from faintspot.control.loop_delay import LoopDelay, loop_delay
+from faintspot.control.loop_delay import FEWEST_SUBAPERTURES, LoopDelay, loop_delay
 from faintspot.sensor.pupil import subapertures_across
 from faintspot.turbulence.strength import turbulence_strength
 
@@ -30,6 +30,7 @@ _TIMES_AT_LIMIT = 3  # that a largest value occurs, to be taken for a limit
 _DRAWS = 1000
 _GAIN_SPREAD = 0.5  # of the deviation of the centroid gain from 1: it differs between spatial scales
 _MOST_UNMEASURED = 0.2  # of the slopes; large ones are missed most, so that the others vary too little
+_WIND_ERROR = 0.35  # sub-apertures per second: measured slopes are not quite mean gradients
 _PARABOLA_ERROR = 0.03  # of the noise: turbulence and speckles within two frames are no parabola
 
 
@@ -227,6 +228,9 @@ def _turbulence(report: LoopReport, seen: OpenLoop, delay: LoopDelay) -> None:
     report.turbulence = identified
     report.spectra = modal_spectra(seen.telemetry, identified)
     _vibrations(report, identified)
+    if len(loop.cells) < FEWEST_SUBAPERTURES:
+        part.missing = f"Fewer than {FEWEST_SUBAPERTURES} sub-apertures show neither winds nor r0."
+        return
     report.parts["noise"].known += recorded_discrepancy(loop, seen, identified)
     if loop.subaperture_m is None:
         part.missing = "Without subaperture_m (or diameter_m) neither r0 nor winds are known."
@@ -253,7 +257,7 @@ def _winds(identified: Identified, r0: Measured) -> list[Measured]:
     """Return coherence time, mean wind speed, and each layer's speed, direction and share."""
     turbulence = identified.turbulence
     winds, share = turbulence.wind_m_per_s, turbulence.fraction
-    errors = identified.wind_error_m_per_s
+    errors = np.hypot(identified.wind_error_m_per_s, _WIND_ERROR * turbulence.subaperture_m)
     rng = np.random.default_rng(1)
     drawn = winds + errors * rng.standard_normal((_DRAWS, *winds.shape))
     weight = np.maximum(share + identified.fraction_error * rng.standard_normal((_DRAWS, len(share))), 1e-6)

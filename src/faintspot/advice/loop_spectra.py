@@ -87,7 +87,7 @@ def _model(records: SlopeRecords, found: Identified, window: Floats, bins: NDArr
     matrices = spectra.matrices(np.asarray(distinct)).real
     diagonal = np.arange(m)
     matrices[:, diagonal, diagonal] += found.noise_factor * records.noise_px2
-    for each in found.vibrations:
+    for each in found.moving:
         line = spectra.of_process(m * each.rms_px**2 * each.correlation(rate, length)).real
         shape = shapes[MODES.index(each.mode)]
         matrices += np.maximum(line, 0.0)[:, None, None] * np.outer(shape, shape)

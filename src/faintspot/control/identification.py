@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.control.layer_likelihood import LayerLikelihood, Layers
 from faintspot.control.models import SlopeModel
+from faintspot.control.oscillators import fitted_oscillators
 from faintspot.control.slope_records import SlopeRecords
 from faintspot.control.telemetry import OpenLoopTelemetry
 from faintspot.control.vibrations import Vibration, find_vibrations, with_vibrations
@@ -37,6 +38,8 @@ class Identified:
     """(layers,): standard errors; NaN if not fitted."""
     criterion: float
     """Half the Bayesian information criterion, up to a constant."""
+    oscillators: tuple[Vibration, ...] = ()
+    """Oscillators that stand for turbulence and vibrations of a single sub-aperture; then r0 is infinite."""
 
     @property
     def layers(self) -> list[SlopeTurbulence]:
@@ -55,8 +58,16 @@ class Identified:
 
     def slope_model(self) -> SlopeModel:
         """Return the temporal model of the slopes, vibrations included."""
-        model = SlopeModel.of_covariances(self.covariances_px2())
-        return with_vibrations(model, self.vibrations, self.turbulence.positions_m, self.rate_hz)
+        slopes = 2 * len(self.turbulence.positions_m)
+        model = SlopeModel(*np.zeros((3, 0, slopes, slopes)))
+        if not self.oscillators:
+            model = SlopeModel.of_covariances(self.covariances_px2())
+        return with_vibrations(model, self.moving, self.turbulence.positions_m, self.rate_hz)
+
+    @property
+    def moving(self) -> tuple[Vibration, ...]:
+        """Oscillators of the model: vibrations, or all that a single sub-aperture sees."""
+        return self.oscillators or self.vibrations
 
     def summary(self) -> str:
         """Return a summary of one line."""
@@ -65,6 +76,8 @@ class Identified:
             f"{math.hypot(x, y):.1f} m/s to {math.degrees(math.atan2(y, x)) % 360:.0f} degrees ({part:.0%})"
             for (x, y), part in sorted(zip(winds, shares, strict=True), key=lambda each: -each[1])
         ]
+        if self.oscillators:
+            return ", ".join(f"{each.mode} at {each.frequency_hz:.1f} Hz" for each in self.oscillators)
         shaking = [f"{each.mode} shakes at {each.frequency_hz:.1f} Hz" for each in self.vibrations]
         air = ", ".join(layers) if self.is_layered else "winds from anywhere"
         return ", ".join([air, *shaking])
@@ -92,9 +105,15 @@ class Identification:
         records = SlopeRecords.of(telemetry, site)
         self._vibrations = find_vibrations(records.modes(), rate_hz, records.slopes.shape[1])
         self._likelihood = LayerLikelihood(records, rate_hz, self._vibrations)
+        self._records = records
 
     def layers(self, start: Identified | None = None) -> Identified:
-        """Return layers with winds fitted to the telemetry, from earlier ones on, if any."""
+        """Return layers with winds fitted to the telemetry, from earlier ones on, if any.
+
+        A single sub-aperture shows no winds: of it, oscillators are fitted.
+        """
+        if len(self._site.positions_m) == 1:
+            return self._oscillating()
         first = self._likelihood.peaks() if start is None else start.parameters()
         return self._identified(*self._likelihood.selected(first))
 
@@ -108,6 +127,14 @@ class Identification:
         still = replace(self._site, fraction=np.ones(len(speeds)), wind_m_per_s=np.outer(speeds, [1.0, 0.0]))
         winds = still.from_anywhere().wind_m_per_s
         return self._identified(self._likelihood.of_winds(winds[None]), is_layered=False)
+
+    def _oscillating(self) -> Identified:
+        records, none = self._records, np.full((1, 2), np.nan)
+        found, noise_px2 = fitted_oscillators(records.modes()[:, :2], self._rate_hz, records.slopes.shape[1])
+        still = replace(self._site, r0_m=math.inf, fraction=np.ones(1), wind_m_per_s=np.zeros((1, 2)))
+        factor = float((noise_px2 / records.noise_px2).mean())
+        known = factor, self._vibrations, self._rate_hz, False, none, none[0, :1], math.nan
+        return Identified(still, *known, found)
 
     def _identified(
         self, layers: Layers, errors: Floats | None = None, *, is_layered: bool = True

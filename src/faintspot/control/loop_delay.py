@@ -31,6 +31,8 @@ _SPEEDS_M_PER_S = (1.0, 3.0, 6.0, 10.0, 15.0, 22.0, 32.0)
 _DIRECTIONS = 4  # of half a turn: opposite winds have the same spectrum
 _MOST_SUBAPERTURES = 40
 _UPDATES = 200
+FEWEST_SUBAPERTURES = 3
+"""Of fewer, only tip and tilt are seen, in which vibrations cannot be told from turbulence."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +74,12 @@ def loop_delay(
     Raises
     ------
     InputError
-        When fewer than 8 pieces of 128 consecutive frames, half overlapping, are there.
+        When there are fewer than 3 sub-apertures, because vibrations change tip and tilt, or fewer than 8
+        pieces of 128 consecutive frames, half overlapping.
     """
     n = len(site.positions_m)
+    if n < FEWEST_SUBAPERTURES:
+        raise InputError(f"recording: expected {FEWEST_SUBAPERTURES} sub-apertures or more, got {n}")
     kept = np.arange(n)[:: math.ceil(n / _MOST_SUBAPERTURES)]
     both = np.concatenate([kept, kept + n])
     site = replace(site, positions_m=site.positions_m[kept])
@@ -108,8 +113,7 @@ def _moments(values: Floats, weight: Floats) -> tuple[float, float]:
 def _without_tilt(slopes: Floats) -> Floats:
     """Return slopes without each frame's mean along x and y, where vibrations are, and without their mean."""
     axes = (slopes - slopes.mean(axis=0)).reshape(len(slopes), 2, -1)
-    if axes.shape[2] > 2:
-        axes = axes - axes.mean(axis=2, keepdims=True)
+    axes = axes - axes.mean(axis=2, keepdims=True)
     return np.asarray(axes.reshape(slopes.shape))
 
 
@@ -148,7 +152,7 @@ def _turbulence(site: SlopeTurbulence, rate_hz: float, window: Floats) -> Floats
     bins = np.arange(length // 2 + 1)
     spectra = SlopeSpectra(site, 1 / rate_hz, window, bins, max(_SPEEDS_M_PER_S) * length / rate_hz)
     tables, _ = spectra.tables(site.outer_scale_m)
-    within = np.eye(n) - 1 / n if n > 2 else np.eye(n)
+    within = np.eye(n) - 1 / n
     angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     found = [np.ones(len(bins))]
     for speed in _SPEEDS_M_PER_S:

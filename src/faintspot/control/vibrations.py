@@ -27,6 +27,7 @@ _LINE_BINS = 12  # on each side of a peak, to which a line is fitted
 _SMOOTH_ORDER = 3  # of the polynomial that is the logarithm of the spectrum without the line
 _MOST_TRIED, _MOST_PER_MODE = 6, 2
 _DAMPING = 1e-6, 0.1
+_MOST_DAMPING = 0.05  # that of telescopes' structures is 0.005 to 0.03
 _LEAST_DAMPING = 1e-3  # of a model: the phase of no vibration is certain for ever
 _START_DAMPING = 3e-3
 
@@ -59,10 +60,11 @@ class Vibration:
     def correlation(self, rate_hz: float, frames: int) -> Floats:
         """Return the autocorrelation at lags of 0, 1, ... frames."""
         one, two = self.recursion(rate_hz)
-        found = [1.0, one / (1 - two)]
-        while len(found) < frames:
-            found.append(one * found[-1] + two * found[-2])
-        return np.array(found[:frames])
+        radius, lags = math.sqrt(-two), np.arange(frames)
+        cosine = one / (2 * radius)
+        angle, sine = math.acos(cosine), math.sqrt(1 - cosine**2)
+        later = (one / (radius * (1 - two)) - cosine) / sine
+        return np.asarray(radius**lags * (np.cos(angle * lags) + later * np.sin(angle * lags)))
 
 
 def mode_shapes(positions_m: Floats) -> Floats:
@@ -85,20 +87,45 @@ def find_vibrations(amplitudes: Floats, rate_hz: float, slopes: int) -> tuple[Vi
     slopes : int
         Number of slopes that the modes were taken from.
     """
-    length = 2 * int(min(_SEGMENT_S * rate_hz, 2 * len(amplitudes) / (_FEWEST_SEGMENTS + 1)) / 2)
-    if length < 2 * _BACKGROUND_BINS:
+    if _segment_length(len(amplitudes), rate_hz) < 2 * _BACKGROUND_BINS:
         return ()
+    spectra, found = mode_spectra(amplitudes, rate_hz), []
+    for mode, spectrum in zip(MODES, spectra.power, strict=True):
+        lines = _Lines(spectrum, spectra, rate_hz, slopes)
+        found += list(itertools.islice(lines.found(mode), _MOST_PER_MODE))
+    return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class ModeSpectra:
+    """Mean power spectra of modes in half-overlapping windowed segments."""
+
+    power: Floats
+    """(modes, frequencies): white noise has its variance."""
+    window: Floats
+    """(length,): window of a segment; the sum of squares is 1."""
+    segments: int
+
+    @property
+    def length(self) -> int:
+        """Frames of a segment."""
+        return len(self.window)
+
+
+def mode_spectra(amplitudes: Floats, rate_hz: float) -> ModeSpectra:
+    """Return the spectra of amplitudes, (frames, modes)."""
+    length = _segment_length(len(amplitudes), rate_hz)
     window = np.hanning(length + 2)[1:-1]
     window /= np.linalg.norm(window)
     starts = range(0, len(amplitudes) - length + 1, length // 2)
     segments = np.array([amplitudes[start : start + length] for start in starts])
     segments -= segments.mean(axis=1, keepdims=True)
-    spectra = np.square(np.abs(np.fft.rfft(segments * window[:, None], axis=1))).mean(axis=0).T
-    found = []
-    for mode, spectrum in zip(MODES, spectra, strict=True):
-        lines = _Lines(spectrum, window, len(segments), rate_hz, slopes)
-        found += list(itertools.islice(lines.found(mode), _MOST_PER_MODE))
-    return tuple(found)
+    power = np.square(np.abs(np.fft.rfft(segments * window[:, None], axis=1))).mean(axis=0).T
+    return ModeSpectra(power, window, len(segments))
+
+
+def _segment_length(frames: int, rate_hz: float) -> int:
+    return 2 * int(min(_SEGMENT_S * rate_hz, 2 * frames / (_FEWEST_SEGMENTS + 1)) / 2)
 
 
 def with_vibrations(
@@ -131,10 +158,10 @@ def with_vibrations(
 class _Lines:
     """Spectrum of a mode that is searched for lines."""
 
-    def __init__(self, spectrum: Floats, window: Floats, segments: int, rate_hz: float, slopes: int) -> None:
-        self._spectrum, self._segments, self._rate_hz, self._slopes = spectrum, segments, rate_hz, slopes
-        self._bin_hz = rate_hz / len(window)
-        middle = gamma(segments, scale=1 / segments).median()
+    def __init__(self, spectrum: Floats, of: ModeSpectra, rate_hz: float, slopes: int) -> None:
+        self._spectrum, self._segments, self._rate_hz, self._slopes = spectrum, of.segments, rate_hz, slopes
+        self._bin_hz, window = rate_hz / of.length, of.window
+        middle = gamma(of.segments, scale=1 / of.segments).median()
         background = median_filter(spectrum, _BACKGROUND_BINS, mode="nearest") / middle
         self._background = np.maximum(background, 1e-12 * spectrum.max() + 1e-300)
         self._correlation = np.correlate(window, window, "full")[len(window) - 1 :]
@@ -195,7 +222,7 @@ class _Lines:
             return None
         errors, found = _errors(misfit_with, best), line(best)
         frequency, rms = errors[0] * self._bin_hz, 0.5 * errors[2] * found.rms_px
-        if not math.isfinite(frequency + rms):
+        if found.damping > _MOST_DAMPING or not math.isfinite(frequency + rms):
             return None
         return replace(found, frequency_error_hz=float(frequency), rms_error_px=float(rms))
 
