@@ -39,12 +39,13 @@ _ORDER = (
     "loop",
     "control",
     "prediction",
+    "winds",
     "startup",
     "gpu",
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
-LONG = {"realtime_sustained", "telemetry", "recorded_tip_tilt", "prediction"}
-"""Run only when named, or with --full: 12 minutes, an hour, with a recording of its own, 20 minutes."""
+LONG = {"realtime_sustained", "telemetry", "recorded_tip_tilt", "winds"}
+"""Run only when named, or with --full: 12 minutes, an hour, with a recording of its own, 15 minutes."""
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _FOLDER = click.option(
     "--folder",

@@ -5,8 +5,6 @@ vibration are learnt from the telemetry of an integrator. The rivals (`pip insta
 the same telemetry; their options and gain are those that leave the least phase on other telemetry, as the
 integrator's gain is. All are scored on other turbulence; the rivals with brighter stars as well, so that the
 gain in magnitudes shows.
-
-In winds that drift, the filter is learnt again and handed over as beside a running engine.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,18 +26,15 @@ from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.control import slope_turbulence
 from faintspot.ao_loop.simulation import measure_gains
 from faintspot.ao_loop.telescope_model import TelescopeModel, prepare
-from faintspot.control.base import Controller, Expected
+from faintspot.control.base import LEARNT, Controller, Expected
 from faintspot.control.commands import CommandDelayLine
-from faintspot.control.guarded import HANDOVER_FRAMES
 from faintspot.control.learning import GAINS, KALMAN, Plant, learn
 from faintspot.control.learnt import Learnt
 from faintspot.control.phase import residual_phase
-from faintspot.control.relearning import Relearnt, relearn
 from faintspot.control.telemetry import OpenLoopTelemetry, make_telemetry
 from faintspot.control.vibrations import Vibration
 from faintspot.experiments.statistics import paired_mean
 from faintspot.pipeline.settings import Settings
-from faintspot.realtime.successor import Ready, Successor
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
@@ -53,8 +48,6 @@ LEARNING, TUNING = (2000, 2000), (2001, 1000)
 VIBRATION_NM, WIDTH_PX, TELEMETRY_GAIN = 120.0, 2.2, 0.2
 OURS, TARGET = "learnt", 0.3
 VIBRATION = Vibration("tip", 45.0, 0.005, 1.0, 0.0, 0.0)
-DRIFT, DRIFT_DEG, DRIFT_S, DRIFTING, DRIFT_TARGET = 0.2, 20.0, 60.0, 5, 0.66
-LEARN_EVERY_S, LEARNING_TAKES_S = 10.0, 2.0
 _GRIDS: dict[str, dict[str, tuple[Any, ...]]] = {
     "least_squares": {"order": (4, 8, 16, 32), "regularization": (1e-3, 1e-2, 1e-1, 1.0)},
     "ar_kalman": {"noise_band": (0.05, 0.1, 0.2, 0.4)},
@@ -127,15 +120,17 @@ class Rival:
 
 @dataclass(frozen=True)
 class Case:
-    """A star, with or without the vibration."""
+    """A star, with or without the vibration, and a loop with a window of some width."""
 
     photons: float
     vibration_nm: float
+    name: str = "diffraction_limit"
+    width_px: float = WIDTH_PX
 
     @property
     def configuration(self) -> LoopConfiguration:
         """The loop."""
-        return load_loop("diffraction_limit").replace("camera", photons_per_subaperture=self.photons)
+        return load_loop(self.name).replace("camera", photons_per_subaperture=self.photons)
 
     @property
     def plant(self) -> Plant:
@@ -161,23 +156,34 @@ class Case:
             run.step(controller)
         return float(run.strehl[SETTLE:].mean()), run.telemetry(SETTLE, frames)
 
-    def learnt(self, telemetry: OpenLoopTelemetry) -> Learnt:
+    def learnt(self, telemetry: OpenLoopTelemetry, winds: str = LEARNT) -> Learnt:
         """Return our filter."""
-        return learn(KALMAN, self.plant, telemetry, self.site, self.rate_hz)
+        return learn(KALMAN, self.plant, telemetry, self.site, self.rate_hz, winds)
+
+    def telemetry(self) -> tuple[OpenLoopTelemetry, OpenLoopTelemetry]:
+        """Return telemetry with an integrator, to learn from and to tune with."""
+        make = partial(self.plant.integrator, TELEMETRY_GAIN)
+        return self.observed(make, *LEARNING)[1], self.observed(make, *TUNING)[1]
+
+    @property
+    def phase(self) -> Floats:
+        """See `residual_phase`."""
+        plant, cells = self.plant, prepare(self.configuration).sensor.layout.cells
+        return residual_phase(plant.reconstructor.matrix, plant.interaction, cells)
+
+    def integrator(self, tuning: OpenLoopTelemetry) -> Make:
+        """Return the integrator with the gain that leaves the least phase variance."""
+        return partial(self.plant.integrator, self.plant.best_gain(GAINS, tuning, self.phase)[0])
 
     def controllers(self, *, ours: bool) -> dict[str, Make]:
         """Return controllers that have learnt: the rivals, tuned, and the integrator and ours."""
-        plant, cells = self.plant, prepare(self.configuration).sensor.layout.cells
-        integrator = partial(plant.integrator, TELEMETRY_GAIN)
-        learning, tuning = (self.observed(integrator, *each)[1] for each in (LEARNING, TUNING))
-        phase = residual_phase(plant.reconstructor.matrix, plant.interaction, cells)
+        plant, phase, (learning, tuning) = self.plant, self.phase, self.telemetry()
         found: dict[str, Make] = {
             name: min(rivals(name, plant, learning), key=lambda make: plant.left(make, tuning, phase))
             for name in _GRIDS
         }
         if ours:
-            gain = min(GAINS, key=lambda each: plant.left(partial(plant.integrator, each), tuning, phase))
-            found |= {"integrator": partial(plant.integrator, gain), OURS: self.learnt(learning).controller}
+            found |= {"integrator": self.integrator(tuning), OURS: self.learnt(learning).controller}
         return found
 
 
@@ -209,7 +215,7 @@ class Run:
             shaken: Any = Shaken(self.model.atmosphere, *known, frames)
             self.model.atmosphere = shaken
         flux_e = case.photons * sensor.illumination
-        settings = Settings("window", window_fwhm_px=WIDTH_PX, flux_e=flux_e)
+        settings = Settings("window", window_fwhm_px=case.width_px, flux_e=flux_e)
         self._pipeline = make_pipeline(configuration, sensor, Method("window", settings))
         self._centroid_gain = measure_gains(configuration, [self._pipeline], seed=1)[0]
         self.line = CommandDelayLine(self.model.optics.mirror.commands, self._plant.delay_frames)
@@ -255,82 +261,10 @@ def rivals(name: str, plant: Plant, telemetry: OpenLoopTelemetry) -> Iterator[Ma
 
 
 def run() -> list[Table]:
-    """Compare them with and without a vibration, and let the winds drift."""
-    found = drift_table()
+    """Compare them with and without a vibration."""
     if importlib.util.find_spec("pyrtc") is None:
-        return [Table("prediction", "Prediction", [], ["pyrtcao is not installed: no rivals"]), found]
-    return [*(table for vibration_nm in (0.0, VIBRATION_NM) for table in _tables(vibration_nm)), found]
-
-
-def drift_table() -> Table:
-    """Measure the filter in winds that drift; it is learnt again as beside an engine."""
-    case = Case(FLUXES[0], 0.0)
-    telemetry = case.observed(partial(case.plant.integrator, TELEMETRY_GAIN), *LEARNING)[1]
-    learnt = case.learnt(telemetry)
-    runs = [drifting(case, learnt, realisation) for realisation in range(DRIFTING)]
-    rows = []
-    for period, each in enumerate(np.transpose([run.strehl for run in runs])):
-        mean = paired_mean(each)
-        values = {"Strehl": mean.value, "error": mean.standard_error, "lowest": each.min()}
-        times = f"{period * LEARN_EVERY_S:g} to {(period + 1) * LEARN_EVERY_S:g} s"
-        rows.append(Row(times, values, f">= {DRIFT_TARGET:g}", bool(each.min() >= DRIFT_TARGET)))
-    about = f"Winds that drift by {DRIFT:.0%} and {DRIFT_DEG:g} degrees in {DRIFT_S:g} s"
-    at, other = np.max([run.changes_nm for run in runs], axis=0)
-    notes = [
-        f"{DRIFTING} realisations; filters handed over: {[run.handed_over for run in runs]}",
-        f"largest rms change of commands in a frame: {at:.0f} nm at a handover, {other:.0f} nm otherwise",
-    ]
-    return Table("prediction-drift", about, rows, notes)
-
-
-class Drifted(NamedTuple):
-    """What came out in winds that drift."""
-
-    strehl: Floats
-    """(periods,): means between learnings."""
-    handed_over: int
-    """Number of filters."""
-    changes_nm: tuple[float, float]
-    """Largest rms change of commands from frame to frame: at a handover, and otherwise."""
-
-
-def drifting(case: Case, learnt: Learnt, realisation: int) -> Drifted:
-    """Simulate a run; filters are learnt and handed over as beside an engine."""
-    every, later = (round(each * case.rate_hz) for each in (LEARN_EVERY_S, LEARNING_TAKES_S))
-    run = Run(case, realisation, round(DRIFT_S * case.rate_hz))
-    controller, running = learnt.controller(run.line), learnt.model
-    change, at_handover = np.zeros((2, len(run.strehl)))
-    wind, successor = run.model.atmosphere.velocity, None
-    found: Relearnt | None = None
-    while run.frame < len(run.strehl):
-        part = run.frame / len(run.strehl)
-        now = (1 + DRIFT * part) * wind @ _rotation(DRIFT_DEG * part)
-        run.model.atmosphere = run.model.atmosphere.blown(now, run.time_s)
-        last, before = run.frame, run.line.latest.copy()
-        run.step(controller)
-        change[last] = np.sqrt(np.mean(np.square(run.line.latest - before)))
-        if successor is not None and successor.is_settling:
-            successor.follow(run.line, run.slopes[last], run.errors[last], run.slopes[last], None)
-        elif successor is not None:
-            controller, run.line = successor.take_over(run.line)[1:3]
-            successor, at_handover[run.frame : run.frame + HANDOVER_FRAMES] = None, 1.0
-        if run.frame % every == 0 and run.frame < len(run.strehl):
-            telemetry = run.telemetry(run.frame - every, run.frame)
-            start = None if found is None else found.learnt.found
-            found = relearn(case.plant, running, telemetry, case.site, case.rate_hz, start)
-        if run.frame % every == later and found is not None and found.is_better:
-            running, line = found.learnt.model, CommandDelayLine(len(run.line.latest), run.line.delay_frames)
-            successor = Successor(Ready(KALMAN, found.learnt.controller(line), line, False, True, True))
-    run.strehl[:SETTLE], change[:SETTLE] = np.nan, 0.0
-    largest = float((at_handover * change).max()), float((change - at_handover * change).max())
-    count = round(at_handover.sum() / HANDOVER_FRAMES)
-    return Drifted(np.nanmean(run.strehl.reshape(-1, every), axis=1), count, largest)
-
-
-def _rotation(degrees: float) -> Floats:
-    """Return the matrix that turns rows of two numbers."""
-    cos, sin = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
-    return np.array([[cos, sin], [-sin, cos]])
+        return [Table("prediction", "Prediction", [], ["pyrtcao is not installed: nothing to compare with"])]
+    return [table for vibration_nm in (0.0, VIBRATION_NM) for table in _tables(vibration_nm)]
 
 
 def _tables(vibration_nm: float) -> tuple[Table, Table]:
