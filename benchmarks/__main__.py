@@ -45,7 +45,7 @@ _ORDER = (
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
 LONG = {"realtime_sustained", "telemetry", "recorded_tip_tilt", "winds"}
-"""Run only when named, or with --full: 12 minutes, an hour, with a recording of its own, 15 minutes."""
+"""Run only when named, or with --full: 12 minutes, an hour, with a recording of its own, 5 minutes."""
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _FOLDER = click.option(
     "--folder",
