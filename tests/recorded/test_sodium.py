@@ -59,14 +59,19 @@ def calibration() -> fs.Calibration:
 def test_profile_and_spot_are_found(recording: Path) -> None:
     """Two peaks from one: 12 % of the flux is elsewhere, of 30 % in the first estimate; the spot to 5 %."""
     with open_frames([recording / "frames.npy"]) as source:
-        known = sodium_of_frames(source, LAYOUT, calibration(), LASER)
-    found = known.fit.profile
-    density = np.interp(TRUE.altitudes_m, found.altitudes_m, found.density, 0.0, 0.0)
+        known, places = found = sodium_of_frames(source, LAYOUT, calibration(), LASER)
+    known, places = found
+    profile = known.fit.profile
+    density = np.interp(TRUE.altitudes_m, profile.altitudes_m, profile.density, 0.0, 0.0)
     assert 0.5 * np.trapezoid(np.abs(density - TRUE.density), TRUE.altitudes_m) < 0.12
     motion = 0.2**2
     width = 0.5 * np.hypot(2.4, 2.355 * np.sqrt(motion))
     assert known.spot_fwhm_arcsec == pytest.approx(width, rel=0.05)
     np.testing.assert_allclose(known.fit.flux_e, 200.0, rtol=0.05)
+    # The lattice of the spots, whose displacements are random, is that of the windows.
+    wrong = replace(LAYOUT, centres=1.01 * LAYOUT.centres + 0.5)
+    np.testing.assert_allclose(found.lattice_of(wrong).centres, LAYOUT.centres, atol=0.15)
+    assert np.abs(places).max() < 0.5
 
 
 def test_command_and_report(recording: Path, run: Commands) -> None:

@@ -21,6 +21,8 @@ from faintspot.recorded.sodium import MOST_FRAMES, sodium_of_frames
 from faintspot.sensor.layout import Layout
 from faintspot.spots.laser_spots import LaserSpots, laser_of
 
+_SAME_PX = 0.05  # nearer centres stay
+
 
 @click.command(short_help="Learn the sodium profile of a laser guide star from frames.")
 @click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
@@ -50,7 +52,8 @@ def command(
     the mean image of FRAMES. The spots may move by about their width, as in a closed loop. The layout must
     know pixel_scale_arcsec, and subaperture_m or diameter_m. Writes TOML's name with .sodium.npz, and
     profile and spot_fwhm_arcsec of [laser]. `faintspot slopes` and the engine then know the shape of every
-    spot; other keys of [laser] stay.
+    spot; other keys of [laser] stay. Centres that `faintspot layout` found are put on the lattice of the
+    spots' centres of gravity: those of the brightest points have the focus of a profile with several peaks.
 
     \b
     Examples:
@@ -66,12 +69,13 @@ def command(
         raise InputError(f"{config}: expected a table [laser], or --launch-m")
     layout, calibration = Layout.from_tables(config, document), Calibration.from_tables(config, document)
     drawing = picture_file(Path(config), picture, ".sodium.png")
-    with open_frames(frames, key=key) as source, progress_bar("sodium", "frames") as show:
-        known = sodium_of_frames(source, layout, calibration, laser, most_frames=most, progress=show)
-    path, profile = derived(config, ".sodium.npz"), known.fit.profile
+    with open_frames(frames, key=key) as source, progress_bar("sodium", "steps") as show:
+        found = sodium_of_frames(source, layout, calibration, laser, most_frames=most, progress=show)
+    known, path = found.known, derived(config, ".sodium.npz")
+    profile = known.fit.profile
     profile.save(path)
-    found = {"profile": path.name, "spot_fwhm_arcsec": float(f"{known.spot_fwhm_arcsec:.4g}")}
-    save_tables(config, {"laser": {**document["laser"], **found}})
+    learnt = {"profile": path.name, "spot_fwhm_arcsec": float(f"{known.spot_fwhm_arcsec:.4g}")}
+    save_tables(config, {"laser": {**document["laser"], **learnt}})
     longest = np.hypot(*known.star.elongation_px(profile).T)
     click.echo(
         f"{path}: mean {profile.mean_m / 1e3:.1f} km, standard deviation {profile.std_m / 1e3:.1f} km; spots "
@@ -79,6 +83,14 @@ def command(
         f"{longest.max():.1f} px, mean flux {np.median(known.fit.flux_e):.3g} e-"
     )
     click.echo(f"  {config}: profile and spot_fwhm_arcsec of [laser] written")
+    if "centres" in document["layout"]:
+        lattice = found.lattice_of(layout)
+        moved = np.abs(lattice.centres - layout.centres).max()
+        if moved > _SAME_PX:
+            lattice.save(config)
+            click.echo(
+                f"  centres of [layout] moved by up to {moved:.2f} px, to the spots' centres of gravity"
+            )
     if drawing is not None:
         from faintspot.recorded.sodium_section import profile_figure
 

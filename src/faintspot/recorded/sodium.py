@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,28 @@ from faintspot.training.sodium import MeanImages
 _BLOCK_FRAMES = 20
 _FITS = 2  # the first one finds the shape, with which the spots are located for the second
 _SEARCH_RANGE_PX = 3.0
+_LIT = 0.3  # of the median flux
 MOST_FRAMES = 2000
+
+
+class SodiumOfFrames(NamedTuple):
+    """Sodium profile of recorded frames, and where their spots are."""
+
+    known: KnownSodium
+    places_px: NDArray[np.float64]
+    """x and y of the spots' centres of gravity from the window centres, (n, 2)."""
+
+    def lattice_of(self, layout: Layout) -> Layout:
+        """Return the layout with centres on the lattice of the spots' centres of gravity.
+
+        A lattice of the brightest points, as `Layout.from_frame` finds it, has the focus and the tilt of a
+        profile with several peaks.
+        """
+        before = np.column_stack([layout.centres, np.ones(len(layout))])
+        lit = self.known.fit.flux_e > _LIT * np.median(self.known.fit.flux_e)
+        spots = layout.centres - layout.offsets + self.places_px
+        moved = np.linalg.lstsq(before[lit], spots[lit], rcond=None)[0]
+        return replace(layout, centres=before @ moved)
 
 
 def sodium_of_frames(
@@ -30,7 +53,7 @@ def sodium_of_frames(
     *,
     most_frames: int = MOST_FRAMES,
     progress: Callable[[int, int], None] | None = None,
-) -> KnownSodium:
+) -> SodiumOfFrames:
     """Return the sodium profile and the width of the spot that the mean of recorded frames shows.
 
     Parameters
@@ -45,7 +68,7 @@ def sodium_of_frames(
     most_frames : int
         Number of frames to read, from the first on.
     progress : callable, optional
-        Called with the number of finished frames and that of all.
+        Called with the number of finished steps, frames and fits, and that of all.
 
     Raises
     ------
@@ -58,10 +81,10 @@ def sodium_of_frames(
         images, _ = calibrated_images(block, layout, calibration)
         total += images.sum(axis=0, dtype=np.float64)
         if progress is not None:
-            progress(min(first + _BLOCK_FRAMES, count), count)
+            progress(min(first + _BLOCK_FRAMES, count), count + _FITS)
     images_e, dark = total / count, dark_variance_e2(layout, calibration)
     places, profile = _centres_of_gravity(images_e), star.focused(laser.profile)
-    for _ in range(_FITS):
+    for fits in range(1, _FITS + 1):
         mean = MeanImages(images_e, places, frames=count)
         known = KnownSodium.learnt(mean, star, profile, dark)
         located = measure_images(
@@ -71,7 +94,9 @@ def sodium_of_frames(
             psf=known.psf(layout.window),
         )
         places, profile = np.stack([located.x, located.y], axis=1).astype(np.float64), known.fit.profile
-    return known
+        if progress is not None:
+            progress(count + fits, count + _FITS)
+    return SodiumOfFrames(known, places)
 
 
 def _centres_of_gravity(images: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -49,7 +49,7 @@ def sodium_section_of_frames(
 ) -> Section:
     """Return the section with the configured profile, and that of frames; or why there is none."""
     try:
-        known = sodium_of_frames(source, layout, calibration, laser, most_frames=most_frames)
+        known, _ = sodium_of_frames(source, layout, calibration, laser, most_frames=most_frames)
     except InputError as error:
         return Section("sodium", "Sodium profile", missing=f"Not fitted: {error}.")
     profiles = {"configured": known.star.focused(laser.profile), "these frames": known.fit.profile}
