@@ -40,6 +40,7 @@ ARCSEC = math.pi / 180 / 3600
 
 SPOT_FWHM = 0.886  # full width at half maximum of sinc^2, in lambda / d
 _MOST_POINTS = 4096**2  # of a wavefront
+_ROLLING_DELAY = 2
 _POINT_FIELD = 0.9  # of a window that holds a laser guide star
 _POSITION_RANGE_PX = {CLOSED: 2.0, OPEN: 5.0}
 
@@ -340,6 +341,11 @@ def _check_sampling(whole: LoopConfiguration) -> None:
     one_of("control.winds", whole.control.winds, WINDS)
     if not isinstance(whole.mirror.tip_tilt, bool):
         raise InputError(f"mirror.tip_tilt = {whole.mirror.tip_tilt!r}: expected true or false")
+    if whole.camera.rolling_shutter and whole.control.delay_frames < _ROLLING_DELAY:
+        raise InputError(
+            f"camera.rolling_shutter = {whole.camera.rolling_shutter:g}: expected control.delay_frames >= "
+            f"{_ROLLING_DELAY}, as the last rows see the mirror's next commands"
+        )
     sensor = whole.sensor
     check_size(
         "sensor: (subapertures x samples)^2", [(sensor.subapertures * sensor.samples) ** 2], _MOST_POINTS

@@ -89,6 +89,8 @@ class Camera:
     bits: int | None = number(None, 1, 32, whole=True)
     background_e: float = number(0.0, 0.0, 1e6)
     dark_e: float = number(0.0, 0.0, 1e6)
+    rolling_shutter: float = number(0.0, 0.0, 1.0)
+    """Part of a frame by which the exposure of the last row is later than that of the first."""
 
 
 @dataclass(frozen=True)

@@ -273,7 +273,7 @@ class _Loop:
         time = self.disabled_errors.time_s(frame, self.configuration.control.frame_rate_hz)
         after, seen = self.telescope_model.wavefronts(time, commands)
         self._observe(frame, time, after)
-        slopes = self._measure(frame, seen)
+        slopes = self._measure(frame, self.telescope_model.by_rows(time, seen, self.line.around))
         error = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
         per_px = 1 / self.divisors[number]
         vector, covariance = (each.astype(np.float64) for each in (slopes.vector, slopes.covariance_xy))

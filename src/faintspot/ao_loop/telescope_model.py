@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -89,6 +90,10 @@ class TelescopeModel:
         self.detector: Exposing = NoiselessDetector(camera) if noiseless else camera
         self._best_fit = BestFit.of(optics.mirror, optics.pupil, piston=False) if correctable else None
         self._laser = laser_source(configuration)
+        self._rolling, self._rate_hz = (
+            configuration.camera.rolling_shutter,
+            configuration.control.frame_rate_hz,
+        )
         self._sees_mirror = configuration.control.mode == CLOSED
         self._science_wavelength_m = configuration.science.wavelength_m
         self._seed, self._realisation = seed, realisation
@@ -102,6 +107,38 @@ class TelescopeModel:
             atmosphere = self._best_fit.fitted(atmosphere)
         after = atmosphere + self.optics.mirror.wavefront_nm(commands)
         return after, after if self._sees_mirror else atmosphere
+
+    def by_rows(
+        self,
+        time_s: float,
+        seen_nm: NDArray[np.float32],
+        commands: Sequence[NDArray[np.floating]],
+    ) -> NDArray[np.float32]:
+        """Return the wavefront that the rows of a rolling shutter see, each in the middle of its exposure.
+
+        It is interpolated linearly between the first, the middle and the last row. The middle row is exposed
+        as a frame without a rolling shutter is; others see the commands of two frames, in proportion.
+
+        Parameters
+        ----------
+        time_s : float
+            Middle of the frame.
+        seen_nm : (points, points) array
+            Wavefront of the middle row, as `wavefronts` returns it.
+        commands : sequence of (commands,) array
+            Those of the frame before, of this frame and of the frame after.
+        """
+        if not self._rolling:
+            return seen_nm
+        before, acting, after = commands
+        ends = []
+        for side, other in ((-0.5, before), (0.5, after)):
+            mixed = acting + 0.5 * self._rolling * (other - acting)
+            ends.append(self.wavefronts(time_s + side * self._rolling / self._rate_hz, mixed)[1])
+        place = (2.0 * np.arange(len(seen_nm)) + 1.0) / len(seen_nm) - 1.0  # -1 to 1
+        first, last = (np.maximum(side * place, 0.0).astype(np.float32)[:, None] for side in (-1.0, 1.0))
+        rows: NDArray[np.float32] = (1.0 - first - last) * seen_nm + first * ends[0] + last * ends[1]
+        return rows
 
     def truth(self, time_s: float, wavefront_nm: NDArray[np.float32]) -> Truth:
         """Return the true values of a residual wavefront."""

@@ -17,6 +17,7 @@ from faintspot.ao_loop.camera import make_detector
 from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.telescope_model import TelescopeModel
 from faintspot.base.closing import Closing
+from faintspot.base.errors import InputError
 from faintspot.realtime.camera import CameraReport, Readout, StopEvent, readout_type
 from faintspot.realtime.command_stream import CommandStream
 from faintspot.realtime.control import EFFECT_TIMEOUT_S, Handler, changes_of
@@ -108,6 +109,8 @@ class SimulatedTelescope(Readout, Closing):
         slots: int = 4,
         say: Callable[[str], None] | None = None,
     ) -> None:
+        if configuration.camera.rolling_shutter:
+            raise InputError("camera.rolling_shutter: expected 0, as this telescope knows no later commands")
         self.configuration, self.name, self._say = configuration, name, say or (lambda _: None)
         self._conditions = Conditions.of(configuration)
         start = configuration.run.seed if seed is None else seed
