@@ -60,7 +60,6 @@ def test_profile_and_spot_are_found(recording: Path) -> None:
     """Two peaks from one: 12 % of the flux is elsewhere, of 30 % in the first estimate; the spot to 5 %."""
     with open_frames([recording / "frames.npy"]) as source:
         known, places = found = sodium_of_frames(source, LAYOUT, calibration(), LASER)
-    known, places = found
     profile = known.fit.profile
     density = np.interp(TRUE.altitudes_m, profile.altitudes_m, profile.density, 0.0, 0.0)
     assert 0.5 * np.trapezoid(np.abs(density - TRUE.density), TRUE.altitudes_m) < 0.12
