@@ -10,12 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.advice.loop_cases import AIR, LOOP_GAIN, NOISE_PX, recorded
+from tests.advice.loop_cases import AIR, LOOP_GAIN, NOISE_PX, RATE_HZ, recorded
+from tests.control.driven import driven, oscillator
 
 from faintspot.advice.loop_choices import AS_RUN, BEST, FILTER, MODES
+from faintspot.advice.loop_page import page_of_loop
 from faintspot.advice.loop_report import LoopReport, report_of_loop
 from faintspot.advice.measured import Measured
+from faintspot.advice.open_loop import open_loop_of
 from faintspot.base.errors import InputError
+from faintspot.control.loop_delay import LoopDelay
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +49,17 @@ def test_noise(report: LoopReport) -> None:
     assert value(report, "noise", "noise of a slope").value == pytest.approx(NOISE_PX, rel=0.05)
     assert report.noise_px is not None
     assert report.noise_px == pytest.approx(np.full(50, NOISE_PX), rel=0.2)
+
+
+def test_a_fast_vibration_is_no_noise() -> None:
+    """A tip of 90 Hz at 250 frames/s is no parabola within five frames."""
+    loop = recorded()
+    slopes = loop.slopes.copy()
+    slopes[:, :25] += 0.6 * np.sin(2 * np.pi * 90 / RATE_HZ * loop.frame)[:, None]
+    known = LoopDelay(2.0, 0.0, 1.0, 0.0)
+    noise = np.sqrt(open_loop_of(replace(loop, slopes=slopes), known).variance)
+    assert noise == pytest.approx(np.full(50, NOISE_PX), rel=0.2)
+    assert np.sqrt(np.square(noise).mean()) == pytest.approx(NOISE_PX, rel=0.03)
 
 
 def test_turbulence(report: LoopReport) -> None:
@@ -149,3 +164,33 @@ def test_constant_slopes() -> None:
     loop = recorded()
     with pytest.raises(InputError, match="expected slopes that vary"):
         report_of_loop(replace(loop, slopes=np.full_like(loop.slopes, 0.1)))
+
+
+def test_a_single_sub_aperture() -> None:
+    """Neither delay, winds nor r0 are known; vibrations and other choices are."""
+    rng = np.random.default_rng(3)
+    frames = 4000
+    moving = [
+        driven(rng, frames, 500.0, 2, oscillator(1.5, 0.5, 1.0), oscillator(20, 0.002, 0.4)) for _ in "xy"
+    ]
+    slopes, commands = 0.3 * rng.standard_normal((frames, 2)), np.zeros((frames, 2))
+    for frame in range(frames):
+        slopes[frame] += np.array(moving)[:, frame] + commands[max(frame - 2, 0)]
+        commands[frame] = commands[frame - 1] - 0.2 * slopes[frame]
+    loop = replace(
+        recorded(),
+        slopes=slopes,
+        frame=np.arange(frames),
+        cells=np.zeros((1, 2), np.int64),
+        commands=commands,
+        interaction=np.eye(2),
+        frame_rate_hz=500.0,
+    )
+    found = report_of_loop(loop)
+    assert math.isnan(value(found, "loop", "delay").value)
+    assert not found.parts["turbulence"].known
+    assert found.parts["turbulence"].missing
+    assert value(found, "vibrations", "frequency of tip").value == pytest.approx(20.0, abs=0.3)
+    left = {each.name: each.residual for each in found.choices}
+    assert left[FILTER].value + left[FILTER].error < left[BEST].value
+    assert "with fitting error" not in page_of_loop(found)

@@ -65,5 +65,5 @@ def test_the_learnt_filter_beats_the_best_integrator() -> None:
 
 def test_delay_is_not_told() -> None:
     run = np.zeros(_FRAMES, np.int64)
-    with pytest.raises(InputError, match="expected 3 sub-apertures or more, got 1"):
+    with pytest.raises(InputError, match="expected 3 sub-apertures"):
         loop_delay(_seen(4), np.zeros((_FRAMES, 2)), run, _SITE, _RATE_HZ)

@@ -33,6 +33,8 @@ FEWEST_FRAMES = 600
 _MOST_SLOPES = 500  # beyond, the filter takes too long to learn
 _LEAK = 0.01
 _BLOCKS = 12
+_SPREAD_AS_RUN, _SPREAD_OF_OTHERS = 0.5, 1.0
+"""Standard errors, in differences between the views: other control changes noise and gain of the slopes."""
 _LEAST_COMPARED = 0.25  # of the frames: those with the largest shares of measured slopes
 _FITTING, _FITTING_ERROR = 0.28, 0.04  # rad^2 at (sub-aperture / r0)^(5/3): continuous mirrors
 _R0_WAVELENGTH_NM = 500.0
@@ -185,12 +187,14 @@ def _choice(
 ) -> Choice:
     """Return a choice from its squared phase in each view."""
     unit = scale.factor**2
-    square, error = _mean_of_views([values - each for values, each in zip(left, noise, strict=True)], unit)
+    spread = _SPREAD_AS_RUN if name == AS_RUN else _SPREAD_OF_OTHERS
+    without = [values - each for values, each in zip(left, noise, strict=True)]
+    square, error = _mean_of_views(without, unit, spread)
     error = math.hypot(error, unit * noise[0] * scale.noise_error, scale.gain_error * square)
     less = Measured("less than as it ran", scale.unit, remark="the loop was open")
     if ran is not None:
         saved = [before - after for before, after in zip(ran, left, strict=True)]
-        less = _root(less.name, scale.unit, *_mean_of_views(saved, unit))
+        less = _root(less.name, scale.unit, *_mean_of_views(saved, unit, spread))
     total = square + scale.fitting_nm2
     total_error = math.hypot(error, scale.fitting_error_nm2)
     wave = (2 * math.pi / scale.wavelength_nm) ** 2
@@ -206,12 +210,12 @@ def _choice(
     )
 
 
-def _mean_of_views(values: list[Floats], unit: float) -> tuple[float, float]:
+def _mean_of_views(values: list[Floats], unit: float, spread: float) -> tuple[float, float]:
     """Return the mean of all views and its standard error."""
     block = max(1, len(values[0]) // _BLOCKS)
     means = [mean_by_blocks(each, block) for each in values]
     found = [each.value for each in means]
-    error = math.hypot(means[0].standard_error, 0.5 * (max(found) - min(found)))
+    error = math.hypot(means[0].standard_error, spread * (max(found) - min(found)))
     return unit * float(np.mean(found)), unit * error
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from faintspot.advice.loop_choices import AS_RUN, BEST, FILTER
-from faintspot.advice.loop_report import LoopReport, Part
+from faintspot.advice.loop_report import LoopReport, Part, wind_errors
 from faintspot.advice.measured import Measured
 from faintspot.report.drawing import GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
 from faintspot.report.figure_data import FigureWithData
@@ -68,20 +68,27 @@ def _with_interval(measured: Measured, unit: str = "") -> str:
 
 
 def _choices_table(report: LoopReport) -> Table:
-    rows = []
-    for each in report.choices:
-        gain = f"{each.gain:.2f}" if np.isfinite(each.gain) else "–"
-        values = (each.residual, each.less, each.total, each.strehl)
-        rows.append([each.name, gain, *(_with_interval(value) for value in values)])
     unit = report.choices[0].residual.unit
-    columns = [f"{name} ({unit})" for name in ("residual", "less than as run", "with fitting error")]
-    return Table(["control", "gain", *columns, "Strehl ratio"], rows, _TEXT["choices.table"])
+    columns = {
+        f"residual ({unit})": [each.residual for each in report.choices],
+        f"less than as run ({unit})": [each.less for each in report.choices],
+        f"with fitting error ({unit})": [each.total for each in report.choices],
+        "Strehl ratio": [each.strehl for each in report.choices],
+    }
+    known = {
+        name: values for name, values in columns.items() if any(np.isfinite(each.value) for each in values)
+    }
+    rows = []
+    for each, *values in zip(report.choices, *known.values(), strict=True):
+        gain = f"{each.gain:.2f}" if np.isfinite(each.gain) else "–"
+        rows.append([each.name, gain, *map(_with_interval, values)])
+    return Table(["control", "gain", *known], rows, _TEXT["choices.table"])
 
 
 @styled
 def _noise_figure(report: LoopReport) -> FigureWithData | None:
     """Draw the noise of each sub-aperture along x and y."""
-    if report.noise_px is None:
+    if report.noise_px is None or len(report.loop.cells) == 1:
         return None
     figure, cells = new_figure(WIDTH * 0.7, 4.0), report.loop.cells - report.loop.cells.min(axis=0)
     axes = list(figure.subplots(1, 2))
@@ -100,11 +107,11 @@ def _noise_figure(report: LoopReport) -> FigureWithData | None:
 def _wind_figure(report: LoopReport) -> FigureWithData | None:
     """Draw the wind of each layer, with errors."""
     found = report.turbulence
-    if found is None or report.loop.subaperture_m is None:
+    if found is None or report.loop.subaperture_m is None or not found.is_layered:
         return None
     figure = new_figure(WIDTH * 0.5, 5.4)
     axes = figure.subplots()
-    winds, errors = found.turbulence.wind_m_per_s, found.wind_error_m_per_s
+    winds, errors = found.turbulence.wind_m_per_s, wind_errors(found)
     share = found.turbulence.fraction
     reach = 1.25 * float(np.hypot(*winds.T).max())
     for radius in np.arange(5, reach, 5):
@@ -127,9 +134,10 @@ def _spectra_figure(report: LoopReport) -> FigureWithData | None:
     spectra = report.spectra
     if spectra is None:
         return None
-    figure = new_figure(WIDTH, 7.2)
+    lines = (len(spectra.measured) + 1) // 2
+    figure = new_figure(WIDTH, 3.6 * lines)
     rows = []
-    panels = figure.subplots(2, 2).ravel()
+    panels = figure.subplots(lines, 2).ravel()
     for panel in panels[len(spectra.measured) :]:
         panel.set_visible(False)
     for panel, name in zip(panels, spectra.measured, strict=False):

@@ -257,7 +257,7 @@ def _winds(identified: Identified, r0: Measured) -> list[Measured]:
     """Return coherence time, mean wind speed, and each layer's speed, direction and share."""
     turbulence = identified.turbulence
     winds, share = turbulence.wind_m_per_s, turbulence.fraction
-    errors = np.hypot(identified.wind_error_m_per_s, _WIND_ERROR * turbulence.subaperture_m)
+    errors = wind_errors(identified)
     rng = np.random.default_rng(1)
     drawn = winds + errors * rng.standard_normal((_DRAWS, *winds.shape))
     weight = np.maximum(share + identified.fraction_error * rng.standard_normal((_DRAWS, len(share))), 1e-6)
@@ -283,6 +283,11 @@ def _winds(identified: Identified, r0: Measured) -> list[Measured]:
             Measured(f"{name}: share", "", float(share[number]), float(identified.fraction_error[number])),
         ]
     return known
+
+
+def wind_errors(identified: Identified) -> Floats:
+    """Return standard errors (layers, 2) of winds, m/s, with those of the model."""
+    return np.hypot(identified.wind_error_m_per_s, _WIND_ERROR * identified.turbulence.subaperture_m)
 
 
 def _vibrations(report: LoopReport, identified: Identified) -> None:

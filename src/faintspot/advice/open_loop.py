@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from faintspot.advice.recorded_loop import RecordedLoop
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
-from faintspot.control.loop_delay import LoopDelay
+from faintspot.control.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
 from faintspot.control.telemetry import LEAST_VARIANCE_PX2, OpenLoopTelemetry
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 from faintspot.turbulence.strength import OUTER_SCALE_M
@@ -111,7 +111,25 @@ def _held(loop: RecordedLoop, delay: LoopDelay) -> tuple[Floats, NDArray[np.bool
 
 
 def _noise_variance(slopes: Floats) -> tuple[Floats, Floats]:
-    """Return the variance of each slope's noise, and the number of frames that it is from."""
+    """Return the variance of each slope's noise, and the number of frames that it is from.
+
+    From the slopes without each frame's mean along x and y, which fast vibrations change.
+    """
+    n = slopes.shape[1] // 2
+    if n < FEWEST_SUBAPERTURES:
+        return _deviation(slopes)
+    axes = slopes.reshape(-1, 2, n)
+    known = np.isfinite(axes)
+    mean = np.nansum(axes, axis=2, keepdims=True) / np.maximum(known.sum(axis=2, keepdims=True), 1)
+    left, count = _deviation((axes - mean).reshape(slopes.shape))
+    left = left.reshape(2, n)
+    # The mean takes some of each slope's noise away, and adds some of the others'.
+    total = left.sum(axis=1, keepdims=True) * n / (n - 1)
+    return ((left - total / n**2) / (1 - 2 / n)).ravel(), count
+
+
+def _deviation(slopes: Floats) -> tuple[Floats, Floats]:
+    """Return the variance of slopes about parabolas through their neighbours in time, and the frames."""
     near, far = slopes[3:-1] + slopes[1:-3], slopes[4:] + slopes[:-4]
     products = slopes[2:-2] * (slopes[2:-2] - (4 * near - far) / 6)
     count = np.isfinite(products).sum(axis=0)

@@ -79,7 +79,10 @@ def loop_delay(
     """
     n = len(site.positions_m)
     if n < FEWEST_SUBAPERTURES:
-        raise InputError(f"recording: expected {FEWEST_SUBAPERTURES} sub-apertures or more, got {n}")
+        raise InputError(
+            f"recording: expected {FEWEST_SUBAPERTURES} sub-apertures or more, as vibrations hide it in tip "
+            f"and tilt, got {n}"
+        )
     kept = np.arange(n)[:: math.ceil(n / _MOST_SUBAPERTURES)]
     both = np.concatenate([kept, kept + n])
     site = replace(site, positions_m=site.positions_m[kept])
