@@ -28,7 +28,9 @@ def both() -> tuple[list[Guarded], list[CommandDelayLine]]:
     options: dict[str, Any] = {"prior_std_px": np.full(M, 0.7), "noise_factor": 1.3}
 
     def learnt(line: CommandDelayLine) -> Predictive:
-        return Predictive(line, INTERACTION, LocalPredictor(arrays), PLANT.reconstructor.clean)
+        return Predictive(
+            line, INTERACTION, LocalPredictor(arrays), PLANT.reconstructor.clean, from_latest=True
+        )
 
     plain = partial(PLANT.integrator, GAIN)
     fast = LargeGuarded(

@@ -12,7 +12,7 @@ from tests.control.control_cases import CELLS, FRAME_S, LAYERS, PLANT, TURBULENC
 from tests.control.frozen_flow import frozen_slopes
 
 from faintspot.base.errors import InputError
-from faintspot.control import learning, local_covariance, local_kalman
+from faintspot.control import learning, local_covariance, local_kalman, local_model
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.kalman import SlopePredictor
 from faintspot.control.kalman import steady_covariance as dense_covariance
@@ -69,7 +69,8 @@ def _transition(model: LocalModel) -> np.ndarray:
     return np.asarray(local_covariance._transition(model).toarray(), np.float64)
 
 
-def test_where_all_are_neighbours_the_model_is_the_same() -> None:
+def test_where_all_are_neighbours_the_model_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local_model, "_RIDGE", 1e-4)  # that of the model of all slopes
     local = LocalModel.of_layers(PAIR.layers(), FRAME_S)
     dense = SlopeModel.of_covariances(np.array([layer.lagged_px2(FRAME_S) for layer in PAIR.layers()]))
     m = dense.slopes
@@ -92,24 +93,59 @@ def test_driving_noise_is_what_neighbours_do_not_explain() -> None:
         np.testing.assert_allclose(model.driving[layer], left, atol=1e-5 * np.trace(same))
 
 
-def test_a_step_of_the_covariance_is_the_textbooks() -> None:
+@pytest.mark.parametrize("reach", [1.0, 9.0])
+def test_a_step_of_the_covariance_is_the_textbooks(reach: float) -> None:
+    """With gains among all, and with those that know only some neighbours (Joseph's form)."""
     model = LocalModel.of_layers(TURBULENCE.layers(), FRAME_S)
-    before = local_covariance._prior(TURBULENCE.layers(), FRAME_S)
-    half = len(before) // 2
+    before = local_covariance._prior(TURBULENCE.layers(), FRAME_S).astype(np.float64)
+    around, half = neighbours_within(CELLS, reach), len(before) // 2
     step = np.vstack([_transition(model), np.eye(half, 2 * half)])
     seen = np.hstack([np.eye(18), np.eye(18), np.zeros((18, half))])
-    gain = before @ seen.T @ np.linalg.inv(seen @ before @ seen.T + np.diag(NOISE_PX2))
-    expected = step @ (before - gain @ seen @ before) @ step.T
+    gain = np.zeros((2 * half, 18))
+    total, across = seen @ before @ seen.T + np.diag(NOISE_PX2), before @ seen.T
+    for row in range(2 * half):
+        near = around[row % 9][around[row % 9] < 9]
+        both = np.concatenate([near, near + 9])
+        gain[row, both] = np.linalg.solve(total[np.ix_(both, both)], across[row, both])
+    left = np.eye(2 * half) - gain @ seen
+    expected = step @ (left @ before @ left.T + gain @ np.diag(NOISE_PX2) @ gain.T) @ step.T
     for layer in range(2):
         part = slice(18 * layer, 18 * (layer + 1))
         expected[part, part] += model.driving[layer]
     found = local_covariance._next(
-        before,
+        before.astype(np.float32),
         local_covariance._transition(model),
         model.driving.astype(np.float32),
         NOISE_PX2.astype(np.float32),
+        around,
     )
     np.testing.assert_allclose(found, expected, atol=1e-5 * before.max())
+
+
+def test_errors_die_away() -> None:
+    """Without measurements to follow, any error shrinks with all gains: no frame of noise stays.
+
+    Gains made for the covariance of the best filter let errors with periods of six sub-apertures grow.
+    """
+    cells = np.array([[row, column] for row in range(14) for column in range(14)], np.float64)
+    winds = np.array([[5.6, 2.1], [2.1, 11.8], [-7.5, -20.7]])
+    air = replace(
+        TURBULENCE,
+        positions_m=0.5 * cells,
+        subaperture_m=0.5,
+        fraction=np.array([0.6, 0.25, 0.15]),
+        wind_m_per_s=winds,
+    )
+    usual = np.full(392, float(np.diag(air.covariance_px2()).mean()))
+    predictor = LocalPredictor(local_filter(air.layers(), 1 / 500, usual))
+    for factor in (0.125, 1.0, 8.0):
+        predictor._state[:-1] = np.random.default_rng(1).standard_normal(predictor._state[:-1].shape)
+        sizes = []
+        for _ in range(800):
+            predictor.correct(np.zeros(392), factor * usual)
+            predictor.advance()
+            sizes.append(np.linalg.norm(predictor._state))
+        assert sizes[-1] < 0.5 * sizes[-300]  # a factor of 0.9977 in each frame
 
 
 def test_the_error_is_nearly_that_of_the_riccati_equation(arrays: dict[str, Any]) -> None:

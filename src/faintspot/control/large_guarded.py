@@ -58,7 +58,7 @@ class LargeGuarded(Guarded):
     ) -> None:
 
         def learnt(line: CommandDelayLine) -> Predictive:
-            return Predictive(line, interaction, predictor, reconstructor.clean)
+            return Predictive(line, interaction, predictor, reconstructor.clean, from_latest=True)
 
         def plain(line: CommandDelayLine) -> Integrator:
             return Integrator(line, interaction, reconstructor, plain_gain, leak)
@@ -68,8 +68,8 @@ class LargeGuarded(Guarded):
         self._product = _Product(interaction)
         self._reconstruct, self._clean = _Product(reconstructor.matrix), _Product(reconstructor.clean)
         self._compare = _Product(phase)
-        self._held = np.zeros((4, len(interaction)))
-        """Slopes that commands cause: of mirror, filter and integrator, acting; of the integrator, latest."""
+        self._held = np.zeros((5, len(interaction)))
+        """Slopes that commands cause: of mirror, filter and integrator, acting; of the latter two, latest."""
         self._held_at = -1
         self._rest: tuple[Floats, ...] | None = None
         """Slopes of the previous frame, as far as it is not complete."""
@@ -77,7 +77,7 @@ class LargeGuarded(Guarded):
     def expected(self) -> Expected:
         """See `Controller`."""
         self._complete()
-        held, _, _, latest = self._held
+        held, _, _, _, latest = self._held
         if self.chosen == _PLAIN:
             return Expected(held - latest, None)
         return Expected(held + self._predictor.mean_px, self._predictor.std_px)
@@ -98,7 +98,7 @@ class LargeGuarded(Guarded):
         """See `Controller`; noise of x and y is taken to be independent."""
         expected = self.expected().mean_px
         alone, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
-        held, of_learnt, of_plain, latest = self._held
+        held, of_learnt, of_plain, _, latest = self._held
         open_loop = alone - held
         left = trust * (open_loop + of_learnt), trust * (open_loop + of_plain)
         expects = of_plain - latest
@@ -114,7 +114,8 @@ class LargeGuarded(Guarded):
             line.put(self._keep * line.latest - self._gain * self._reconstruct(for_plain)[0])
         else:
             self._predictor.correct(open_loop, variance)
-            line.put(-self._clean(self._predictor.ahead(line.delay_frames))[0])
+            left = self._predictor.ahead(line.delay_frames) + self._held[3]
+            line.put(line.latest - self._clean(left)[0])
 
     def _complete(self) -> None:
         """Complete the previous frame: the other controller, the comparison, and what acts in this frame."""
@@ -128,8 +129,9 @@ class LargeGuarded(Guarded):
             self._held_at = -1
         if self._held_at != self._line.place:
             learnt_line, plain_line = self._lines
-            acting = self._line.acting, learnt_line.acting, plain_line.acting, plain_line.latest
-            self._held, self._held_at = self._product(*acting), self._line.place
+            acting = self._line.acting, learnt_line.acting, plain_line.acting
+            self._held = self._product(*acting, learnt_line.latest, plain_line.latest)
+            self._held_at = self._line.place
 
 
 class _Product:

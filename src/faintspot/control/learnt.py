@@ -146,7 +146,7 @@ class Model:
         if self.kind == POLC:
             covariances = arrays["now_px2"], arrays["ahead_px2"]
             return PseudoOpenLoop(line, plant.interaction, *covariances, clean, float(arrays["gain"]))
-        return Predictive(line, plant.interaction, self.predictor(), clean)
+        return Predictive(line, plant.interaction, self.predictor(), clean, from_latest=self.is_local)
 
     def compiled(self, plant: Plant, line: CommandDelayLine, phase: Floats, **options: Any) -> CompiledKalman:
         """Return the Kalman filter of a small sensor with its fallback, see `CompiledKalman`."""

@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.linalg import cholesky
-from scipy.linalg.blas import ssyrk, strsm
 
 from faintspot.control.kalman import LARGEST_VARIANCE_PX2
 from faintspot.control.local_model import Indices, LocalModel, both_axes, solve_locally
@@ -17,7 +15,7 @@ from faintspot.turbulence.slope_covariance import SlopeTurbulence
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-STEPS = (8, 4), (1, 8)
+STEPS = (8, 8), (1, 12)
 """Frames that count as one, and number of such steps: long steps converge soon, the last ones are exact."""
 
 
@@ -25,12 +23,15 @@ def steady_covariance(
     layers: Sequence[SlopeTurbulence],
     frame_s: float,
     variance_px2: Floats,
+    neighbours: Indices,
     progress: Callable[[], None] | None = None,
 ) -> tuple[LocalModel, Singles]:
     """Return the model for single frames, and the covariance (states, states) px^2 of its prediction's error.
 
-    The state is y[k] of every layer, then y[k - 1] of every layer, each all x, then all y. The Riccati
-    recursion runs from the turbulence's own covariance, first with the mean of several frames as one.
+    The state is y[k] of every layer, then y[k - 1] of every layer, each all x, then all y. The recursion
+    runs from the turbulence's own covariance, first with the mean of several frames as one. It follows the
+    error that the gains of `local_gains` leave (Joseph's form): the covariance of the best gains is
+    smaller, and gains made for it amplify errors with periods of about two times their reach.
 
     Parameters
     ----------
@@ -39,6 +40,8 @@ def steady_covariance(
         Time between two frames.
     variance_px2 : (m,) array
         Variance of the slopes' noise.
+    neighbours : (n, k) array
+        By which each sub-aperture is corrected, as from `neighbours_within`.
     progress : callable, optional
         Called after each of the steps.
     """
@@ -51,7 +54,7 @@ def steady_covariance(
             half = len(covariance) // 2
             covariance = np.tile(covariance[:half, :half], (2, 2))
         for _ in range(steps):
-            covariance = _next(covariance, onward, driving, noise)
+            covariance = _next(covariance, onward, driving, noise, neighbours)
             if progress is not None:
                 progress()
     return model, covariance
@@ -111,19 +114,31 @@ def _transition(model: LocalModel) -> sparse.csr_matrix:
     return sparse.csr_matrix((values, (rows, columns)), shape=(half, 2 * half))
 
 
-def _next(covariance: Singles, onward: sparse.csr_matrix, driving: Singles, noise: Singles) -> Singles:
-    """Return the covariance one step later: a measurement, then the prediction."""
+def _corrections(gains: Floats, neighbours: Indices) -> sparse.csr_matrix:
+    """Return the matrix (states, m) from surprises to the state."""
+    n, rows, _ = gains.shape
+    columns = both_axes(neighbours, n)
+    there = np.broadcast_to((columns < 2 * n)[:, None], gains.shape)
+    own, row, place = np.nonzero(there)
+    return sparse.csr_matrix(
+        (gains.astype(np.float32)[there], (row * n + own, columns[own, place])), shape=(rows * n, 2 * n)
+    )
+
+
+def _next(
+    covariance: Singles, onward: sparse.csr_matrix, driving: Singles, noise: Singles, neighbours: Indices
+) -> Singles:
+    """Return the covariance one step later: a measurement, then the prediction; the first is overwritten."""
     layers, m, _ = driving.shape
     half = layers * m
     seen, slopes = of_slopes(covariance, layers)
+    gain = _corrections(local_gains(seen, slopes, noise.astype(np.float64), neighbours), neighbours)
     slopes[np.diag_indices(m)] += noise
-    lower = cholesky(slopes, lower=True).astype(np.float32)
-    known = strsm(1.0, lower, seen.T.astype(np.float32), lower=1)
-    covariance = np.tril(ssyrk(-1.0, known, 1.0, covariance.T, trans=1, lower=1))  # half of it is computed
-    covariance += np.tril(covariance, -1).T
-    across = onward @ covariance
-    now = onward @ np.ascontiguousarray(across.T)
-    now = 0.5 * (now + now.T)
+    rest = np.ascontiguousarray((0.5 * (gain @ slopes) - seen).T, np.float32)
+    _add_symmetric(covariance, gain, rest)
+    across = _product(onward, covariance)
+    now = _product(onward, np.ascontiguousarray(across.T))
+    now = 0.5 * (now + now.T)  # rounding errors that are not symmetric would grow
     blocks = now.reshape(layers, m, layers, m)
     for layer in range(layers):
         blocks[layer, :, layer] += driving[layer]
@@ -131,3 +146,25 @@ def _next(covariance: Singles, onward: sparse.csr_matrix, driving: Singles, nois
     after[:half, :half], after[half:, half:] = now, covariance[:half, :half]
     after[:half, half:], after[half:, :half] = across[:, :half], across[:, :half].T
     return after
+
+
+def _add_symmetric(covariance: Singles, left: sparse.csr_matrix, right: Singles) -> None:
+    """Add left right and its transpose, in parts that a processor's cache holds."""
+    for columns in _parts(len(covariance)):
+        part = left @ np.ascontiguousarray(right[:, columns])
+        covariance[:, columns] += part
+        for rows in _parts(len(covariance)):
+            covariance[columns, rows] += part[rows].T
+
+
+def _product(left: sparse.csr_matrix, right: Singles) -> Singles:
+    """Return left right, in parts that a processor's cache holds."""
+    out = np.empty((left.shape[0], right.shape[1]), np.float32)
+    for columns in _parts(right.shape[1]):
+        out[:, columns] = left @ np.ascontiguousarray(right[:, columns])
+    return out
+
+
+def _parts(length: int) -> list[slice]:
+    """Return slices of 512."""
+    return [slice(start, start + 512) for start in range(0, length, 512)]

@@ -21,7 +21,7 @@ from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 
-_REACH = 5.0  # sub-apertures, from which corrections come
+_REACH = 2.5  # sub-apertures, from which corrections come
 NOISE_STEP = 2.0
 _LEVELS = range(-3, 4)
 _MOST_STATES = 22_000  # whose covariances take 8 GB while they are computed
@@ -129,10 +129,10 @@ def local_filter(
         variance_px2, predicted_px2 (m,): of noise and of the prediction's error. share (layers,).
     """
     layers = at_most(layers, max(1, _MOST_STATES // (2 * len(variance_px2))))
-    model, covariance = steady_covariance(layers, frame_s, variance_px2, progress)
+    around = neighbours_within(layers[0].positions_m, _REACH * layers[0].subaperture_m)
+    model, covariance = steady_covariance(layers, frame_s, variance_px2, around, progress)
     with_slopes, predicted = of_slopes(covariance, model.layers)
     del covariance
-    around = neighbours_within(layers[0].positions_m, _REACH * layers[0].subaperture_m)
     gains = [
         local_gains(with_slopes, predicted, NOISE_STEP**level * variance_px2, around) for level in _LEVELS
     ]

@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
 _REACH = 1.5  # sub-apertures: with the diagonal neighbours
-_RIDGE = 1e-4  # of a slope's variance
+_RIDGE = 1e-3  # of a slope's variance
 _LEAST_DRIVING = 1e-6  # of a slope's variance
 
 
