@@ -1,8 +1,7 @@
 """Frame to command: what do commands add to slopes, and is the loop in real time the simulated one?
 
 Latency: 36 sub-apertures, 66 commands, frames that are there; what the engine's thread needs from the slopes'
-publication to that of the commands. For an extremely large telescope, 4616 sub-apertures and 5000 commands,
-the integrator's product alone: the compiled loop and the BLAS that NumPy has, one core; memory limits it.
+publication to that of the commands. Larger sensors: `control`.
 
 Loop: a simulated telescope and an engine as processes of their own, an integrator on brightest pixels,
 compared with `simulate_loop` on the same air, frame by frame. The frame rate is low and the read-out short,
@@ -13,40 +12,32 @@ are as much slower, so that the loop is as late as at 250 frames/s. Two processo
 from __future__ import annotations
 
 import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from functools import partial
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
 
-from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
+from benchmarks.measuring import Row, Table
+from benchmarks.realtime_processes import engine_and_telescope
 from faintspot import Calibration, Layout, Settings, SlopePipeline
 from faintspot.ao_loop import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.ao_loop.control import slope_turbulence
 from faintspot.ao_loop.engine_files import write_engine_files
 from faintspot.ao_loop.telescope_model import prepare
-from faintspot.control.compiled import integrate
 from faintspot.control.configuration import Control, ControlOptions, load_control
 from faintspot.control.learnt import CONTROLS, KALMAN, POLC, Model
 from faintspot.control.models import SlopeModel
-from faintspot.kernels.compiling import Direct
 from faintspot.pipeline import configuration as configuration_file
-from faintspot.realtime.control import request
 from faintspot.realtime.engine import Engine
 from faintspot.realtime.pixel_ring import PixelRing
-from faintspot.realtime.private_socket import socket_path
 
 FRAMES, COMMANDS = 2000, 66
 LOOP_FRAMES, SETTLED, REALISATIONS, RATE_HZ = 500, 150, 3, 20.0
-_ELT_SLOPES, _ELT_COMMANDS = 9232, 5000
 _TRUTH_FRAME, _TRUTH_STREHL, _TRUTH_COMMANDS = 0, 1, 6
-_COMMAND = [sys.executable, "-m", "faintspot", "realtime"]
 TARGETS_US = 5.0, 20.0
 
 
@@ -122,66 +113,6 @@ def _row(label: str, layout: Layout, control: Control, target_us: float) -> Row:
     return Row(title, columns, f"<= {target_us:g} us", columns["both, p50"] <= target_us)
 
 
-def _large() -> Table:
-    """Time the integrator's product of an extremely large telescope, ms."""
-    rng = np.random.default_rng(1)
-    columns = rng.standard_normal((_ELT_SLOPES, _ELT_COMMANDS))
-    slopes, line = rng.standard_normal(_ELT_SLOPES), np.zeros((2, _ELT_COMMANDS))
-    single = columns.astype(np.float32)
-    few = slopes.astype(np.float32)
-    candidates: dict[str, Candidate] = {
-        "compiled, float64": partial(Direct(integrate), slopes, columns, 0.4, 0.99, 1e30, line, 0),
-        "BLAS, float64": lambda: slopes @ columns,
-        "BLAS, float32": lambda: few @ single,
-    }
-    with pinned():
-        times = interleaved(candidates, fewest=3)
-    found = [
-        Row(
-            name,
-            {
-                "ms a frame": best(times, name) * 1e3,
-                "GB/s": (single if "32" in name else columns).nbytes / best(times, name) / 1e9,
-            },
-        )
-        for name in candidates
-    ]
-    return Table("realtime-commands-elt", f"{_ELT_SLOPES} slopes, {_ELT_COMMANDS} commands, one core", found)
-
-
-@contextmanager
-def _processes(name: str, folder: Path, engine: Path, realisation: int) -> Iterator[subprocess.Popen[bytes]]:
-    """Start an engine, and the telescope as soon as it waits for frames; give the telescope."""
-    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    run = [*_COMMAND, "run", "--config", str(engine), "--name", name, "--close-loop", "--images-every", "0"]
-    started = [subprocess.Popen(run, **quiet)]
-    try:
-        end = time.monotonic() + 120.0
-        while time.monotonic() < end:
-            with suppress(Exception):
-                request(socket_path(name), "status")
-                break
-            time.sleep(0.2)
-        options = [
-            "--name",
-            name,
-            "--frames",
-            str(LOOP_FRAMES),
-            "--readout-fraction",
-            "0.3",
-            "--realisation",
-            str(realisation),
-        ]
-        started.append(
-            subprocess.Popen([*_COMMAND, "telescope", "run", str(folder / "loop.toml"), *options], **quiet)
-        )
-        yield started[-1]
-    finally:
-        for process in started[::-1]:
-            process.terminate()
-            process.wait()
-
-
 def _observed(name: str, telescope: subprocess.Popen[bytes]) -> np.ndarray[Any, Any]:
     """Return the truth of every frame that could be read, (frames, values), until the telescope ends."""
     import pyshmem
@@ -214,7 +145,8 @@ def compared(
         run = configuration.replace("run", frames=LOOP_FRAMES, settle_frames=SETTLED)
         for number in range(realisations):
             name = f"faintspot_benchmark_{uuid4().hex[:8]}"
-            with _processes(name, folder, path, number) as telescope:
+            options = [f"--frames={LOOP_FRAMES}", "--readout-fraction=0.3", f"--realisation={number}"]
+            with engine_and_telescope(name, path, folder / "loop.toml", options) as (_, telescope):
                 truth = _observed(name, telescope)
             settled = truth[truth[:, _TRUTH_FRAME] >= SETTLED]
             late = settled[:, _TRUTH_FRAME] - settled[:, _TRUTH_COMMANDS]
@@ -262,5 +194,5 @@ def _loop() -> Table:
 
 
 def run() -> list[Table]:
-    """Measure latency, the large product, and the loop."""
-    return [_latency(), _large(), _loop()]
+    """Measure latency and the loop."""
+    return [_latency(), _loop()]

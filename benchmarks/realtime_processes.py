@@ -1,4 +1,4 @@
-"""An engine and a simulated camera as processes of their own, and what they say of a run."""
+"""An engine and a simulated camera or telescope as processes of their own, and what they say of a run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -88,6 +88,31 @@ def engine_and_camera(
             for process in reversed(started):
                 process.terminate()
                 process.wait()
+
+
+@contextmanager
+def engine_and_telescope(
+    name: str, engine: Path, loop: Path, telescope: Sequence[str] = (), priority: int = 0
+) -> Iterator[tuple[Processes, subprocess.Popen[bytes]]]:
+    """Start an engine with its loop closed, and the telescope as soon as it waits for frames; end them."""
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    options = ["--config", str(engine), "--name", name, "--close-loop", "--images-every", "0"]
+    started = [subprocess.Popen([*_COMMAND, "run", *options, "--priority", str(priority)], **quiet)]
+    try:
+        end = time.monotonic() + PATIENCE_S
+        while time.monotonic() < end:
+            with suppress(InputError):
+                request(socket_path(name), "status")
+                break
+            time.sleep(0.2)
+        first = ["chrt", "-f", str(priority)] if priority else []
+        run = [*first, *_COMMAND, "telescope", "run", str(loop), "--name", name, *telescope]
+        started.append(subprocess.Popen(run, **quiet))
+        yield Processes(name, *started), started[1]
+    finally:
+        for process in reversed(started):
+            process.terminate()
+            process.wait()
 
 
 def involuntary_switches(pid: int) -> int:
