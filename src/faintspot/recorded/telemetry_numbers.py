@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,12 +160,16 @@ def change_rows(telemetry: Telemetry) -> Sequence[tuple[int, float, str, str]]:
         place = int(np.searchsorted(telemetry.frame, change["frame"]))
         inside = place < len(telemetry.frame) and change["frame"] >= telemetry.frame[0]
         seconds = float(telemetry.last_row_time_ns[place] - start) / 1e9 if inside else np.nan
-        what = ", ".join(f"{name} = {_shortened(f'{value}')}" for name, value in change["changes"].items())
+        what = ", ".join(f"{name} = {_shortened(value)}" for name, value in change["changes"].items())
         where = change["where"]
         shown = "all" if where is None else where if isinstance(where, str) else ", ".join(map(str, where))
         rows.append((int(change["frame"]), seconds, what, shown))
     return rows
 
 
-def _shortened(text: str) -> str:
+def _shortened(value: Any) -> str:
+    """Return a value as text; of a table, such as a sodium profile, what is no list."""
+    text = str(value)
+    if isinstance(value, Mapping):
+        text = ", ".join(f"{name} {item}" for name, item in value.items() if not isinstance(item, list))
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."

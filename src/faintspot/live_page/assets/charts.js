@@ -138,7 +138,7 @@ export function drawProfile(canvas, altitudes, lines) {
   const { context, width, height, y } = axes(canvas, low, high, yTicksOf(low, high, false));
   const x = (value) => LEFT + value / most * (width - LEFT - RIGHT);
   context.fillStyle = ink.soft;
-  for (const value of ticks(0, most, 4)) context.fillText(inWords(Number(value.toPrecision(6))), x(value), height - 5);
+  for (const value of ticks(0, most, 4)) context.fillText(String(Number(value.toPrecision(6))), x(value), height - 5);
   for (const { values, colour, dash } of lines) {
     context.strokeStyle = ink[colour];
     context.setLineDash(dash ? [3, 3] : []);

@@ -259,14 +259,17 @@ function showFigures() {
   const changes = values.changes || [];
   byId("changes-section").hidden = changes.length === 0;
   byId("changes").replaceChildren(...changes.slice(-8).reverse().map(({ frame, changes: what, where }) => {
-    const text = Object.entries(what).map(([name, value]) => `${name} = ${shortened(JSON.stringify(value))}`).join(", ");
+    const text = Object.entries(what).map(([name, value]) => `${name} = ${shortened(value)}`).join(", ");
     return element("li", { textContent: `from frame ${frame}: ${text}${where === null ? "" : `, sub-apertures ${where}`}` });
   }));
 }
 
 const LONGEST = 80;
 
-function shortened(text) {
+function shortened(value) {
+  const numbers = value && typeof value === "object" && !Array.isArray(value)
+    ? Object.entries(value).filter(([, item]) => !Array.isArray(item)) : null;
+  const text = numbers ? numbers.map(([name, item]) => `${name} ${item}`).join(", ") : JSON.stringify(value);
   return text.length > LONGEST ? `${text.slice(0, LONGEST)}…` : text;
 }
 
@@ -326,7 +329,7 @@ function showSodium(sodium) {
   if (!sodium) return;
   const { altitude_km: altitudes, flux_per_km: now, before_per_km: before, spot_fwhm_arcsec: width, fault } = sodium;
   if (altitudes) drawProfile(byId("sodium"), altitudes, [{ values: before, colour: "soft", dash: true }, { values: now, colour: "first" }]);
-  const shown = altitudes ? `flux per km against km; dashed: before; spot ${inWords(width)} arcsec` : "";
+  const shown = altitudes ? `altitude (km) against flux per km; dashed: before; spot ${inWords(width)} arcsec` : "";
   say("sodium-caption", fault ? `no longer followed: ${fault}` : shown);
 }
 
