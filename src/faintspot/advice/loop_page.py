@@ -15,6 +15,7 @@ from faintspot.report.page import Page, Section, Table, html_of
 from faintspot.report.texts import Texts
 
 _TEXT = Texts("faintspot.advice")
+_STREHL = "Strehl ratio"
 _MOST_DECIMALS = 6
 
 
@@ -73,7 +74,7 @@ def _choices_table(report: LoopReport) -> Table:
         f"residual ({unit})": [each.residual for each in report.choices],
         f"less than as run ({unit})": [each.less for each in report.choices],
         f"with fitting error ({unit})": [each.total for each in report.choices],
-        "Strehl ratio": [each.strehl for each in report.choices],
+        _STREHL: [each.strehl for each in report.choices],
     }
     known = {
         name: values for name, values in columns.items() if any(np.isfinite(each.value) for each in values)
@@ -82,7 +83,8 @@ def _choices_table(report: LoopReport) -> Table:
     for each, *values in zip(report.choices, *known.values(), strict=True):
         gain = f"{each.gain:.2f}" if np.isfinite(each.gain) else "–"
         rows.append([each.name, gain, *map(_with_interval, values)])
-    return Table(["control", "gain", *known], rows, _TEXT["choices.table"])
+    texts = ["choices.table", *(["choices.strehl"] if _STREHL in known else [])]
+    return Table(["control", "gain", *known], rows, " ".join(_TEXT[name] for name in texts))
 
 
 @styled
