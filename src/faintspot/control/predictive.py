@@ -81,7 +81,7 @@ class Predictive:
         The wavefront, as commands that cause it, from open-loop slopes without noise.
     from_latest : bool
         Whether the command is the latest one, corrected for what it leaves of the prediction. What a
-        regularised reconstructor leaves then vanishes over frames: with many sub-apertures, 8 % of focus.
+        regularised reconstructor leaves then vanishes over frames: of 40 x 40 sub-apertures 14 % of focus.
     """
 
     undoes_prior = True
