@@ -158,8 +158,8 @@ def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
             mark = {"color": drawn["color"], "marker": "|", "ms": 16, "mew": 2.2, "lw": 0, "elinewidth": 2.2}
             axes.errorbar(limit.magnitude.value, answer.level, xerr=error, zorder=5, **mark)
     axes.axhline(answer.level, color=GREY, lw=1, zorder=0)
-    words, place = f"Strehl {answer.level:.2f}: limiting magnitudes", (0.99, answer.level)
-    note(axes, words, place, "axes fraction, data", xytext=(0, 3), ha="right", color="#666666")
+    words, place = f"Strehl {answer.level:.2f}: limiting magnitudes", (0.01, answer.level)
+    note(axes, words, place, "axes fraction, data", xytext=(0, 3), color="#666666")
     if answer.question.configuration.photons in answer.photons:
         axes.axvline(magnitudes[answer.at_star], color="black", lw=0.8, ls=":", zorder=0)
         where = (magnitudes[answer.at_star], 0.99)

@@ -59,7 +59,7 @@ def recommendation(answer: LoopAnswer) -> list[str]:
 def difference_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
     """Describe the gain of a method over another, in Strehl ratio and limiting magnitude."""
     found = answer.difference(name, reference, answer.at_star)
-    verdict = {1: "", 0: ", within its error", -1: ", less beyond its error"}[found.decided]
+    verdict = {1: "", 0: " (its 95 % interval includes 0)", -1: ", less beyond its error"}[found.decided]
     text = f"Strehl ratio {with_error(found, sign=True, smallest=_SMALLEST_ERROR)}{verdict}"
     return f"{text}; limiting magnitude {gain_in_words(answer, name, reference)}"
 
