@@ -39,12 +39,9 @@ class Parts(NamedTuple):
     @classmethod
     def from_tables(cls, path: Path, document: Mapping[str, dict[str, Any]]) -> Parts:
         """Read the parts from the tables of a configuration file; PSF and score may be absent."""
-        return cls(
-            Settings.from_tables(path, document),
-            Calibration.from_tables(path, document),
-            psf_of(path, document),
-            score_of(path, document),
-        )
+        settings = Settings.from_tables(path, document)
+        calibration, psf = Calibration.from_tables(path, document), psf_of(path, document)
+        return cls(settings, calibration, psf, score_of(path, document, psf))
 
 
 class Configuration(NamedTuple):
@@ -145,7 +142,8 @@ def unpacked(files: Mapping[str, str]) -> tuple[Calibration, PSF | None, Score |
         except (OSError, ValueError, TypeError, AttributeError):
             raise InputError("configuration: expected files in base64") from None
         document = read_tables(path)
-        return Calibration.from_tables(path, document), psf_of(path, document), score_of(path, document)
+        calibration, psf = Calibration.from_tables(path, document), psf_of(path, document)
+        return calibration, psf, score_of(path, document, psf)
 
 
 def to_text(*items: Layout | Calibration | Settings) -> str:
@@ -184,10 +182,13 @@ def _laser_psf(path: Path, document: Mapping[str, dict[str, Any]]) -> PSF | None
         return laser.psf(laser.star_of(layout), layout.window)
 
 
-def _laser_score(path: Path, document: Mapping[str, dict[str, Any]]) -> Score | None:
+def _laser_score(path: Path, document: Mapping[str, dict[str, Any]], psf: PSF | None) -> Score | None:
     """Return the linear matched filter of a laser guide star, if the configuration wants it."""
-    laser, psf = laser_of(path, document), psf_of(path, document)
-    if laser is None or psf is None or not laser.matched_filter:
+    laser = laser_of(path, document)
+    if laser is None or not laser.matched_filter:
+        return None
+    psf = psf_of(path, document) if psf is None else psf
+    if psf is None:
         return None
     layout, settings = Layout.from_tables(path, document), Settings.from_tables(path, document)
     if settings.flux_e is None:
@@ -197,13 +198,14 @@ def _laser_score(path: Path, document: Mapping[str, dict[str, Any]]) -> Score | 
         return matched_filter(psf, layout, Calibration.from_tables(path, document), flux)
 
 
-def score_of(path: Path, document: Mapping[str, dict[str, Any]]) -> Score | None:
+def score_of(path: Path, document: Mapping[str, dict[str, Any]], psf: PSF | None = None) -> Score | None:
     """Return the score that a configuration file names, or None.
 
-    Without a table [score] it is the linear matched filter of a laser guide star, if [laser] wants it.
+    Without a table [score] it is the linear matched filter of a laser guide star, if [laser] wants it, for
+    the PSF of `psf_of`, which is made here if it is not given.
     """
     if "score" not in document:
-        return _laser_score(path, document)
+        return _laser_score(path, document, psf)
     with errors_of_table(path, "score"):
         return load_score(_named_file(path, "score", document["score"], ("file",)))
 

@@ -2,18 +2,94 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import tempfile
 import threading
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from faintspot.base.errors import InputError
 from faintspot.realtime.child_processes import ChildProcesses
+from faintspot.realtime.private_socket import socket_path
+from faintspot.realtime.telemetry import TelemetryReader
 
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-NICEST = 19
+_NICEST = 19
 _WATCH_S = 1.0
+
+
+class BesideEngine(ABC):
+    """Reader of a running engine's telemetry that answers to it, in another process than the engine.
+
+    Parameters
+    ----------
+    name : str
+        Name of the engine.
+
+    Raises
+    ------
+    InputError
+        When there is no engine.
+    """
+
+    look_s: float
+    """Time between two looks at the telemetry."""
+    patience_s: float
+    """Processor time after which an answer ends the process."""
+    failed: str
+    """Words for what an answer could not do."""
+
+    def __init__(self, name: str) -> None:
+        self._path, self._reader = socket_path(name), TelemetryReader.attach(name)
+
+    def close(self) -> None:
+        """Close the telemetry."""
+        self._reader.close()
+
+    @property
+    def ended(self) -> bool:
+        """Whether the engine has ended."""
+        return self._reader.stale
+
+    @abstractmethod
+    def take(self) -> bool:
+        """Take the telemetry that has come; return whether it is enough for an answer."""
+
+    @abstractmethod
+    def answer(self) -> str | None:
+        """Answer to the engine; return a line about it, if there is something to say.
+
+        Raises
+        ------
+        InputError
+            When the telemetry tells nothing, or the engine refuses the answer.
+        """
+
+    def run(self, say: Callable[[str], None]) -> None:
+        """Answer at the lowest priority until the engine ends; `say` takes a line for each answer."""
+        os.nice(_NICEST)
+        try:
+            while not self.ended:
+                time.sleep(self.look_s)
+                if self.take():
+                    self._answer_in_time(say)
+        finally:
+            self.close()
+
+    def _answer_in_time(self, say: Callable[[str], None]) -> None:
+        signal.setitimer(signal.ITIMER_PROF, self.patience_s)  # processor time: it may wait for long
+        try:
+            line = self.answer()
+            if line is not None:
+                say(line)
+        except InputError as error:
+            say(f"{self.failed}: {error}")
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
 
 
 @contextmanager

@@ -6,10 +6,7 @@ prepared in another thread than that which measures. If the process ends or hang
 
 from __future__ import annotations
 
-import os
-import signal
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,19 +22,15 @@ from faintspot.control.recording import CLOSED, site_of, telemetry_of_recording
 from faintspot.control.relearning import FEWEST_FRAMES, Relearnt, relearn
 from faintspot.io.telemetry import Telemetry, stored_names
 from faintspot.pipeline.settings import Settings
-from faintspot.realtime.beside import NICEST, process_beside
+from faintspot.realtime.beside import BesideEngine, process_beside
 from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
 from faintspot.realtime.engine import Engine
-from faintspot.realtime.private_socket import socket_path
-from faintspot.realtime.telemetry import TelemetryReader
 from faintspot.sensor.layout import Layout
 
-_LOOK_S = 0.5  # the ring keeps some seconds
-_PATIENCE_S = 300.0
 _FROM_NOTHING_EVERY = 6  # learnings, as a search from known layers finds no new one
 
 
-class LearningBeside:
+class LearningBeside(BesideEngine):
     """Learner of a running engine's Kalman filter, in another process than the engine.
 
     Parameters
@@ -55,6 +48,10 @@ class LearningBeside:
         When the configuration has no Kalman filter or no size of a sub-aperture, or there is no engine.
     """
 
+    look_s = 0.5  # the ring keeps some seconds
+    patience_s = 300.0
+    failed = "not learnt"
+
     def __init__(self, name: str, config: str | Path, every_s: float) -> None:
         control = load_control(config)
         if control is None or control.options.controller != KALMAN:
@@ -62,20 +59,11 @@ class LearningBeside:
         layout = Layout.load(config)
         self._control: Control = control
         self._site, self._layout = site_of(layout), layout
-        self._path, self._every_s = socket_path(name), every_s
-        self._reader = TelemetryReader.attach(name)
+        super().__init__(name)
+        self._every_s = every_s
         self._cursor, self._records = self._reader.records.written, list[NDArray[Any]]()
         self._last: Relearnt | None = None
         self._count = 0
-
-    def close(self) -> None:
-        """Close the telemetry."""
-        self._reader.close()
-
-    @property
-    def ended(self) -> bool:
-        """Whether the engine has ended."""
-        return self._reader.stale
 
     def take(self) -> bool:
         """Take the records that have come; return whether they are enough to learn from."""
@@ -101,6 +89,11 @@ class LearningBeside:
             return 0.0
         first, last = (self._records[end]["last_row_time_ns"][end] for end in (0, -1))
         return (int(last) - int(first)) / 1e9
+
+    def answer(self) -> str:
+        """See `BesideEngine`: learn, and offer the filter."""
+        found, taken = self.learn()
+        return f"{found.summary()}; {'taken' if taken else 'not taken'}"
 
     def learn(self) -> tuple[Relearnt, bool]:
         """Learn from the records since the last time; return the result and whether the engine took it.
@@ -159,23 +152,7 @@ def learn_repeatedly(name: str, config: str | Path, every_s: float, say: Callabl
     InputError
         See `LearningBeside`.
     """
-    learning = LearningBeside(name, config, every_s)
-    os.nice(NICEST)
-    try:
-        while not learning.ended:
-            time.sleep(_LOOK_S)
-            if not learning.take():
-                continue
-            signal.setitimer(signal.ITIMER_PROF, _PATIENCE_S)  # processor time: it may wait for long
-            try:
-                found, taken = learning.learn()
-                say(f"{found.summary()}; {'taken' if taken else 'not taken'}")
-            except InputError as error:
-                say(f"not learnt: {error}")
-            finally:
-                signal.setitimer(signal.ITIMER_PROF, 0.0)
-    finally:
-        learning.close()
+    LearningBeside(name, config, every_s).run(say)
 
 
 @contextmanager

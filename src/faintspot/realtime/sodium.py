@@ -7,8 +7,6 @@ the process ends or hangs, the engine goes on with the last profile.
 
 from __future__ import annotations
 
-import os
-import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -24,11 +22,9 @@ from faintspot.base.errors import InputError
 from faintspot.base.flags import INVALID
 from faintspot.control.configuration import load_control
 from faintspot.pipeline import configuration
-from faintspot.realtime.beside import NICEST, process_beside
+from faintspot.realtime.beside import BesideEngine, process_beside
 from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
 from faintspot.realtime.engine import Engine
-from faintspot.realtime.private_socket import socket_path
-from faintspot.realtime.telemetry import TelemetryReader
 from faintspot.spots.laser_spots import load_laser, matched_filter
 from faintspot.spots.sodium import SodiumProfile
 from faintspot.training.known_sodium import KnownSodium, calibrated_images, dark_variance_e2
@@ -36,16 +32,14 @@ from faintspot.training.sodium import MeanImages
 
 Floats = NDArray[np.float64]
 
-_LOOK_S = 0.1  # the ring keeps 2 to 16 images
 _FEWEST_IMAGES = 20
 _LEAST_VALID = 0.5  # of the sub-apertures
 _SPOT_EVERY = 20  # fits: the width of the spot changes with the seeing
 _LEAST_CHANGE = 0.02  # of the flux at other altitudes
 _LEAST_FLUX_CHANGE = 0.2
-_PATIENCE_S = 120.0
 
 
-class SodiumFollower:
+class SodiumFollower(BesideEngine):
     """Follower of the sodium layer that a running engine's laser guide star shows.
 
     Parameters
@@ -61,11 +55,15 @@ class SodiumFollower:
         When the configuration has no laser that is followed, the layout no angles, or there is no engine.
     """
 
+    look_s = 0.1  # the ring keeps 2 to 16 images
+    patience_s = 120.0
+    failed = "not followed"
+
     def __init__(self, name: str, config: str | Path) -> None:
         laser = load_laser(config)
         if laser is None or not laser.follow_every_s:
             raise InputError(f"{config}: expected [laser] with follow_every_s > 0, to follow its profile")
-        self._laser, self._path = laser, socket_path(name)
+        self._laser = laser
         self._layout, _, self._calibration, _, _ = configuration.load_all(config)
         self._star = laser.star_of(self._layout)
         self._dark = dark_variance_e2(self._layout, self._calibration)
@@ -75,22 +73,13 @@ class SodiumFollower:
         if control is not None and control.reference is not None:
             reference = np.reshape(control.reference, reference.shape)
         self._zero = self._layout.offsets + reference.T
-        self._reader = TelemetryReader.attach(name)
+        super().__init__(name)
         self._cursors = [self._reader.records.written, self._reader.images.written]
         self._mean: MeanImages | None = None
         self._known: KnownSodium | None = None
         self._handed: KnownSodium | None = None
         self._fits, self._count, self._times_s = 0, 0, [0.0, 0.0]
         self._due_s = time.monotonic() + laser.follow_every_s
-
-    def close(self) -> None:
-        """Close the telemetry."""
-        self._reader.close()
-
-    @property
-    def ended(self) -> bool:
-        """Whether the engine has ended."""
-        return self._reader.stale
 
     def take(self) -> bool:
         """Take the images that have come into the running mean; return whether a fit is due."""
@@ -138,6 +127,14 @@ class SodiumFollower:
         self._fits += 1
         self._profile = self._known.fit.profile
         return self._known
+
+    def answer(self) -> str | None:
+        """See `BesideEngine`: fit the profile, and hand it over if it is new."""
+        known = self.fit()
+        if not self.is_new(known):
+            return None
+        frame = self.hand_over(known)
+        return f"{known.fit.profile}, spot {known.spot_fwhm_arcsec:.2f} arcsec, from frame {frame} on"
 
     def is_new(self, known: KnownSodium) -> bool:
         """Return whether profile, spot or flux differ from what the engine has."""
@@ -213,26 +210,7 @@ def follow_repeatedly(name: str, config: str | Path, say: Callable[[str], None])
     InputError
         See `SodiumFollower`.
     """
-    follower = SodiumFollower(name, config)
-    os.nice(NICEST)
-    try:
-        while not follower.ended:
-            time.sleep(_LOOK_S)
-            if not follower.take():
-                continue
-            signal.setitimer(signal.ITIMER_PROF, _PATIENCE_S)  # processor time: it may wait for long
-            try:
-                known = follower.fit()
-                if follower.is_new(known):
-                    frame = follower.hand_over(known)
-                    spot = f"spot {known.spot_fwhm_arcsec:.2f} arcsec"
-                    say(f"{known.fit.profile}, {spot}, from frame {frame} on")
-            except InputError as error:
-                say(f"not followed: {error}")
-            finally:
-                signal.setitimer(signal.ITIMER_PROF, 0.0)
-    finally:
-        follower.close()
+    SodiumFollower(name, config).run(say)
 
 
 @contextmanager
