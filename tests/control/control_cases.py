@@ -6,7 +6,7 @@ import numpy as np
 
 from faintspot.control.learning import Plant
 from faintspot.control.models import SlopeModel
-from faintspot.control.phase import residual_phase
+from faintspot.control.phase import phase_of_commands
 from faintspot.control.reconstructor import make_reconstructor
 from faintspot.control.telemetry import OpenLoopTelemetry
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
@@ -28,7 +28,8 @@ LAYERS = SlopeModel.of_covariances(np.array([layer.lagged_px2(FRAME_S) for layer
 INTERACTION = np.random.default_rng(1).standard_normal((18, 12))
 ERRORS = np.full(18, 0.3)
 PLANT = Plant(INTERACTION, make_reconstructor(INTERACTION), 2, 0.01)
-PHASE = residual_phase(PLANT.reconstructor.matrix, INTERACTION, CELLS.astype(int))
+PHASE_OF_COMMANDS = phase_of_commands(INTERACTION, CELLS.astype(int))
+PHASE = PHASE_OF_COMMANDS @ PLANT.reconstructor.matrix
 
 
 def telemetry(

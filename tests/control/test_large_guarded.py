@@ -7,7 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.control.control_cases import FRAME_S, INTERACTION, PHASE, PLANT, TURBULENCE, telemetry
+from tests.control.control_cases import (
+    FRAME_S,
+    INTERACTION,
+    PHASE,
+    PHASE_OF_COMMANDS,
+    PLANT,
+    TURBULENCE,
+    telemetry,
+)
 
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.guarded import Guarded
@@ -37,8 +45,8 @@ def both() -> tuple[list[Guarded], list[CommandDelayLine]]:
         lines[1],
         INTERACTION,
         PLANT.reconstructor,
-        PHASE,
-        LocalPredictor(arrays),
+        PHASE_OF_COMMANDS,
+        arrays,
         GAIN,
         PLANT.leak,
         **options,

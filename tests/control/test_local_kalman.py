@@ -66,7 +66,7 @@ def test_weak_layers_join_those_of_similar_wind(monkeypatch: pytest.MonkeyPatch)
 
 
 def _transition(model: LocalModel) -> np.ndarray:
-    return np.asarray(local_covariance._transition(model).toarray(), np.float64)
+    return np.asarray(local_covariance._transition(model.neighbours, model.weights).toarray(), np.float64)
 
 
 def test_where_all_are_neighbours_the_model_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -114,7 +114,7 @@ def test_a_step_of_the_covariance_is_the_textbooks(reach: float) -> None:
         expected[part, part] += model.driving[layer]
     found = local_covariance._next(
         before.astype(np.float32),
-        local_covariance._transition(model),
+        local_covariance._transition(model.neighbours, model.weights),
         model.driving.astype(np.float32),
         NOISE_PX2.astype(np.float32),
         around,

@@ -78,3 +78,11 @@ def test_slopes_without_noise_are_hardly_damped() -> None:
     reconstructor = make_reconstructor(matrix, 1e6)
     left = np.linalg.norm(reconstructor.clean @ matrix @ command - command)
     assert left < 0.3 * np.linalg.norm(reconstructor(matrix @ command) - command)
+
+
+def test_of_many_actuators_low_orders_are_corrected_as_well() -> None:
+    """They move slopes a tenth as much as others; of few actuators, these would be among the noisiest."""
+    corrected = [make_reconstructor(np.diag(np.linspace(0.1, 1.0, n)))(np.eye(n)[0])[0] for n in (100, 1000)]
+    few, many = 0.1 * np.array(corrected)
+    assert few < 0.5
+    assert many > 1.3 * few

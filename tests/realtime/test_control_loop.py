@@ -41,7 +41,7 @@ class PlainControl(Control):
         if kind == KALMAN:
             model = self.model
             of_both = partial(model.controller, plant), partial(plant.integrator, model.plain_gain)
-            return Guarded(line, self.interaction, model.phase, *of_both)
+            return Guarded(line, self.interaction, model.phase(plant), *of_both)
         controller: Controller = self.model.controller(plant, line)
         return controller
 
@@ -77,7 +77,7 @@ def controls(draw: Any) -> Control:
         arrays = {name: scaled(draw, array) for name, array in own.arrays.items()}
         gain, factor = (draw(st.sampled_from([usual] * 20 + [*EXTREMES])) for usual in (0.4, 1.0))
         left = draw(st.sampled_from([(1.0, 2.0), (2.0, 1.0)]))
-        model = Model(kind, arrays, gain, factor, left, scaled(draw, own.phase))
+        model = Model(kind, arrays, gain, factor, left, scaled(draw, own.phase_of_commands))
     options = {
         "controller": kind,
         "gain": draw(st.sampled_from([0.4, 0.0, 2.0])),

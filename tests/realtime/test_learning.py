@@ -44,7 +44,7 @@ def model() -> Model:
 def outdated(model: Model) -> Model:
     """Return the model of slopes that are forgotten from frame to frame."""
     arrays = {**model.arrays, "first": 0.1 * model.arrays["first"], "second": 0.0 * model.arrays["second"]}
-    return Model(KALMAN, arrays, 0.4, 1.0, model.left, model.phase)
+    return Model(KALMAN, arrays, 0.4, 1.0, model.left, model.phase_of_commands)
 
 
 class Run:
@@ -93,7 +93,9 @@ def test_a_new_filter_goes_on_from_the_mirror(name: str, model: Model) -> None:
     assert np.abs(after[:SETTLE_FRAMES] - others[100:-100]).max() > 0.2 * largest
     np.testing.assert_allclose(after[-85:], others[-85:], atol=0.02 * largest)
     with pytest.raises(InputError, match="first"):
-        run.loop.renew(Model(KALMAN, {**model.arrays, "first": np.eye(3)}, 0.4, 1.0, model.left, model.phase))
+        run.loop.renew(
+            Model(KALMAN, {**model.arrays, "first": np.eye(3)}, 0.4, 1.0, model.left, model.phase_of_commands)
+        )
     for each in (run, other):
         each.ring.close()
 

@@ -87,7 +87,7 @@ FLUX, DISPLACEMENT, FLUX_TIMES_DISPLACEMENT = range(3)
 
 
 @_compiled
-def displaced_flux(commands: Any, flux: Any, columns: Any, displaced: Any, said: Any) -> None:
+def displaced_flux(commands: Any, flux: Any, columns: Any, work: Any, said: Any) -> None:
     """Write means of the flux, of the squared displacement by the mirror, and of their product.
 
     Parameters
@@ -96,16 +96,19 @@ def displaced_flux(commands: Any, flux: Any, columns: Any, displaced: Any, said:
         Commands that acted in the frame.
     flux : (n,) float32 array
         What is not finite counts as 0.
-    columns : (commands, 2 n) float64 array
+    columns : (commands, 2 n) float32 array
         The interaction matrix, transposed, see `add_products`.
-    displaced : (1, 2 n) float64 array
-        Work array: displacements, all x, then all y.
+    work : tuple of (1, commands) and (1, 2 n) float32 arrays
+        Commands, and displacements: all x, then all y.
     said : (3,) float64 array
         `FLUX`, `DISPLACEMENT` (px^2), `FLUX_TIMES_DISPLACEMENT`.
     """
     n = flux.shape[0]
+    acting, displaced = work
+    for c in range(commands.shape[0]):
+        acting[0, c] = commands[c]
     displaced[:] = 0.0
-    add_products(columns, commands.reshape(1, commands.shape[0]), displaced)
+    add_products(columns, acting, displaced)
     said[:] = 0.0
     for s in range(n):
         square = displaced[0, s] * displaced[0, s] + displaced[0, n + s] * displaced[0, n + s]

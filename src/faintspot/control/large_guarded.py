@@ -1,8 +1,9 @@
-"""Guarded predictive control of large sensors: each matrix is read once in a frame."""
+"""Guarded predictive control of large sensors: little is left to do when a frame's slopes arrive."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled import add_products
 from faintspot.control.guarded import Guarded
 from faintspot.control.integrator import Integrator
+from faintspot.control.local_covariance import replies
 from faintspot.control.local_kalman import LocalPredictor
 from faintspot.control.predictive import Predictive
 from faintspot.control.reconstructor import Reconstructor
@@ -23,12 +25,24 @@ Floats = NDArray[np.float64]
 _LEARNT, _PLAIN = range(2)
 
 
+class _Frame(NamedTuple):
+    """A frame whose command has been sent."""
+
+    open_loop: Floats
+    variance: Floats
+    left_by_learnt: Floats
+    left_by_plain: Floats
+    missing: Floats
+    """What the integrator's estimator would have added to the latter, where it trusts its prior."""
+
+
 class LargeGuarded(Guarded):
     """`Guarded` with `Predictive` and the integrator, for large sensors.
 
-    Reading matrices takes most of the time of a frame. They are kept in float32, and each is read once.
-    Before the command goes out, one product is computed; three more follow with the next frame, or when
-    somebody asks what is expected.
+    Reading matrices takes most of the time of a frame. They are kept in float32. The predictive command is
+    linear in what the slopes differ from their prediction; the matrix of that is computed beforehand, and so
+    is the command for slopes as predicted. When slopes arrive, one product is left. Four more follow with the
+    next frame, or when somebody asks what is expected.
 
     Parameters
     ----------
@@ -36,9 +50,10 @@ class LargeGuarded(Guarded):
         To the mirror.
     interaction : (m, commands) array
     reconstructor : Reconstructor
-    phase : (k, m) array
-        From slopes to the compared amplitudes, see `residual_phase`.
-    predictor : LocalPredictor
+    phase_of_commands : (commands, commands) array
+        From commands to the compared amplitudes, see `phase.phase_of_commands`.
+    arrays : mapping
+        Of the filter, as from `local_filter`.
     plain_gain, leak : float
         Of the integrator.
     options
@@ -50,12 +65,13 @@ class LargeGuarded(Guarded):
         line: CommandDelayLine,
         interaction: Floats,
         reconstructor: Reconstructor,
-        phase: Floats,
-        predictor: LocalPredictor,
+        phase_of_commands: Floats,
+        arrays: Mapping[str, Any],
         plain_gain: float,
         leak: float,
         **options: Any,
     ) -> None:
+        predictor = LocalPredictor(arrays)
 
         def learnt(line: CommandDelayLine) -> Predictive:
             return Predictive(line, interaction, predictor, reconstructor.clean, from_latest=True)
@@ -63,24 +79,29 @@ class LargeGuarded(Guarded):
         def plain(line: CommandDelayLine) -> Integrator:
             return Integrator(line, interaction, reconstructor, plain_gain, leak)
 
-        super().__init__(line, interaction, phase, learnt, plain, **options)
+        super().__init__(line, interaction, phase_of_commands, learnt, plain, **options)
         self._predictor, self._gain, self._keep = predictor, plain_gain, 1.0 - leak
-        self._product = _Product(interaction)
-        self._reconstruct, self._clean = _Product(reconstructor.matrix), _Product(reconstructor.clean)
-        self._compare = _Product(phase)
-        self._held = np.zeros((5, len(interaction)))
-        """Slopes that commands cause: of mirror, filter and integrator, acting; of the latter two, latest."""
-        self._held_at = -1
-        self._rest: tuple[Floats, ...] | None = None
-        """Slopes of the previous frame, as far as it is not complete."""
+        self._product, self._reconstruct = _Product(interaction), _Product(reconstructor.matrix)
+        self._clean, self._compare = _Product(reconstructor.clean), _Product(phase_of_commands)
+        found = replies(arrays, line.delay_frames)
+        self._replies = [_Product((each.T @ reconstructor.clean.T).T) for each in found]
+        self._caused = np.zeros((2, len(line.rows), len(interaction)))
+        """Slopes that the commands of both lines cause, row by row."""
+        self._held, self._held_at = np.zeros(len(interaction)), -1
+        """Slopes that the mirror adds."""
+        self._mean = np.zeros(len(interaction))
+        self._if_as_predicted = np.zeros(interaction.shape[1])
+        """The predictive command for slopes as predicted."""
+        self._frame: _Frame | None = None
+        """The previous frame, while it is not complete."""
+        self._restarted = True
 
     def expected(self) -> Expected:
         """See `Controller`."""
         self._complete()
-        held, _, _, _, latest = self._held
         if self.chosen == _PLAIN:
-            return Expected(held - latest, None)
-        return Expected(held + self._predictor.mean_px, self._predictor.std_px)
+            return Expected(self._held - self._of_line(_PLAIN, 0), None)
+        return Expected(self._held + self._mean, self._predictor.std_px)
 
     def fall_back(self) -> None:
         """See `Guarded`."""
@@ -90,7 +111,7 @@ class LargeGuarded(Guarded):
     def begin(self) -> None:
         """See `Controller`; both restart from there."""
         super().begin()
-        self._rest, self._held_at = None, -1
+        self._frame, self._restarted = None, True
 
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
@@ -98,40 +119,75 @@ class LargeGuarded(Guarded):
         """See `Controller`; noise of x and y is taken to be independent."""
         expected = self.expected().mean_px
         alone, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
-        held, of_learnt, of_plain, _, latest = self._held
-        open_loop = alone - held
-        left = trust * (open_loop + of_learnt), trust * (open_loop + of_plain)
-        expects = of_plain - latest
-        for_plain = expects + trust * (open_loop + of_plain - expects)
-        self._follow(self.chosen, open_loop, self._noise_factor * variance, for_plain)
-        self._send()
-        self._rest = open_loop, self._noise_factor * variance, for_plain, *left
-
-    def _follow(self, which: int, open_loop: Floats, variance: Floats, for_plain: Floats) -> None:
-        """Update one of the controllers."""
-        line = self._lines[which]
-        if which == _PLAIN:
-            line.put(self._keep * line.latest - self._gain * self._reconstruct(for_plain)[0])
+        open_loop, acting = alone - self._held, self._of_line(_PLAIN, 1)
+        by_learnt, by_plain = trust * (open_loop + self._of_line(_LEARNT, 1)), trust * (open_loop + acting)
+        missing = (1 - trust) * (acting - self._of_line(_PLAIN, 0))
+        self._frame = frame = _Frame(open_loop, self._noise_factor * variance, by_learnt, by_plain, missing)
+        if self.chosen == _LEARNT:
+            self._predict(frame)
         else:
-            self._predictor.correct(open_loop, variance)
-            left = self._predictor.ahead(line.delay_frames) + self._held[3]
-            line.put(line.latest - self._clean(left)[0])
+            self._integrate(*self._reconstruct(frame.left_by_plain + missing))
+        self._send()
+
+    def _predict(self, frame: _Frame) -> None:
+        """Compute the predictive command."""
+        surprise, level = self._predictor.surprise(frame.open_loop - self._mean, frame.variance)
+        self._lines[_LEARNT].put(self._if_as_predicted - self._replies[level](surprise)[0])
+
+    def _integrate(self, wavefront: Floats) -> None:
+        """Compute the integrator's command."""
+        line = self._lines[_PLAIN]
+        line.put(self._keep * line.latest - self._gain * wavefront)
 
     def _complete(self) -> None:
-        """Complete the previous frame: the other controller, the comparison, and what acts in this frame."""
-        if self._rest is not None:
-            open_loop, variance, for_plain, *left = self._rest
-            self._rest = None
-            self._follow(1 - self.chosen, open_loop, variance, for_plain)
+        """Complete the previous frame, and compute what does not need the slopes of this one."""
+        frame, self._frame = self._frame, None
+        if frame is not None:
+            learnt, plain = self._compare(*self._follow_up(frame))
+            self._predictor.correct(frame.open_loop, frame.variance)
             self._predictor.advance()
-            learnt, plain = np.square(self._compare(*left), dtype=np.float64).sum(axis=1)
-            self._choose((learnt - plain) / max(learnt + plain, 1e-30))
-            self._held_at = -1
-        if self._held_at != self._line.place:
-            learnt_line, plain_line = self._lines
-            acting = self._line.acting, learnt_line.acting, plain_line.acting
-            self._held = self._product(*acting, learnt_line.latest, plain_line.latest)
-            self._held_at = self._line.place
+            left, by_plain = float(learnt @ learnt), float(plain @ plain)
+            self._choose((left - by_plain) / max(left + by_plain, 1e-30))
+        if frame is not None or self._restarted or self._held_at != self._line.place:
+            self._follow_mirror(is_new=frame is not None or self._restarted)
+
+    def _follow_up(self, frame: _Frame) -> Floats:
+        """Compute the command that was not sent; return the wavefronts that both leave, as commands."""
+        left = frame.left_by_learnt, frame.left_by_plain
+        if self.chosen == _PLAIN:
+            self._predict(frame)
+            return self._reconstruct(*left)
+        if not frame.missing.any():
+            found = self._reconstruct(*left)
+            self._integrate(found[_PLAIN])
+            return found
+        found = self._reconstruct(*left, frame.missing)
+        self._integrate(found[_PLAIN] + found[-1])
+        return found[:-1]
+
+    def _follow_mirror(self, *, is_new: bool) -> None:
+        """Compute the slopes that commands cause and, if the latest are new, the prediction."""
+        lines, mirror = self._lines, self._line
+        commands = [line.latest for line in lines] if is_new else []
+        same = [np.array_equal(line.acting, mirror.acting) for line in lines]
+        if not any(same):
+            commands.append(mirror.acting)
+        found = self._product(*commands) if commands else np.zeros((0, 0))
+        if is_new:
+            for caused, line, slopes in zip(self._caused, lines, found, strict=False):
+                caused[slice(None) if self._restarted else line.place - 1] = slopes
+            self._restarted = False
+            self._mean = self._predictor.mean_px
+            left = self._predictor.ahead(lines[_LEARNT].delay_frames) + self._of_line(_LEARNT, 0)
+            self._if_as_predicted = lines[_LEARNT].latest - self._clean(left)[0]
+        self._held = self._of_line(same.index(True), 1) if any(same) else found[-1]
+        self._held_at = mirror.place
+
+    def _of_line(self, which: int, acting: int) -> Floats:
+        """Return the slopes that the latest command of a line causes, or the one that acts in this frame."""
+        rows = self._caused[which]
+        slopes: Floats = rows[(self._lines[which].place + (2 * acting - 1)) % len(rows)]
+        return slopes
 
 
 class _Product:

@@ -26,7 +26,7 @@ from faintspot.control.learnt import (
 from faintspot.control.local_covariance import STEPS
 from faintspot.control.local_kalman import local_filter
 from faintspot.control.modal_gains import largest_stable_gain, modal_gains
-from faintspot.control.phase import residual_phase
+from faintspot.control.phase import phase_of_commands
 from faintspot.control.telemetry import OpenLoopTelemetry, usual_variance
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
@@ -76,11 +76,11 @@ def learn(
         Called with the steps done and their number while filters of many slopes are computed.
     """
     cells = np.rint(site.positions_m[:, ::-1] / site.subaperture_m).astype(np.int64)
-    phase = residual_phase(plant.reconstructor.matrix, plant.interaction, cells)
+    of_commands = phase_of_commands(plant.interaction, cells)
     frames = max(_FEWEST_REPLAYED, _MOST_REPLAYED // len(site.positions_m) // 2)
     whole, telemetry = telemetry, telemetry.part(-frames, None)
-    gain, plain_left = plant.best_gain(GAINS, telemetry, phase)
-    plain = Model(kind, {}, gain, 1.0, (math.inf, plain_left), phase)
+    gain, plain_left = plant.best_gain(GAINS, telemetry, of_commands @ plant.reconstructor.matrix)
+    plain = Model(kind, {}, gain, 1.0, (math.inf, plain_left), of_commands)
     if kind == MODAL:
         return Learnt(plant, _modal(plain, plant, telemetry))
     identification = Identification(whole, site, rate_hz)

@@ -52,7 +52,7 @@ _OF_KIND = {
 }
 _SQUARE = {"now_px2", "ahead_px2"}
 _OF_LAYERS = {"first", "second", "driving_px2"}
-_OF_ALL = ("plain_gain", "noise_factor", "left", "phase")
+_OF_ALL = ("plain_gain", "noise_factor", "left", "phase_of_commands")
 _COVARIANCE = -1e8, 1e8  # px^2: of slopes of 1e4 px
 _RANGES = {
     "gains": (0.0, 2.0),
@@ -131,8 +131,8 @@ class Model:
     """Factor on the variances of standard errors."""
     left: tuple[float, float]
     """Residual phase variance of the learnt and the plain controller on the telemetry, noise included."""
-    phase: Floats
-    """(commands, m): matrix of the measure that compares both; see `residual_phase`."""
+    phase_of_commands: Floats
+    """(commands, commands): matrix of the measure that compares both; see `phase_of_commands`."""
     description: str = ""
     covariance: Floats | None = None
     """(states, states) px^2: as from `steady_covariance`, where it is known already."""
@@ -174,9 +174,13 @@ class Model:
         line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames)
         return self.compiled(plant, line, phase).replayed(telemetry)
 
+    def phase(self, plant: Plant) -> Floats:
+        """Return the matrix (commands, m) from slopes to what is compared."""
+        return np.asarray(self.phase_of_commands @ plant.reconstructor.matrix)
+
     def scored(self, plant: Plant, telemetry: OpenLoopTelemetry) -> Model:
         """Return the model with its residual on telemetry."""
-        left = mean_left(self.replayed(plant, telemetry, self.phase), telemetry, settled(telemetry))
+        left = mean_left(self.replayed(plant, telemetry, self.phase(plant)), telemetry, settled(telemetry))
         is_dense = self.kind == KALMAN and not self.is_local
         return replace(self, left=(left, self.left[1]), covariance=self._covariance if is_dense else None)
 
@@ -248,7 +252,7 @@ class Model:
             float(numbers["plain_gain"]),
             float(numbers["noise_factor"]),
             (float(learnt), float(plain)),
-            numbers["phase"],
+            numbers["phase_of_commands"],
         )
 
     def check(self, plant: Plant) -> None:
@@ -269,7 +273,7 @@ def _checked(found: Mapping[str, Any], plant: Plant) -> dict[str, Floats]:
     ranges = {**_RANGES, "near": (0, slopes // 2), "around": (0, slopes // 2)}
     numbers = {name: numbers_between(name, value, *ranges.get(name, ())) for name, value in found.items()}
     shapes: dict[str, tuple[int, ...]] = {"gains": (modes,), "variance_px2": (slopes,), "left": (2,)}
-    shapes["phase"] = commands, slopes
+    shapes["phase_of_commands"] = commands, commands
     shapes |= dict.fromkeys(_SQUARE, (slopes, slopes))
     layers = len(numbers["first"]) if "first" in numbers and numbers["first"].ndim == 3 else 1
     shapes |= dict.fromkeys(_OF_LAYERS, (layers, slopes, slopes))
@@ -306,17 +310,15 @@ class Learnt:
         """Return the controller, with the estimator's prior if it has one."""
         plant, model = self.plant, self.model
         if model.kind == KALMAN and not model.is_local:
-            return model.compiled(plant, line, model.phase, prior_std_px=prior_std_px)
+            return model.compiled(plant, line, model.phase(plant), prior_std_px=prior_std_px)
         options: dict[str, Any] = {
             "prior_std_px": prior_std_px,
             "noise_factor": model.noise_factor,
             "prefers_plain": model.left[1] < model.left[0],
         }
-        interaction, phase, gain = plant.interaction, model.phase, model.plain_gain
+        interaction, gain = plant.interaction, model.plain_gain
         if model.is_local:
-            predictor, reconstructor = LocalPredictor(model.arrays), plant.reconstructor
-            return LargeGuarded(
-                line, interaction, reconstructor, phase, predictor, gain, plant.leak, **options
-            )
-        plain = partial(plant.integrator, gain)
-        return Guarded(line, interaction, phase, partial(model.controller, plant), plain, **options)
+            of_loop = interaction, plant.reconstructor, model.phase_of_commands
+            return LargeGuarded(line, *of_loop, model.arrays, gain, plant.leak, **options)
+        learnt, plain = partial(model.controller, plant), partial(plant.integrator, gain)
+        return Guarded(line, interaction, model.phase(plant), learnt, plain, **options)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ def steady_covariance(
     covariance = _prior(layers, STEPS[0][0] * frame_s)
     for number, (frames, steps) in enumerate(STEPS):
         model = LocalModel.of_layers(layers, frames * frame_s)
-        onward, driving = _transition(model), model.driving.astype(np.float32)
+        onward, driving = _transition(model.neighbours, model.weights), model.driving.astype(np.float32)
         noise = (np.minimum(variance_px2, LARGEST_VARIANCE_PX2) / frames).astype(np.float32)
         if number:  # what was before a long step is not known better than what is now
             half = len(covariance) // 2
@@ -91,6 +92,25 @@ def local_gains(
     return solve_locally(total, own, both_axes(neighbours, n))
 
 
+def replies(arrays: Mapping[str, Any], frames: int) -> Iterator[sparse.csr_matrix]:
+    """Return for each set of gains how predicted slopes answer to surprises, (m, m).
+
+    Parameters
+    ----------
+    arrays : mapping
+        As from `local_kalman.local_filter`.
+    frames : int
+        For how many frames later the slopes are predicted.
+    """
+    onward, slopes = _transition(arrays["near"], arrays["weights"]), 2 * len(arrays["near"])
+    half = onward.shape[0]
+    for gains in arrays["corrections"]:
+        state = _corrections(gains, arrays["around"])
+        for _ in range(frames):
+            state = sparse.vstack([onward @ state, state[:half]], "csr")
+        yield sum(state[start : start + slopes] for start in range(0, half, slopes))
+
+
 def _prior(layers: Sequence[SlopeTurbulence], step_s: float) -> Singles:
     """Return the covariance of the state before any measurement."""
     m = 2 * len(layers[0].positions_m)
@@ -102,15 +122,16 @@ def _prior(layers: Sequence[SlopeTurbulence], step_s: float) -> Singles:
     return prior.reshape(2 * len(layers) * m, -1)
 
 
-def _transition(model: LocalModel) -> sparse.csr_matrix:
-    """Return the matrix (states / 2, states) from the state to y[k + 1]."""
-    n, m, half = len(model.neighbours), model.slopes, model.layers * model.slopes
-    there = np.broadcast_to((model.neighbours < n)[:, None, None, None], model.weights.shape)
+def _transition(neighbours: Indices, weights: Floats) -> sparse.csr_matrix:
+    """Return the matrix (states / 2, states) from the state to y[k + 1]; for arguments see `LocalModel`."""
+    n = len(neighbours)
+    m, half = 2 * n, 2 * n * len(weights)
+    there = np.broadcast_to((neighbours < n)[:, None, None, None], weights.shape)
     layer, own, axis, time, other, place = np.nonzero(there)
-    seen = model.neighbours[own, place]
+    seen = neighbours[own, place]
     rows = layer * m + axis * n + own
     columns = time * half + layer * m + other * n + seen
-    values = model.weights.astype(np.float32)[there]
+    values = weights.astype(np.float32)[there]
     return sparse.csr_matrix((values, (rows, columns)), shape=(half, 2 * half))
 
 

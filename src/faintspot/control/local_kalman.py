@@ -74,17 +74,21 @@ class LocalPredictor:
 
         Noise of x and y is taken to be independent.
         """
-        measured = variance_px2 < LARGEST_VARIANCE_PX2
-        surprise = np.where(measured, slopes_px - self.mean_px, 0.0)
+        surprise, level = self.surprise(slopes_px - self.mean_px, variance_px2)
         self._surprise[:-1] = surprise.reshape(2, -1).T
-        _CORRECT(self._state, self._gains[self._level(variance_px2, measured)], self._around, self._surprise)
+        _CORRECT(self._state, self._gains[level], self._around, self._surprise)
 
-    def _level(self, variance_px2: Floats, measured: NDArray[np.bool_]) -> int:
-        """Return the gains for the mean noise of the slopes that were measured."""
+    def surprise(self, difference_px: Floats, variance_px2: Floats) -> tuple[Floats, int]:
+        """Return what slopes differ from the prediction, 0 where not measured, and which gains to use.
+
+        They are the gains for the mean noise of the slopes that were measured.
+        """
+        measured = variance_px2 < LARGEST_VARIANCE_PX2
         if not measured.any():
-            return 0
+            return np.zeros_like(difference_px), 0
         more = np.log(variance_px2[measured] / self._usual_px2[measured]).mean() / math.log(NOISE_STEP)
-        return int(np.clip(round(float(more)) - _LEVELS[0], 0, len(_LEVELS) - 1))
+        level = round(float(more)) + len(self._gains) // 2
+        return np.where(measured, difference_px, 0.0), int(np.clip(level, 0, len(self._gains) - 1))
 
     def advance(self) -> None:
         """Predict the next frame."""

@@ -19,13 +19,24 @@ _MASS = np.array([[2.0, 1.0], [1.0, 2.0]]) / 6  # products of linear elements, i
 def residual_phase(matrix: Floats, interaction: Floats, cells: ArrayLike) -> Floats:
     """Return the matrix (commands, 2 n) from slopes to amplitudes whose sum of squares is the phase variance.
 
-    The slopes' commands cause a wavefront that is bilinear between the corners of the sub-apertures (Fried
-    1977, JOSA 67, 370); its variance over all sub-apertures is in (px x side of a sub-aperture)^2.
-
     Parameters
     ----------
     matrix : (commands, 2 n) array
         From slopes to commands, as of a `Reconstructor`.
+    interaction, cells
+        As for `phase_of_commands`.
+    """
+    return np.asarray(phase_of_commands(interaction, cells) @ matrix)
+
+
+def phase_of_commands(interaction: Floats, cells: ArrayLike) -> Floats:
+    """Return the matrix (commands, commands) to amplitudes whose sum of squares is the phase variance.
+
+    Commands cause a wavefront that is bilinear between the corners of the sub-apertures (Fried 1977,
+    JOSA 67, 370); its variance over all sub-apertures is in (px x side of a sub-aperture)^2.
+
+    Parameters
+    ----------
     interaction : (2 n, commands) array
         Slopes for a unit of each command.
     cells : (n, 2) array of int
@@ -35,8 +46,7 @@ def residual_phase(matrix: Floats, interaction: Floats, cells: ArrayLike) -> Flo
     corners = np.linalg.pinv(slopes, rcond=_UNSEEN) @ interaction
     corners -= mean @ corners
     values, vectors = np.linalg.eigh(corners.T @ mass @ corners)
-    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return np.asarray(root @ matrix)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
 def _corner_geometry(cells: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:

@@ -15,8 +15,9 @@ Floats = NDArray[np.float64]
 
 _LARGEST_ANSWER_PX = 1e-12, 1e12
 """Range of the largest element of an interaction matrix; its square is far from the limits of float64."""
-_RIDGE_CLEAN = 3e-3  # of slopes that a filter has freed of most of their noise
 _RIDGE = 3e-2  # of the mean square of the driven combinations' slopes: weak ones move less, noise does too
+_RIDGE_CLEAN = 3e-3  # of slopes that a filter has freed of most of their noise
+_RIDGE_OF_MANY = 11.0  # at most, divided by the number of combinations: low orders of many move slopes less
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +96,10 @@ def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) 
     return Reconstructor(plain, modes, seen, clean)
 
 
-def _estimator(slopes_of_modes: Floats, weighted: Floats, ridge: float = _RIDGE) -> Floats:
+def _estimator(slopes_of_modes: Floats, weighted: Floats, largest_ridge: float = _RIDGE) -> Floats:
     """Return (modes, 2 n): modes from slopes, by least squares with a ridge; `weighted_slopes` or equal."""
     normal = weighted.T @ slopes_of_modes
+    ridge = min(largest_ridge, _RIDGE_OF_MANY / len(normal))
     normal[np.diag_indices_from(normal)] += ridge * np.trace(normal) / len(normal)
     return np.asarray(np.linalg.solve(normal, weighted.T))
 

@@ -91,8 +91,9 @@ def relearn(
     learnt = learn(KALMAN, plant, telemetry.part(0, first), site, rate_hz, start=start)
     new, begin = learnt.model, max(0, first - SETTLE_FRAMES)
     replayed = telemetry.part(begin, None)  # all have settled when the part begins that they are judged on
-    by_integrator = plant.replayed_integrators([new.plain_gain], replayed, new.phase)[0]
-    found = *(model.replayed(plant, replayed, new.phase) for model in (new, running)), by_integrator
+    phase = new.phase(plant)
+    by_integrator = plant.replayed_integrators([new.plain_gain], replayed, phase)[0]
+    found = *(model.replayed(plant, replayed, phase) for model in (new, running)), by_integrator
     left, by_running, by_integrator = (each[first - begin :] for each in found)
     means = float(left.mean()), float(by_running.mean()), float(by_integrator.mean())
     scored = replace(new, left=(means[0], means[2]))  # by which the engine chooses what begins

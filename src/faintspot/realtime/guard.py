@@ -163,9 +163,9 @@ class LostSpots:
     """
 
     def __init__(self, interaction: Floats, frames: int) -> None:
-        self._columns = np.ascontiguousarray(interaction.T)
+        self._columns = np.ascontiguousarray(interaction.T, np.float32)
         self._of_late, self._said = frames, np.zeros(3)
-        self._displaced = np.zeros((1, len(interaction)))
+        self._work = tuple(np.zeros((1, side), np.float32) for side in self._columns.shape)
         self._summarise = Direct(displaced_flux)
         self.forget()
         self.take(np.zeros(interaction.shape[1]), np.zeros(len(interaction) // 2, np.float32))  # compiles
@@ -178,7 +178,7 @@ class LostSpots:
 
     def take(self, commands: Floats, flux: NDArray[np.float32]) -> None:
         """Take a frame: the commands that acted in it, and its flux (n,)."""
-        self._summarise(commands, flux, self._columns, self._displaced, self._said)
+        self._summarise(commands, flux, self._columns, self._work, self._said)
         said = self._said
         seen = said.item(FLUX)
         self._frames += 1
