@@ -101,7 +101,8 @@ def drifting(case: Case, learnt: Learnt, realisation: int) -> Drifted:
         run.step(controller)
         change[last] = np.sqrt(np.mean(np.square(run.line.latest - before)))
         if successor is not None and successor.is_settling:
-            successor.follow(run.line, run.slopes[last], run.errors[last], run.slopes[last], None)
+            own = run.slopes[last]
+            successor.follow(run.line, own, run.errors[last], np.zeros(len(own) // 2), own, None)
         elif successor is not None:
             controller, run.line = successor.take_over(run.line)[1:3]
             successor, at_handover[run.frame : run.frame + HANDOVER_FRAMES] = None, 1.0

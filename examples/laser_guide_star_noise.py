@@ -2,8 +2,9 @@
 
 Prints Markdown tables for an 8 m telescope with 20 x 20 sub-apertures, open loop: residual wavefront of the
 minimum-variance reconstructor and noise of weighted least squares, with equal weights, with the variances of
-x and y, and with their covariance; then the share of true positions within the stated ellipses. The slopes
-are those of `ml` with the known profile. Errors: standard error over wavefronts.
+x and y, and with their covariance; then the same for the predictions of Kalman filters, and the share of true
+positions within the stated ellipses. The slopes are those of `ml` with the known profile, those of the
+filters have the noise of the Cramer-Rao bound. Errors: standard error over wavefronts, or blocks of frames.
 
     python examples/laser_guide_star_noise.py
 """
@@ -20,8 +21,12 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from faintspot.cli.progress import progress_bar
+from faintspot.control.kalman import SlopePredictor
+from faintspot.control.local_kalman import LocalPredictor, local_filter
+from faintspot.control.models import SlopeModel
 from faintspot.control.noise import add_noise, weighted_slopes
-from faintspot.turbulence.slope_covariance import phase_covariance_rad2
+from faintspot.control.phase import phase_of_commands
+from faintspot.turbulence.slope_covariance import SlopeTurbulence, phase_covariance_rad2
 
 Floats = NDArray[np.float64]
 
@@ -32,6 +37,9 @@ FLUXES = (60.0, 200.0, 600.0)
 COVERAGE_FLUXES = (15.0, 30.0, 60.0, 120.0, 250.0, 500.0, 1000.0)
 OF_95_PERCENT = 5.991  # squared Mahalanobis distance, of two dimensions
 WEIGHTS = ("equal", "variances", "covariances")
+RATE_HZ, DELAY_FRAMES, RADIUS_M = 500.0, 2, 2.0  # of the filters; sub-apertures this near to the centre
+FRACTION, WIND_M_PER_S = (0.65, 0.35), ((9.0, 4.0), (-12.0, 18.0))
+SETTLE_FRAMES, BLOCK_FRAMES = 100, 100
 
 
 class Launch(NamedTuple):
@@ -170,6 +178,78 @@ def gain_tables(frames: int, advance: Any) -> None:
             advance(1)
 
 
+def turbulence(inner: NDArray[np.bool_]) -> SlopeTurbulence:
+    """Return two layers over the inner sub-apertures."""
+    pixel_rad = np.radians(laser.PIXEL_ARCSEC / 3600)
+    site = laser.PLACES[inner], SUBAPERTURE_M, pixel_rad, R0_M, OUTER_SCALE_M
+    return SlopeTurbulence(*site, np.array(FRACTION), np.array(WIND_M_PER_S))
+
+
+def slopes_of(model: SlopeModel, frames: int, rng: np.random.Generator) -> Floats:
+    """Return slopes (frames, m) as the model makes them [px]."""
+    roots = np.linalg.cholesky(model.driving)
+    now = before = np.zeros((model.layers, model.slopes))
+    slopes = np.empty((frames, model.slopes))
+    for frame in range(-SETTLE_FRAMES, frames):
+        chance = np.einsum("lij,lj->li", roots, rng.standard_normal(now.shape))
+        kept = np.einsum("lij,lj->li", model.first, now) + np.einsum("lij,lj->li", model.second, before)
+        now, before = kept + chance, now
+        if frame >= 0:
+            slopes[frame] = now.sum(axis=0)
+    return slopes
+
+
+def left_by(filtered: Any, true: Floats, noise: Floats, variance: Floats, phase: Floats) -> Floats:
+    """Return the wavefront error of predictions, rms of each block of frames [nm]."""
+    squares = np.empty(len(true) - DELAY_FRAMES)
+    filtered.begin(true[0])
+    for frame in range(len(squares)):
+        filtered.correct(true[frame] + noise[frame], variance)
+        error = (filtered.ahead(DELAY_FRAMES) - true[frame + DELAY_FRAMES]).reshape(2, -1)
+        squares[frame] = np.square(phase @ (error - error.mean(axis=1, keepdims=True)).ravel()).sum()
+        filtered.advance()
+    blocks = (len(squares) - SETTLE_FRAMES) // BLOCK_FRAMES
+    scored = squares[SETTLE_FRAMES : SETTLE_FRAMES + blocks * BLOCK_FRAMES]
+    return np.sqrt(scored.reshape(blocks, -1).mean(axis=1))
+
+
+def filter_table(frames: int, advance: Any) -> None:
+    """Print wavefront errors of the predictions of Kalman filters, and what covariances gain [nm]."""
+    inner = np.hypot(*laser.PLACES.T) < RADIUS_M
+    air, n = turbulence(inner), np.count_nonzero(inner)
+    lagged = np.array([layer.lagged_px2(1 / RATE_HZ) for layer in air.layers()])
+    model = SlopeModel.of_covariances(lagged)
+    cells = np.rint(laser.PLACES[inner][:, ::-1] / SUBAPERTURE_M - 0.5).astype(int)
+    to_nm = 1e9 * SUBAPERTURE_M * np.radians(laser.PIXEL_ARCSEC / 3600)
+    phase = to_nm * phase_of_commands(np.eye(2 * n), cells - cells.min(axis=0))
+    true = slopes_of(model, frames, np.random.default_rng(1))
+    chance = np.random.default_rng(2).standard_normal((frames, n, 2))
+    title = "variances | covariances | gain of covariances"
+    print(f"\n| launch, window | flux | all slopes: {title} | near slopes: {title} |")
+    print("|---" * 8 + "|")
+    for launch in LAUNCHES[::2]:
+        psf, window = spots_of(launch), (launch.side, launch.side)
+        for flux in FLUXES:
+            bound = fs.cramer_rao_covariance(flux, psf, window, detector=laser.DETECTOR)[inner]
+            drawn = np.einsum("nij,fnj->fin", np.linalg.cholesky(bound), chance)
+            noise, variance = drawn.reshape(frames, 2 * n), np.diagonal(bound, axis1=1, axis2=2).T.ravel()
+            cells_of_row = []
+            for kind in ("all", "near"):
+                left = []
+                for shared in (np.zeros(n), bound[:, 0, 1]):
+                    if kind == "all":
+                        made: Any = SlopePredictor(model, variance, shared, steady=True)
+                    else:
+                        usual = variance, None, shared
+                        made = LocalPredictor(local_filter(air.layers(), 1 / RATE_HZ, *usual))
+                    left.append(left_by(made, true, noise, variance, phase))
+                gain = left[0] - left[1]
+                cells_of_row += [f"{np.sqrt(np.square(each).mean()):.1f}" for each in left]
+                cells_of_row.append(f"{gain.mean():.1f} ± {gain.std(ddof=1) / np.sqrt(len(gain)):.1f}")
+            print(f"| {launch.text} | {flux:g} e- | " + " | ".join(cells_of_row) + " |", flush=True)
+            advance(1)
+
+
 def coverage_table(frames: int, advance: Any) -> None:
     """Print the share of true positions within the stated ellipses of 95 %, for motions as in a loop."""
     print("\n| launch, window | " + " | ".join(f"{flux:g} e-" for flux in COVERAGE_FLUXES) + " |")
@@ -206,9 +286,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Measure what covariances of slopes gain.")
     parser.add_argument("--wavefronts", type=int, default=40, help="Wavefronts for each flux. [default: 40]")
     parser.add_argument("--frames", type=int, default=100, help="Frames for the ellipses. [default: 100]")
-    parser.add_argument("--parts", nargs="*", default=["gain", "coverage"], help="Tables.")
+    parser.add_argument("--parts", nargs="*", default=["gain", "filter", "coverage"], help="Tables.")
+    parser.add_argument(
+        "--loop-frames", type=int, default=2602, help="Frames of the filters. [default: 2602]"
+    )
     chosen = parser.parse_args()
-    steps = {"gain": len(LAUNCHES) * len(FLUXES), "coverage": len(LAUNCHES) * len(COVERAGE_FLUXES)}
+    steps = {
+        "gain": len(LAUNCHES) * len(FLUXES),
+        "filter": len(LAUNCHES[::2]) * len(FLUXES),
+        "coverage": len(LAUNCHES) * len(COVERAGE_FLUXES),
+    }
     total, done = sum(steps[part] for part in chosen.parts), 0
     with progress_bar("Covariances of slopes", "steps") as show:
 
@@ -220,6 +307,9 @@ def main() -> None:
         if "gain" in chosen.parts:
             print("\n## Residual wavefront [nm rms]")
             gain_tables(chosen.wavefronts, advance)
+        if "filter" in chosen.parts:
+            print("\n## Predictions of Kalman filters [nm rms]")
+            filter_table(chosen.loop_frames, advance)
         if "coverage" in chosen.parts:
             print("\n## Positions within the ellipses of 95 %")
             coverage_table(chosen.frames, advance)

@@ -64,6 +64,7 @@ def recording(
         "flux": each,
         "standard_error_x": each + 0.1,
         "standard_error_y": each + 0.1,
+        "covariance_xy": each,
         "iterations": each.astype(np.int32),
         "flags": each.astype(np.uint8),
         "late": np.zeros(frames, np.int64),

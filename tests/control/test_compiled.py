@@ -50,20 +50,22 @@ def test_what_is_not_valid_is_not_measured() -> None:
     flags[[2, 5]] = SubapertureFlag.NO_FLUX, SubapertureFlag.TOO_MANY_BAD_PIXELS
     flags[7] = SubapertureFlag.SATURATED  # only informs
     x[2], y[3] = 100.0, np.nan
-    slopes, errors, said = np.full(2 * N, 9.0), np.full(2 * N, 9.0), np.zeros(2)
-    true_slopes(x, y, flags, error, error, 0.5, slopes, errors, said)
+    slopes, errors, covariance, said = (np.full(size, 9.0) for size in (2 * N, 2 * N, N, 2))
+    true_slopes(x, y, flags, error, error, 0.1 * error, 0.5, slopes, errors, covariance, said)
     lost = np.tile(np.isin(np.arange(N), [2, 3, 5]), 2)
     np.testing.assert_array_equal(slopes[lost], 0.0)
     np.testing.assert_array_equal(np.isinf(errors), lost)
     np.testing.assert_allclose(slopes[~lost], np.concatenate([x, y])[~lost] / 0.5)
     np.testing.assert_array_equal(errors[~lost], 1.0)
+    np.testing.assert_allclose(covariance, np.where(lost[:N], 0.0, 0.2))
     assert said[INVALID_PART] == pytest.approx(3 / 9)
     assert said[MEAN_SQUARE] == pytest.approx(np.square(slopes[~lost]).mean())
 
 
 def test_no_valid_slope_at_all() -> None:
-    slopes, errors, said = np.ones(2 * N), np.ones(2 * N), np.zeros(2)
+    slopes, errors, covariance, said = (np.ones(size) for size in (2 * N, 2 * N, N, 2))
     zeros = np.zeros(N, np.float32)
-    true_slopes(zeros, zeros, np.ones(N, np.uint8), zeros, zeros, 1.0, slopes, errors, said)
+    known = zeros, zeros, np.ones(N, np.uint8), zeros, zeros, zeros
+    true_slopes(*known, 1.0, slopes, errors, covariance, said)
     assert said.tolist() == [1.0, 0.0]
     assert not slopes.any()

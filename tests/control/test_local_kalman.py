@@ -21,10 +21,12 @@ from faintspot.control.learnt import Model
 from faintspot.control.local_kalman import LocalPredictor, local_filter
 from faintspot.control.local_model import LocalModel, at_most, neighbours_within, solve_locally
 from faintspot.control.models import SlopeModel
+from faintspot.control.noise import add_noise
 
 SIDE_M = TURBULENCE.subaperture_m
 PAIR = replace(TURBULENCE, positions_m=CELLS[[0, 1, 3, 4]][:, ::-1] * SIDE_M)  # all adjacent to each other
 NOISE_PX2 = np.full(18, 0.25)
+SHARED_PX2 = np.linspace(-0.2, 0.2, 9)  # of x and y
 
 
 @pytest.fixture(scope="module")
@@ -100,15 +102,17 @@ def test_a_step_of_the_covariance_is_the_textbooks(reach: float) -> None:
     before = local_covariance._prior(TURBULENCE.layers(), FRAME_S).astype(np.float64)
     around, half = neighbours_within(CELLS, reach), len(before) // 2
     step = np.vstack([_transition(model), np.eye(half, 2 * half)])
+    noise = np.diag(NOISE_PX2)
+    add_noise(noise, np.zeros(18), SHARED_PX2)
     seen = np.hstack([np.eye(18), np.eye(18), np.zeros((18, half))])
     gain = np.zeros((2 * half, 18))
-    total, across = seen @ before @ seen.T + np.diag(NOISE_PX2), before @ seen.T
+    total, across = seen @ before @ seen.T + noise, before @ seen.T
     for row in range(2 * half):
         near = around[row % 9][around[row % 9] < 9]
         both = np.concatenate([near, near + 9])
         gain[row, both] = np.linalg.solve(total[np.ix_(both, both)], across[row, both])
     left = np.eye(2 * half) - gain @ seen
-    expected = step @ (left @ before @ left.T + gain @ np.diag(NOISE_PX2) @ gain.T) @ step.T
+    expected = step @ (left @ before @ left.T + gain @ noise @ gain.T) @ step.T
     for layer in range(2):
         part = slice(18 * layer, 18 * (layer + 1))
         expected[part, part] += model.driving[layer]
@@ -116,7 +120,7 @@ def test_a_step_of_the_covariance_is_the_textbooks(reach: float) -> None:
         before.astype(np.float32),
         local_covariance._transition(model.neighbours, model.weights),
         model.driving.astype(np.float32),
-        NOISE_PX2.astype(np.float32),
+        (NOISE_PX2, SHARED_PX2),
         around,
     )
     np.testing.assert_allclose(found, expected, atol=1e-5 * before.max())

@@ -53,6 +53,7 @@ def recording(frames: int = 700) -> Any:
         valid=np.ones((len(kept), 9), bool),
         standard_error_x=error,
         standard_error_y=error,
+        covariance_xy=-0.4 * error**2,
         last_row_time_ns=(kept * FRAME_S * 1e9).astype(np.int64),
     )
 
@@ -68,6 +69,7 @@ def test_open_loop_slopes_of_the_longest_stretch() -> None:
     lost[301 - first, [4, 13]] = True
     np.testing.assert_array_equal(np.isinf(found.variance_px2), lost)
     np.testing.assert_allclose(found.variance_px2[~lost], 0.09, rtol=1e-5)
+    np.testing.assert_allclose(found.covariances_px2, np.where(lost[:, :9], 0.0, -0.036), rtol=1e-5)
     np.testing.assert_array_equal(found.trust, ~lost)
 
 

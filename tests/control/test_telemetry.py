@@ -8,7 +8,7 @@ from tests.control.control_cases import FRAME_S, PHASE, PLANT, TURBULENCE, telem
 
 from faintspot.control.learning import CONTROLS, INTEGRATOR, learn
 from faintspot.control.modal_gains import GAINS, largest_stable_gain, modal_gains
-from faintspot.control.telemetry import OpenLoopTelemetry, without_prior
+from faintspot.control.telemetry import OpenLoopTelemetry, usual_noise, without_prior
 
 
 def test_a_prior_is_taken_out_again() -> None:
@@ -29,6 +29,22 @@ def test_posteriors_wider_than_the_prior_stay_harmless() -> None:
     _, variance, trust = without_prior(np.ones(3), np.array([2.0, 1.0, np.inf]), np.zeros(3), np.ones(3))
     np.testing.assert_allclose(variance, [50.0, 50.0, np.inf])
     np.testing.assert_allclose(trust, [1 / 51, 1 / 51, 0.0])
+
+
+def test_usual_noise_gives_the_mean_information() -> None:
+    """Of one sub-aperture, against whole matrices; without y in one frame, and nothing in another."""
+    rng = np.random.default_rng(1)
+    roots = rng.standard_normal((20, 2, 2))
+    noise = roots @ roots.swapaxes(1, 2) + np.eye(2)
+    information = np.linalg.inv(noise)
+    variance, covariance = np.diagonal(noise, axis1=1, axis2=2).copy(), noise[:, 0, 1].copy()
+    variance[3, 1], variance[7], covariance[[3, 7]] = np.inf, np.inf, 0.0
+    information[3], information[7] = np.diag([1 / variance[3, 0], 0.0]), 0.0
+    zeros = np.zeros_like(variance)
+    found, shared = usual_noise(OpenLoopTelemetry(zeros, variance, zeros, covariance[:, None]))
+    usual = np.linalg.inv(information.mean(axis=0))
+    np.testing.assert_allclose(found, np.diag(usual))
+    np.testing.assert_allclose(shared, usual[0, 1])
 
 
 @pytest.mark.parametrize("kind", [kind for kind in CONTROLS if kind != INTEGRATOR])

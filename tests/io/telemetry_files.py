@@ -29,11 +29,12 @@ CHANGES = [
     {"frame": 12, "number": 1, "changes": {"noise_std": 2.5, "rule": "it's"}, "where": [1, 2]},
     {"frame": 20, "number": 2, "changes": {"noise_std": [i / 7 for i in range(200)]}, "where": None},
 ]
+FLOATS = "x", "y", "flux", "standard_error_x", "standard_error_y", "covariance_xy"
 RECORD = np.dtype(
     [
         *[(name, np.int64) for name in ("sequence", "frame", "method", "change")],
         *[(name, np.int64) for name in ("last_row_time_ns", "published_time_ns", "clock_offset_ns")],
-        *[(name, np.float32, (N,)) for name in ("x", "y", "flux", "standard_error_x", "standard_error_y")],
+        *[(name, np.float32, (N,)) for name in FLOATS],
         ("iterations", np.int32, (N,)),
         ("flags", np.uint8, (N,)),
     ]
@@ -58,7 +59,7 @@ def records_of(first: int, count: int) -> np.ndarray:
     records["last_row_time_ns"] = 10**12 + records["frame"] * 10**6
     records["published_time_ns"] = records["last_row_time_ns"] + 50_000
     records["clock_offset_ns"] = START_NS - 10**12
-    for name in ("x", "y", "flux", "standard_error_x", "standard_error_y"):
+    for name in FLOATS:
         records[name] = rng.normal(size=(count, N))
     records["flags"][:, 3] = 1
     return records

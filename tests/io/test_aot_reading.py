@@ -62,6 +62,9 @@ def test_ours_bit_for_bit(tmp_path: Path, reference: Any) -> None:
     assert np.array_equal(sensor.slopes[:, 1], telemetry.y)
     assert np.array_equal(sensor.flux, telemetry.flux)
     assert sensor.unit == "pix"
+    assert sensor.noise is not None
+    assert np.array_equal(sensor.noise[:, 1], np.square(telemetry.standard_error_y))
+    assert np.array_equal(sensor.noise[:, 2], telemetry.covariance_xy)
     assert np.array_equal(sensor.frame, telemetry.frame)
     assert np.array_equal(sensor.unix_time_s, telemetry.unix_time_s)
     assert np.array_equal(sensor.image_frame, telemetry.image_frame)

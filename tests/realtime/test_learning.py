@@ -63,7 +63,7 @@ class Run:
             seen = (OPEN_LOOP[number] + INTERACTION @ self._sent.pop(0)).astype(np.float32)
             arrays = [np.zeros(9, kind) for kind in RESULT_TYPES]
             arrays[:2] = np.split(seen, 2)
-            arrays[-2:] = [np.full(9, NOISE_PX, np.float32)] * 2
+            arrays[-3:-1] = [np.full(9, NOISE_PX, np.float32)] * 2
             slopes = Slopes(*arrays)
             self.loop.take_turn(None)
             sent.append(self.loop.follow(slopes, number).copy())

@@ -195,6 +195,7 @@ def telemetry_of(record: LoopRecord, method: Method) -> OpenLoopTelemetry:
         held,
         expected,
         prior_std_px(method, held.shape[1]),
+        record.covariance_xy_px2.astype(np.float64) / divisor**2,
     )
     return telemetry.part(_SETTLE_FRAMES, record.frames - record.delay_frames)
 

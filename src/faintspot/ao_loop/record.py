@@ -17,7 +17,7 @@ class LoopRecord(Stored):
     """One run of `simulate_loop`, n sub-apertures and m commands."""
 
     WHAT: ClassVar[str] = "a record of a loop"
-    FORMAT: ClassVar[int] = 2
+    FORMAT: ClassVar[int] = 3
 
     slopes_px: NDArray[np.float32]
     """(frames, 2 n): all x, then all y, from the reference, before division by the centroid gain."""
@@ -25,6 +25,8 @@ class LoopRecord(Stored):
     """(frames, n)"""
     standard_error_px: NDArray[np.float32]
     """(frames, 2 n); infinite where invalid or unknown."""
+    covariance_xy_px2: NDArray[np.float32]
+    """(frames, n): covariance of the errors of x and y."""
     commands: NDArray[np.float32]
     """(frames, m): commands that acted during each frame [nm]."""
     strehl: NDArray[np.float64]

@@ -223,6 +223,7 @@ class _Loop:
         self.slopes = np.zeros((frames, 2 * n), np.float32)
         self.valid = np.zeros((frames, n), np.bool_)
         self.errors = np.zeros((frames, 2 * n), np.float32)
+        self.covariances = np.zeros((frames, n), np.float32)
         self.commands = np.zeros((frames, optics.mirror.commands), np.float32)
         self.truth = np.zeros((3, frames))
         self.zernike = np.zeros((frames, 10), np.float32)
@@ -282,6 +283,7 @@ class _Loop:
             vector = self.low_orders.merged(frame, seen, vector, slopes.flags)
         self.controllers[number].update(vector, error.astype(np.float64) * per_px, covariance * per_px**2)
         self.slopes[frame], self.errors[frame] = slopes.vector, error
+        self.covariances[frame] = slopes.covariance_xy
         self.valid[frame], self.commands[frame] = slopes.valid, commands
 
     def _observe(self, frame: int, time: float, wavefront: NDArray[np.float32]) -> None:
@@ -338,6 +340,7 @@ class _Loop:
             self.slopes,
             self.valid,
             self.errors,
+            self.covariances,
             self.commands,
             strehl,
             residual,

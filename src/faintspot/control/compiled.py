@@ -25,17 +25,29 @@ square of a slope along one axis, px^2."""
 
 @_compiled
 def true_slopes(
-    x: Any, y: Any, flags: Any, error_x: Any, error_y: Any, gain: Any, slopes: Any, errors: Any, said: Any
+    x: Any,
+    y: Any,
+    flags: Any,
+    error_x: Any,
+    error_y: Any,
+    covariance_xy: Any,
+    gain: Any,
+    slopes: Any,
+    errors: Any,
+    covariance: Any,
+    said: Any,
 ) -> None:
-    """Write slopes [true px], all x, then all y, and their errors; invalid: 0 and infinite.
+    """Write slopes [true px], all x, then all y, their errors and covariances; invalid: 0, infinite and 0.
 
     Parameters
     ----------
-    x, y, flags, error_x, error_y : (n,) arrays
+    x, y, flags, error_x, error_y, covariance_xy : (n,) arrays
         As in `faintspot.Slopes`.
     gain : float
         Centroid gain.
     slopes, errors : (2 n,) float64 arrays
+    covariance : (n,) float64 array
+        Covariances of x and y.
     said : (2,) float64 array
         `INVALID_PART`, `MEAN_SQUARE`.
     """
@@ -46,10 +58,12 @@ def true_slopes(
         if flags[s] & _INVALID == 0 and np.isfinite(along) and np.isfinite(across):
             slopes[s], slopes[n + s] = along, across
             errors[s], errors[n + s] = error_x[s] * scale, error_y[s] * scale
+            covariance[s] = covariance_xy[s] * scale * scale
             square += along * along + across * across
         else:
             slopes[s] = slopes[n + s] = 0.0
             errors[s] = errors[n + s] = np.inf
+            covariance[s] = 0.0
             invalid += 1
     said[INVALID_PART] = invalid / n
     said[MEAN_SQUARE] = square / (2 * max(n - invalid, 1))

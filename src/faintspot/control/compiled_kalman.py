@@ -116,6 +116,7 @@ class CompiledKalman:
         self._noise_factor = float(noise_factor)
         self._numbers = float(plain_gain), 1.0 - leak, float(line.largest), steps
         self._std_px, self._shares = predictor.std_px, shares(predictor.model)
+        self._independent = np.zeros(slopes // 2)
         self._is_behind = False
         self._held_at = -1
         """Position of the delay line at which the acting command was turned into slopes."""
@@ -158,7 +159,7 @@ class CompiledKalman:
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
     ) -> None:
-        """See `Controller`; noise of x and y is taken to be independent.
+        """See `Controller`; of an estimator with a prior, x and y are taken to be independent.
 
         Raises
         ------
@@ -170,6 +171,7 @@ class CompiledKalman:
         total = FOLLOW(
             slopes_px,
             standard_error_px,
+            self._independent if covariance_xy_px2 is None else covariance_xy_px2,
             _NO_PRIOR if prior is None else prior,
             self._noise_factor,
             self._numbers,
@@ -189,9 +191,11 @@ class CompiledKalman:
         squares = np.zeros(len(telemetry))
         variance = np.maximum(self._noise_factor * telemetry.variance_px2, LEAST_VARIANCE_PX2)
         slopes, trust = telemetry.open_loop_px, telemetry.trust
+        covariance = self._noise_factor * telemetry.covariances_px2
         self._memory.state[:], self._memory.slopes[PREDICTED] = 0.0, 0.0
         line = np.zeros_like(self._lines.learnt)
-        replay(slopes, variance, trust, self._numbers[-1], self._matrices, line, self._memory, squares)
+        what = slopes, variance, covariance, trust
+        replay(*what, self._numbers[-1], self._matrices, line, self._memory, squares)
         return squares
 
     def _catch_up(self) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.models import SlopeModel
-from faintspot.control.noise import add_noise
+from faintspot.control.noise import add_noise, weighted_slopes
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +27,8 @@ class SlopePredictor:
     model : SlopeModel
     variance_px2 : (m,) array
         Usual variance of the slopes' noise.
+    covariance_xy_px2 : (m / 2,) array, optional
+        Usual covariance of the noise of x and y of each sub-aperture. Default: 0.
     steady : bool
         Whether the gain does not follow the noise of frames: one product with a matrix, much less work.
     covariance : (states, states) array, optional
@@ -37,18 +39,22 @@ class SlopePredictor:
         self,
         model: SlopeModel,
         variance_px2: Floats,
+        covariance_xy_px2: Floats | None = None,
         *,
         steady: bool = False,
         covariance: Floats | None = None,
     ) -> None:
         self.model, self._steady = model, steady
-        self.covariance = steady_covariance(model, variance_px2) if covariance is None else covariance
+        if covariance is None:
+            covariance = steady_covariance(model, variance_px2, covariance_xy_px2)
+        self.covariance = covariance
         """(states, states): covariance of the state's error before a measurement."""
         self.with_slopes = self.covariance @ model.seen.T
         """(states, m): covariance of the errors of state and slopes."""
         self.predicted_px2 = model.seen @ self.with_slopes
         """(m, m): covariance of the predicted slopes' error."""
-        self.usual_px2 = self.predicted_px2 + np.diag(np.minimum(variance_px2, LARGEST_VARIANCE_PX2))
+        self.usual_px2 = self.predicted_px2.copy()
+        add_noise(self.usual_px2, np.minimum(variance_px2, LARGEST_VARIANCE_PX2), covariance_xy_px2)
         """(m, m): covariance of measured slopes about the prediction, with their usual noise."""
         self._gain = np.linalg.solve(self.usual_px2, self.with_slopes.T).T
         self.state = np.zeros(model.states)
@@ -113,16 +119,18 @@ def shares(model: SlopeModel) -> Floats:
     return np.asarray(driving / driving.sum())
 
 
-def steady_covariance(model: SlopeModel, variance_px2: Floats) -> Floats:
+def steady_covariance(
+    model: SlopeModel, variance_px2: Floats, covariance_xy_px2: Floats | None = None
+) -> Floats:
     """Return the steady-state covariance (states, states) of the predicted state's error.
 
     The discrete algebraic Riccati equation by doubling (Chu, Fan & Lin 2005, Linear Algebra Appl. 396, 55):
     twice as many frames with each step.
     """
     n, m = model.states, model.slopes
-    seen, information = model.seen, 1 / np.minimum(variance_px2, LARGEST_VARIANCE_PX2)
+    seen, variance = model.seen, np.minimum(variance_px2, LARGEST_VARIANCE_PX2)
     step = model.onward.T  # transposed: of the dual problem
-    informed = seen.T @ (information[:, None] * seen)
+    informed = seen.T @ weighted_slopes(seen, variance, covariance_xy_px2)
     error = np.zeros((n, n))
     for layer, driving in enumerate(model.driving):
         now = slice(2 * m * layer, 2 * m * layer + m)

@@ -28,8 +28,8 @@ _compiled = partial(compiled_with, source=__file__)
 
 # Rows of memory: of slopes, and of commands; the first four are commands and what they add to slopes.
 HELD, HELD_LEARNT, HELD_PLAIN, LATEST_PLAIN, _LEFT_LEARNT, _LEFT_PLAIN, _FOR_PLAIN = range(7)
-_VARIANCE, _SCALE, _SURPRISE, _SOLUTION, _DIRECTION, _IMAGE, _SPARE, PREDICTED = range(7, 15)
-SLOPE_ROWS = 15
+_VARIANCE, _COVARIANCE, _SCALE, _SURPRISE, _SOLUTION, _DIRECTION, _IMAGE, _SPARE, PREDICTED = range(7, 16)
+SLOPE_ROWS = 16
 _MADE, _LEFT, _OFFSET = 4, 5, 7
 COMMAND_ROWS = 8
 # Of the guard: 1 where the plain one's commands go out; the same of the frame before, or another number;
@@ -84,7 +84,9 @@ class Memory(NamedTuple):
 
 
 @_compiled
-def _take(slopes: Any, errors: Any, prior_std: Any, noise_factor: Any, rows: Any, chosen: Any) -> None:
+def _take(
+    slopes: Any, errors: Any, covariance: Any, prior_std: Any, noise_factor: Any, rows: Any, chosen: Any
+) -> None:
     """Write the inputs of both controllers; see `Guarded.update` and `telemetry.without_prior`."""
     for s in range(slopes.shape[0]):
         held, of_learnt, of_plain = rows[HELD, s], rows[HELD_LEARNT, s], rows[HELD_PLAIN, s]
@@ -108,6 +110,17 @@ def _take(slopes: Any, errors: Any, prior_std: Any, noise_factor: Any, rows: Any
         measured = measured and noise < LARGEST_VARIANCE_PX2
         rows[_VARIANCE, s] = noise if measured else math.inf
         rows[_SURPRISE, s] = open_loop - rows[PREDICTED, s] if measured else 0.0
+    # Of an estimator with a prior, the covariance of the frame alone is not known.
+    _correlate(covariance, noise_factor if prior_std.shape[0] == 0 else 0.0, rows)
+
+
+@_compiled
+def _correlate(covariance: Any, factor: Any, rows: Any) -> None:
+    """Write the covariances of x and y where both were measured."""
+    n = covariance.shape[0]
+    for s in range(n):
+        both = rows[_VARIANCE, s] < math.inf and rows[_VARIANCE, n + s] < math.inf
+        rows[_COVARIANCE, s] = rows[_COVARIANCE, n + s] = factor * covariance[s] if both else 0.0
 
 
 @_compiled
@@ -119,7 +132,7 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
     than usual.
     """
     m = rows.shape[1]
-    variance, scale, left = rows[_VARIANCE], rows[_SCALE], rows[_SURPRISE]
+    variance, covariance, scale, left = rows[_VARIANCE], rows[_COVARIANCE], rows[_SCALE], rows[_SURPRISE]
     solution, direction = rows[_SOLUTION], rows[_DIRECTION]
     for s in range(m):
         own = matrices.uncertainty[s, s]
@@ -146,7 +159,8 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
         curvature = 0.0
         for s in range(m):
             if scale[s] > 0.0:
-                rows[_IMAGE, s] += variance[s] * direction[s]
+                other = direction[(s + m // 2) % m]
+                rows[_IMAGE, s] += variance[s] * direction[s] + covariance[s] * other
                 curvature += direction[s] * rows[_IMAGE, s]
         step = descent / curvature
         for s in range(m):
@@ -257,6 +271,7 @@ def hold(matrices: Any, lines: Any, places: Any, memory: Any) -> None:
 def follow(
     slopes: Any,
     errors: Any,
+    covariance: Any,
     prior_std: Any,
     noise_factor: Any,
     numbers: Any,
@@ -271,6 +286,8 @@ def follow(
     ----------
     slopes, errors : (m,) float64 arrays
         Finite; infinite error: not measured.
+    covariance : (m / 2,) float64 array
+        Covariances of the noise of x and y.
     prior_std : (m,) or (0,) float64 array
         Prior of the estimator; none.
     noise_factor : float
@@ -283,7 +300,7 @@ def follow(
     here, of_learnt, of_plain = places
     gain, keep, largest, steps = numbers
     plainly = memory.guard[CHOSEN] > 0.0
-    _take(slopes, errors, prior_std, noise_factor, memory.slopes, plainly)
+    _take(slopes, errors, covariance, prior_std, noise_factor, memory.slopes, plainly)
     if plainly:
         total: float = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
     else:
@@ -318,7 +335,15 @@ def go_on(numbers: Any, matrices: Any, lines: Any, places: Any, memory: Any) -> 
 
 @_compiled
 def replay(
-    open_loop: Any, variance: Any, trust: Any, steps: Any, matrices: Any, line: Any, memory: Any, squares: Any
+    open_loop: Any,
+    variance: Any,
+    covariance: Any,
+    trust: Any,
+    steps: Any,
+    matrices: Any,
+    line: Any,
+    memory: Any,
+    squares: Any,
 ) -> None:
     """Write the squared residual that the filter alone would have left in each recorded frame.
 
@@ -326,6 +351,7 @@ def replay(
     ----------
     open_loop, variance, trust : (frames, m) float64 arrays
         See `OpenLoopTelemetry`.
+    covariance : (frames, m / 2) float64 array
     steps : int
         Of conjugate gradients.
     matrices : Matrices
@@ -347,6 +373,7 @@ def replay(
             rows[_LEFT_LEARNT, s] = trust[frame, s] * (open_loop[frame, s] + rows[HELD, s])
             rows[_VARIANCE, s] = variance[frame, s] if measured else math.inf
             rows[_SURPRISE, s] = open_loop[frame, s] - rows[PREDICTED, s] if measured else 0.0
+        _correlate(covariance[frame], 1.0, rows)
         left, square = memory.commands[_LEFT : _LEFT + 1], 0.0
         left[:] = 0.0
         add_products(matrices.phase, rows[_LEFT_LEARNT : _LEFT_LEARNT + 1], left)

@@ -116,7 +116,7 @@ class LargeGuarded(Guarded):
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
     ) -> None:
-        """See `Controller`; noise of x and y is taken to be independent."""
+        """See `Controller`; the gains have the usual covariances of x and y."""
         expected = self.expected().mean_px
         alone, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
         open_loop, acting = alone - self._held, self._of_line(_PLAIN, 1)

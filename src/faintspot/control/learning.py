@@ -27,7 +27,7 @@ from faintspot.control.local_covariance import STEPS
 from faintspot.control.local_kalman import local_filter
 from faintspot.control.modal_gains import largest_stable_gain, modal_gains
 from faintspot.control.phase import phase_of_commands
-from faintspot.control.telemetry import OpenLoopTelemetry, usual_variance
+from faintspot.control.telemetry import OpenLoopTelemetry, usual_noise
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 __all__ = ["CONTROLS", "INTEGRATOR", "KALMAN", "MODAL", "POLC", "Learnt", "Plant", "learn"]
@@ -113,9 +113,9 @@ def _kalman(
     advance: Callable[[], None], model: Model, plant: Plant, telemetry: OpenLoopTelemetry, found: Identified
 ) -> Model:
     """Return the model with its Kalman filter and residual."""
-    variance = usual_variance(telemetry.scaled(found.noise_factor))
+    variance, covariance = usual_noise(telemetry.scaled(found.noise_factor))
     if len(variance) > _MOST_SLOPES:
-        arrays = local_filter(found.layers, 1 / found.rate_hz, variance, advance)
+        arrays = local_filter(found.layers, 1 / found.rate_hz, variance, advance, covariance)
     else:
         slopes = found.slope_model()
         arrays = {
@@ -123,6 +123,7 @@ def _kalman(
             "second": slopes.second,
             "driving_px2": slopes.driving,
             "variance_px2": variance,
+            "covariance_xy_px2": covariance,
         }
     return replace(model, arrays=arrays).scored(plant, telemetry)
 

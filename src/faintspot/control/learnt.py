@@ -47,9 +47,10 @@ _LOCAL = "local kalman"  # in files: KALMAN for a large sensor
 _OF_KIND = {
     MODAL: ("gains",),
     POLC: ("now_px2", "ahead_px2", "gain"),
-    KALMAN: ("first", "second", "driving_px2", "variance_px2"),
+    KALMAN: ("first", "second", "driving_px2", "variance_px2", "covariance_xy_px2"),
     _LOCAL: ("near", "around", "weights", "corrections", "variance_px2", "predicted_px2", "share"),
 }
+_NOISE = "variance_px2", "covariance_xy_px2"
 _SQUARE = {"now_px2", "ahead_px2"}
 _OF_LAYERS = {"first", "second", "driving_px2"}
 _OF_ALL = ("plain_gain", "noise_factor", "left", "phase_of_commands")
@@ -63,6 +64,7 @@ _RANGES = {
     "now_px2": _COVARIANCE,
     "ahead_px2": _COVARIANCE,
     "driving_px2": _COVARIANCE,
+    "covariance_xy_px2": _COVARIANCE,
     "predicted_px2": (0.0, 1e8),
     "share": (0.0, 1.0),
     "weights": (-1e6, 1e6),
@@ -124,7 +126,8 @@ class Model:
     kind: str
     arrays: Mapping[str, Floats]
     """modal: gains (modes,). polc: now_px2 and ahead_px2 (m, m), gain. kalman: first, second and driving_px2
-    (layers, m, m), variance_px2 (m,) of the slopes' noise; for large sensors those of `local_filter`."""
+    (layers, m, m), variance_px2 (m,) and covariance_xy_px2 (m / 2,) of the slopes' noise; for large sensors
+    those of `local_filter`."""
     plain_gain: float
     """Gain of the fallback integrator."""
     noise_factor: float
@@ -198,8 +201,7 @@ class Model:
         """Return the Kalman filter of the model."""
         if self.is_local:
             return LocalPredictor(self.arrays)
-        model, variance = self._slopes, self.arrays["variance_px2"]
-        return SlopePredictor(model, variance, covariance=self._covariance)
+        return SlopePredictor(self._slopes, *self._noise, covariance=self._covariance)
 
     def with_noise(self, scale: float) -> Model:
         """Return the model of "kalman" with the noise variances scaled by a factor."""
@@ -207,7 +209,7 @@ class Model:
             return self
         arrays = self.arrays
         if not self.is_local:  # which has gains for several variances
-            arrays = {**arrays, "variance_px2": scale * arrays["variance_px2"]}
+            arrays = {**arrays, **{name: scale * arrays[name] for name in _NOISE}}
         text, factor = f"{self.description}, and {scale:g} of that", scale * self.noise_factor
         return replace(self, arrays=arrays, noise_factor=factor, description=text, covariance=None)
 
@@ -219,7 +221,13 @@ class Model:
     def _covariance(self) -> Floats:
         if self.covariance is not None:
             return self.covariance
-        return steady_covariance(self._slopes, self.arrays["variance_px2"])
+        return steady_covariance(self._slopes, *self._noise)
+
+    @property
+    def _noise(self) -> tuple[Floats, Floats]:
+        """Variances and covariances of the slopes' noise."""
+        variance, covariance = (self.arrays[name] for name in _NOISE)
+        return variance, covariance
 
     def save(self, path: str | Path) -> None:
         """Write the model to a NumPy file (.npz).
@@ -274,6 +282,7 @@ def _checked(found: Mapping[str, Any], plant: Plant) -> dict[str, Floats]:
     numbers = {name: numbers_between(name, value, *ranges.get(name, ())) for name, value in found.items()}
     shapes: dict[str, tuple[int, ...]] = {"gains": (modes,), "variance_px2": (slopes,), "left": (2,)}
     shapes["phase_of_commands"] = commands, commands
+    shapes["covariance_xy_px2"] = (slopes // 2,)
     shapes |= dict.fromkeys(_SQUARE, (slopes, slopes))
     layers = len(numbers["first"]) if "first" in numbers and numbers["first"].ndim == 3 else 1
     shapes |= dict.fromkeys(_OF_LAYERS, (layers, slopes, slopes))

@@ -11,10 +11,13 @@ from scipy import sparse
 
 from faintspot.control.kalman import LARGEST_VARIANCE_PX2
 from faintspot.control.local_model import Indices, LocalModel, both_axes, solve_locally
+from faintspot.control.noise import add_noise
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+Noise = tuple[Floats, Floats | None]
+"""Variances of slopes (m,), and covariances of x and y (m / 2,), px^2."""
 
 STEPS = (8, 8), (1, 12)
 """Frames that count as one, and number of such steps: long steps converge soon, the last ones are exact."""
@@ -26,6 +29,7 @@ def steady_covariance(
     variance_px2: Floats,
     neighbours: Indices,
     progress: Callable[[], None] | None = None,
+    covariance_xy_px2: Floats | None = None,
 ) -> tuple[LocalModel, Singles]:
     """Return the model for single frames, and the covariance (states, states) px^2 of its prediction's error.
 
@@ -45,12 +49,15 @@ def steady_covariance(
         By which each sub-aperture is corrected, as from `neighbours_within`.
     progress : callable, optional
         Called after each of the steps.
+    covariance_xy_px2 : (m / 2,) array, optional
+        Covariance of the noise of x and y of each sub-aperture. Default: 0.
     """
     covariance = _prior(layers, STEPS[0][0] * frame_s)
     for number, (frames, steps) in enumerate(STEPS):
         model = LocalModel.of_layers(layers, frames * frame_s)
         onward, driving = _transition(model.neighbours, model.weights), model.driving.astype(np.float32)
-        noise = (np.minimum(variance_px2, LARGEST_VARIANCE_PX2) / frames).astype(np.float32)
+        variance = np.minimum(variance_px2, LARGEST_VARIANCE_PX2) / frames
+        noise = variance, None if covariance_xy_px2 is None else covariance_xy_px2 / frames
         if number:  # what was before a long step is not known better than what is now
             half = len(covariance) // 2
             covariance = np.tile(covariance[:half, :half], (2, 2))
@@ -70,9 +77,7 @@ def of_slopes(covariance: Singles, layers: int) -> tuple[Floats, Floats]:
     return seen, 0.5 * (slopes + slopes.T)
 
 
-def local_gains(
-    with_slopes: Floats, predicted_px2: Floats, variance_px2: Floats, neighbours: Indices
-) -> Floats:
+def local_gains(with_slopes: Floats, measured_px2: Floats, neighbours: Indices) -> Floats:
     """Return how the states of each sub-aperture are corrected, (n, 4 layers, 2 k).
 
     Rows are y[k], then y[k - 1] of every layer, x and y; columns the x, then the y slopes of neighbours. Each
@@ -80,16 +85,16 @@ def local_gains(
 
     Parameters
     ----------
-    with_slopes, predicted_px2
+    with_slopes : (states, m) array
         As from `of_slopes`.
-    variance_px2 : (m,) array
+    measured_px2 : (m, m) array
+        Covariance of the predicted slopes' error and of the noise.
     neighbours : (n, k) array
         As from `neighbours_within`.
     """
     n = len(neighbours)
-    total = predicted_px2 + np.diag(np.minimum(variance_px2, LARGEST_VARIANCE_PX2))
     own = with_slopes.reshape(-1, n, 2 * n).swapaxes(0, 1)
-    return solve_locally(total, own, both_axes(neighbours, n))
+    return solve_locally(measured_px2, own, both_axes(neighbours, n))
 
 
 def replies(arrays: Mapping[str, Any], frames: int) -> Iterator[sparse.csr_matrix]:
@@ -147,14 +152,14 @@ def _corrections(gains: Floats, neighbours: Indices) -> sparse.csr_matrix:
 
 
 def _next(
-    covariance: Singles, onward: sparse.csr_matrix, driving: Singles, noise: Singles, neighbours: Indices
+    covariance: Singles, onward: sparse.csr_matrix, driving: Singles, noise: Noise, neighbours: Indices
 ) -> Singles:
     """Return the covariance one step later: a measurement, then the prediction; the first is overwritten."""
     layers, m, _ = driving.shape
     half = layers * m
     seen, slopes = of_slopes(covariance, layers)
-    gain = _corrections(local_gains(seen, slopes, noise.astype(np.float64), neighbours), neighbours)
-    slopes[np.diag_indices(m)] += noise
+    add_noise(slopes, *noise)
+    gain = _corrections(local_gains(seen, slopes, neighbours), neighbours)
     rest = np.ascontiguousarray((0.5 * (gain @ slopes) - seen).T, np.float32)
     _add_symmetric(covariance, gain, rest)
     across = _product(onward, covariance)

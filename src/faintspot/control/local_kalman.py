@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from faintspot.control.kalman import LARGEST_VARIANCE_PX2
 from faintspot.control.local_covariance import local_gains, of_slopes, steady_covariance
 from faintspot.control.local_model import at_most, neighbours_within
+from faintspot.control.noise import add_noise
 from faintspot.kernels.compiling import Direct, compiled_with
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
@@ -72,7 +73,7 @@ class LocalPredictor:
     ) -> None:
         """Update with the measured open-loop slopes of this frame; infinite variance: invalid.
 
-        Noise of x and y is taken to be independent.
+        The gains have the usual covariances of x and y.
         """
         surprise, level = self.surprise(slopes_px - self.mean_px, variance_px2)
         self._surprise[:-1] = surprise.reshape(2, -1).T
@@ -110,6 +111,7 @@ def local_filter(
     frame_s: float,
     variance_px2: Floats,
     progress: Callable[[], None] | None = None,
+    covariance_xy_px2: Floats | None = None,
 ) -> dict[str, Floats]:
     """Return the arrays of a `LocalPredictor` for frozen layers.
 
@@ -124,6 +126,8 @@ def local_filter(
         Usual variance of the slopes' noise.
     progress : callable, optional
         See `steady_covariance`.
+    covariance_xy_px2 : (m / 2,) array, optional
+        Usual covariance of the noise of x and y of each sub-aperture. Default: 0.
 
     Returns
     -------
@@ -134,12 +138,15 @@ def local_filter(
     """
     layers = at_most(layers, max(1, _MOST_STATES // (2 * len(variance_px2))))
     around = neighbours_within(layers[0].positions_m, _REACH * layers[0].subaperture_m)
-    model, covariance = steady_covariance(layers, frame_s, variance_px2, around, progress)
+    model, covariance = steady_covariance(layers, frame_s, variance_px2, around, progress, covariance_xy_px2)
     with_slopes, predicted = of_slopes(covariance, model.layers)
     del covariance
-    gains = [
-        local_gains(with_slopes, predicted, NOISE_STEP**level * variance_px2, around) for level in _LEVELS
-    ]
+    gains = []
+    for level in _LEVELS:
+        measured, factor = predicted.copy(), NOISE_STEP**level
+        covariance_xy = None if covariance_xy_px2 is None else factor * covariance_xy_px2
+        add_noise(measured, np.minimum(factor * variance_px2, LARGEST_VARIANCE_PX2), covariance_xy)
+        gains.append(local_gains(with_slopes, measured, around))
     return {
         "near": model.neighbours,
         "around": around,

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-_LARGEST_CORRELATION = 0.99  # of x and y: a narrower ellipse is not known from one frame
+LARGEST_CORRELATION = 0.99  # of x and y: a narrower ellipse is not known from one frame
 
 
 def add_noise(matrix_px2: Floats, variance_px2: Floats, covariance_xy_px2: Floats | None = None) -> None:
@@ -45,7 +45,7 @@ def weighted_slopes(slopes: Floats, variance_px2: Floats, covariance_xy_px2: Flo
     scaled = root * slopes
     if covariance_xy_px2 is not None:
         (of_x, of_y), (x, y) = np.split(root, 2), np.split(scaled, 2)
-        rho = np.clip(covariance_xy_px2[:, None] * of_x * of_y, -_LARGEST_CORRELATION, _LARGEST_CORRELATION)
+        rho = np.clip(covariance_xy_px2[:, None] * of_x * of_y, -LARGEST_CORRELATION, LARGEST_CORRELATION)
         scaled = np.concatenate([x - rho * y, y - rho * x]) / np.tile(1 - rho**2, (2, 1))
     weighted: Floats = root * scaled
     return weighted

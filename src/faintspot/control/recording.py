@@ -76,7 +76,8 @@ def telemetry_of_recording(
     slopes, error, held, expected = recorded_slopes(recording, control, rows, predicted, "recording")
     times = recording.last_row_time_ns[start:stop]
     rate = (stop - start - 1) / max(float(times[-1] - times[0]) / 1e9, 1e-9)
-    return make_telemetry(slopes, error, held, expected, prior_std_px), rate
+    covariance = recording.covariance_xy[rows].astype(np.float64) / control.options.centroid_gain**2
+    return make_telemetry(slopes, error, held, expected, prior_std_px, covariance), rate
 
 
 def check_commands(recording: Recording, control: Control, what: str) -> None:

@@ -42,7 +42,7 @@ def replayed_frames(
     """
     line = CommandDelayLine(interaction.shape[1], delay_frames)
     controller = make(line)
-    error = np.sqrt(telemetry.variance_px2)
+    error, covariance = np.sqrt(telemetry.variance_px2), telemetry.covariances_px2
     left = np.zeros_like(telemetry.open_loop_px)
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable loop leaves more than can be told
         for frame, slopes in enumerate(telemetry.open_loop_px):
@@ -50,7 +50,8 @@ def replayed_frames(
             trust = telemetry.trust[frame]
             left[frame] = trust * residual
             try:
-                controller.update(as_estimated(residual, trust, controller), error[frame])
+                estimated = as_estimated(residual, trust, controller)
+                controller.update(estimated, error[frame], covariance[frame])
             except ArithmeticError:  # its commands are not finite
                 return np.full(len(left), np.inf)
         return np.asarray(np.square(left @ phase.T).sum(axis=1))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.base import Controller
+from faintspot.control.noise import LARGEST_CORRELATION
 
 Floats = NDArray[np.float64]
 
@@ -27,17 +28,33 @@ class OpenLoopTelemetry:
     trust: Floats
     """(frames, m): part of a deviation from what was expected that the estimator gives: 1, of estimators with
     a prior less, where not measured 0."""
+    covariance_xy_px2: Floats | None = None
+    """(frames, m / 2): covariance of the noise of x and y, 0 where not measured; None: independent."""
 
     def __len__(self) -> int:
         return len(self.open_loop_px)
 
     def part(self, start: int, stop: int | None) -> OpenLoopTelemetry:
         """Return a selection of frames."""
-        return OpenLoopTelemetry(*(each[start:stop] for each in vars(self).values()))
+        known = {name: each for name, each in vars(self).items() if each is not None}
+        return OpenLoopTelemetry(**{name: each[start:stop] for name, each in known.items()})
+
+    @property
+    def covariances_px2(self) -> Floats:
+        """(frames, m / 2): covariance of the noise of x and y; 0 where they are independent."""
+        if self.covariance_xy_px2 is None:
+            return np.zeros((len(self), self.open_loop_px.shape[1] // 2))
+        return self.covariance_xy_px2
 
     def scaled(self, noise_factor: float) -> OpenLoopTelemetry:
         """Return the same telemetry with the noise scaled."""
-        return OpenLoopTelemetry(self.open_loop_px, self.variance_px2 * noise_factor, self.trust)
+        covariance = self.covariance_xy_px2
+        return OpenLoopTelemetry(
+            self.open_loop_px,
+            self.variance_px2 * noise_factor,
+            self.trust,
+            None if covariance is None else covariance * noise_factor,
+        )
 
 
 def make_telemetry(
@@ -46,6 +63,7 @@ def make_telemetry(
     held_px: Floats,
     expected_px: Floats,
     prior_std_px: Floats | None,
+    covariance_xy_px2: Floats | None = None,
 ) -> OpenLoopTelemetry:
     """Return telemetry of residual slopes, (frames, m).
 
@@ -57,9 +75,16 @@ def make_telemetry(
         What the mirror added to the slopes.
     expected_px, prior_std_px : (frames, m) array
         Prior of an estimator whose slopes and errors are those of the posterior; None: it has none.
+    covariance_xy_px2 : (frames, m / 2) array, optional
+        Covariance of the errors of x and y; that of an estimator with a prior is not used, as the frame's own
+        is not known. Default: 0.
     """
     slopes, variance, trust = without_prior(slopes_px, standard_error_px, expected_px, prior_std_px)
-    return OpenLoopTelemetry(slopes - held_px, variance, trust)
+    covariance = None
+    if covariance_xy_px2 is not None and prior_std_px is None and covariance_xy_px2.any():
+        measured = np.isfinite(variance).reshape(len(variance), 2, -1).all(axis=1)
+        covariance = np.where(measured, covariance_xy_px2, 0.0)
+    return OpenLoopTelemetry(slopes - held_px, variance, trust, covariance)
 
 
 def without_prior(
@@ -84,10 +109,24 @@ def without_prior(
     return alone, np.where(measured, prior / share, np.inf), trust
 
 
-def usual_variance(telemetry: OpenLoopTelemetry) -> Floats:
-    """Return (m,): the variance of noise that gives as much information as the frames do on average."""
-    information = np.where(np.isfinite(telemetry.variance_px2), 1 / telemetry.variance_px2, 0.0)
-    return np.asarray(1 / np.maximum(information.mean(axis=0), 1e-6))
+def usual_noise(telemetry: OpenLoopTelemetry) -> tuple[Floats, Floats]:
+    """Return the noise that gives as much information as the frames do on average.
+
+    Returns
+    -------
+    variance_px2, covariance_xy_px2 : (m,), (m / 2,) array
+    """
+    variance, covariance = telemetry.variance_px2, telemetry.covariances_px2
+    x, y = np.split(variance, 2, axis=1)
+    seen = np.isfinite(x) & np.isfinite(y)
+    root = np.sqrt(np.where(seen, x, 1.0) * np.where(seen, y, 1.0))
+    rho = np.where(seen, np.clip(covariance / root, -LARGEST_CORRELATION, LARGEST_CORRELATION), 0.0)
+    rest = 1 - np.square(rho)
+    information = np.where(np.isfinite(variance), 1 / (variance * np.tile(rest, (1, 2))), 0.0).mean(axis=0)
+    of_x, of_y = np.split(np.maximum(information, 1e-6), 2)
+    shared = (rho / (root * rest)).mean(axis=0)
+    both = of_x * of_y - np.square(shared)
+    return np.concatenate([of_y / both, of_x / both]), shared / both
 
 
 def as_estimated(slopes_px: Floats, trust: Floats, controller: Controller) -> Floats:

@@ -1,8 +1,8 @@
 """Writing telemetry as a file of the Adaptive Optics Telemetry standard (AOT, FITS), with aotpy.
 
 Dimensions and units follow the documentation of aotpy 3 (https://pypi.org/project/aotpy/). AOT has fields for
-slopes, fluxes, frames and times. It has none for errors of slopes, flags, iterations, the interleaved
-configurations and denoised images: these stay in the Zarr store.
+slopes, fluxes, frames and times. It has none for the noise of slopes, which has a table of its own, and none
+for flags, iterations, the interleaved configurations and denoised images: these stay in the Zarr store.
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ from faintspot.io.telemetry import Telemetry
 
 # The standard demands both, which a sensor alone does not have.
 _EXPECTED = r".AOT_(WAVEFRONT_CORRECTORS|LOOPS). .* contains no data"
+NOISE = "SLOPES_NOISE"
+"""Name of the table with the noise of slopes."""
+NOISE_COLUMNS = "VAR_X", "VAR_Y", "COV_XY"
 AO_MODES = ("SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO")
 
 
@@ -35,8 +38,10 @@ def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") 
     as `ref_measurements`, px from the centre of each window. Fluxes are sums over the sub-aperture in
     electrons after background subtraction; the standard has averages in ADU. The keyword CONFIG holds the
     initial estimator and settings; CHG1, CHG2 and so on hold changes. LAYOUT and SUBTRACT of the references
-    hold the layout and the exact reference slopes as JSON texts. There are no wavefront correctors and loops,
-    so that aotpy warns when it reads the file. All data are in memory at once.
+    hold the layout and the exact reference slopes as JSON texts. The table SLOPES_NOISE, which is not part
+    of the standard, holds VAR_X, VAR_Y (infinite where unknown) and COV_XY of the slopes, px^2, a row for
+    each frame. There are no wavefront correctors and loops, so that aotpy warns when it reads the file.
+    All data are in memory at once.
 
     Parameters
     ----------
@@ -72,6 +77,7 @@ def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") 
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", _EXPECTED)
         file = AOTFITSWriter(_system(telemetry, ao_mode)).get_hdulist()
+    file.append(_noise(telemetry))
     write_atomically(target, file.writeto)
 
 
@@ -94,6 +100,18 @@ def _system(telemetry: Telemetry, ao_mode: str) -> Any:
         wavefront_sensors=[_sensor(telemetry, source, tables.get("estimator", {}).get("name"))],
         metadata=_metadata(telemetry),
     )
+
+
+def _noise(telemetry: Telemetry) -> Any:
+    """Return the table with variances and covariance of every slope's errors."""
+    from astropy.io import fits
+
+    errors = telemetry.standard_error_x, telemetry.standard_error_y
+    columns = [
+        fits.Column(name, f"{values.shape[1]}E", "pix2", array=values)
+        for name, values in zip(NOISE_COLUMNS, (*np.square(errors), telemetry.covariance_xy), strict=True)
+    ]
+    return fits.BinTableHDU.from_columns(columns, name=NOISE)
 
 
 def _metadata(telemetry: Telemetry) -> list[Any]:

@@ -19,6 +19,7 @@ from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import parse_json
 from faintspot.base.sizes import check_bytes, memory_bytes
+from faintspot.io.aot import NOISE, NOISE_COLUMNS
 from faintspot.io.fits_units import AOT_VERSION, units_of, whole_units
 from faintspot.io.locations import one_line
 from faintspot.sensor.layout import Layout
@@ -70,6 +71,8 @@ class AotSensor:
     slopes: NDArray[Any] | None
     """Slopes as stored, (t, 2, n): x and y, in `unit`."""
     unit: str
+    noise: NDArray[Any] | None
+    """Variances of x and y and their covariance, px^2, (t, 3, n), in files written by faintspot."""
     frame: NDArray[np.float64]
     """Frame numbers of the slopes; empty if the file has none."""
     unix_time_s: NDArray[np.float64]
@@ -164,6 +167,7 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
         try:
             # By default aotpy would ask for external images in a dialogue, or fetch them.
             system = AOTFITSReader(path, externals="ignore").get_system()
+            noise = _noise(path)
         except Exception as error:  # aotpy raises many kinds of errors on damaged files
             raise InputError(f"{path}: the AOT file is not valid ({one_line(error)})") from None
     sensors = [each for each in system.wavefront_sensors if isinstance(each, aotpy.ShackHartmann)]
@@ -172,7 +176,7 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
         each for each in system.loops if isinstance(each, aotpy.ControlLoop) and each.input_sensor is found
     ]
     try:
-        return _sensor(path, found, system, loops)
+        return _sensor(path, found, system, loops, noise)
     except InputError as error:
         raise InputError(f"{path}: sensor {found.uid!r}: {error}") from None
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
@@ -199,7 +203,7 @@ def _pixels_of(sensor: Any) -> str | None:
     return None if image is None or image.data is None else str(image.name)
 
 
-def _sensor(path: Path, found: Any, system: Any, loops: list[Any]) -> AotSensor:
+def _sensor(path: Path, found: Any, system: Any, loops: list[Any], noise: Any) -> AotSensor:
     n = int(found.n_valid_subapertures)
     name, size = _pixels_of(found), None
     pixels = None if name is None else found.detector.pixel_intensities
@@ -217,6 +221,8 @@ def _sensor(path: Path, found: Any, system: Any, loops: list[Any]) -> AotSensor:
     slopes, flux = _data_of(found, "measurements"), _data_of(found, "subaperture_intensities")
     if slopes is not None and slopes.shape[1:] != (2, n):
         raise InputError(f"measurements: expected shape (t, 2, {n}), got {slopes.shape}")
+    if noise is not None and (slopes is None or noise.shape != (len(slopes), 3, n)):
+        raise InputError(f"{NOISE}: expected as many variances and covariances as slopes, got {noise.shape}")
     numbers, times = _time_of(found.measurements)
     scale = _number(found.detector, "pixel_scale")
     return AotSensor(
@@ -231,6 +237,7 @@ def _sensor(path: Path, found: Any, system: Any, loops: list[Any]) -> AotSensor:
         _time_of(pixels)[0],
         slopes,
         "" if slopes is None else str(found.measurements.unit or ""),
+        noise,
         numbers,
         times,
         flux,
@@ -323,6 +330,17 @@ def _data_of(owner: Any, name: str) -> Any:
         return None
     data = np.asarray(image.data)
     return data.astype(data.dtype.newbyteorder("="), copy=False)
+
+
+def _noise(path: Path) -> NDArray[np.float32] | None:
+    """Return the noise of slopes in files written by faintspot, (t, 3, n), or None."""
+    from astropy.io import fits
+
+    with fits.open(path) as units:
+        if NOISE not in units:
+            return None
+        table = units[NOISE].data
+        return np.stack([np.asarray(table[name], np.float32) for name in NOISE_COLUMNS], axis=1)
 
 
 def _time_of(image: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -48,11 +48,7 @@ _DIMENSIONS = {
     "image_frame": ("image",),
     "commands": ("frame", "command"),
 }
-_NOT_IN_ALL: dict[str, NDArray[Any]] = {
-    "late": np.zeros((0,), np.int64),
-    "loop": np.zeros((0,), np.int64),
-    "commands": np.zeros((0, 0), np.float32),
-}
+NOT_IN_ALL = {"late": np.int64, "loop": np.int64, "commands": np.float32, "covariance_xy": np.float32}
 """What some recordings do not have, e.g. those of an engine without commands: zeros stand for it."""
 _NOT_STORED = "sequence"  # used by the rings only
 
@@ -90,6 +86,8 @@ class Telemetry:
     standard_error_x: NDArray[np.float32]
     """Standard error of x, px."""
     standard_error_y: NDArray[np.float32]
+    covariance_xy: NDArray[np.float32]
+    """Covariance of the errors of x and y, px^2; 0 in recordings without it."""
     iterations: NDArray[np.int32]
     flags: NDArray[np.uint8]
     """Bits of `faintspot.SubapertureFlag`."""
@@ -246,10 +244,8 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
         )
         check_bytes(store, total, memory_bytes() // 2, "telemetry")
         for name in _ARRAYS:
-            if name in _NOT_IN_ALL and name not in group:
-                arrays[name] = np.zeros(
-                    (finished["frame"], *_NOT_IN_ALL[name].shape[1:]), _NOT_IN_ALL[name].dtype
-                )
+            if name in NOT_IN_ALL and name not in group:
+                arrays[name] = zeros_for(name, finished["frame"], group["x"].shape[1])
                 continue
             array = group[name]
             count = finished[_dimensions(name, array.ndim)[0]]
@@ -262,6 +258,12 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
     except Exception as error:  # zarr raises many kinds of errors on broken stores
         raise InputError(f"{store}: the store is damaged ({one_line(error)})") from None
     return Telemetry(**arrays, changes=changes, attributes=attributes)
+
+
+def zeros_for(name: str, frames: int, n: int) -> NDArray[Any]:
+    """Return what stands for an array of `NOT_IN_ALL` that a recording of n sub-apertures lacks."""
+    shape = {"commands": (frames, 0), "covariance_xy": (frames, n)}.get(name, (frames,))
+    return np.zeros(shape, NOT_IN_ALL[name])
 
 
 def attributes_of(store: Path) -> dict[str, Any]:

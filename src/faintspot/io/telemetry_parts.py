@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.io.locations import one_line
-from faintspot.io.telemetry import attributes_of, finished_of, stored_names
+from faintspot.io.telemetry import NOT_IN_ALL, attributes_of, finished_of, stored_names, zeros_for
 from faintspot.io.zarr_store import open_store, read_items
 
 
@@ -66,7 +66,7 @@ class StoredTelemetry:
         for kind in kinds:
             for name in stored_names(kind):
                 wanted = kind[name].shape
-                if self._array(name).shape[1:] != wanted:
+                if self.read(name, 0, 0).shape[1:] != wanted:
                     raise InputError(
                         f"{self.path}: the store is damaged ({name}: expected items of {wanted})"
                     )
@@ -79,6 +79,8 @@ class StoredTelemetry:
         InputError
             When the store is damaged there.
         """
+        if name in NOT_IN_ALL and name not in self:
+            return zeros_for(name, stop - start, self._array("x").shape[1])
         array = self._array(name)
         if stop > array.shape[0]:
             raise InputError(f"{self.path}: the store is damaged ({name}: {array.shape[0]} of {stop})")

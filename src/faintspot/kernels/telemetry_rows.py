@@ -12,11 +12,18 @@ _INVALID, _NOT_CONVERGED = int(INVALID), int(SubapertureFlag.NOT_CONVERGED)
 
 @compiled
 def fill_telemetry_rows(
-    flux: Any, flags: Any, iterations: Any, error_x: Any, error_y: Any, counts: Any, table: Any
+    flux: Any,
+    flags: Any,
+    iterations: Any,
+    error_x: Any,
+    error_y: Any,
+    covariance_xy: Any,
+    counts: Any,
+    table: Any,
 ) -> None:
-    """Fill a table (6, n), and count: invalid sub-apertures, those at the iteration limit, iterations.
+    """Fill a table (7, n), and count: invalid sub-apertures, those at the iteration limit, iterations.
 
-    Rows of the table: flux, valid, standard errors of x and y, iterations, flags.
+    Rows of the table: flux, valid, standard errors of x and y, iterations, flags, covariance of x and y.
     """
     counts[0] = counts[1] = counts[2] = 0
     for s in range(flux.shape[0]):
@@ -30,3 +37,4 @@ def fill_telemetry_rows(
         table[3, s] = error_y[s]
         table[4, s] = iterations[s]
         table[5, s] = flags[s]
+        table[6, s] = covariance_xy[s]

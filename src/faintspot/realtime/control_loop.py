@@ -72,6 +72,7 @@ class ControlLoop:
         if held is not None:
             self._line.hold(held.astype(np.float64))
         self._slopes, self._errors = np.zeros((2, 2 * len(layout)))
+        self._covariance = np.zeros(len(layout))
         self._said = np.zeros(2)
         self._true_slopes = Direct(true_slopes)
         self._removed_modes = control.removed_modes
@@ -114,9 +115,11 @@ class ControlLoop:
             slopes.flags,
             slopes.standard_error_x,
             slopes.standard_error_y,
+            slopes.covariance_xy,
             self._centroid_gain,
             self._slopes,
             self._errors,
+            self._covariance,
             self._said,
         )
         if self._removed_modes:
@@ -160,7 +163,7 @@ class ControlLoop:
         if self.closed and not self._begins and successor.is_settling:
             std = on.controller.prior_std_px if prior is not None and on.takes_prior else None
             mean = self._slopes if prior is None else prior.mean_px.reshape(-1).astype(np.float64)
-            successor.follow(self._line, self._slopes, self._errors, mean, std)
+            successor.follow(self._line, self._slopes, self._errors, self._covariance, mean, std)
             return
         if self._successor is successor:  # else a newer one has come
             self._successor = None
@@ -213,7 +216,7 @@ class ControlLoop:
             if self._begins:
                 self._begins = False
                 on.controller.begin()
-            on.controller.update(self._slopes, self._errors)
+            on.controller.update(self._slopes, self._errors, self._covariance)
         except Exception as error:  # nothing raises in the frame path
             self._fail(error)
 

@@ -22,7 +22,10 @@ from faintspot.realtime.shared_streams import (
     pyshmem_module,
 )
 
-DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
+DETAILS = (
+    *("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags"),
+    "covariance_xy_px2",
+)
 """Rows of the stream of details."""
 MARKS = ("frame", "method", "settings_change", "last_row_ns", "published_ns")
 """Contents of the stream of marks; times are those of CLOCK_MONOTONIC."""
@@ -31,7 +34,7 @@ MARKS = ("frame", "method", "settings_change", "last_row_ns", "published_ns")
 class SlopeStreams:
     """Three streams, or four with commands, each stamped with the frame's number as `frame_id`.
 
-    NAME_slopes holds all x, then all y, float32 px (2 n,), for a reconstructor. NAME_details holds (6, n)
+    NAME_slopes holds all x, then all y, float32 px (2 n,), for a reconstructor. NAME_details holds (7, n)
     float32, rows as `DETAILS`. NAME_marks holds int64 numbers and times of the measurement, as `MARKS`. The
     slopes are published first. NAME_commands holds the mirror's commands, float32 (commands,), in the
     interaction matrix's unit.
@@ -153,7 +156,7 @@ class SlopeStreams:
 
     def _fill_details(self, slopes: Slopes, table: NDArray[np.float32]) -> None:
         """Write the rows of `DETAILS` and count invalid slopes and iterations."""
-        errors = slopes.standard_error_x, slopes.standard_error_y
+        errors = slopes.standard_error_x, slopes.standard_error_y, slopes.covariance_xy
         self._fill(slopes.flux, slopes.flags, slopes.iterations, *errors, self._counts, table)
 
     def publish_marks(self, marks: tuple[int, ...]) -> None:

@@ -70,7 +70,13 @@ class Successor:
         return self._frames < self._settles_in and not self.has_failed
 
     def follow(
-        self, line: CommandDelayLine, slopes: Floats, errors: Floats, expected: Floats, prior: Floats | None
+        self,
+        line: CommandDelayLine,
+        slopes: Floats,
+        errors: Floats,
+        covariance: Floats,
+        expected: Floats,
+        prior: Floats | None,
     ) -> None:
         """Take a frame whose command has been sent.
 
@@ -78,7 +84,7 @@ class Successor:
         ----------
         line : CommandDelayLine
             To the mirror.
-        slopes, errors : (2 n,) arrays
+        slopes, errors, covariance : (2 n,), (2 n,) and (n,) arrays
             As for `Controller.update`.
         expected, prior : (2 n,) array
             Mean and standard deviation of the estimator's prior; None: it had none.
@@ -88,7 +94,7 @@ class Successor:
         if self._frames == 0:
             self.ready.controller.begin()
         try:
-            self.ready.controller.update(alone, np.sqrt(variance))
+            self.ready.controller.update(alone, np.sqrt(variance), covariance if prior is None else None)
         except ArithmeticError:
             self.has_failed = True
         self._frames += 1

@@ -82,6 +82,7 @@ class TelemetryRing(Closing):
         # One array per field; each row is the target of one copy, without temporary objects.
         self._x, self._y, self._flux = items["x"], items["y"], items["flux"]
         self._error_x, self._error_y = items["standard_error_x"], items["standard_error_y"]
+        self._covariance_xy = items["covariance_xy"]
         self._iterations, self._flags = items["iterations"], items["flags"]
         if description["commands"]:
             self._loop, self._commands = items["loop"], items["commands"]
@@ -118,7 +119,7 @@ class TelemetryRing(Closing):
         parts : mapping, optional
             Calibration, PSF and score, for readers (`faintspot.pipeline.configuration.packed`).
         records : int, optional
-            Number of records, about 60 + 25 n bytes each: a reader may lag by one frame less. Default: as
+            Number of records, about 60 + 29 n bytes each: a reader may lag by one frame less. Default: as
             many as fit into 32 MiB, up to 4096.
         image_slots : int, optional
             Number of images. Default: as many as fit into 16 MiB, 2 to 16.
@@ -197,6 +198,7 @@ class TelemetryRing(Closing):
         )
         self._x[place], self._y[place], self._flux[place] = slopes.x, slopes.y, slopes.flux
         self._error_x[place], self._error_y[place] = slopes.standard_error_x, slopes.standard_error_y
+        self._covariance_xy[place] = slopes.covariance_xy
         self._iterations[place], self._flags[place] = slopes.iterations, slopes.flags
         if commands is not None:
             self._loop[place], self._commands[place] = loop, commands

@@ -30,7 +30,7 @@ def record_type(n: int, commands: int = 0) -> np.dtype[np.void]:
     """
     numbers = ("sequence", "frame", "method", "change", "last_row_time_ns", "published_time_ns")
     head = [(name, np.int64) for name in (*numbers, "clock_offset_ns", "late")]
-    floats = ("x", "y", "flux", "standard_error_x", "standard_error_y")
+    floats = ("x", "y", "flux", "standard_error_x", "standard_error_y", "covariance_xy")
     body = [(name, np.float32, (n,)) for name in floats]
     control = [("loop", np.int64), ("commands", np.float32, (commands,))] if commands else []
     return np.dtype(

@@ -195,11 +195,10 @@ def _changes(telemetry: Telemetry) -> Section:
 
 def _slopes(telemetry: Telemetry) -> dict[str, Slopes]:
     """Return the slopes of every method."""
-    names = ("x", "y", "flux", "flags", "iterations", "standard_error_x", "standard_error_y")
+    errors = "standard_error_x", "standard_error_y", "covariance_xy"
+    names = ("x", "y", "flux", "flags", "iterations", *errors)
     found = {}
     for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
         own = {of: getattr(telemetry, of)[telemetry.method == method] for of in names}
-        shape = own["x"].shape
-        absent = {"bad_pixels": np.zeros(shape, np.int32), "covariance_xy": np.zeros(shape, np.float32)}
-        found[name] = Slopes(**own, **absent)
+        found[name] = Slopes(**own, bad_pixels=np.zeros(own["x"].shape, np.int32))
     return found
