@@ -116,11 +116,11 @@ def _take(
 
 @_compiled
 def _correlate(covariance: Any, factor: Any, rows: Any) -> None:
-    """Write the covariances of x and y where both were measured."""
+    """Write the covariances of x and y, 0 where one was not measured."""
     n = covariance.shape[0]
     for s in range(n):
         both = rows[_VARIANCE, s] < math.inf and rows[_VARIANCE, n + s] < math.inf
-        rows[_COVARIANCE, s] = rows[_COVARIANCE, n + s] = factor * covariance[s] if both else 0.0
+        rows[_COVARIANCE, s] = factor * covariance[s] if both else 0.0
 
 
 @_compiled
@@ -131,7 +131,7 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
     for the usual noise, scaled to this frame's variances: nearly the solution, where noise is not much other
     than usual.
     """
-    m = rows.shape[1]
+    m, n = rows.shape[1], rows.shape[1] // 2
     variance, covariance, scale, left = rows[_VARIANCE], rows[_COVARIANCE], rows[_SCALE], rows[_SURPRISE]
     solution, direction = rows[_SOLUTION], rows[_DIRECTION]
     for s in range(m):
@@ -154,13 +154,14 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
         before = descent
         for s in range(m):
             direction[s] = rows[_IMAGE, s] + more * direction[s]
-            rows[_IMAGE, s] = 0.0
+        for s in range(n):
+            rows[_IMAGE, s] = covariance[s] * direction[n + s]
+            rows[_IMAGE, n + s] = covariance[s] * direction[s]
         add_products(matrices.uncertainty, rows[_DIRECTION : _DIRECTION + 1], rows[_IMAGE : _IMAGE + 1])
         curvature = 0.0
         for s in range(m):
             if scale[s] > 0.0:
-                other = direction[(s + m // 2) % m]
-                rows[_IMAGE, s] += variance[s] * direction[s] + covariance[s] * other
+                rows[_IMAGE, s] += variance[s] * direction[s]
                 curvature += direction[s] * rows[_IMAGE, s]
         step = descent / curvature
         for s in range(m):
