@@ -128,6 +128,7 @@ def show(answer: LoopAnswer) -> None:
     say([heading])
     say(rest, "  ")
     console.print(gain_table(answer))
+    say([loop_text.about_the_limits(answer)], "  ")
     if answer.question.radius is not None:
         console.print(sky_table(answer))
     say(loop_text.about_the_sky(answer), "  ")
@@ -162,7 +163,6 @@ def gain_table(answer: LoopAnswer) -> Table:
             same = name == reference
             cells.append("" if same else loop_text.gain_in_words(answer, name, reference))
         table.add_row(name, *cells, style="bold" if name == answer.best.name else None)
-    table.caption = f"Limiting magnitude: for a Strehl ratio of {answer.level:.3g}, interpolated."
     return table
 
 

@@ -17,7 +17,7 @@ from faintspot.ao_loop.sections import CLOSED, RunLength
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError
 from faintspot.config.options import AUTO, Option
-from faintspot.control.learning import CONTROLS, INTEGRATOR, KALMAN, MODAL
+from faintspot.control.learning import CONTROLS, INTEGRATOR, KALMAN
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.correlation import Correlation
 from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
@@ -157,7 +157,7 @@ class MethodKind:
         tuned = {LOOP_GAIN: Tunable(_LOOP_GAINS, _FIRST_LOOP_GAINS)}
         if self.control != INTEGRATOR:
             tuned[LOOP_GAIN] = Tunable(_TELEMETRY_GAINS, _FIRST_TELEMETRY_GAINS)
-        if self.control not in (INTEGRATOR, MODAL):
+        if self.control == KALMAN and self.estimator.takes_prior:
             tuned[NOISE_SCALE] = Tunable(_NOISE_SCALES, _FIRST_NOISE_SCALES)
         for number, (name, values) in enumerate(options.items()):
             tuned[name] = _spread(values, _FIRST_VALUES[min(number, len(_FIRST_VALUES) - 1)])

@@ -77,6 +77,12 @@ def gain_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
     return f"{'>' if mine > other else '<'}{least:+.2f}"
 
 
+def about_the_limits(answer: LoopAnswer) -> str:
+    """Explain the table of limiting magnitudes and its errors."""
+    seconds = answer.scored_frames / answer.question.configuration.control.frame_rate_hz
+    return _TEXT("loop_answer.limiting", level=answer.level, seconds=seconds)
+
+
 def limit_in_words(answer: LoopAnswer, name: str) -> str:
     """Return a method's limiting magnitude with its error."""
     limit = answer.limit(name)

@@ -132,11 +132,12 @@ def tune(
     """Find the settings of a method that give the highest Strehl ratio at the configuration's flux.
 
     All combinations of a few values of each option first, then steps from the best ones to
-    neighbouring values of one option at a time, as long as that helps. Where control learns from telemetry,
-    which takes much longer than a run, the estimator's options and the gain at which telemetry is taken are
-    those that are best with the integrator, and only the control's own options are searched. All have the
-    same turbulence and noise; realisations are those from `FIRST_TUNING_REALISATION` on, which are not
-    scored.
+    neighbouring values of one option at a time, as long as that helps. Then each positive number goes to the
+    top of the parabola through the best value and those beside it, which scatters less than the best value.
+    Where control learns from telemetry, which takes much longer than a run, the estimator's options and the
+    gain at which telemetry is taken are those that are best with the integrator, and only the control's own
+    options are searched. All have the same turbulence and noise; realisations are those from
+    `FIRST_TUNING_REALISATION` on, which are not scored.
 
     Parameters
     ----------
@@ -187,6 +188,8 @@ def _sought(
     advance: Advance | None,
 ) -> Tuned:
     """Return the best of the values that are tuned."""
+    if all(len(each.values) == 1 for each in tuned.values()):
+        return Tuned({name: each.values[0] for name, each in tuned.items()}, math.nan, 0)
     trials = _Trials(kind, configuration, search, advance)
     coarse = [
         dict(zip(tuned, values, strict=True))
@@ -198,7 +201,7 @@ def _sought(
     finalists = sorted(ranked[: search.finalists], key=trials.fine, reverse=True)
     tops = [_climbed(start, tuned, trials, search.rounds) for start in finalists[: search.climbs]]
     best = max(tops, key=trials.fine)
-    return Tuned(best, trials.fine(best), trials.tried)
+    return Tuned(_between(best, tuned, trials), trials.fine(best), trials.tried)
 
 
 def _climbed(
@@ -212,6 +215,27 @@ def _climbed(
             break
         best = better
     return best
+
+
+def _between(best: Choice, tuned: Mapping[str, Tunable], trials: _Trials) -> dict[str, Any]:
+    """Return the best choice with each positive number at the top of the parabola through its neighbours."""
+    found = dict(best)
+    for name, each in tuned.items():
+        near = [best, *(other for other in _neighbours(best, tuned) if other[name] != best[name])]
+        if len(near) < 3 or not _is_scale(each.values):
+            continue
+        strehl = [trials.fine(choice) for choice in near]
+        place = np.log([choice[name] for choice in near])
+        bend, slope, _ = np.polyfit(place - place[0], strehl, 2)
+        if bend < 0:
+            top = np.clip(place[0] - slope / (2 * bend), place.min(), place.max())
+            found[name] = float(f"{math.exp(top):.3g}")
+    return found
+
+
+def _is_scale(values: Sequence[Any]) -> bool:
+    """Return whether an option's values are positive numbers, between which it may be."""
+    return all(isinstance(value, float) and value > 0 for value in values)
 
 
 def tuning_unit(
@@ -247,8 +271,7 @@ def smoothed(
     found = [dict(choice) for choice in choices]
     for name in tuned[0].keys() & declared.keys():
         offered = [each[name].values for each in tuned]
-        values = {value for each in offered for value in each}
-        if declared[name].whole or not all(isinstance(value, float) and value > 0 for value in values):
+        if declared[name].whole or not all(_is_scale(values) for values in offered):
             continue
         line = theilslopes(np.log([choice[name] for choice in choices]), flux, method="joint")
         for choice, log_flux, each in zip(found, flux, offered, strict=True):
@@ -269,6 +292,8 @@ def tuning_frames(
     search, tuned = _searched(kind, configuration, search, slopes)
     combinations = math.prod(len(each.first) for each in tuned.values())
     several = sum(len(each.values) > 1 for each in tuned.values())
+    if several == 0:
+        return 0
     climbs = min(search.climbs, search.finalists)
     looks = search.finalists + 2 * several * climbs * min(2, search.rounds) if search.rounds else 0
     simulated = combinations * search.coarse_frames + looks * search.frames * search.realisations
