@@ -111,8 +111,10 @@ def _with_vibration(case: Case, rng: np.random.Generator) -> Case:
 
 def recorded(case: Case) -> tuple[RecordedLoop, Truth]:
     """Run the loop of a case; slopes by `window`, divided by the calibrated centroid gain."""
-    configuration, method = case.configuration(), Method("window", Settings("window"))
+    configuration = case.configuration()
     telescope = TelescopeModel(configuration, case.seed)
+    flux_e = case.photons * telescope.optics.sensor.illumination
+    method = Method("window", Settings("window", flux_e=flux_e))
     if case.from_hcipy:
         telescope.atmosphere = HcipyLayers(configuration, case.seed)  # type: ignore[assignment]
     optics, rate = telescope.optics, configuration.control.frame_rate_hz

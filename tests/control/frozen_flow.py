@@ -18,14 +18,14 @@ def frozen_slopes(air: SlopeTurbulence, frames: int, rate_hz: float, rng: np.ran
     time = np.arange(frames) / rate_hz
     total = np.zeros((frames, 2 * len(air.positions_m)))
     low, high = np.log(0.02 / air.outer_scale_m), np.log(4.0 / air.subaperture_m)
-    shares = air.fraction / air.fraction.sum()
+    shares, side_m = air.fraction / air.fraction.sum(), air.averaged * air.subaperture_m
     for share, wind in zip(shares, air.wind_m_per_s, strict=True):
         size = np.exp(rng.uniform(low, high, WAVES))
         angle = rng.uniform(0, 2 * np.pi, WAVES)
         wave = size[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
         power = SPECTRUM * air.r0_m ** (-5 / 3) * (size**2 + air.outer_scale_m**-2) ** (-11 / 6)
         variance = share * power * 2 * np.pi * size**2 * (high - low) / WAVES  # rad^2 of each wave
-        strength = np.sqrt(variance) * np.sinc(wave * air.subaperture_m).prod(axis=1)
+        strength = np.sqrt(variance) * np.sinc(wave * side_m).prod(axis=1)
         moved = 2 * np.pi * np.outer(time, wave @ wind)
         place = 2 * np.pi * air.positions_m @ wave.T
         one, other = rng.standard_normal((2, WAVES)) * strength

@@ -50,6 +50,13 @@ def test_ahead_repeats_the_recursion(model: SlopeModel) -> None:
 
 
 @MODELS
+def test_an_error_spreads_as_the_state_does(model: SlopeModel) -> None:
+    onward, driving, _ = _textbook(model)
+    once = onward @ driving @ onward.T + driving
+    np.testing.assert_allclose(model.spread(driving, 2), onward @ once @ onward.T + driving, atol=1e-12)
+
+
+@MODELS
 def test_the_steady_error_solves_the_riccati_equation(model: SlopeModel) -> None:
     onward, driving, seen = _textbook(model)
     variance = np.linspace(0.05, 0.5, model.slopes)

@@ -1,4 +1,9 @@
-"""Residual wavefront of other controllers, by replay of the slopes of a recorded loop."""
+"""Residual wavefront of other controllers, by replay of the slopes of a recorded loop.
+
+Recorded slopes hold more than turbulence and white noise: unequal centroid gains, speckles. These grow with
+the residual wavefront, so a filter that leaves less has less of them. Its residual is that in the identified
+turbulence, with the noise of small displacements.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +21,8 @@ from faintspot.advice.open_loop import OpenLoop
 from faintspot.advice.recorded_loop import RecordedLoop
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
+from faintspot.control.identification import Identified
+from faintspot.control.kalman import steady_covariance
 from faintspot.control.learning import GAINS, KALMAN, MODAL, learn
 from faintspot.control.learnt import SETTLE_FRAMES, Model, Plant
 from faintspot.control.loop_delay import LoopDelay
@@ -37,6 +44,7 @@ _SPREAD_AS_RUN, _SPREAD_OF_OTHERS = 0.5, 1.0
 """Standard errors, in differences between the views: other control changes noise and gain of the slopes."""
 _LEAST_COMPARED = 0.25  # of the frames: those with the largest shares of measured slopes
 _FITTING, _FITTING_ERROR = 0.28, 0.04  # rad^2 at (sub-aperture / r0)^(5/3): continuous mirrors
+_ALIASING = 0.08  # rad^2, likewise: what the sensor mistakes for larger scales (Rigaut et al. 1998)
 _R0_WAVELENGTH_NM = 500.0
 
 
@@ -63,9 +71,17 @@ class Choice:
 
 
 def compared_choices(
-    loop: RecordedLoop, seen: OpenLoop, delay: LoopDelay, site: SlopeTurbulence, r0: Measured
+    loop: RecordedLoop,
+    seen: OpenLoop,
+    delay: LoopDelay,
+    site: SlopeTurbulence,
+    r0: Measured,
+    identified: Identified | None,
 ) -> list[Choice]:
     """Replay integrators of several gains and a predictive filter that learns from the first half.
+
+    Where the turbulence is identified, the filter's residual is that in this turbulence, and the difference
+    from the replay is an error.
 
     Raises
     ------
@@ -103,7 +119,10 @@ def compared_choices(
         )
         found.append(compare(BEST, *integrators([learnt.plain_gain]), gain=learnt.plain_gain))
         found.append(compare(MODES, learnt_left(modal)))
-        found.append(compare(FILTER, learnt_left(learnt)))
+        expected = math.nan
+        if identified is not None:
+            expected = _expected_left(identified, plant, delay.gain**2 * seen.variance, phase)
+        found.append(compare(FILTER, learnt_left(learnt), expected=expected))
     else:
         best, _ = plant.best_gain(GAINS, first, phase)
         found.append(compare(BEST, *integrators([best]), gain=best))
@@ -112,6 +131,13 @@ def compared_choices(
         if values[0].max() < np.inf and values[0].mean() < uncorrected:  # else it is not stable
             found.append(compare("integrator", values, gain=gain))
     return [_at_gain(each, delay.gain) for each in found]
+
+
+def _expected_left(identified: Identified, plant: Plant, variance: Floats, phase: Floats) -> float:
+    """Return the phase variance that the predictive filter leaves in the turbulence that was identified."""
+    model = identified.slope_model()
+    after = model.spread(steady_covariance(model, variance), plant.delay_frames - 1)
+    return float(np.einsum("pi,ij,pj->", phase, model.seen @ after @ model.seen.T, phase))
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,9 +198,10 @@ class _Scale:
             return cls(unit, 1.0, math.nan, math.nan, math.nan, gain_error, noise_error)
         factor = loop.pixel_scale_arcsec * ARCSEC * loop.subaperture_m * 1e9
         square = (loop.subaperture_m / r0.value) ** (5 / 3) * (_R0_WAVELENGTH_NM / (2 * math.pi)) ** 2
-        error = square * math.hypot(_FITTING_ERROR, _FITTING * 5 / 3 * r0.error / r0.value)
+        unseen = _FITTING + _ALIASING
+        error = square * math.hypot(_FITTING_ERROR, unseen * 5 / 3 * r0.error / r0.value)
         wavelength_nm = loop.science_wavelength_m * 1e9
-        return cls("nm", factor, _FITTING * square, error, wavelength_nm, gain_error, noise_error)
+        return cls("nm", factor, unseen * square, error, wavelength_nm, gain_error, noise_error)
 
 
 def _choice(
@@ -184,17 +211,21 @@ def _choice(
     noise: list[float],
     scale: _Scale,
     gain: float = math.nan,
+    expected: float = math.nan,
 ) -> Choice:
-    """Return a choice from its squared phase in each view."""
+    """Return a choice from its squared phase in each view, or from the expected one."""
     unit = scale.factor**2
     spread = _SPREAD_AS_RUN if name == AS_RUN else _SPREAD_OF_OTHERS
     without = [values - each for values, each in zip(left, noise, strict=True)]
     square, error = _mean_of_views(without, unit, spread)
     error = math.hypot(error, unit * noise[0] * scale.noise_error, scale.gain_error * square)
     less = Measured("less than as it ran", scale.unit, remark="the loop was open")
+    corrected = 0.0 if math.isnan(expected) else square - unit * expected
+    square, error = square - corrected, math.hypot(error, corrected)
     if ran is not None:
         saved = [before - after for before, after in zip(ran, left, strict=True)]
-        less = _root(less.name, scale.unit, *_mean_of_views(saved, unit, spread))
+        mean, spread_of_mean = _mean_of_views(saved, unit, spread)
+        less = _root(less.name, scale.unit, mean + corrected, math.hypot(spread_of_mean, corrected))
     total = square + scale.fitting_nm2
     total_error = math.hypot(error, scale.fitting_error_nm2)
     wave = (2 * math.pi / scale.wavelength_nm) ** 2
@@ -204,7 +235,7 @@ def _choice(
         name,
         _root("residual", scale.unit, square, error),
         less,
-        _root("with the fitting error", scale.unit, total, total_error, remark),
+        _root("with fitting and aliasing", scale.unit, total, total_error, remark),
         Measured("Strehl ratio", "", min(strehl, 1.0), strehl * wave * total_error, remark),
         gain,
     )

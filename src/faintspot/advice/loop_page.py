@@ -73,7 +73,7 @@ def _choices_table(report: LoopReport) -> Table:
     columns = {
         f"residual ({unit})": [each.residual for each in report.choices],
         f"less than as run ({unit})": [each.less for each in report.choices],
-        f"with fitting error ({unit})": [each.total for each in report.choices],
+        f"with fitting and aliasing ({unit})": [each.total for each in report.choices],
         _STREHL: [each.strehl for each in report.choices],
     }
     known = {

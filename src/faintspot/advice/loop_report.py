@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -239,9 +239,11 @@ def _turbulence(report: LoopReport, seen: OpenLoop, delay: LoopDelay) -> None:
     if loop.pixel_scale_arcsec is not None:
         rows = seen.telemetry.trust.any(axis=1)
         slopes = seen.telemetry.open_loop_px[rows], seen.residual[rows], seen.run[rows]
+        # A matrix of mean gradients makes of what the mirror corrects mean gradients, too.
+        averaged = 0.5 * (1 + identified.turbulence.averaged)
         found = turbulence_strength(
             *slopes,
-            site,
+            replace(site, averaged=averaged),
             gain_error=delay.gain_error / delay.gain,
             gain_spread=_GAIN_SPREAD * abs(1 - delay.gain),
             outer_scale_m=loop.outer_scale_m,
@@ -313,7 +315,7 @@ def _choices(report: LoopReport, seen: OpenLoop, delay: LoopDelay) -> None:
     turbulence = report.parts["turbulence"].known
     r0 = next((each for each in turbulence if each.name.startswith("r0")), Measured("r0", "m"))
     try:
-        report.choices = compared_choices(loop, seen, delay, site_of_loop(loop), r0)
+        report.choices = compared_choices(loop, seen, delay, site_of_loop(loop), r0, report.turbulence)
     except InputError as error:
         part.missing = str(error)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from faintspot.turbulence.slope_covariance import SlopeTurbulence
 Floats = NDArray[np.float64]
 
 _SPEEDS_M_PER_S = (5.0, 10.0, 20.0)  # of winds from anywhere
+_AVERAGED = (1.0, 0.85, 0.7, 0.55)  # values of `SlopeTurbulence.averaged` that are tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +106,7 @@ class Identification:
         self._site, self._rate_hz = site, rate_hz
         records = SlopeRecords.of(telemetry, site)
         self._vibrations = find_vibrations(records.modes(), rate_hz, records.slopes.shape[1])
-        self._likelihood = LayerLikelihood(records, rate_hz, self._vibrations)
+        self._given = LayerLikelihood(records, rate_hz, self._vibrations)
         self._records = records
 
     def layers(self, start: Identified | None = None) -> Identified:
@@ -114,19 +116,39 @@ class Identification:
         """
         if len(self._site.positions_m) == 1:
             return self._oscillating()
-        first = self._likelihood.peaks() if start is None else start.parameters()
-        return self._identified(*self._likelihood.selected(first))
+        if start is not None:
+            likelihood = self._given.averaging(start.turbulence.averaged)
+            return self._identified(likelihood, *likelihood.selected(start.parameters()))
+        likelihood, _ = self._best
+        found, errors = likelihood.selected(likelihood.peaks())
+        # Winds from anywhere are not quite the turbulence, so neighbouring values are tried with layers, too.
+        place = _AVERAGED.index(likelihood.averaged)
+        for averaged in _AVERAGED[max(place - 1, 0) : place + 2]:
+            other = self._given.averaging(averaged)
+            refined = other.refined(found)
+            if refined.criterion < found.criterion:
+                likelihood, found, errors = other, refined, other.errors(refined)
+        return self._identified(likelihood, found, errors)
 
     def of_winds(self, winds_m_per_s: Floats) -> Identified:
         """Return layers with given winds, (layers, 2), and fitted strengths."""
-        return self._identified(self._likelihood.of_winds(np.asarray(winds_m_per_s, np.float64)[:, None]))
+        likelihood, _ = self._best
+        winds = np.asarray(winds_m_per_s, np.float64)[:, None]
+        return self._identified(likelihood, likelihood.of_winds(winds))
 
     def anywhere(self) -> Identified:
         """Return isotropic turbulence: winds of several speeds, equally from all directions."""
+        return self._identified(*self._best, is_layered=False)
+
+    @cached_property
+    def _best(self) -> tuple[LayerLikelihood, Layers]:
+        """The likelihood with the best of `_AVERAGED` for winds from anywhere, and these."""
         speeds = np.array(_SPEEDS_M_PER_S)
         still = replace(self._site, fraction=np.ones(len(speeds)), wind_m_per_s=np.outer(speeds, [1.0, 0.0]))
         winds = still.from_anywhere().wind_m_per_s
-        return self._identified(self._likelihood.of_winds(winds[None]), is_layered=False)
+        tried = [self._given.averaging(each) for each in _AVERAGED]
+        found = [(each, each.of_winds(winds[None])) for each in tried]
+        return min(found, key=lambda each: each[1].criterion)
 
     def _oscillating(self) -> Identified:
         records, none = self._records, np.full((1, 2), np.nan)
@@ -137,7 +159,12 @@ class Identification:
         return Identified(still, *known, found)
 
     def _identified(
-        self, layers: Layers, errors: Floats | None = None, *, is_layered: bool = True
+        self,
+        likelihood: LayerLikelihood,
+        layers: Layers,
+        errors: Floats | None = None,
+        *,
+        is_layered: bool = True,
     ) -> Identified:
         fraction = layers.strength / layers.strength.sum()
         errors = np.full((len(fraction), 3), np.nan) if errors is None else errors
@@ -147,6 +174,7 @@ class Identification:
             outer_scale_m=layers.outer_scale_m,
             fraction=fraction,
             wind_m_per_s=layers.wind_m_per_s,
+            averaged=likelihood.averaged,
         )
         return Identified(
             turbulence,

@@ -8,6 +8,7 @@ and layers are merged or left out as long as the Bayesian information criterion 
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,9 +38,7 @@ overestimated as much."""
 _REFINEMENTS = 40
 _SPEED_UNIT = 2.0  # m/s, in which winds have about the same effect as logarithms of strengths
 _NOISE = 1e-3, 1e3
-_UNMODELLED = 0.01
-"""Part of the turbulence's spectra that is not as in the model, in each slope independently: centroid gains,
-speckles. Bright stars, whose noise does not hide it, would have false layers."""
+_UNMODELLED, _UNMODELLED_RANGE = 0.03, (0.003, 0.3)  # of `Layers.unmodelled`: the first value, and limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +51,9 @@ class Layers:
     """(layers,): r0^(-5/3)."""
     noise: float
     outer_scale_m: float
+    unmodelled: float = _UNMODELLED
+    """Part of the turbulence's spectra that is not as in the model, in each slope independently: centroid
+    gains, aliasing, speckles. Bright stars, whose noise does not hide it, would have false layers."""
     criterion: float = math.inf
 
 
@@ -72,7 +74,7 @@ class LayerLikelihood:
         self._weight = len(segments) / every
         step_s = every / rate_hz
         reach_m = _FASTEST_M_PER_S * length * step_s
-        self._site = records.site
+        self._site, self.averaged = records.site, records.site.averaged
         self._spectra = SlopeSpectra(records.site, step_s, window, self._bins, reach_m)
         self._tables, _ = self._spectra.tables(records.site.outer_scale_m)
         self._noise_px2 = records.noise_px2
@@ -91,35 +93,44 @@ class LayerLikelihood:
             total += spectrum.real[:, None, None] * np.outer(shape, shape)
         return total
 
-    def _matrices(self, distinct: Complex) -> Complex:
+    def averaging(self, averaged: float) -> LayerLikelihood:
+        """Return the likelihood with another `SlopeTurbulence.averaged`."""
+        other = copy.copy(self)
+        other.averaged, other._spectra = averaged, self._spectra.averaging(averaged)
+        other._tables, _ = other._spectra.tables(self._site.outer_scale_m)
+        return other
+
+    def _matrices(self, distinct: Complex, unmodelled: float) -> Complex:
         """Return the cross-spectra of turbulence with what is not modelled of it."""
         full, diagonal = self._spectra.matrices(distinct), np.arange(len(self._noise_px2))
-        full[:, diagonal, diagonal] *= 1 + _UNMODELLED
+        full[:, diagonal, diagonal] *= 1 + unmodelled
         return full
 
-    def _summed(self, gradient: Complex) -> Complex:
+    def _summed(self, gradient: Complex, unmodelled: float) -> Complex:
         """Return `SlopeSpectra.summed` for `_matrices`."""
         diagonal = np.arange(len(self._noise_px2))
         scaled = gradient.copy()
-        scaled[:, diagonal, diagonal] *= 1 + _UNMODELLED
+        scaled[:, diagonal, diagonal] *= 1 + unmodelled
         return self._spectra.summed(scaled)
 
-    def _residual(self, distinct: Complex, noise: float) -> tuple[Complex, Complex]:
-        """Return the model's cross-spectra and their inverse."""
-        model = self._matrices(distinct) + self._vibrating
+    def _residual(self, turbulence: Complex, noise: float) -> tuple[Complex, Complex]:
+        """Return the model's cross-spectra and their inverse, from those of the turbulence."""
+        model = turbulence + self._vibrating
         diagonal = np.arange(len(self._noise_px2))
         model[:, diagonal, diagonal] += noise * self._noise_px2
         return model, np.asarray(np.linalg.inv(model), np.complex128)
 
-    def _value(self, distinct: Complex, noise: float) -> tuple[float, Complex, float]:
-        """Return the misfit, and its derivatives with the distinct spectra and the noise."""
-        model, inverse = self._residual(distinct, noise)
+    def _value(self, distinct: Complex, noise: float, unmodelled: float) -> tuple[float, Complex, Floats]:
+        """Return the misfit, and its derivatives with the distinct spectra and with the other two."""
+        turbulence = self._matrices(distinct, unmodelled)
+        model, inverse = self._residual(turbulence, noise)
         explained = inverse @ self._measured
         _, logarithm = np.linalg.slogdet(model)
         value = self._weight * float(logarithm.sum() + np.trace(explained, axis1=1, axis2=2).real.sum())
         gradient = self._weight * (inverse - explained @ inverse)
-        of_noise = float((np.diagonal(gradient, axis1=1, axis2=2).real @ self._noise_px2).sum())
-        return value, self._summed(gradient), of_noise
+        own, air = (np.diagonal(each, axis1=1, axis2=2).real for each in (gradient, turbulence))
+        of_others = np.array([(own @ self._noise_px2).sum(), (own * air).sum() / (1 + unmodelled)])
+        return value, self._summed(gradient, unmodelled), of_others
 
     def strengths(self, spectra: Complex, start: float, noise: float = 1.0) -> tuple[Floats, float]:
         """Return strengths of given spectra (components, frequencies, distinct), and the noise.
@@ -132,10 +143,10 @@ class LayerLikelihood:
         for update in range(_UPDATES):
             power = 0.5 if update < _FIRST_UPDATES else 0.9
             distinct = (strength.astype(np.float32) @ flat).reshape(spectra.shape[1:]).astype(np.complex128)
-            _, inverse = self._residual(distinct, noise)
+            _, inverse = self._residual(self._matrices(distinct, _UNMODELLED), noise)
             explained = inverse @ self._measured @ inverse
             seen, expected = (
-                (flat @ self._summed(each).ravel().astype(np.complex64)).real.astype(np.float64)
+                (flat @ self._summed(each, _UNMODELLED).ravel().astype(np.complex64)).real.astype(np.float64)
                 for each in (explained, inverse)
             )
             strength *= (np.maximum(seen, 0.0) / np.maximum(expected, 1e-30)) ** power
@@ -155,14 +166,14 @@ class LayerLikelihood:
             ]
         )
         strength, noise = self.strengths(spectra, self._start())
-        value, _, _ = self._value(np.tensordot(strength, spectra, 1), noise)
+        value, _, _ = self._value(np.tensordot(strength, spectra, 1), noise, _UNMODELLED)
         known, each = self._site.outer_scale_m, winds_m_per_s.shape[1]
         return Layers(
             winds_m_per_s.reshape(-1, 2),
             np.repeat(strength / each, each),
             noise,
             known,
-            value + self._penalty(len(strength) + 1),
+            criterion=value + self._penalty(len(strength) + 1),
         )
 
     def peaks(self) -> Layers:
@@ -219,15 +230,16 @@ class LayerLikelihood:
             options={"maxiter": _REFINEMENTS, "ftol": 2e-7},
         )
         return replace(
-            _unpacked(found.x, count), criterion=scale * float(found.fun) + self._penalty(3 * count + 2)
+            _unpacked(found.x, count), criterion=scale * float(found.fun) + self._penalty(3 * count + 3)
         )
 
     def _of_layers(self, layers: Layers) -> tuple[float, Floats]:
         """Return the misfit of layers, and its derivatives with respect to the packed parameters."""
         derivatives, total = self._derivatives(layers)
-        value, gradient, of_noise = self._value(total, layers.noise)
+        others = np.array([layers.noise, layers.unmodelled])
+        value, gradient, of_others = self._value(total, *others)
         of_spectra = [float((gradient * each).sum().real) for each in derivatives]
-        return value, np.array([*of_spectra[:-1], of_noise * layers.noise, of_spectra[-1]])
+        return value, np.array([*of_spectra[:-1], *(of_others * others), of_spectra[-1]])
 
     def _derivatives(self, layers: Layers) -> tuple[list[Complex], Complex]:
         """Return the derivatives of the distinct spectra with winds, strengths and outer scale, and them."""
@@ -244,14 +256,18 @@ class LayerLikelihood:
     def errors(self, layers: Layers) -> Floats:
         """Return (layers, 3) standard errors of winds (x, y, m/s) and of the logarithm of the strength."""
         derivatives, total = self._derivatives(layers)
-        _, inverse = self._residual(total, layers.noise)
-        noise = np.zeros_like(inverse)
+        turbulence = self._matrices(total, layers.unmodelled)
+        _, inverse = self._residual(turbulence, layers.noise)
+        others = np.zeros((2, *inverse.shape), np.complex128)
         diagonal = np.arange(len(self._noise_px2))
-        noise[:, diagonal, diagonal] = layers.noise * self._noise_px2
-        changes = np.array([inverse @ each for each in (*map(self._matrices, derivatives), noise)])
+        others[0][:, diagonal, diagonal] = layers.noise * self._noise_px2
+        part = layers.unmodelled / (1 + layers.unmodelled)
+        others[1][:, diagonal, diagonal] = part * turbulence[:, diagonal, diagonal]
+        of_spectra = (self._matrices(each, layers.unmodelled) for each in derivatives)
+        changes = np.array([inverse @ each for each in (*of_spectra, *others)])
         flat = changes.reshape(len(changes), -1)
         information = self._weight * (flat @ changes.swapaxes(2, 3).reshape(len(changes), -1).T).real
-        information[-2, -2] += OUTER_SCALE_SPREAD**-2
+        information[-3, -3] += OUTER_SCALE_SPREAD**-2
         count = len(layers.strength)
         errors = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information, hermitian=True)), 0.0))
         winds = _SPEED_UNIT * errors[: 2 * count].reshape(count, 2)
@@ -262,7 +278,8 @@ class LayerLikelihood:
 
     def _start(self) -> float:
         """Return a strength r0^(-5/3) from the total variance."""
-        still = self._matrices(self._spectra.of_wind(np.array([10.0, 0.0]), self._tables))
+        air = self._spectra.of_wind(np.array([10.0, 0.0]), self._tables)
+        still = self._matrices(air, _UNMODELLED)
         measured, theory = (np.trace(each, axis1=1, axis2=2).real.sum() for each in (self._measured, still))
         return float(0.5 * measured / theory)
 
@@ -322,18 +339,19 @@ def _with_one_less(layers: Layers) -> list[Layers]:
 
 
 def _packed(layers: Layers) -> Floats:
-    """Return the parameters scaled to similar size: winds, logarithms of strengths, noise, outer scale."""
-    ends = [math.log(layers.noise), math.log(layers.outer_scale_m)]
+    """Return the parameters scaled to similar size: winds, and logarithms of all others."""
+    ends = np.log([layers.noise, layers.unmodelled, layers.outer_scale_m])
     return np.concatenate([layers.wind_m_per_s.ravel() / _SPEED_UNIT, np.log(layers.strength), ends])
 
 
 def _unpacked(x: Floats, count: int) -> Layers:
-    strength, noise, scale = np.exp(x[2 * count : -2]), math.exp(x[-2]), math.exp(x[-1])
-    return Layers(_SPEED_UNIT * x[: 2 * count].reshape(count, 2), strength, noise, scale)
+    noise, unmodelled, scale = map(math.exp, x[-3:])
+    winds = _SPEED_UNIT * x[: 2 * count].reshape(count, 2)
+    return Layers(winds, np.exp(x[2 * count : -3]), noise, scale, unmodelled)
 
 
 def _bounds(count: int) -> list[tuple[float, float]]:
     fastest = _FASTEST_M_PER_S / _SPEED_UNIT
     logarithms = [(-25.0, 25.0)] * count
-    ends = [(math.log(low), math.log(high)) for low, high in (_NOISE, (2.0, 200.0))]
+    ends = [(math.log(low), math.log(high)) for low, high in (_NOISE, _UNMODELLED_RANGE, (2.0, 200.0))]
     return [(-fastest, fastest)] * (2 * count) + logarithms + ends

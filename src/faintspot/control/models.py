@@ -87,6 +87,15 @@ class SlopeModel:
             seen = seen @ self.onward
         return seen
 
+    def spread(self, covariance: Floats, frames: int) -> Floats:
+        """Return the covariance (states, states) of the state's error a number of frames later."""
+        driving = np.concatenate([self.driving, np.zeros_like(self.driving)])
+        order = np.arange(2 * self.layers).reshape(2, -1).T.ravel()
+        added = block_diag(*driving[order])
+        for _ in range(frames):
+            covariance = self.onward @ covariance @ self.onward.T + added
+        return covariance
+
 
 def _regression(moments_px2: Floats) -> tuple[Floats, Floats, Floats]:
     """Return `first`, `second` and `driving` of one layer, (m, m), for moments (3 m, 3 m)."""

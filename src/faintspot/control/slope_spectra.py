@@ -7,6 +7,7 @@ coarsely far from it, for some outer scales, and interpolated in the logarithm o
 
 from __future__ import annotations
 
+import copy
 import math
 from functools import lru_cache, partial
 from typing import Any
@@ -37,7 +38,7 @@ class SlopeSpectra:
     Parameters
     ----------
     site : SlopeTurbulence
-        Positions, sub-aperture and pixel scale are used; strength, outer scale and winds are not.
+        Strength, outer scale and winds are not used.
     step_s : float
         Time between two values of a record.
     window : (length,) array
@@ -57,6 +58,7 @@ class SlopeSpectra:
         self._transform = np.exp(-2j * np.pi / length * np.outer(bins, lags))
         self._transform *= np.correlate(window, window, "full")
         self._site, self._side = site, site.subaperture_m
+        self._averaged_m = site.averaged * site.subaperture_m
         apart = np.round((site.positions_m[:, None] - site.positions_m).reshape(-1, 2), 6)
         is_opposite = (apart[:, 0] < 0) | ((apart[:, 0] == 0) & (apart[:, 1] < 0))
         self._apart_m, which = np.unique(
@@ -77,6 +79,12 @@ class SlopeSpectra:
             (np.ones(entries), (self._which.ravel(), np.arange(entries))), shape=(3 * distinct, entries)
         )
 
+    def averaging(self, averaged: float) -> SlopeSpectra:
+        """Return the spectra of other `SlopeTurbulence.averaged`."""
+        other = copy.copy(self)
+        other._averaged_m = averaged * self._side
+        return other
+
     def tables(self, outer_scale_m: float) -> tuple[Floats, Floats]:
         """Return tables of the covariances xx, xy and yy of turbulence with r0 = 1 m, and their derivatives.
 
@@ -84,7 +92,7 @@ class SlopeSpectra:
         """
         place = (math.log(outer_scale_m) - _FIRST_LOG_SCALE) / _LOG_SCALE_STEP
         node = int(min(max(math.floor(place), 0), _SCALES - 2))
-        of_sensor = self._side, self._nodes
+        of_sensor = self._side, self._averaged_m, self._nodes
         low, high = (self._site.px2_per_rad2_per_m2 * _table(*of_sensor, each) for each in (node, node + 1))
         return low + (place - node) * (high - low), (high - low) / _LOG_SCALE_STEP
 
@@ -135,11 +143,11 @@ class SlopeSpectra:
 
 
 @lru_cache(maxsize=2 * _SCALES)
-def _table(side_m: float, nodes: int, scale: int) -> Floats:
+def _table(side_m: float, averaged_m: float, nodes: int, scale: int) -> Floats:
     """Return spline coefficients (3, places, places), rad^2 m^-2, for one of the outer scales."""
     place = side_m * np.sinh(_SPACING * np.arange(nodes))
     x, y = (each.ravel() for each in np.meshgrid(place, place, indexing="ij"))
-    tables = gradient_covariances(x, y, side_m, math.exp(_FIRST_LOG_SCALE + scale * _LOG_SCALE_STEP))
+    tables = gradient_covariances(x, y, averaged_m, math.exp(_FIRST_LOG_SCALE + scale * _LOG_SCALE_STEP))
     even, odd = (each.reshape(nodes, -1) for each in tables[:2])
     quarters = (even, 1), (odd, -1), (even.T, 1)
     return np.array([spline_filter(_four_quarters(*each), order=3) for each in quarters])

@@ -47,6 +47,10 @@ class SlopeTurbulence:
         Strength of each layer; only ratios matter.
     wind_m_per_s : (layers, 2) array
         Velocity of each layer along x and y.
+    averaged : float
+        Side of the square in which a slope is the mean gradient, in sub-apertures. 1: centres of gravity of
+        all flux. Near the diffraction limit windows see the least-squares tilt, which varies as the mean
+        gradient in a smaller square does.
     """
 
     positions_m: Floats
@@ -56,6 +60,7 @@ class SlopeTurbulence:
     outer_scale_m: float
     fraction: Floats
     wind_m_per_s: Floats
+    averaged: float = 1.0
 
     def covariance_px2(self, later_s: float = 0.0) -> Floats:
         """Return E[slopes at t + later_s, slopes at t], (2 n, 2 n) px^2: all x, then all y."""
@@ -72,7 +77,8 @@ class SlopeTurbulence:
         shifts_m = np.asarray(later_s)[:, None, None] * wind
         distinct_m, of_layer = np.unique(shifts_m.reshape(-1, 2), axis=0, return_inverse=True)
         along, across = (apart_m - distinct_m[:, None]).transpose(2, 0, 1)
-        found = gradient_covariances(along, across, self.subaperture_m, self.outer_scale_m)
+        side_m = self.averaged * self.subaperture_m
+        found = gradient_covariances(along, across, side_m, self.outer_scale_m)
         found *= self.r0_m ** (-5 / 3) * self.px2_per_rad2_per_m2
         blocks = [
             np.tensordot(part, found[:, each], axes=([0], [1]))[:, which]
