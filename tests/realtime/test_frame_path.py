@@ -15,9 +15,12 @@ from tests.simulated import frames_of
 import faintspot as fs
 from faintspot.kernels.ordered import store
 from faintspot.kernels.streaming import (
+    COLD,
     LAST_ROW,
     MARGIN,
+    PACE_CELLS,
     SHORTEST_NS,
+    SLEEPS,
     WOKEN_LATE,
     Arrival,
     sleep_until_due,
@@ -166,11 +169,17 @@ def test_threads_that_sleep_until_rows_are_due_give_the_same_slopes(threads: int
             assert_same(path.slopes, expected, number)
 
 
+def pace_of(last_row_ns: int, margin_ns: int) -> NDArray[np.int64]:
+    pace = np.zeros(PACE_CELLS, np.int64)
+    pace[LAST_ROW], pace[MARGIN] = last_row_ns, margin_ns
+    return pace
+
+
 @pytest.mark.portable
 def test_a_pause_of_the_camera_delays_no_later_frame() -> None:
     """After a frame that came 2 s late a thread sleeps hardly longer than before."""
     cells, control, due = np.zeros(2, np.int64), np.zeros(1, np.int64), np.full(1, 3_000_000)
-    pace = np.array([time.monotonic_ns() - 2 * 10**9, SHORTEST_NS, 0])
+    pace = pace_of(time.monotonic_ns() - 2 * 10**9, SHORTEST_NS)
     threading.Timer(0.05, store, (cells, 1, 1)).start()
     assert wait_for_group(Arrival(cells, 0, 1, control, 0, pace, due), 0, 1, 0)
     assert 3_000_000 < due[0] < 4_000_000
@@ -179,7 +188,7 @@ def test_a_pause_of_the_camera_delays_no_later_frame() -> None:
 @pytest.mark.portable
 def test_a_thread_that_woke_up_late_wakes_up_earlier_next_time() -> None:
     cells, control, due = np.zeros(2, np.int64), np.zeros(1, np.int64), np.full(1, 200_000_000)
-    pace = np.array([0, SHORTEST_NS, 0])
+    pace = pace_of(0, SHORTEST_NS)
     arrival = Arrival(cells, 0, 1, control, 0, pace, due)
     assert not sleep_until_due(arrival, 0, 1, 0)  # compiled; nothing is known yet
     pace[LAST_ROW] = time.monotonic_ns()
@@ -189,3 +198,13 @@ def test_a_thread_that_woke_up_late_wakes_up_earlier_next_time() -> None:
     assert pace[MARGIN] > SHORTEST_NS
     assert due[0] < 200_000_000
     assert wait_for_group(arrival, 0, 1, 0)
+
+
+@pytest.mark.portable
+def test_a_margin_above_the_time_between_frames_does_not_end_sleeping() -> None:
+    cells, control, due = np.zeros(2, np.int64), np.zeros(1, np.int64), np.full(1, 50_000_000)
+    pace = pace_of(time.monotonic_ns(), 80_000_000)
+    assert sleep_until_due(Arrival(cells, 0, 1, control, 0, pace, due), 0, 1, 0)
+    assert pace[SLEEPS] > 0
+    assert pace[COLD] == 1
+    assert pace[MARGIN] <= due[0] // 2

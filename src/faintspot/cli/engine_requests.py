@@ -66,9 +66,10 @@ def summary(reply: dict[str, Any]) -> str:
     lines = [
         f"{reply['name']}: {counters['processed']} frames measured, {lost} lost, {counters['late']} late"
     ]
-    if reply["late_because"]:
-        causes = ", ".join(f"{cause} {count}" for cause, count in reply["late_because"].items())
-        lines.append(f"late because: {causes}")
+    for what in ("late", "lost"):
+        if counts := reply[f"{what}_because"]:
+            causes = ", ".join(f"{cause} {count}" for cause, count in counts.items())
+            lines.append(f"{what} because: {causes}")
     lines += [f"{title}: {text}" for title, text in notes(reply).items()]
     if reply["loop"]["state"] != "none":
         lines.append(loop_in_words(reply["loop"]))

@@ -127,7 +127,17 @@ def run(
     if engine.loop is not None and close_loop:
         engine.loop.close()
     server = ControlServer(socket_path(name), commands_of(engine), lengthy=LENGTHY)
-    with server, real_time(processors, priority) as refused:
+    learns = nullcontext() if interleave else _learning(engine, config)
+    page = page_beside(name) if live else nullcontext()
+    # Processes beside the engine start first: otherwise they would have its processors and priority.
+    with (
+        server,
+        stop_on_signal() as stop,
+        learns,
+        _following(engine, config),
+        page,
+        real_time(processors, priority) as refused,
+    ):
         engine.refused = refused
         for line in refused:
             click.echo(f"not permitted, going on without: {line}", err=True)
@@ -135,11 +145,8 @@ def run(
             f"{name}: {len(layout)} sub-apertures, estimator {settings.estimator.name}; waiting for frames, "
             "Ctrl-C stops"
         )
-        learns = nullcontext() if interleave else _learning(engine, config)
-        page = page_beside(name) if live else nullcontext()
-        with stop_on_signal() as stop, learns, _following(engine, config), page:
-            threading.Thread(target=_stop_when_set, args=(stop, engine), daemon=True).start()
-            engine.run(frames)
+        threading.Thread(target=_stop_when_set, args=(stop, engine), daemon=True).start()
+        engine.run(frames)
     click.echo(summary(engine.status()))
 
 

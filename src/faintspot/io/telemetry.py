@@ -48,7 +48,10 @@ _DIMENSIONS = {
     "image_frame": ("image",),
     "commands": ("frame", "command"),
 }
-NOT_IN_ALL = {"late": np.int64, "loop": np.int64, "commands": np.float32, "covariance_xy": np.float32}
+NOT_IN_ALL = {
+    **dict.fromkeys(("late", "lost", "lost_because", "loop"), np.int64),
+    **dict.fromkeys(("commands", "covariance_xy"), np.float32),
+}
 """What some recordings do not have, e.g. those of an engine without commands: zeros stand for it."""
 _NOT_STORED = "sequence"  # used by the rings only
 
@@ -93,6 +96,10 @@ class Telemetry:
     """Bits of `faintspot.SubapertureFlag`."""
     late: NDArray[np.int64]
     """Cause of a frame that was late (`faintspot.realtime.lateness.CAUSES`); 0: in time."""
+    lost: NDArray[np.int64]
+    """Number of frames that the engine lost since the one before."""
+    lost_because: NDArray[np.int64]
+    """Cause of the last of them, likewise."""
     loop: NDArray[np.int64]
     """State of the loop: 0 no loop, 1 open, 2 closed."""
     commands: NDArray[np.float32]

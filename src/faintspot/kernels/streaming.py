@@ -25,9 +25,10 @@ from faintspot.kernels.simd import intrinsic
 
 LOOKS_BETWEEN_STOPS = 1024  # at the progress, between two looks at whether to give up
 
-LAST_ROW, MARGIN, WOKEN_LATE, PACE_CELLS = range(4)
+LAST_ROW, MARGIN, WOKEN_LATE, COLD, SLEEPS, PACE_CELLS = range(6)
 """Cells of `Arrival.pace`: time of the last row of the frame before (0: not known, do not sleep), how long
-before rows are due a thread wakes up, and how often rows were there before it woke up; their number. ns."""
+before rows are due a thread wakes up, how often rows were there before it woke up, whether the thread has
+slept since the last rehearsal, and how often it has slept; their number. ns."""
 SHORTEST_NS = 60_000
 _LONGEST_NS = 20_000_000  # so that a stop is noticed
 _GROWTH, _LATE = 4, 200  # a late waking adds 1/4 to the margin; it settles where that is one waking in 200
@@ -93,24 +94,31 @@ def wait_for_rows(
 
 @compiled
 def sleep_until_due(arrival: Any, frame: Any, rows: Any, item: Any) -> Any:
-    """Sleep until shortly before a group's rows are due; return whether they are still to come after it."""
+    """Sleep until shortly before a group's rows are due; return whether to rehearse before they come.
+
+    That is when the thread has slept since the last rehearsal, and there is time for one.
+    """
     pace, due = arrival.pace, arrival.due
     cells = arrival.cells, arrival.frame_cell, arrival.rows_cell
     if pace[LAST_ROW] == 0 or rows_are_there(*cells, frame, rows):
         return False
-    left = pace[LAST_ROW] + due[item] - pace[MARGIN] - now_ns()
-    if left <= SHORTEST_NS:
-        return False
-    while left > 0 and look_at(arrival.control, arrival.stop_cell) == 0:
-        sleep_ns(min(left, _LONGEST_NS))
-        left = pace[LAST_ROW] + due[item] - pace[MARGIN] - now_ns()
-    if rows_are_there(*cells, frame, rows):
-        pace[WOKEN_LATE] += 1
-        pace[MARGIN] = min(pace[MARGIN] + pace[MARGIN] // _GROWTH, max(due[item] // 2, SHORTEST_NS))
-        due[item] -= due[item] // _SLOWNESS
-        return False
-    pace[MARGIN] = max(pace[MARGIN] - pace[MARGIN] // (_GROWTH * _LATE), SHORTEST_NS)
-    return True
+    # A margin learnt while rows came later would keep the thread from ever sleeping again.
+    margin = min(pace[MARGIN], max(due[item] // 2, SHORTEST_NS))
+    awake = pace[LAST_ROW] + due[item] - margin
+    left = awake - now_ns()
+    if left > SHORTEST_NS:
+        pace[COLD] = 1
+        while left > 0 and look_at(arrival.control, arrival.stop_cell) == 0:
+            sleep_ns(min(left, _LONGEST_NS))
+            pace[SLEEPS] += 1
+            left = awake - now_ns()
+        if rows_are_there(*cells, frame, rows):
+            pace[WOKEN_LATE] += 1
+            pace[MARGIN] = margin + margin // _GROWTH
+            due[item] -= due[item] // _SLOWNESS
+            return False
+        pace[MARGIN] = max(margin - margin // (_GROWTH * _LATE), SHORTEST_NS)
+    return pace[COLD] != 0 and left + margin >= SHORTEST_NS
 
 
 @compiled

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import tempfile
 import threading
@@ -15,10 +14,10 @@ from pathlib import Path
 from faintspot.base.errors import InputError
 from faintspot.realtime.child_processes import ChildProcesses
 from faintspot.realtime.private_socket import socket_path
+from faintspot.realtime.scheduling import lowest_priority
 from faintspot.realtime.telemetry import TelemetryReader
 
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-_NICEST = 19
 _WATCH_S = 1.0
 
 
@@ -71,7 +70,7 @@ class BesideEngine(ABC):
 
     def run(self, say: Callable[[str], None]) -> None:
         """Answer at the lowest priority until the engine ends; `say` takes a line for each answer."""
-        os.nice(_NICEST)
+        lowest_priority()
         try:
             while not self.ended:
                 time.sleep(self.look_s)

@@ -21,7 +21,7 @@ from faintspot.realtime.engine_plan import EnginePlan, SettingsPreparer
 from faintspot.realtime.flux_following import FluxFollower
 from faintspot.realtime.frame_path import FramePath
 from faintspot.realtime.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
-from faintspot.realtime.lateness import CAUSES, Lateness
+from faintspot.realtime.lateness import CAUSES, IN_TIME, INCOMPLETE, WORKER, Lateness
 from faintspot.realtime.live import Change, LiveSettings
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.prediction_stream import PredictionStream
@@ -114,6 +114,9 @@ class Engine:
         self._lateness = Lateness()
         self.late_because: dict[str, int] = {}
         """Number of late frames by cause; see `faintspot.realtime.lateness`."""
+        self.lost_because: dict[str, int] = {}
+        """Number of lost frames by cause."""
+        self._lost = 0, IN_TIME  # since the last measured frame: their number, and the last one's cause
         self.refused: list[str] = []
         """Parts of the real-time scheduling that were not permitted."""
         self.advice: list[str] = []
@@ -183,6 +186,7 @@ class Engine:
             "preparing": self.live.preparing,
             "counters": self.counters.as_dict(),
             "late_because": dict(self.late_because),
+            "lost_because": dict(self.lost_because),
             "latency": self.latencies.as_dict(),
             "estimator": self.live.settings.estimator.name,
             "subapertures": len(self.live.running.layout),
@@ -396,7 +400,7 @@ class Engine:
         counters, slopes = self.counters, path.slopes
         moment = ring.last_row_time_ns(number, arrival) if number >= 0 else 0
         if not moment:
-            self._lose(ring, arrival, number)
+            self._lose(ring, path, arrival, number)
             return
         self._streams.publish_slopes(slopes, number)
         published = time.monotonic_ns()
@@ -415,10 +419,12 @@ class Engine:
         self._streams.publish_marks((number, method, change, moment, published))
         invalid, limited, iterations = self._streams.publish_details(slopes, number)
         late = latency > self._deadline_ns
-        cause = self._lateness.cause(late, self.live.preparing is not None, path.woken_late)
+        cause = self._cause(late, path)
+        causes = cause, *self._lost
         self._telemetry.write(
-            number, method, change, moment, published, slopes, late=cause, loop=state, commands=commands
+            number, method, change, moment, published, slopes, causes=causes, loop=state, commands=commands
         )
+        self._lost = 0, IN_TIME
         if self._flux is not None:
             self._flux.take(slopes.flux)
         if self._streams.commands_lost:
@@ -434,7 +440,7 @@ class Engine:
         counters.iterations += iterations
         counters.late += late
         if late:
-            self.late_because[CAUSES[cause]] = self.late_because.get(CAUSES[cause], 0) + 1
+            _count(self.late_because, cause)
         counters.estimator_failures += path.failed
         if self._arrival and number != self._number + 1:
             skipped = left_out(self._number, number)
@@ -445,25 +451,30 @@ class Engine:
         self._arrival, self._number = arrival, number
         self._last_row_ns = moment if self._sleeps else 0
 
-    def _lose(self, ring: PixelRing, arrival: int, number: int) -> None:
+    def _lose(self, ring: PixelRing, path: FramePath, arrival: int, number: int) -> None:
         """Count a frame that cannot be published, and find the next one."""
-        counters = self.counters
-        counters.frames_in += 1
-        counters.dropped += 1
-        self._arrival, self._last_row_ns = arrival, 0
+        counters, cause, passed_over = self.counters, self._cause(True, path), 0
+        self._last_row_ns = 0
         if number >= 0 and ring.intact(number, arrival):  # the next one began before its last row arrived
             counters.short += 1
-            self._number = number
-            return
-        if ring.number_of(arrival) >= 0:  # complete, but a worker died and its share is missing
-            self._number = ring.number_of(arrival)
-            return
-        counters.torn += 1  # overwritten: continue with the newest frame
-        newest = ring.arrivals
-        counters.dropped += max(newest - 1 - arrival, 0)
-        counters.frames_in += max(newest - 1 - arrival, 0)
-        self._arrival = max(newest - 1, arrival)
-        self._number = ring.number_of(newest) - 1
+            self._number, cause = number, INCOMPLETE
+        elif ring.number_of(arrival) >= 0:  # complete, but a worker died and its share is missing
+            self._number, cause = ring.number_of(arrival), WORKER
+        else:  # overwritten: continue with the newest frame
+            newest = ring.arrivals
+            passed_over = max(newest - 1 - arrival, 0)
+            counters.torn += 1
+            counters.passed_over += passed_over
+            self._number = ring.number_of(newest) - 1
+        self._arrival = arrival + passed_over
+        counters.frames_in += 1 + passed_over
+        counters.dropped += 1 + passed_over
+        _count(self.lost_because, cause, 1 + passed_over)
+        self._lost = self._lost[0] + 1 + passed_over, cause
+
+    def _cause(self, late: bool, path: FramePath) -> int:
+        """Return why a frame was late or lost, if it was."""
+        return self._lateness.cause(late, self.live.preparing is not None, path.woken_late, path.sleeps)
 
     # The watcher's thread ---------------------------------------------------------------------------
 
@@ -511,3 +522,8 @@ class Engine:
         if now != told:
             self._telemetry.write_change(self._number, self.live.change_number, now, None)
         return now
+
+
+def _count(causes: dict[str, int], cause: int, frames: int = 1) -> None:
+    """Count frames of a cause."""
+    causes[CAUSES[cause]] = causes.get(CAUSES[cause], 0) + frames

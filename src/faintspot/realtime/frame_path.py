@@ -20,10 +20,12 @@ from faintspot.kernels.compiling import Direct
 from faintspot.kernels.groups import DENOISED, STAGE_ROWS, SlopeArrays, new_scratch
 from faintspot.kernels.host import WIDTHS, lanes_for
 from faintspot.kernels.streaming import (
+    COLD,
     LAST_ROW,
     MARGIN,
     PACE_CELLS,
     SHORTEST_NS,
+    SLEEPS,
     WOKEN_LATE,
     Arrival,
     sleep_until_due,
@@ -107,21 +109,23 @@ class _Groups:
         `waiting` has the cell that ends waiting, and the share's `Arrival.pace`. See `FramePath.measure` for
         `rehearse`.
         """
-        number, slot = frame
+        number, work = frame[0], self._work[frame[1]]
         start, last, stop = self._ranges[share]
         control, pace = waiting
         cells = progress.cells, progress.frame_cell, progress.rows_cell
         arrival = Arrival(*cells, control, STOP_CELL, pace, self._due)
         rest = self._scratch[share], *after
         if rehearse is not None:
-            if self._kernel(arrival, number, self._last_rows, *self._work[slot], start, last, *rest) < last:
-                return False
-            if last < stop and self._sleep(arrival, number, self._last_rows[last], last):
-                # A frame that has passed is not waited for: only code and data come into the cache again.
-                self._kernel(arrival, -1, self._last_rows, *self._work[slot], last, last + 1, *rest)
-                rehearse()
-            start = last
-        done: int = self._kernel(arrival, number, self._last_rows, *self._work[slot], start, stop, *rest)
+            for group in sorted({start, last}):
+                if self._kernel(arrival, number, self._last_rows, *work, start, group, *rest) < group:
+                    return False
+                start = group
+                if group < stop and self._sleep(arrival, number, self._last_rows[group], group):
+                    # A frame that has passed is not waited for: only code and data come into the cache again.
+                    self._kernel(arrival, -1, self._last_rows, *work, last, last + 1, *rest)
+                    rehearse()
+                    pace[COLD] = 0
+        done: int = self._kernel(arrival, number, self._last_rows, *work, start, stop, *rest)
         return done == stop
 
     def _range(self, start: int, stop: int) -> tuple[int, int, int]:
@@ -211,6 +215,11 @@ class FramePath:
         """How often a thread has woken up after the rows that it waits for were there."""
         return int(self._pace[:, WOKEN_LATE].sum())
 
+    @property
+    def sleeps(self) -> int:
+        """How often the caller's thread has slept until rows were due."""
+        return int(self._pace[0, SLEEPS])
+
     def warm_up(self) -> None:
         """Measure the present content of the first slot, to compile everything and fill the caches."""
         progress = self._progress
@@ -296,8 +305,7 @@ class FramePath:
         """Measure one share of a frame's groups; the last share includes the narrow group."""
         waiting = self._control, self._pace[share]
         narrow = self._narrow if share == self._shares - 1 else None
-        first = None if narrow is not None else rehearse
-        whole = self._wide.measure(share, frame, progress, waiting, after, first)
+        whole = self._wide.measure(share, frame, progress, waiting, after, rehearse)
         if narrow is None:
             return whole
         return whole and narrow.measure(0, frame, progress, waiting, after, rehearse)

@@ -6,11 +6,13 @@ import ctypes
 import gc
 import os
 import sys
+import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 _LOCK_CURRENT_AND_FUTURE = 3  # MCL_CURRENT | MCL_FUTURE
 _SWITCH_S = 20e-6
+_NICEST = 19
 
 
 @contextmanager
@@ -27,6 +29,13 @@ def quick_switching(seconds: float = 50e-6) -> Iterator[None]:
         sys.setswitchinterval(before)
 
 
+def lowest_priority() -> None:
+    """Leave the processor to others, also where the process was started with real-time priority."""
+    os.setpriority(os.PRIO_PROCESS, 0, _NICEST)
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # pushes nobody aside when it wakes
+
+
 @contextmanager
 def real_time(cpus: Sequence[int] | None = None, priority: int = 0) -> Iterator[list[str]]:
     """Run with real-time scheduling within a context.
@@ -34,9 +43,11 @@ def real_time(cpus: Sequence[int] | None = None, priority: int = 0) -> Iterator[
     Parameters
     ----------
     cpus : sequence of int, optional
-        Processors to run on. Default: all that the process may use.
+        Processors that this thread runs on. Default: all that the process may use.
     priority : int
-        Priority of SCHED_FIFO, 1 to 99; 0 leaves the scheduler and memory locking unchanged.
+        Priority of SCHED_FIFO, 1 to 99, of all threads of the process; 0 leaves the scheduler and memory
+        locking unchanged. A thread without it that holds Python's interpreter lock may lose the processor to
+        another program, and a thread that measures then waits for both.
 
     Yields
     ------
@@ -45,7 +56,7 @@ def real_time(cpus: Sequence[int] | None = None, priority: int = 0) -> Iterator[
     """
     refused: list[str] = []
     before = os.sched_getaffinity(0) if cpus else None
-    policy = os.sched_getscheduler(0), os.sched_getparam(0)
+    policies = {thread: (os.sched_getscheduler(thread), os.sched_getparam(thread)) for thread in _threads()}
     if cpus:
         try:
             os.sched_setaffinity(0, cpus)
@@ -53,7 +64,9 @@ def real_time(cpus: Sequence[int] | None = None, priority: int = 0) -> Iterator[
             refused.append(f"processors {', '.join(map(str, cpus))}: {error.strerror}")
     if priority:
         try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+            for thread in _threads():
+                with suppress(ProcessLookupError):  # it has ended
+                    os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
         except OSError as error:
             refused.append(f"real-time priority {priority}: {error.strerror}")
         if ctypes.CDLL(None, use_errno=True).mlockall(_LOCK_CURRENT_AND_FUTURE):
@@ -71,6 +84,16 @@ def real_time(cpus: Sequence[int] | None = None, priority: int = 0) -> Iterator[
         gc.unfreeze()
         if priority:
             ctypes.CDLL(None).munlockall()
-            os.sched_setscheduler(0, *policy)
+            for thread in _threads():
+                with suppress(ProcessLookupError):
+                    os.sched_setscheduler(thread, *policies.get(thread, policies[threading.get_native_id()]))
         if before is not None:
             os.sched_setaffinity(0, before)
+
+
+def _threads() -> list[int]:
+    """Return the threads of this process; 0, the calling one, where the system does not list them."""
+    try:
+        return [int(name) for name in os.listdir("/proc/self/task")]
+    except OSError:
+        return [0]

@@ -55,7 +55,7 @@ __all__ = ["TelemetryReader", "TelemetryRing"]
 
 _MAGIC = b"fstelem1"
 _START = struct.Struct("<8sII")
-_HEAD = struct.Struct("<8q")
+_HEAD = struct.Struct("<10q")
 _BYTE = np.dtype(np.uint8)
 _RECORD_BYTES, _IMAGE_BYTES = 1 << 25, 1 << 24  # small enough for a container's 64 MiB of shared memory
 
@@ -159,7 +159,7 @@ class TelemetryRing(Closing):
         published_ns: int,
         slopes: Slopes,
         *,
-        late: int = 0,
+        causes: tuple[int, int, int] = (0, 0, 0),
         loop: int = 0,
         commands: NDArray[np.float64] | None = None,
     ) -> None:
@@ -175,8 +175,8 @@ class TelemetryRing(Closing):
             Times of CLOCK_MONOTONIC, ns.
         slopes : Slopes
             Slopes of one frame; copied.
-        late : int
-            Cause of lateness, as in `record_type`.
+        causes : (int, int, int)
+            Cause of lateness, number of frames lost before this one, and the cause, as in `record_type`.
         loop : int
             State of the loop, as in `record_type`.
         commands : (commands,) array, optional
@@ -194,7 +194,7 @@ class TelemetryRing(Closing):
             last_row_ns,
             published_ns,
             time.time_ns() - time.monotonic_ns(),
-            late,
+            *causes,
         )
         self._x[place], self._y[place], self._flux[place] = slopes.x, slopes.y, slopes.flux
         self._error_x[place], self._error_y[place] = slopes.standard_error_x, slopes.standard_error_y

@@ -24,12 +24,13 @@ def record_type(n: int, commands: int = 0) -> np.dtype[np.void]:
     `sequence` counts the records from 0, `frame` is the camera's number, `method` the number of the
     interleaved configuration, `change` that of the last change of settings that applies. Times are of
     CLOCK_MONOTONIC, ns; `clock_offset_ns` added to them gives Unix time by the wall clock at that moment.
-    `late` is 0 for a frame in time, else the cause (`faintspot.realtime.lateness.CAUSES`).
+    `late` is 0 for a frame in time, else the cause (`faintspot.realtime.lateness.CAUSES`). `lost` is the
+    number of frames lost since the record before, and `lost_because` the cause.
     With commands, the record also has those that follow from the frame, in the interaction matrix's unit, and
     the loop's state `loop`: 1 open, 2 closed.
     """
     numbers = ("sequence", "frame", "method", "change", "last_row_time_ns", "published_time_ns")
-    head = [(name, np.int64) for name in (*numbers, "clock_offset_ns", "late")]
+    head = [(name, np.int64) for name in (*numbers, "clock_offset_ns", "late", "lost", "lost_because")]
     floats = ("x", "y", "flux", "standard_error_x", "standard_error_y", "covariance_xy")
     body = [(name, np.float32, (n,)) for name in floats]
     control = [("loop", np.int64), ("commands", np.float32, (commands,))] if commands else []

@@ -95,7 +95,9 @@ class Counters:
     short: int = 0
     """Frames that ended before their last row; also counted as dropped."""
     torn: int = 0
-    """Frames that were overwritten while being measured; also counted as dropped."""
+    """Frames that were overwritten before they were measured; also counted as dropped."""
+    passed_over: int = 0
+    """Frames that were left out after such a frame, to go on with the newest; also counted as dropped."""
     invalid_subapertures: int = 0
     """Invalid slopes."""
     at_iteration_limit: int = 0
