@@ -31,6 +31,7 @@ before rows are due a thread wakes up, how often rows were there before it woke 
 slept since the last rehearsal, and how often it has slept; their number. ns."""
 SHORTEST_NS = 60_000
 _LONGEST_NS = 20_000_000  # so that a stop is noticed
+_NAP_NS = 50_000
 _GROWTH, _LATE = 4, 200  # a late waking adds 1/4 to the margin; it settles where that is one waking in 200
 _SLOWNESS = 8  # rows that come twice as late are believed after some 6 frames
 
@@ -82,7 +83,12 @@ def rows_are_there(progress: Any, frame_cell: Any, rows_cell: Any, frame: Any, r
 def wait_for_rows(
     progress: Any, frame_cell: Any, rows_cell: Any, frame: Any, rows: Any, control: Any, stop_cell: Any
 ) -> Any:
-    """Wait until the rows are there, or `control[stop_cell]` is not 0; return whether they are there."""
+    """Wait until the rows are there, or `control[stop_cell]` is not 0; return whether they are there.
+
+    After a while without rows it sleeps between looks: real-time threads that poll on all processors would
+    keep a camera's process from ever writing them.
+    """
+    begun = now_ns()
     while True:
         for _ in range(LOOKS_BETWEEN_STOPS):
             if rows_are_there(progress, frame_cell, rows_cell, frame, rows):
@@ -90,6 +96,8 @@ def wait_for_rows(
             breathe()
         if look_at(control, stop_cell) != 0:
             return False
+        if now_ns() - begun > _LONGEST_NS:
+            sleep_ns(_NAP_NS)
 
 
 @compiled
