@@ -30,7 +30,7 @@ _TIMES_AT_LIMIT = 3  # that a largest value occurs, to be taken for a limit
 _DRAWS = 1000
 _GAIN_SPREAD = 0.5  # of the deviation of the centroid gain from 1: it differs between spatial scales
 _MOST_UNMEASURED = 0.2  # of the slopes; large ones are missed most, so that the others vary too little
-_WIND_ERROR = 0.35  # sub-apertures per second: measured slopes are not quite mean gradients
+_WIND_ERROR = 0.35  # sub-apertures per second: measured slopes are not quite mean gradients in squares
 _PARABOLA_ERROR = 0.03  # of the noise: turbulence and speckles within two frames are no parabola
 
 
