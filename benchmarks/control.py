@@ -160,7 +160,7 @@ def _of_size(across: int) -> list[Row]:
 
 def _random_filter(cells: NDArray[np.float64], rng: np.random.Generator) -> dict[str, Any]:
     """Return arrays as of a filter of three layers, with weights that let its state fade."""
-    near, around = neighbours_within(cells, 1.5), neighbours_within(cells, 2.5)
+    near, around = neighbours_within(cells, 1.5), neighbours_within(cells, 6.0)
     shapes = {"near": near, "around": around, "share": np.full(_LAYERS, 1 / _LAYERS)}
     wanted = local_shapes(shapes, 2 * len(cells))
     filled = {

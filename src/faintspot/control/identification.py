@@ -73,13 +73,13 @@ class Identified:
 
     def summary(self) -> str:
         """Return a summary of one line."""
+        if self.oscillators:
+            return ", ".join(f"{each.mode} at {each.frequency_hz:.1f} Hz" for each in self.oscillators)
         winds, shares = self.turbulence.wind_m_per_s, self.turbulence.fraction
         layers = [
             f"{math.hypot(x, y):.1f} m/s to {math.degrees(math.atan2(y, x)) % 360:.0f} degrees ({part:.0%})"
             for (x, y), part in sorted(zip(winds, shares, strict=True), key=lambda each: -each[1])
         ]
-        if self.oscillators:
-            return ", ".join(f"{each.mode} at {each.frequency_hz:.1f} Hz" for each in self.oscillators)
         shaking = [f"{each.mode} shakes at {each.frequency_hz:.1f} Hz" for each in self.vibrations]
         air = ", ".join(layers) if self.is_layered else "winds from anywhere"
         return ", ".join([air, *shaking])

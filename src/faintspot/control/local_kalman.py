@@ -6,7 +6,7 @@ The work of a frame is proportional to the number of slopes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -15,14 +15,18 @@ from numpy.typing import NDArray
 
 from faintspot.control.kalman import LARGEST_VARIANCE_PX2
 from faintspot.control.local_covariance import local_gains, of_slopes, steady_covariance
-from faintspot.control.local_model import at_most, neighbours_within
+from faintspot.control.local_model import Indices, at_most, neighbours_within
 from faintspot.control.noise import add_noise
 from faintspot.kernels.compiling import Direct, compiled_with
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 
-_REACH = 2.5  # sub-apertures, from which corrections come
+_REACH_OF_COVARIANCE = 2.5
+"""Sub-apertures from within which corrections come while the covariance is computed: more take much time."""
+_REACHES = 6.0, 4.3, 3.2, 2.5
+"""The same for the filter: the first with which errors die away. It is shorter for more sub-apertures."""
+_MOST_REMAINING, _SETTLING_FRAMES, _SCORED_FRAMES = 0.9998, 2500, 500
 NOISE_STEP = 2.0
 _LEVELS = range(-3, 4)
 _MOST_STATES = 22_000  # whose covariances take 8 GB while they are computed
@@ -91,6 +95,30 @@ class LocalPredictor:
         level = round(float(more)) + len(self._gains) // 2
         return np.where(measured, difference_px, 0.0), int(np.clip(level, 0, len(self._gains) - 1))
 
+    def remaining(self, positions_m: Floats, level: int) -> float:
+        """Return the part of an error that a frame leaves in the long run; the state is lost.
+
+        Parameters
+        ----------
+        positions_m : (n, 2) array
+            Of the sub-apertures.
+        level : int
+            Which gains.
+        """
+        rng, state = np.random.default_rng(1), self._state[:-1]
+        pupil = np.column_stack([np.ones(len(positions_m)), positions_m / np.abs(positions_m).max()])
+        state[:] = rng.standard_normal(state.shape)  # errors over short distances, and over the whole pupil
+        state += np.tensordot(pupil, rng.standard_normal((3, *state.shape[1:])), 1)
+        scored = 0.0
+        for frame in range(_SETTLING_FRAMES + _SCORED_FRAMES):
+            self._surprise[:-1] = -self.mean_px.reshape(2, -1).T
+            _CORRECT(self._state, self._gains[level], self._around, self._surprise)
+            self.advance()
+            size = float(np.linalg.norm(self._state))
+            self._state /= size
+            scored += math.log(size) if frame >= _SETTLING_FRAMES else 0.0
+        return math.exp(scored / _SCORED_FRAMES)
+
     def advance(self) -> None:
         """Predict the next frame."""
         _ADVANCE(self._state, self._weights, self._near, self._later)
@@ -137,25 +165,36 @@ def local_filter(
         variance_px2, predicted_px2 (m,): of noise and of the prediction's error. share (layers,).
     """
     layers = at_most(layers, max(1, _MOST_STATES // (2 * len(variance_px2))))
-    around = neighbours_within(layers[0].positions_m, _REACH * layers[0].subaperture_m)
-    model, covariance = steady_covariance(layers, frame_s, variance_px2, around, progress, covariance_xy_px2)
+    positions, side = layers[0].positions_m, layers[0].subaperture_m
+    near = neighbours_within(positions, _REACH_OF_COVARIANCE * side)
+    model, covariance = steady_covariance(layers, frame_s, variance_px2, near, progress, covariance_xy_px2)
     with_slopes, predicted = of_slopes(covariance, model.layers)
     del covariance
-    gains = []
-    for level in _LEVELS:
-        measured, factor = predicted.copy(), NOISE_STEP**level
-        covariance_xy = None if covariance_xy_px2 is None else factor * covariance_xy_px2
-        add_noise(measured, np.minimum(factor * variance_px2, LARGEST_VARIANCE_PX2), covariance_xy)
-        gains.append(local_gains(with_slopes, measured, around))
-    return {
+    arrays = {
         "near": model.neighbours,
-        "around": around,
         "weights": model.weights.astype(np.float32),
-        "corrections": np.array(gains, np.float32),
         "variance_px2": variance_px2,
         "predicted_px2": np.diag(predicted).copy(),
         "share": model.variance_px2 / model.variance_px2.sum(),
     }
+
+    def corrections(around: Indices, levels: Iterable[int]) -> Floats:
+        gains = []
+        for level in levels:
+            measured, factor = predicted.copy(), NOISE_STEP**level
+            covariance_xy = None if covariance_xy_px2 is None else factor * covariance_xy_px2
+            add_noise(measured, np.minimum(factor * variance_px2, LARGEST_VARIANCE_PX2), covariance_xy)
+            gains.append(local_gains(with_slopes, measured, around))
+        return np.array(gains, np.float32)
+
+    for reach in _REACHES:
+        around = neighbours_within(positions, reach * side)
+        tried = LocalPredictor(
+            {**arrays, "around": around, "corrections": corrections(around, (_LEVELS[0], 0))}
+        )
+        if all(tried.remaining(positions, level) < _MOST_REMAINING for level in range(2)):
+            break
+    return {**arrays, "around": around, "corrections": corrections(around, _LEVELS)}
 
 
 def local_shapes(arrays: Mapping[str, Any], slopes: int) -> dict[str, tuple[int, ...]]:

@@ -21,7 +21,9 @@ Indices = NDArray[np.int32]
 
 _REACH = 1.5  # sub-apertures: with the diagonal neighbours
 _RIDGE = 1e-3  # of a slope's variance
+_FADING = 1e-3  # of the turbulence in a step: what slopes do not show, like layers that cancel, dies away
 _LEAST_DRIVING = 1e-6  # of a slope's variance
+_AT_ONCE = 64  # sub-apertures whose equations are solved together: more would take more memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,15 +102,18 @@ def solve_locally(matrix: Floats, right: Floats, chosen: Indices, ridge: float =
     ridge : float
         Added to the diagonal.
     """
-    m = len(matrix)
-    there = chosen < m
-    index = np.where(there, chosen, 0)
-    pairs = there[:, :, None] & there[:, None, :]
-    local = np.where(pairs, matrix[index[:, :, None], index[:, None, :]], 0.0)
-    diagonal = np.arange(chosen.shape[1])
-    local[:, diagonal, diagonal] += np.where(there, ridge, 1.0)
-    wanted = np.where(there[:, None, :], np.take_along_axis(right, index[:, None, :], axis=2), 0.0)
-    return np.asarray(np.linalg.solve(local, wanted.swapaxes(1, 2)).swapaxes(1, 2))
+    m, (n, k) = len(matrix), chosen.shape
+    diagonal, found = np.arange(k), np.empty((n, right.shape[1], k))
+    for part in (slice(start, start + _AT_ONCE) for start in range(0, n, _AT_ONCE)):
+        there = chosen[part] < m
+        index = np.where(there, chosen[part], 0)
+        pairs = there[:, :, None] & there[:, None, :]
+        local = np.where(pairs, matrix[index[:, :, None], index[:, None, :]], 0.0)
+        local[:, diagonal, diagonal] += np.where(there, ridge, 1.0)
+        seen = np.take_along_axis(right[part], index[:, None, :], axis=2)
+        wanted = np.where(there[:, None, :], seen, 0.0)
+        found[part] = np.linalg.solve(local, wanted.swapaxes(1, 2)).swapaxes(1, 2)
+    return found
 
 
 def _regression(covariances_px2: Floats, near: Indices) -> tuple[Floats, Floats, float]:
@@ -120,7 +125,7 @@ def _regression(covariances_px2: Floats, near: Indices) -> tuple[Floats, Floats,
     axes = both_axes(near, n)
     chosen = np.concatenate([np.where(axes < m, axes, 2 * m), np.where(axes < m, axes + m, 2 * m)], axis=1)
     both = np.stack([onward[:n], onward[n:]], axis=1)
-    weights = solve_locally(past, both, chosen.astype(np.int32), _RIDGE * variance)
+    weights = (1 - _FADING) * solve_locally(past, both, chosen.astype(np.int32), _RIDGE * variance)
     left = same - _explained(weights, chosen, past, onward)
     left[np.diag_indices(m)] += _LEAST_DRIVING * variance
     return weights.reshape(n, 2, 2, 2, -1), 0.5 * (left + left.T), variance
