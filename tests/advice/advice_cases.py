@@ -67,7 +67,7 @@ def recording(
         "covariance_xy": each,
         "iterations": each.astype(np.int32),
         "flags": each.astype(np.uint8),
-        "late": np.zeros(frames, np.int64),
+        **{name: np.zeros(frames, np.int64) for name in ("late", "lost", "lost_because")},
         "loop": np.full(frames, 2),
         "commands": commands,
         "image_frame": np.zeros(0, np.int64),

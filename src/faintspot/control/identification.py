@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,7 +21,8 @@ from faintspot.turbulence.slope_covariance import SlopeTurbulence
 Floats = NDArray[np.float64]
 
 _SPEEDS_M_PER_S = (5.0, 10.0, 20.0)  # of winds from anywhere
-_AVERAGED = (1.0, 0.85, 0.7, 0.55)  # values of `SlopeTurbulence.averaged` that are tried
+AVERAGED = 1.0, 0.85, 0.7, 0.55
+"""Values of `SlopeTurbulence.averaged` that describe slopes; a filter for them is best with the first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +97,8 @@ class Identification:
         Positions, sub-aperture and pixel scale; its outer scale is assumed within a factor of two.
     rate_hz : float
         Frames per second.
+    averaged : sequence of float
+        Values of `SlopeTurbulence.averaged` of which the likeliest is used.
 
     Raises
     ------
@@ -102,8 +106,14 @@ class Identification:
         When too few sub-apertures were measured, or too few frames without a gap.
     """
 
-    def __init__(self, telemetry: OpenLoopTelemetry, site: SlopeTurbulence, rate_hz: float) -> None:
-        self._site, self._rate_hz = site, rate_hz
+    def __init__(
+        self,
+        telemetry: OpenLoopTelemetry,
+        site: SlopeTurbulence,
+        rate_hz: float,
+        averaged: Sequence[float] = AVERAGED,
+    ) -> None:
+        self._site, self._rate_hz, self._averaged = site, rate_hz, tuple(averaged)
         records = SlopeRecords.of(telemetry, site)
         self._vibrations = find_vibrations(records.modes(), rate_hz, records.slopes.shape[1])
         self._given = LayerLikelihood(records, rate_hz, self._vibrations)
@@ -122,8 +132,8 @@ class Identification:
         likelihood, _ = self._best
         found, errors = likelihood.selected(likelihood.peaks())
         # Winds from anywhere are not quite the turbulence, so neighbouring values are tried with layers, too.
-        place = _AVERAGED.index(likelihood.averaged)
-        for averaged in _AVERAGED[max(place - 1, 0) : place + 2]:
+        place = self._averaged.index(likelihood.averaged)
+        for averaged in self._averaged[max(place - 1, 0) : place + 2]:
             other = self._given.averaging(averaged)
             refined = other.refined(found)
             if refined.criterion < found.criterion:
@@ -142,11 +152,11 @@ class Identification:
 
     @cached_property
     def _best(self) -> tuple[LayerLikelihood, Layers]:
-        """The likelihood with the best of `_AVERAGED` for winds from anywhere, and these."""
+        """The likelihood with the best of `averaged` for winds from anywhere, and these."""
         speeds = np.array(_SPEEDS_M_PER_S)
         still = replace(self._site, fraction=np.ones(len(speeds)), wind_m_per_s=np.outer(speeds, [1.0, 0.0]))
         winds = still.from_anywhere().wind_m_per_s
-        tried = [self._given.averaging(each) for each in _AVERAGED]
+        tried = [self._given.averaging(each) for each in self._averaged]
         found = [(each, each.of_winds(winds[None])) for each in tried]
         return min(found, key=lambda each: each[1].criterion)
 

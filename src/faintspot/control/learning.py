@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.base import ASSUMED, LEARNT
-from faintspot.control.identification import Identification, Identified
+from faintspot.control.identification import AVERAGED, Identification, Identified
 from faintspot.control.learnt import (
     CONTROLS,
     INTEGRATOR,
@@ -83,7 +83,7 @@ def learn(
     plain = Model(kind, {}, gain, 1.0, (math.inf, plain_left), of_commands)
     if kind == MODAL:
         return Learnt(plant, _modal(plain, plant, telemetry))
-    identification = Identification(whole, site, rate_hz)
+    identification = Identification(whole, site, rate_hz, AVERAGED[:1])
     tried = []
     known = start if start is not None and start.is_layered and winds == LEARNT else None
     if known is None:  # else the comparison was made before
