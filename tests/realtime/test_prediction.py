@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -124,6 +125,48 @@ def test_a_prediction_s_writer_may_die() -> None:
         assert np.isnan(prior.std_px).all()
     assert reader.counters.restarts == 2
     reader.close()
+
+
+def test_a_stream_is_not_closed_while_it_is_read() -> None:
+    """Closing unmaps its memory: the engine's thread would read what is no longer there."""
+
+    class Removed:
+        """A stream whose name leads nowhere, and which takes long to read."""
+
+        count, maker = 1, "nobody"
+        closed = closed_while_read = False
+
+        def __init__(self) -> None:
+            self.reading, self.go_on = threading.Event(), threading.Event()
+
+        def same(self) -> None:
+            return None
+
+        def read(self, out: np.ndarray, limit_s: float) -> None:
+            self.reading.set()
+            self.go_on.wait(10.0)
+            self.closed_while_read = self.closed
+
+        def close(self) -> None:
+            self.closed = True
+
+    reader = PredictionStream(f"fs_test_{uuid4().hex[:12]}", Prior(2, 10.0))
+    removed = Removed()
+    reader._follower.source = removed  # type: ignore[assignment]
+    engine = threading.Thread(target=reader.fill, args=(0,))
+    engine.start()
+    assert removed.reading.wait(10.0)
+    watcher = threading.Thread(target=reader.look_after)
+    watcher.start()
+    watcher.join(0.05)
+    assert not removed.closed
+    reader.fill(1)  # meanwhile it is neither read nor waited for
+    removed.go_on.set()
+    engine.join(10.0)
+    watcher.join(10.0)
+    assert removed.closed
+    assert not removed.closed_while_read
+    assert reader.counters.late == 2
 
 
 def test_a_prediction_for_another_frame_is_not_taken() -> None:

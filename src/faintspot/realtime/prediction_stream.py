@@ -57,12 +57,8 @@ class PredictionStream:
     def fill(self, number: int) -> None:
         """Set the prior to the prediction for a frame, or to none; for the engine's thread."""
         self._prior.forget()
-        source, counters, values = self._follower.source, self.counters, self._values
-        try:
-            whole = source is not None and source.count and source.read(values, _READ_S) is not None
-        except Exception:  # the stream was closed meanwhile
-            whole = False
-        if not whole or values[-1] != number:
+        counters, values = self.counters, self._values
+        if not self._read() or values[-1] != number:
             counters.late += 1
             return
         mean, variance = values[:-1].reshape(2, -1)
@@ -71,6 +67,21 @@ class PredictionStream:
             return
         counters.taken += 1
         self._prior.expect(mean, np.sqrt(np.maximum(variance, 0.0)))
+
+    def _read(self) -> bool:
+        """Read the newest prediction; return whether there is one, and the stream is not being closed."""
+        using = self._follower.using
+        if not using.acquire(blocking=False):
+            return False
+        try:
+            source = self._follower.source
+            return bool(
+                source is not None and source.count and source.read(self._values, _READ_S) is not None
+            )
+        except Exception:  # nothing raises in the frame path
+            return False
+        finally:
+            using.release()
 
     def look_after(self) -> None:
         """Check whether the stream is the same, and try to open a missing one; for any other thread."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -220,6 +221,9 @@ class Follower:
         Why there is no stream; "" if there is one.
     seen : int
         Number of publications of the stream up to the last one that `take` returned.
+    using : threading.Lock
+        Held by a thread that reads `source` while another one may call `look` or `close`: a stream that is
+        closed is unmapped at once. Those who hold it take `source` anew.
     """
 
     def __init__(
@@ -236,6 +240,7 @@ class Follower:
         self.name, self._say, self._incompatible, self._meanwhile = name, say, incompatible, meanwhile
         self._holds, self._prepare = holds, prepare
         self.source: Stream | None = None
+        self.using = threading.Lock()
         self.obstacle = "is not there"
         self.counters = StreamCounters() if counters is None else counters
         self.seen, self._said, self._next_look_s = 0, "", -math.inf
@@ -326,6 +331,7 @@ class Follower:
 
     def close(self) -> None:
         """Close the stream."""
-        if self.source is not None:
-            self.source.close()
-            self.source = None
+        source, self.source = self.source, None
+        if source is not None:
+            with self.using:
+                source.close()
