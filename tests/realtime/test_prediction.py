@@ -133,11 +133,11 @@ def test_a_stream_is_not_closed_while_it_is_read() -> None:
     class Removed:
         """A stream whose name leads nowhere, and which takes long to read."""
 
-        count, maker = 1, "nobody"
-        closed = closed_while_read = False
+        count = 1
 
         def __init__(self) -> None:
             self.reading, self.go_on = threading.Event(), threading.Event()
+            self.done: list[str] = []
 
         def same(self) -> None:
             return None
@@ -145,10 +145,10 @@ def test_a_stream_is_not_closed_while_it_is_read() -> None:
         def read(self, out: np.ndarray, limit_s: float) -> None:
             self.reading.set()
             self.go_on.wait(10.0)
-            self.closed_while_read = self.closed
+            self.done.append("read")
 
         def close(self) -> None:
-            self.closed = True
+            self.done.append("closed")
 
     reader = PredictionStream(f"fs_test_{uuid4().hex[:12]}", Prior(2, 10.0))
     removed = Removed()
@@ -159,13 +159,12 @@ def test_a_stream_is_not_closed_while_it_is_read() -> None:
     watcher = threading.Thread(target=reader.look_after)
     watcher.start()
     watcher.join(0.05)
-    assert not removed.closed
+    assert not removed.done
     reader.fill(1)  # meanwhile it is neither read nor waited for
     removed.go_on.set()
     engine.join(10.0)
     watcher.join(10.0)
-    assert removed.closed
-    assert not removed.closed_while_read
+    assert removed.done == ["read", "closed"]
     assert reader.counters.late == 2
 
 
