@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -245,18 +245,24 @@ class Run:
         return make_telemetry(slopes, errors, held, np.zeros_like(held), None)
 
 
-def rivals(name: str, plant: Plant, telemetry: OpenLoopTelemetry) -> Iterator[Make]:
+def rivals(
+    name: str,
+    plant: Plant,
+    telemetry: OpenLoopTelemetry,
+    options: Mapping[str, Sequence[Any]] | None = None,
+    gains: Sequence[float] = _GAINS,
+) -> Iterator[Make]:
     """Return a rival with all options and gains, fitted to telemetry."""
     from pyrtc.predictive import make_predictor  # type: ignore[import-untyped, unused-ignore]
 
-    modes, options = plant.reconstructor.modes, _GRIDS[name]
+    modes, options = plant.reconstructor.modes, _GRIDS[name] if options is None else options
     for matrix in (plant.reconstructor.matrix, plant.reconstructor.clean):
         to_modes = modes.T @ matrix
         history = (np.sign(telemetry.trust) * telemetry.open_loop_px) @ to_modes.T
         for values in itertools.product(*options.values()):
             chosen = {"type": name, "horizon": plant.delay_frames, **dict(zip(options, values, strict=True))}
             predictor = make_predictor(chosen, modes.shape[1]).fit(history)
-            for gain in _GAINS:
+            for gain in gains:
                 yield partial(Rival, plant=plant, to_modes=to_modes, predictor=predictor, gain=gain)
 
 

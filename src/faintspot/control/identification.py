@@ -133,7 +133,7 @@ class Identification:
         found, errors = likelihood.selected(likelihood.peaks())
         # Winds from anywhere are not quite the turbulence, so neighbouring values are tried with layers, too.
         place = self._averaged.index(likelihood.averaged)
-        for averaged in self._averaged[max(place - 1, 0) : place + 2]:
+        for averaged in (*self._averaged[max(place - 1, 0) : place], *self._averaged[place + 1 : place + 2]):
             other = self._given.averaging(averaged)
             refined = other.refined(found)
             if refined.criterion < found.criterion:
