@@ -1,4 +1,4 @@
-"""What a telescope knows of the sodium layer: a profile learnt before a run, and followed in it."""
+"""Knowledge of the sodium layer in a simulated loop: a profile learnt before a run, and followed in it."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class _Frame(NamedTuple):
     left_by_learnt: Floats
     left_by_plain: Floats
     missing: Floats
-    """What the integrator's estimator would have added to the latter, where it trusts its prior."""
+    """Addition to the latter by the integrator's estimator, where it trusts its prior."""
 
 
 class LargeGuarded(Guarded):

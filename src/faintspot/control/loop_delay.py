@@ -32,7 +32,7 @@ _DIRECTIONS = 4  # of half a turn: opposite winds have the same spectrum
 _MOST_SUBAPERTURES = 40
 _UPDATES = 200
 FEWEST_SUBAPERTURES = 3
-"""Of fewer, only tip and tilt are seen, in which vibrations cannot be told from turbulence."""
+"""Fewer show only tip and tilt, in which vibrations cannot be told from turbulence."""
 
 
 @dataclass(frozen=True)

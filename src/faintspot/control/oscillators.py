@@ -24,7 +24,7 @@ _WIDTHS = (3, 15, 61)  # bins, of maxima that are sought
 _FREQUENCIES = 1e-4, 0.25  # of the frame rate; faster ones cannot be predicted over the delay of a loop
 _DAMPINGS = 1e-4, 0.99
 _TURBULENCE = 0.002, 0.9
-"""Frequency, of the frame rate, and damping from which that of turbulence is sought."""
+"""Frequency, as a part of the frame rate, and damping from which the fit of turbulence starts."""
 
 
 def fitted_oscillators(

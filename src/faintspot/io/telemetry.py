@@ -52,7 +52,7 @@ NOT_IN_ALL = {
     **dict.fromkeys(("late", "lost", "lost_because", "loop"), np.int64),
     **dict.fromkeys(("commands", "covariance_xy"), np.float32),
 }
-"""What some recordings do not have, e.g. those of an engine without commands: zeros stand for it."""
+"""Values that some recordings lack, e.g. those of an engine without commands; they are read as zeros."""
 _NOT_STORED = "sequence"  # used by the rings only
 
 

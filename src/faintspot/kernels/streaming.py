@@ -26,9 +26,10 @@ from faintspot.kernels.simd import intrinsic
 LOOKS_BETWEEN_STOPS = 1024  # at the progress, between two looks at whether to give up
 
 LAST_ROW, MARGIN, WOKEN_LATE, COLD, SLEEPS, PACE_CELLS = range(6)
-"""Cells of `Arrival.pace`: time of the last row of the frame before (0: not known, do not sleep), how long
-before rows are due a thread wakes up, how often rows were there before it woke up, whether the thread has
-slept since the last rehearsal, and how often it has slept; their number. ns."""
+"""Cells of `Arrival.pace`, and their number. LAST_ROW: time of the last row of the frame before [ns]; 0: not
+known, do not sleep. MARGIN: time before rows are due at which a thread wakes up [ns]. WOKEN_LATE: number of
+times that rows were there before it woke up. COLD: whether it has slept since the last rehearsal. SLEEPS:
+number of times that it has slept."""
 SHORTEST_NS = 60_000
 _LONGEST_NS = 20_000_000  # so that a stop is noticed
 _NAP_NS = 50_000

@@ -212,12 +212,12 @@ class FramePath:
 
     @property
     def woken_late(self) -> int:
-        """How often a thread has woken up after the rows that it waits for were there."""
+        """Number of times that a thread has woken up after its rows were there."""
         return int(self._pace[:, WOKEN_LATE].sum())
 
     @property
     def sleeps(self) -> int:
-        """How often the caller's thread has slept until rows were due."""
+        """Number of times that the caller's thread has slept until rows were due."""
         return int(self._pace[0, SLEEPS])
 
     def warm_up(self) -> None:

@@ -16,12 +16,13 @@ CAUSES = (
     "incomplete",
     "worker died",
 )
-"""Causes in words, by their numbers. The first one that applies is named: settings were being prepared in the
-same process, a page of memory was missing, the scheduler gave the processor to another program, another
-thread of the process held what this one needs (Python's interpreter lock), the thread woke up after the rows
-were there. "other" includes long computations, worker threads that were preempted, and a hypervisor that took
-the processor away. Lost frames only: the camera began the next frame before its last row, or a worker
-died."""
+"""Causes in words, by their numbers. The first one that applies is named.
+
+Settings were being prepared in the same process; a page of memory was missing; the scheduler gave the
+processor to another program; another thread of the process held Python's interpreter lock; the thread woke
+up after the rows were there. "other" includes long computations, worker threads that were preempted, and a
+hypervisor that took the processor away. Lost frames only: the camera began the next frame before its last
+row, or a worker died."""
 
 
 class Lateness:

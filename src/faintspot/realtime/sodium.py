@@ -1,4 +1,4 @@
-"""Following a sodium layer beside a running engine: a process of its own fits the profile to its frames.
+"""Following a sodium layer beside a running engine: a separate process fits the profile to its frames.
 
 The engine loses no time with it: the process has the lowest priority and one thread, reads the images that
 telemetry keeps, and makes the spots; the engine prepares them in another thread than that which measures. If

@@ -24,7 +24,7 @@ class Ready(NamedTuple):
     kind: str
     controller: Any
     line: CommandDelayLine
-    """Where its commands go."""
+    """Delay line that its commands enter."""
     predicts: bool
     """Whether its prediction goes to the estimators as a prior."""
     takes_prior: bool

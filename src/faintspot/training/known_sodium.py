@@ -31,7 +31,7 @@ class KnownSodium:
     """Profile, spot and fluxes that mean images have shown."""
 
     star: LaserGuideStar
-    """Whose spot includes turbulence and the motion of the spots."""
+    """Laser guide star; its spot includes turbulence and the motion of the spots."""
     fit: SodiumFit
     dark_variance_e2: ArrayLike
 
