@@ -32,7 +32,7 @@ _LEARNING, _TUNING = 2000, 2001
 """Realisations."""
 _TUNING_FRAMES = 400
 _RIVAL_OPTIONS = {"order": (4, 8, 16), "regularization": (1e-2, 1e-1)}
-_RIVAL_GAINS = 0.5, 0.7, 1.0
+_RIVAL_GAINS = 0.7, 0.5, 1.0
 INTEGRATOR, MODES, NEIGHBOURS, ALL, RIVAL = (
     "integrator",
     "a gain for each mode",
@@ -117,7 +117,12 @@ def _table(name: str, case: Large) -> Table:
 
 
 def _rival(case: Large, learnt_from: OpenLoopTelemetry, tuning: OpenLoopTelemetry) -> Make:
-    """Return the rival with the options that leave the least phase."""
+    """Return the rival with the options, then the gain, that leave the least phase."""
     plant, phase = case.plant, case.phase
-    offered = rivals("least_squares", plant, learnt_from, _RIVAL_OPTIONS, _RIVAL_GAINS)
-    return min(offered, key=lambda make: plant.left(make, tuning, phase))
+
+    def left(make: Make) -> float:
+        return plant.left(make, tuning, phase)
+
+    offered = rivals("least_squares", plant, learnt_from, _RIVAL_OPTIONS, _RIVAL_GAINS[:1])
+    best = min(offered, key=left)
+    return min((partial(best, gain=gain) for gain in _RIVAL_GAINS), key=left)

@@ -251,7 +251,7 @@ def rivals(
     telemetry: OpenLoopTelemetry,
     options: Mapping[str, Sequence[Any]] | None = None,
     gains: Sequence[float] = _GAINS,
-) -> Iterator[Make]:
+) -> Iterator[partial[Rival]]:
     """Return a rival with all options and gains, fitted to telemetry."""
     from pyrtc.predictive import make_predictor  # type: ignore[import-untyped, unused-ignore]
 

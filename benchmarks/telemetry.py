@@ -33,6 +33,19 @@ RANDOM_LOOPS, RANDOM_SEED = 10, 7
 """Realisations and a seed on which nothing was chosen."""
 GAINS = {20.0: (0.17, 0.1), 200.0: (0.4, 0.25)}
 """Gain of the recorded loop and of the other one, by photons per sub-aperture and frame."""
+_LIMITS = {
+    "delay": (0.1, 0.0),
+    "noise of a slope": (0.0, 0.05),
+    "r0 at 500 nm": (0.0, 0.03),
+    "speed (m/s)": (1.0, 0.0),
+    "direction (degrees)": (5.0, 0.0),
+    "frequency of the vibration (Hz)": (0.3, 0.0),
+    "rms of the vibration (nm)": (0.0, 0.15),
+    "residual as it ran": (0.0, 0.07),
+    "residual with another gain": (0.0, 0.07),
+    "residual of the filter": (0.0, 0.07),
+}
+"""Largest difference from the truth for a useful report: a number, and a part of the truth."""
 _LEAST_SHARE = 0.15  # of a layer, for its wind to be compared
 _SAME_LINE_HZ = 1.0
 
@@ -75,12 +88,12 @@ def table_of(label: str, title: str, found: Iterable[Pairs], note: str) -> Table
     for pairs in found:
         for name, values in pairs.items():
             every.setdefault(name, []).extend(values)
-    rows = [Row(name, _statistics(values)) for name, values in every.items()]
+    rows = [Row(name, _statistics(name, values)) for name, values in every.items()]
     title = f"{title}: values beside the truth, and share of 95 % intervals that hold"
     return Table(f"telemetry-{label}", title, rows, [note])
 
 
-def _statistics(values: list[tuple[Measured, float]]) -> dict[str, float]:
+def _statistics(name: str, values: list[tuple[Measured, float]]) -> dict[str, float]:
     value, error, truth = np.array([(each.value, each.error, true) for each, true in values]).T
     if np.isnan(truth).any():
         return {"values": float(len(values))}
@@ -93,6 +106,9 @@ def _statistics(values: list[tuple[Measured, float]]) -> dict[str, float]:
         "intervals that hold": float(np.mean(held)),
         "values": float(len(values)),
     }
+    if name in _LIMITS:
+        number, part = _LIMITS[name]
+        found["within limits"] = float(np.mean(apart <= number + part * np.abs(truth)))
     if truth.all():
         found = {"mean value / truth": float((value / truth).mean())} | found
     return found
