@@ -24,7 +24,7 @@ from faintspot.estimators import Estimator, option, register
 class PowerCentroid(Estimator):
     """Centre of gravity of a power of the image: bright pixels count more."""
 
-    power: Any = option(1.5, "Power of each pixel's light.", low=1.0, high=4.0, per_subaperture=False)
+    power: Any = option(1.5, "Power of each pixel's signal.", low=1.0, high=4.0, per_subaperture=False)
     name = "power"
     label = "power centroid"
 

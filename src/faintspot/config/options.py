@@ -123,7 +123,7 @@ def option(default: Any, meaning: str, **bounds: Any) -> Any:
     >>> @dataclass(frozen=True, eq=False, kw_only=True)
     ... class Power(Estimator):
     ...     name = "power"
-    ...     power: float = option(1.5, "Power of each pixel's light.", low=1.0, high=4.0)
+    ...     power: float = option(1.5, "Power of each pixel's signal.", low=1.0, high=4.0)
     >>> Power(power=9.0)
     Traceback (most recent call last):
         ...

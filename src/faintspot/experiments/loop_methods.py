@@ -164,10 +164,10 @@ class MethodKind:
         return tuned
 
     def method(self, configuration: LoopConfiguration, choice: Choice) -> Method:
-        """Return the method with tuned values, for the configuration's own light.
+        """Return the method with tuned values, for the configuration's own flux.
 
         The PSF of those that need one is that of a flat wavefront; the score is trained on simulated spots
-        of the same strength of turbulence, light and camera.
+        of the same strength of turbulence, flux and camera.
 
         Raises
         ------
