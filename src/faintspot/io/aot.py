@@ -20,13 +20,11 @@ from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import write_atomically
 from faintspot.base.toml_files import parse_text
+from faintspot.io.aot_reading import NOISE, NOISE_COLUMNS
 from faintspot.io.telemetry import Telemetry
 
 # The standard demands both, which a sensor alone does not have.
 _EXPECTED = r".AOT_(WAVEFRONT_CORRECTORS|LOOPS). .* contains no data"
-NOISE = "SLOPES_NOISE"
-"""Name of the table with the noise of slopes."""
-NOISE_COLUMNS = "VAR_X", "VAR_Y", "COV_XY"
 AO_MODES = ("SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO")
 
 

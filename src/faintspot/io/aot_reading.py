@@ -19,12 +19,16 @@ from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import parse_json
 from faintspot.base.sizes import check_bytes, memory_bytes
-from faintspot.io.aot import NOISE, NOISE_COLUMNS
 from faintspot.io.fits_units import AOT_VERSION, units_of, whole_units
 from faintspot.io.locations import one_line
 from faintspot.sensor.layout import Layout
 
 _PIXELS = ("pix", "pixel", "px")
+
+
+NOISE = "SLOPES_NOISE"
+"""Name of the table with the noise of slopes, in files written by faintspot."""
+NOISE_COLUMNS = "VAR_X", "VAR_Y", "COV_XY"
 
 
 @dataclass(frozen=True, eq=False)
