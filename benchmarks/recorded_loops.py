@@ -24,6 +24,7 @@ from faintspot.pipeline.settings import Settings
 Floats = NDArray[np.float64]
 
 SETTLE_FRAMES = 100
+_FLUX_FRAMES = 50
 _LEAK = 0.01
 _WAVELENGTH_M = 500e-9
 
@@ -113,8 +114,7 @@ def recorded(case: Case) -> tuple[RecordedLoop, Truth]:
     """Run the loop of a case; slopes by `window`, divided by the calibrated centroid gain."""
     configuration = case.configuration()
     telescope = TelescopeModel(configuration, case.seed)
-    flux_e = case.photons * telescope.optics.sensor.illumination
-    method = Method("window", Settings("window", flux_e=flux_e))
+    method = Method("window", Settings("window", flux_e=_seen_flux_e(configuration, telescope)))
     if case.from_hcipy:
         telescope.atmosphere = HcipyLayers(configuration, case.seed)  # type: ignore[assignment]
     optics, rate = telescope.optics, configuration.control.frame_rate_hz
@@ -167,6 +167,14 @@ def recorded(case: Case) -> tuple[RecordedLoop, Truth]:
         shaken_nm,
     )
     return loop, truth
+
+
+def _seen_flux_e(configuration: LoopConfiguration, telescope: TelescopeModel) -> Floats:
+    """Return the mean flux in the windows; some of each spot falls outside."""
+    pipeline = make_pipeline(configuration, telescope.optics.sensor, Method("window", Settings("window")))
+    flat = np.zeros_like(telescope.wavefronts(0.0, np.zeros(telescope.optics.mirror.commands))[1])
+    fluxes = [pipeline(telescope.frame(frame, flat)).flux for frame in range(_FLUX_FRAMES)]
+    return np.asarray(np.mean(fluxes, axis=0), np.float64)
 
 
 def winds_of(configuration: LoopConfiguration) -> Floats:

@@ -80,6 +80,23 @@ def test_gaps_and_missing_subapertures() -> None:
     expect_winds(Identification(lost, UNKNOWN, RATE_HZ).layers(), 1.0)
 
 
+def test_slopes_that_tell_little_do_not_count() -> None:
+    """A fifth of the slopes is mostly an estimator's prior, with three times the stated error."""
+    telemetry = observed()
+    rng = np.random.default_rng(4)
+    poor = rng.random(telemetry.open_loop_px.shape) < 0.2
+    wrong = 0.5 * np.sqrt(90.0) * rng.standard_normal(poor.shape)
+    tail = OpenLoopTelemetry(
+        telemetry.open_loop_px + np.where(poor, wrong, 0.0),
+        np.where(poor, 10.0, 1.0) * telemetry.variance_px2,
+        telemetry.trust,
+    )
+    found = Identification(tail, UNKNOWN, RATE_HZ).layers()
+    expect_winds(found, 1.0)
+    # Interpolation in their place halves the noise of a fifth.
+    assert found.noise_factor == pytest.approx(1.2**-2, rel=0.2)
+
+
 def test_turbulence_that_stands_still() -> None:
     """In windows of half a second winds below 2 m/s look alike: no layer is faster than that by much."""
     still = replace(AIR, fraction=np.ones(1), wind_m_per_s=np.array([[0.4, 0.0]]))

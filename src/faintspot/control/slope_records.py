@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 _MOST_SUBAPERTURES = 60
 _LEAST_MEASURED, _LEAST_MEASURED_OF_WINDOW = 0.5, 0.8  # of frames, or of slopes
-_MOST_VARIANCE = 20.0  # of the median: slopes with more count as not measured
+_MOST_VARIANCE = 4.0  # of the median: slopes with more count as not measured. More of them hide weak layers
 
 
 @dataclass(frozen=True, eq=False)
