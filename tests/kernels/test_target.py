@@ -19,8 +19,9 @@ _MEASURE = """
 import json
 from tests.kernels import test_target as here
 from faintspot.kernels.host import lanes_for
+from faintspot.kernels.target import vector_registers
 target, width = here.compile_target(), lanes_for("float32").width
-print(json.dumps([target.cpu, sorted(target.features), width, here.slopes().tolist()]))
+print(json.dumps([target.cpu, sorted(target.features), width, vector_registers(), here.slopes().tolist()]))
 """
 
 
@@ -54,7 +55,8 @@ def test_generic_processor(tmp_path: Path) -> None:
         [sys.executable, "-c", _MEASURE], env=environment, cwd=root, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    cpu, features, width, found = json.loads(done.stdout)
+    cpu, features, width, registers, found = json.loads(done.stdout)
     assert (cpu, features, width) == ("generic", [], 4)
+    assert registers == (32 if compile_target().triple.startswith("aarch64") else 16)
     # float32 rounding (6e-8) over 7 px, summed over 64 pixels and some tens of iterations.
     np.testing.assert_allclose(found, slopes(), atol=2e-5)

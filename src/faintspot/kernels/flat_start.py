@@ -32,7 +32,7 @@ from faintspot.kernels.simd import (
     twice_reciprocal_square_root,
     width_of,
 )
-from faintspot.kernels.sweeps import IMAGE, STATE_VECTORS, bounded_square, store_projected
+from faintspot.kernels.sweeps import IMAGE, STATE_VECTORS, store_projected
 
 FIRST_GUESS = 1.6  # of the multiplier, in units of the strength: the middle of what occurs, 0.5 to 3.5
 MOMENTUM_AGE = 4.0  # the accelerated iteration begins as if it had run for some time
@@ -242,5 +242,5 @@ def start_flat(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, table: Any, 
         for x in range(nx):
             px, py = _field(lanes, rows, y, x, ny, nx, twice * inverse)
             place = (y * nx + x) * STATE_VECTORS * width
-            store_projected(lanes, state, place, px, py, bounded_square(lanes, px, py))
+            store_projected(lanes, state, place, px, py)
     return inverse

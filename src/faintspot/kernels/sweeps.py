@@ -5,8 +5,8 @@ field p = (px, py), which take turns as the current and the previous one, and th
 stored is 2 p, of length at most 2, since 2 / sqrt(a) is cheaper than 1 / sqrt(a).
 
 v = div q - g / lambda of row y is all that row y - 1 still lacks for its update, so a rolling row of vectors
-in scratch replaces every other intermediate image. Rows are swept in pairs, so that every second row only
-passes through it, and a pixel's work is spread over four turns of the loop: see `_turn`.
+in scratch replaces every other intermediate image. Rows are swept in pairs, so that only every second row
+passes through it: see `_turn`.
 
 References: Chambolle 2004 (J. Math. Imaging Vis. 20, 89), Beck & Teboulle 2009 (IEEE Trans. Image Process.
 18, 2419).
@@ -27,11 +27,14 @@ from faintspot.kernels.simd import (
     twice_reciprocal_square_root,
     width_of,
 )
+from faintspot.kernels.target import vector_registers
 
 STATE_VECTORS = 5  # vectors per pixel: 2 px, 2 py of both versions, g
 IMAGE = 4  # place of g among them
 FGP_STEP = 0.125
 CHAMBOLLE_STEP = 0.25
+# With 16 registers, values extrapolated ahead would be spilled to memory and read back.
+EXTRAPOLATES_AHEAD = vector_registers() >= 32
 
 
 @inlined
@@ -46,30 +49,20 @@ def _extrapolate(lanes: Any, state: Any, place: Any, current: Any, previous: Any
 
 
 @inlined
-def bounded_square(lanes: Any, px: Any, py: Any) -> Any:
-    """Return |p|^2, at least four: the divisor in `store_projected`."""
-    return maximum(multiply_add(px, px, py * py), splat(lanes, 4.0))
+def _extrapolate_pair(lanes: Any, state: Any, place: Any, line: Any, versions: Any, momentum: Any) -> Any:
+    """Extrapolate one pixel of the upper row and the pixel below it."""
+    qx, qy = _extrapolate(lanes, state, place, versions[0], versions[1], momentum)
+    rx, ry = _extrapolate(lanes, state, place + line, versions[0], versions[1], momentum)
+    return qx, qy, rx, ry
 
 
 @inlined
-def store_projected(lanes: Any, state: Any, target: Any, px: Any, py: Any, square: Any) -> None:
+def store_projected(lanes: Any, state: Any, target: Any, px: Any, py: Any) -> None:
     """Store the nearest dual vector of length at most two."""
-    shrink = twice_reciprocal_square_root(square)
+    bounded_square = maximum(multiply_add(px, px, py * py), splat(lanes, 4.0))
+    shrink = twice_reciprocal_square_root(bounded_square)
     store(state, target, px * shrink)
     store(state, target + width_of(lanes), py * shrink)
-
-
-@inlined
-def _advance(
-    lanes: Any, state: Any, line: Any, previous: Any, top: Any, targets: Any, steps: Any, bounded: Any
-) -> Any:
-    """Project and store the oldest steps, and bound those after them."""
-    fx, fy, f_square, hx, hy, h_square = bounded
-    if not top:
-        store_projected(lanes, state, targets[0] - line + previous, fx, fy, f_square)
-    store_projected(lanes, state, targets[1] + previous, hx, hy, h_square)
-    fx, fy, hx, hy = steps
-    return fx, fy, bounded_square(lanes, fx, fy), hx, hy, bounded_square(lanes, hx, hy)
 
 
 @inlined
@@ -86,20 +79,23 @@ def _turn(
     left_edge: Any,
     carried: Any,
 ) -> Any:
-    """One column of a pair of rows, at four stages of the work; return what the next turn needs.
+    """Process one column of a pair of rows; return the values that the next turn needs.
 
-    Extrapolate column x + 1; complete v of column x; from that, take the steps of p in the row above the pair
-    (column x) and in its upper row (column x - 1); bound the steps of one turn before, and project and store
-    those of two turns before. No stage waits for another of the same turn: a processor that looks some 150
-    instructions ahead would otherwise wait for the whole chain of a pixel, which takes longer than its work.
+    Extrapolate this column, or the next one where there are registers to keep it in; complete v of this
+    column; from that, update p in the row above the pair (this column) and in its upper row (the column
+    before, `behind`). Sums begin with terms known early, and the extrapolation ahead comes before p is
+    stored: the chain of operations on a pixel takes longer than its arithmetic, and the processor overlaps
+    only the turns that its window of instructions holds.
     """
     width = width_of(lanes)
-    current, previous = versions
+    previous = versions[1]
     momentum, minus_inverse, step = factors
     place, following = places
-    norm, v_above, (qx, qy, rx, ry), (ax, ay, av, bx, bv), (p1, p2, p3), steps, bounded = carried
-    bounded = _advance(lanes, state, line, previous, top, (p2, p3), steps, bounded)
-    fx, fy, _, _ = steps
+    norm, v_above, ahead, (ax, ay, av, bx, bv), behind = carried
+    if EXTRAPOLATES_AHEAD:
+        qx, qy, rx, ry = ahead
+    else:
+        qx, qy, rx, ry = _extrapolate_pair(lanes, state, place, line, versions, momentum)
     here = x * 3 * width
     dx, ex = (qx, rx) if left_edge else (qx - ax, rx - bx)
     if top:
@@ -108,34 +104,33 @@ def _turn(
         qy_above = load(lanes, rows, here + width)
         d = dx + (qy - qy_above)
     e = ex + (ry - qy)
-    v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d * step)
-    w = multiply_add(load(lanes, state, place + line + IMAGE * width), minus_inverse, e * step)
+    v = multiply_add(d, step, load(lanes, state, place + IMAGE * width) * minus_inverse)
+    w = multiply_add(e, step, load(lanes, state, place + line + IMAGE * width) * minus_inverse)
     norm = multiply_add(e, e, multiply_add(d, d, norm))
     if not top:
         v_right = load(lanes, rows, here + 5 * width)
         fx = (v_right - v_above) + load(lanes, rows, here)
-        fy = (v - v_above) + qy_above
+        fy = v + (qy_above - v_above)
         v_above = v_right
-    # At the left edge: the rightmost pixel of the pair above, which has no gradient along x.
-    hx = ax if left_edge else (v - av) + ax
-    hy = (bv - av) + ay
     store(rows, here, rx)
     store(rows, here + width, ry)
     store(rows, here + 2 * width, w)
-    next_qx, next_qy = _extrapolate(lanes, state, following, current, previous, momentum)
-    next_rx, next_ry = _extrapolate(lanes, state, following + line, current, previous, momentum)
-    ahead = next_qx, next_qy, next_rx, next_ry
-    return norm, v_above, ahead, (qx, qy, v, rx, w), (place, p1, p2), (fx, fy, hx, hy), bounded
+    if EXTRAPOLATES_AHEAD:
+        ahead = _extrapolate_pair(lanes, state, following, line, versions, momentum)
+    if not top:
+        store_projected(lanes, state, place - line + previous, fx, fy)
+    # At the left edge: the rightmost pixel of the pair above, which has no gradient along x.
+    hx = ax if left_edge else v + (ax - av)
+    hy = (bv - av) + ay
+    store_projected(lanes, state, behind + previous, hx, hy)
+    return norm, v_above, ahead, (qx, qy, v, rx, w), place
 
 
 @inlined
 def _no_work(lanes: Any, norm: Any, place: Any) -> Any:
-    """Return the initial steps of zero for a pixel that is written again later."""
-    zero, four = splat(lanes, 0.0), splat(lanes, 4.0)
-    nothing = zero, zero, zero, zero
-    bounded = zero, zero, four, zero, zero, four
-    left = zero, zero, zero, zero, zero
-    return norm, zero, nothing, left, (place, place, place), nothing, bounded
+    """Return the initial `carried`: its first update, of zero at `place`, is overwritten later."""
+    zero = splat(lanes, 0.0)
+    return norm, zero, (zero, zero, zero, zero), (zero, zero, zero, zero, zero), place
 
 
 @inlined
@@ -145,14 +140,13 @@ def _sweep_pair(
     """All turns of rows y and y + 1, `top` when y = 0; `rows`: those of row y - 1, then of row y + 1."""
     width = width_of(lanes)
     pixel, line = STATE_VECTORS * width, nx * STATE_VECTORS * width
-    current, previous = versions
     place, last = y * line, y * line + line - pixel
-    norm, v_above, _, left, where, steps, bounded = carried
-    qx, qy = _extrapolate(lanes, state, place, current, previous, factors[0])
-    rx, ry = _extrapolate(lanes, state, place + line, current, previous, factors[0])
+    norm, v_above, ahead, left, behind = carried
+    if EXTRAPOLATES_AHEAD:
+        ahead = _extrapolate_pair(lanes, state, place, line, versions, factors[0])
     if not top:
         v_above = load(lanes, rows, 2 * width)
-    carried = norm, v_above, (qx, qy, rx, ry), left, where, steps, bounded
+    carried = norm, v_above, ahead, left, behind
     places = place, min(place + pixel, last)
     carried = _turn(lanes, state, rows, 0, places, line, versions, factors, top, True, carried)
     for x in range(1, nx):
@@ -165,17 +159,10 @@ def _sweep_pair(
 
 
 @inlined
-def _finish(lanes: Any, state: Any, line: Any, previous: Any, top: Any, carried: Any) -> Any:
-    """Store what is still on its way after the last turn; return the norm."""
-    norm, _, _, (ax, ay, av, _, bv), (p1, p2, p3), (gx, gy, ix, iy), bounded = carried
-    fx, fy, f_square, hx, hy, h_square = bounded
-    if not top:
-        store_projected(lanes, state, p2 - line + previous, fx, fy, f_square)
-        store_projected(lanes, state, p1 - line + previous, gx, gy, bounded_square(lanes, gx, gy))
-    store_projected(lanes, state, p3 + previous, hx, hy, h_square)
-    store_projected(lanes, state, p2 + previous, ix, iy, bounded_square(lanes, ix, iy))
-    ay = (bv - av) + ay
-    store_projected(lanes, state, p1 + previous, ax, ay, bounded_square(lanes, ax, ay))
+def _finish(lanes: Any, state: Any, previous: Any, carried: Any) -> Any:
+    """Update p in the rightmost pixel of the last pair's upper row; return the norm."""
+    norm, _, _, (ax, ay, av, _, bv), behind = carried
+    store_projected(lanes, state, behind + previous, ax, (bv - av) + ay)
     return norm
 
 
@@ -208,9 +195,7 @@ def _update_last_row(lanes: Any, state: Any, rows: Any, target: Any, nx: Any) ->
         here = x * 3 * width
         v_right = load(lanes, rows, here + 5 * width)
         px = (v_right - v) + load(lanes, rows, here)
-        store_projected(
-            lanes, state, target + x * STATE_VECTORS * width, px, zero, bounded_square(lanes, px, zero)
-        )
+        store_projected(lanes, state, target + x * STATE_VECTORS * width, px, zero)
         v = v_right
 
 
@@ -231,7 +216,7 @@ def sweep_fgp(
     if ny % 2 == 0:
         carried = _no_work(lanes, splat(lanes, 0.0), 0)
         carried = _sweep_pair(lanes, state, rows, 0, nx, versions, factors, True, carried)
-        norm = _finish(lanes, state, line, versions[1], True, carried)
+        norm = _finish(lanes, state, versions[1], carried)
         y = 2
     else:
         norm = _first_row(lanes, state, rows, nx, versions, factors)
@@ -241,7 +226,7 @@ def sweep_fgp(
         while y < ny:
             carried = _sweep_pair(lanes, state, rows, y, nx, versions, factors, False, carried)
             y += 2
-        norm = _finish(lanes, state, line, versions[1], False, carried)
+        norm = _finish(lanes, state, versions[1], carried)
     _update_last_row(lanes, state, rows, (ny - 1) * line + versions[1], nx)
     return norm * splat(lanes, 0.25)
 

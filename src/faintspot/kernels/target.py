@@ -28,3 +28,9 @@ def compile_target() -> Target:
     triple, cpu, features = cpu_target.target_context.codegen().magic_tuple()
     names = (name.strip() for name in features.split(","))
     return Target(triple, cpu, frozenset(name[1:] for name in names if name.startswith("+")))
+
+
+def vector_registers() -> int:
+    """Return the number of vector registers of the target: 32 with AVX-512 and on aarch64, else 16."""
+    target = compile_target()
+    return 32 if "avx512vl" in target.features or target.triple.startswith("aarch64") else 16
