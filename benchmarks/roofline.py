@@ -41,6 +41,7 @@ from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved
 from benchmarks.sweeps import SIDE, Group, numba_sweeps
 from faintspot.kernels.host import aligned_zeros
 from faintspot.kernels.sweeps import STATE_VECTORS
+from faintspot.kernels.target import compile_target
 
 WIDTHS = (16, 8, 4)
 TARGET = 0.85
@@ -264,12 +265,12 @@ def _fraction_row(width: int, times: Times, bound: str, mnemonics: list[str], pi
 
 
 def run() -> list[Table]:
-    """Measure for every vector width that this machine has."""
+    """Measure for every vector width of the processor that Numba compiles for."""
     title = "The sweep against the arithmetic issue bound, per pixel of W images"
     if platform.machine() not in ("x86_64", "AMD64"):
         return [Table("roofline", title, [], ["x86-64 only"])]
-    features = llvm.get_host_cpu_features()
-    has = {16: features.get("avx512f"), 8: features.get("avx2"), 4: features.get("avx")}
+    features = compile_target().features
+    has = {16: "avx512f" in features, 8: "avx2" in features, 4: "avx" in features}
     instructions, fractions, notes = [], [], []
     with pinned():
         for width in (w for w in WIDTHS if has[w]):

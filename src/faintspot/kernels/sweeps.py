@@ -18,6 +18,7 @@ from typing import Any
 
 from faintspot.kernels.compiling import compiled, inlined
 from faintspot.kernels.simd import (
+    align_stack,
     load,
     maximum,
     multiply_add,
@@ -209,6 +210,7 @@ def sweep_fgp(
     is 1 / lambda. `rows` has space for 3 (nx + 1) vectors: qx, qy and step * v of each pixel of one
     row.
     """
+    align_stack(lanes)
     width = width_of(lanes)
     line = nx * STATE_VECTORS * width
     versions = current * width, (2 - current) * width
