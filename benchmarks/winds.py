@@ -112,7 +112,9 @@ def drifting(case: Case, learnt: Learnt, realisation: int) -> Drifted:
             found = relearn(case.plant, running, telemetry, case.site, case.rate_hz, start)
         if run.frame % every == later and found is not None and found.is_better:
             running, line = found.learnt.model, CommandDelayLine(len(run.line.latest), run.line.delay_frames)
-            successor = Successor(Ready(KALMAN, found.learnt.controller(line), line, False, True, True))
+            successor = Successor(
+                Ready(KALMAN, found.learnt.controller(line), line, False, True, True, False)
+            )
     run.strehl[:SETTLE], change[:SETTLE] = np.nan, 0.0
     largest = float((at_handover * change).max()), float((change - at_handover * change).max())
     count = round(at_handover.sum() / HANDOVER_FRAMES)

@@ -6,11 +6,13 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 from tests.control.control_cases import FRAME_S, INTERACTION, PLANT, TURBULENCE, telemetry
 
 from faintspot.base.errors import InputError
+from faintspot.control import slope_product
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.configuration import Control, ControlOptions
@@ -18,6 +20,7 @@ from faintspot.control.guarded import Guarded
 from faintspot.control.integrator import Integrator
 from faintspot.control.learning import CONTROLS, INTEGRATOR, KALMAN, learn
 from faintspot.control.learnt import Model
+from faintspot.kernels.products import add_slopes
 from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.realtime.control_loop import ControlLoop
 from faintspot.realtime.prior import Prior
@@ -127,6 +130,45 @@ def any_control(data: st.DataObject) -> None:
 
 def test_what_is_not_finite_never_reaches_the_mirror() -> None:
     settings(max_examples=100, deadline=None)(given(st.data())(any_control))()
+
+
+def test_a_command_that_is_begun_while_rows_arrive_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With lost frames, changed flags and slopes that are not finite; the tolerance is that of float32."""
+    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    options = ControlOptions(centroid_gain=0.8, largest_residual_px=1e30, most_invalid=1.0)
+    whole, begun = (ControlLoop(Control(INTERACTION, None, options), LAYOUT, threads=2) for _ in range(2))
+    assert not begun.begin_product()  # the loop is open
+    for loop in (whole, begun):
+        loop.close()
+    assert not begun.begin_product()
+    rng = np.random.default_rng(4)
+    for number in (0, 1, 2, 5, 6, 7):
+        slopes = Slopes(*(np.zeros(N, kind) for kind in RESULT_TYPES))
+        slopes.x[:], slopes.y[:] = rng.standard_normal((2, N))
+        slopes.x[number % N] = np.nan
+        parts = begun.begin_product()
+        assert len(parts) == (2 if number else 0)
+        for thread, part in enumerate(parts):
+            add_slopes(part, slopes.x, slopes.y, slopes.flags, 5 * thread, 5 * thread + 4)
+        slopes.flags[2] = 1
+        sent = [loop.follow(slopes, number).copy() for loop in (whole, begun)]
+        np.testing.assert_allclose(sent[1], sent[0], atol=1e-6)
+        for loop in (whole, begun):
+            loop.look_after(slopes.flux)
+    assert np.abs(sent[0]).max() > 0.1
+    begun.open()
+    assert not begun.begin_product()
+
+
+def test_no_command_is_begun_if_modes_are_removed_from_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    options = ControlOptions(removed_modes="tip_tilt", largest_residual_px=1e30)
+    loop = ControlLoop(Control(INTERACTION, None, options), LAYOUT)
+    loop.close()
+    slopes = Slopes(*(np.zeros(N, kind) for kind in RESULT_TYPES))
+    loop.follow(slopes, 0)
+    assert loop.closed
+    assert not loop.begin_product()
 
 
 def run(loop: ControlLoop, stroke: float, taken: list[Slopes]) -> str:

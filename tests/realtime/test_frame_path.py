@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from tests.simulated import frames_of
 
 import faintspot as fs
+from faintspot.control import slope_product
+from faintspot.control.slope_product import SlopeProduct
 from faintspot.kernels.ordered import store
 from faintspot.kernels.streaming import (
     COLD,
@@ -97,6 +99,61 @@ def test_same_slopes_as_the_pipeline(name: str, threads: int) -> None:
             writer.join()
             path.flag_doubtful()
             assert_same(path.slopes, expected, number)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_a_product_with_the_slopes_is_begun_while_rows_arrive(
+    threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last rows come when some groups are done. Slopes are the same, and later frames begin anew."""
+    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    data, source = frames(4), Source()
+    expected = pipeline("plain")(data)
+    product = SlopeProduct(np.random.default_rng(1).standard_normal((20, 2 * len(LAYOUT))))
+    taken, columns = product.memory.taken, product.columns.astype(np.float64)
+    middle = LAYOUT.frame_shape[0] // 2
+
+    def write(number: int, frame: NDArray[Any]) -> None:
+        source.slots[number % SLOTS] = frame
+        store(source.cells, 1, middle)
+        store(source.cells, 0, number)
+        end = time.monotonic() + 10.0
+        while not taken.any() and time.monotonic() < end:
+            time.sleep(1e-3)
+        store(source.cells, 1, len(frame))
+
+    with ExitStack() as stack:
+        workers = stack.enter_context(closing(Workers(threads - 1))) if threads > 1 else None
+        path = FramePath(pipeline("plain"), source.slots, source.progress, workers=workers)
+        path.warm_up()
+        for number, frame in enumerate(data):
+            taken[:] = 0.0
+            writer = threading.Thread(target=write, args=(number, frame))
+            writer.start()
+            assert path.measure(number, product=product.parts(threads, 0.5))
+            writer.join()
+            path.flag_doubtful()
+            assert_same(path.slopes, expected, number)
+            vector, begun = 0.5 * path.slopes.vector.astype(np.float64), taken != 0
+            np.testing.assert_array_equal(taken[begun], vector.astype(np.float32)[begun])
+            assert begun.any()
+            np.testing.assert_allclose(product.memory.outs.sum(axis=0), taken @ columns, atol=1e-5)
+            np.testing.assert_allclose(product(vector), vector @ columns, atol=1e-5)  # of float32
+
+
+@pytest.mark.portable
+def test_frames_that_are_there_are_measured_before_any_product(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    data, source = frames(1), Source()
+    source.write(0, data[0])
+    product = SlopeProduct(np.ones((20, 2 * len(LAYOUT))))
+    path = FramePath(pipeline("plain"), source.slots, source.progress)
+    parts = product.parts(1, 1.0)
+    parts[0].taken[:] = 1.0  # of a frame that was lost
+    assert path.measure(0, product=parts)
+    assert not product.memory.taken.any()
+    path.flag_doubtful()
+    assert_same(path.slopes, pipeline("plain")(data), 0)
 
 
 @pytest.mark.portable

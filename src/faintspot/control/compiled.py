@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.flags import INVALID
 from faintspot.control.base import Expected
 from faintspot.control.commands import CommandDelayLine
+from faintspot.control.slope_product import SlopeProduct
 from faintspot.kernels.compiling import Direct, compiled_with
+from faintspot.kernels.products import ProductPart, add_products, finish_product, is_measured
 
 Floats = NDArray[np.float64]
 
-_INVALID = int(INVALID)
 _compiled = partial(compiled_with, source=__file__)
 
 INVALID_PART, MEAN_SQUARE = range(2)
@@ -55,7 +56,7 @@ def true_slopes(
     invalid, square = 0, 0.0
     for s in range(n):
         along, across = x[s] * scale, y[s] * scale
-        if flags[s] & _INVALID == 0 and np.isfinite(along) and np.isfinite(across):
+        if is_measured(along, across, flags[s]):
             slopes[s], slopes[n + s] = along, across
             errors[s], errors[n + s] = error_x[s] * scale, error_y[s] * scale
             covariance[s] = covariance_xy[s] * scale * scale
@@ -67,33 +68,6 @@ def true_slopes(
             invalid += 1
     said[INVALID_PART] = invalid / n
     said[MEAN_SQUARE] = square / (2 * max(n - invalid, 1))
-
-
-@_compiled
-def add_products(columns: Any, vectors: Any, out: Any) -> None:
-    """Add the products of a matrix with vectors.
-
-    Parameters
-    ----------
-    columns : (m, c) array
-        The matrix, transposed, so that results are what the processor works on side by side.
-    vectors : (k, m) array
-    out : (k, c) array
-        All three float32, or all float64.
-    """
-    m, c = columns.shape
-    whole = m - m % 4  # four rows at once: results are read and written a quarter as often
-    for s in range(0, whole, 4):
-        for k in range(vectors.shape[0]):
-            a, b, d, e = vectors[k, s], vectors[k, s + 1], vectors[k, s + 2], vectors[k, s + 3]
-            for i in range(c):
-                out[k, i] += (columns[s, i] * a + columns[s + 1, i] * b) + (
-                    columns[s + 2, i] * d + columns[s + 3, i] * e
-                )
-    for s in range(whole, m):
-        for k in range(vectors.shape[0]):
-            for i in range(c):
-                out[k, i] += columns[s, i] * vectors[k, s]
 
 
 FLUX, DISPLACEMENT, FLUX_TIMES_DISPLACEMENT = range(3)
@@ -134,7 +108,7 @@ def displaced_flux(commands: Any, flux: Any, columns: Any, work: Any, said: Any)
 
 @_compiled
 def integrate(
-    slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, place: Any, work: Any
+    slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, place: Any, memory: Any
 ) -> float:
     """Write the next command: `keep` times the latest minus `gain` times the wavefront, clipped.
 
@@ -151,18 +125,14 @@ def integrate(
         Of a `CommandDelayLine`.
     place : int
         Which row to write; the latest command is in the one before.
-    work : tuple of (1, m) and (1, commands) float32 arrays
-        Slopes, and the wavefront.
+    memory : ProductMemory
+        Of the wavefront.
     """
     latest, out = rows[(place or rows.shape[0]) - 1], rows[place]
-    seen, wavefront = work
-    for s in range(slopes.shape[0]):
-        seen[0, s] = slopes[s]
-    wavefront[:] = 0.0
-    add_products(columns, seen, wavefront)
+    finish_product(columns, slopes, memory)
     total = 0.0
     for c in range(out.shape[0]):
-        wanted = keep * latest[c] - gain * wavefront[0, c]
+        wanted = keep * latest[c] - gain * memory.result[c]
         total += wanted
         out[c] = min(max(wanted, -largest), largest)
     return total
@@ -193,8 +163,7 @@ class CompiledIntegrator:
         self, line: CommandDelayLine, interaction: Floats, reconstruct: Floats, gain: float, leak: float
     ) -> None:
         self._line, self._interaction = line, interaction
-        self._columns = np.ascontiguousarray(reconstruct.T, np.float32)
-        self._work = tuple(np.zeros((1, side), np.float32) for side in self._columns.shape)
+        self._wavefront = SlopeProduct(reconstruct)
         self.gain, self._keep = float(gain), 1.0 - leak
 
     def expected(self) -> Expected:
@@ -208,6 +177,11 @@ class CompiledIntegrator:
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
     ) -> None:
         """See `Controller`; invalid slopes are 0, and all count the same."""
-        line = self._line
+        line, product = self._line, self._wavefront
         numbers = self.gain, self._keep, line.largest
-        line.sent(_INTEGRATE(slopes_px, self._columns, *numbers, line.rows, line.place, self._work))
+        total = _INTEGRATE(slopes_px, product.columns, *numbers, line.rows, line.place, product.memory)
+        line.sent(total)
+
+    def begin_product(self, threads: int, scale: float) -> Sequence[ProductPart]:
+        """Return the parts of the next frame's product with its slopes; see `SlopeProduct.parts`."""
+        return self._wavefront.parts(threads, scale)

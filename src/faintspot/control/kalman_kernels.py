@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.control.compiled import add_products
 from faintspot.control.guarded import (
     CORRELATED_FRAMES,
     FEWEST_FRAMES,
@@ -23,6 +22,7 @@ from faintspot.control.guarded import (
 from faintspot.control.kalman import LARGEST_VARIANCE_PX2
 from faintspot.control.telemetry import LEAST_SHARE, LEAST_VARIANCE_PX2
 from faintspot.kernels.compiling import Direct, compiled_with
+from faintspot.kernels.products import add_products
 
 _compiled = partial(compiled_with, source=__file__)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from faintspot.control.base import Expected
 from faintspot.control.commands import CommandDelayLine
-from faintspot.control.compiled import add_products
 from faintspot.control.guarded import Guarded
 from faintspot.control.integrator import Integrator
 from faintspot.control.local_covariance import replies
 from faintspot.control.local_kalman import LocalPredictor
 from faintspot.control.predictive import Predictive
 from faintspot.control.reconstructor import Reconstructor
+from faintspot.control.slope_product import SlopeProduct
 from faintspot.control.telemetry import without_prior
-from faintspot.kernels.compiling import Direct
+from faintspot.kernels.products import ProductPart
 
 Floats = NDArray[np.float64]
 
@@ -26,14 +26,26 @@ _LEARNT, _PLAIN = range(2)
 
 
 class _Frame(NamedTuple):
-    """A frame whose command has been sent."""
+    """A frame's slopes, and those that commands of both lines cause."""
 
     open_loop: Floats
+    surprise: Floats
+    """Open-loop slopes minus their prediction."""
     variance: Floats
-    left_by_learnt: Floats
-    left_by_plain: Floats
-    missing: Floats
-    """Addition to the latter by the integrator's estimator, where it trusts its prior."""
+    trust: Floats
+    by_learnt: Floats
+    by_plain: Floats
+    by_latest_plain: Floats
+
+    @property
+    def left(self) -> tuple[Floats, Floats]:
+        """What both controllers leave."""
+        return self.trust * (self.open_loop + self.by_learnt), self.trust * (self.open_loop + self.by_plain)
+
+    @property
+    def missing(self) -> Floats:
+        """Addition by the integrator's estimator to what it leaves, where it trusts its prior."""
+        return (1 - self.trust) * (self.by_plain - self.by_latest_plain)
 
 
 class LargeGuarded(Guarded):
@@ -41,8 +53,8 @@ class LargeGuarded(Guarded):
 
     Reading matrices takes most of the time of a frame. They are kept in float32. The predictive command is
     linear in what the slopes differ from their prediction; the matrix of that is computed beforehand, and so
-    is the command for slopes as predicted. When slopes arrive, one product is left. Four more follow with the
-    next frame, or when somebody asks what is expected.
+    is the command for slopes as predicted. When slopes arrive, one product is left, which can be begun while
+    they are measured. Four more follow with the next frame, or when somebody asks what is expected.
 
     Parameters
     ----------
@@ -81,15 +93,18 @@ class LargeGuarded(Guarded):
 
         super().__init__(line, interaction, phase_of_commands, learnt, plain, **options)
         self._predictor, self._gain, self._keep = predictor, plain_gain, 1.0 - leak
-        self._product, self._reconstruct = _Product(interaction), _Product(reconstructor.matrix)
-        self._clean, self._compare = _Product(reconstructor.clean), _Product(phase_of_commands)
+        self._product, self._reconstruct = SlopeProduct(interaction), SlopeProduct(reconstructor.matrix)
+        self._clean, self._compare = SlopeProduct(reconstructor.clean), SlopeProduct(phase_of_commands)
         found = replies(arrays, line.delay_frames)
-        self._replies = [_Product((each.T @ reconstructor.clean.T).T) for each in found]
+        self._replies = [SlopeProduct((each.T @ reconstructor.clean.T).T) for each in found]
         self._caused = np.zeros((2, len(line.rows), len(interaction)))
         """Slopes that the commands of both lines cause, row by row."""
         self._held, self._held_at = np.zeros(len(interaction)), -1
         """Slopes that the mirror adds."""
-        self._mean = np.zeros(len(interaction))
+        self._mean, self._predicted = np.zeros((2, len(interaction)))
+        """Predicted slopes of the open loop, and with what the mirror adds."""
+        self._level = len(self._replies) // 2
+        """Gains of the latest frame."""
         self._if_as_predicted = np.zeros(interaction.shape[1])
         """The predictive command for slopes as predicted."""
         self._frame: _Frame | None = None
@@ -101,7 +116,7 @@ class LargeGuarded(Guarded):
         self._complete()
         if self.chosen == _PLAIN:
             return Expected(self._held - self._of_line(_PLAIN, 0), None)
-        return Expected(self._held + self._mean, self._predictor.std_px)
+        return Expected(self._predicted, self._predictor.std_px)
 
     def fall_back(self) -> None:
         """See `Guarded`."""
@@ -119,20 +134,31 @@ class LargeGuarded(Guarded):
         """See `Controller`; the gains have the usual covariances of x and y."""
         expected = self.expected().mean_px
         alone, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
-        open_loop, acting = alone - self._held, self._of_line(_PLAIN, 1)
-        by_learnt, by_plain = trust * (open_loop + self._of_line(_LEARNT, 1)), trust * (open_loop + acting)
-        missing = (1 - trust) * (acting - self._of_line(_PLAIN, 0))
-        self._frame = frame = _Frame(open_loop, self._noise_factor * variance, by_learnt, by_plain, missing)
+        caused = self._of_line(_LEARNT, 1), self._of_line(_PLAIN, 1), self._of_line(_PLAIN, 0)
+        open_loop, surprise = alone - self._held, alone - self._predicted
+        self._frame = frame = _Frame(open_loop, surprise, self._noise_factor * variance, trust, *caused)
         if self.chosen == _LEARNT:
             self._predict(frame)
         else:
-            self._integrate(*self._reconstruct(frame.left_by_plain + missing))
+            left = trust * (alone - (self._held - frame.by_plain))
+            self._integrate(self._reconstruct(left + frame.missing))
         self._send()
+
+    def begin_product(self, threads: int, scale: float) -> Sequence[ProductPart]:
+        """Return the parts of the next frame's product with its slopes; see `SlopeProduct.parts`.
+
+        There are none before everything is known of the frame before, and of estimators with a prior.
+        """
+        if self._frame is not None or self._held_at != self._line.place or self.prior_std_px is not None:
+            return ()
+        if self.chosen == _PLAIN:
+            return self._reconstruct.parts(threads, scale, self._held - self._of_line(_PLAIN, 1))
+        return self._replies[self._level].parts(threads, scale, self._predicted)
 
     def _predict(self, frame: _Frame) -> None:
         """Compute the predictive command."""
-        surprise, level = self._predictor.surprise(frame.open_loop - self._mean, frame.variance)
-        self._lines[_LEARNT].put(self._if_as_predicted - self._replies[level](surprise)[0])
+        surprise, self._level = self._predictor.surprise(frame.surprise, frame.variance)
+        self._lines[_LEARNT].put(self._if_as_predicted - self._replies[self._level](surprise))
 
     def _integrate(self, wavefront: Floats) -> None:
         """Compute the integrator's command."""
@@ -143,7 +169,7 @@ class LargeGuarded(Guarded):
         """Complete the previous frame, and compute what does not need the slopes of this one."""
         frame, self._frame = self._frame, None
         if frame is not None:
-            learnt, plain = self._compare(*self._follow_up(frame))
+            learnt, plain = self._compare.several(*self._follow_up(frame))
             self._predictor.correct(frame.open_loop, frame.variance)
             self._predictor.advance()
             left, by_plain = float(learnt @ learnt), float(plain @ plain)
@@ -153,15 +179,15 @@ class LargeGuarded(Guarded):
 
     def _follow_up(self, frame: _Frame) -> Floats:
         """Compute the command that was not sent; return the wavefronts that both leave, as commands."""
-        left = frame.left_by_learnt, frame.left_by_plain
+        left, missing = frame.left, frame.missing
         if self.chosen == _PLAIN:
             self._predict(frame)
-            return self._reconstruct(*left)
-        if not frame.missing.any():
-            found = self._reconstruct(*left)
+            return self._reconstruct.several(*left)
+        if not missing.any():
+            found = self._reconstruct.several(*left)
             self._integrate(found[_PLAIN])
             return found
-        found = self._reconstruct(*left, frame.missing)
+        found = self._reconstruct.several(*left, missing)
         self._integrate(found[_PLAIN] + found[-1])
         return found[:-1]
 
@@ -172,35 +198,19 @@ class LargeGuarded(Guarded):
         same = [np.array_equal(line.acting, mirror.acting) for line in lines]
         if not any(same):
             commands.append(mirror.acting)
-        found = self._product(*commands) if commands else np.zeros((0, 0))
+        found = self._product.several(*commands) if commands else np.zeros((0, 0))
         if is_new:
             for caused, line, slopes in zip(self._caused, lines, found, strict=False):
                 caused[slice(None) if self._restarted else line.place - 1] = slopes
             self._restarted = False
             self._mean = self._predictor.mean_px
             left = self._predictor.ahead(lines[_LEARNT].delay_frames) + self._of_line(_LEARNT, 0)
-            self._if_as_predicted = lines[_LEARNT].latest - self._clean(left)[0]
+            self._if_as_predicted = lines[_LEARNT].latest - self._clean(left)
         self._held = self._of_line(same.index(True), 1) if any(same) else found[-1]
-        self._held_at = mirror.place
+        self._held_at, self._predicted = mirror.place, self._held + self._mean
 
     def _of_line(self, which: int, acting: int) -> Floats:
         """Return the slopes that the latest command of a line causes, or the one that acts in this frame."""
         rows = self._caused[which]
         slopes: Floats = rows[(self._lines[which].place + (2 * acting - 1)) % len(rows)]
         return slopes
-
-
-class _Product:
-    """Product of a matrix with a few vectors, in float32; the matrix is read once."""
-
-    def __init__(self, matrix: Floats) -> None:
-        self._columns = np.ascontiguousarray(matrix.T, np.float32)
-
-    def __call__(self, *vectors: Floats) -> Floats:
-        """Return the products, (vectors, rows)."""
-        out = np.zeros((len(vectors), self._columns.shape[1]), np.float32)
-        _ADD_PRODUCTS(self._columns, np.array(vectors, np.float32), out)
-        return out.astype(np.float64)
-
-
-_ADD_PRODUCTS = Direct(add_products)

@@ -6,6 +6,9 @@ inside the compiled code, without Python: nothing lies between the arrival of a 
 A thread sleeps until shortly before the rows of its next group are due, then polls. The kernel takes the
 processor away from real-time threads that never sleep, for 5 % of each second where others want it. When rows
 are due is learnt from the frames, as a time after the last row of the frame before.
+
+Of the product of a reconstructor with the slopes, as much is computed as the time until rows arrive allows:
+groups whose rows are there are measured first.
 """
 
 from __future__ import annotations
@@ -21,15 +24,16 @@ from faintspot.kernels.clock import now_ns, sleep_ns
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.groups import copied
 from faintspot.kernels.ordered import look_at
-from faintspot.kernels.simd import intrinsic
+from faintspot.kernels.products import add_slopes
+from faintspot.kernels.simd import intrinsic, width_of
 
 LOOKS_BETWEEN_STOPS = 1024  # at the progress, between two looks at whether to give up
 
-LAST_ROW, MARGIN, WOKEN_LATE, COLD, SLEEPS, PACE_CELLS = range(6)
+LAST_ROW, MARGIN, WOKEN_LATE, COLD, SLEEPS, PENDING, PACE_CELLS = range(7)
 """Cells of `Arrival.pace`, and their number. LAST_ROW: time of the last row of the frame before [ns]; 0: not
 known, do not sleep. MARGIN: time before rows are due at which a thread wakes up [ns]. WOKEN_LATE: number of
 times that rows were there before it woke up. COLD: whether it has slept since the last rehearsal. SLEEPS:
-number of times that it has slept."""
+number of times that it has slept. PENDING: first group whose product is to be added."""
 SHORTEST_NS = 60_000
 _LONGEST_NS = 20_000_000  # so that a stop is noticed
 _NAP_NS = 50_000
@@ -144,6 +148,27 @@ def wait_for_group(arrival: Any, frame: Any, rows: Any, item: Any) -> Any:
     return there
 
 
+@compiled
+def multiply_until(
+    arrival: Any, frame: Any, rows: Any, item: Any, width: Any, slopes: Any, part: Any
+) -> None:
+    """Add products of groups before `item`, until the rows are there; of `width` sub-apertures each.
+
+    Parameters
+    ----------
+    slopes : SlopeArrays
+    part : ProductPart
+    """
+    if part.columns.shape[0] == 0:
+        return
+    pace, n = arrival.pace, slopes.x.shape[1]
+    cells = arrival.cells, arrival.frame_cell, arrival.rows_cell
+    while pace[PENDING] < item and not rows_are_there(*cells, frame, rows):
+        first = pace[PENDING] * width
+        add_slopes(part, slopes.x[0], slopes.y[0], slopes.flags[0], first, min(first + width, n))
+        pace[PENDING] += 1
+
+
 def measure(source: Any, task: Any, start: Any, stop: Any, scratch: Any, slopes: Any, stages: Any) -> None:
     """Stand for the compiled function that measures groups, which `streamed` puts in its place."""
 
@@ -159,8 +184,9 @@ def stream_groups(
     scratch: Any,
     slopes: Any,
     stages: Any,
+    part: Any,
 ) -> Any:
-    """Measure the groups [start, stop) of a frame while it arrives.
+    """Measure the groups [start, stop) of a frame while it arrives, and begin the product with their slopes.
 
     Parameters
     ----------
@@ -171,13 +197,16 @@ def stream_groups(
         Rows of the frame that each group needs.
     source, task, scratch, slopes, stages
         See `groups.measure_groups`.
+    part : ProductPart
 
     Returns
     -------
     int
         First group that was not measured: `stop` unless waiting was ended.
     """
+    width = width_of(source.lanes)
     for item in range(start, stop):
+        multiply_until(arrival, frame, last_rows[item], item, width, slopes, part)
         sleep_until_due(arrival, frame, last_rows[item], item)
         if not wait_for_group(arrival, frame, last_rows[item], item):
             return item

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from faintspot.control.configuration import Control
 from faintspot.control.guarded import Guarded
 from faintspot.control.learnt import Model
 from faintspot.kernels.compiling import Direct
+from faintspot.kernels.products import ProductPart
 from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.realtime.guard import Guard
 from faintspot.realtime.prior import Prior
@@ -49,6 +51,8 @@ class ControlLoop:
     prior : Prior, optional
         Receives the prediction of the next frame's slopes from a predictive controller while the loop is
         closed.
+    threads : int
+        Number of threads that measure.
 
     Attributes
     ----------
@@ -62,8 +66,9 @@ class ControlLoop:
         layout: Layout,
         held: NDArray[np.floating] | None = None,
         prior: Prior | None = None,
+        threads: int = 1,
     ) -> None:
-        self.control, self.latencies = control, Latencies()
+        self.control, self.latencies, self._threads = control, Latencies(), threads
         self._prior = prior
         self._ready: dict[str, Ready] = {}
         self._successor: Successor | None = None
@@ -90,6 +95,18 @@ class ControlLoop:
         return self._on.line
 
     # The engine's thread ----------------------------------------------------------------------------
+
+    def begin_product(self) -> Sequence[ProductPart]:
+        """Return the product with the coming frame's slopes that may be begun while its rows arrive.
+
+        Its parts are for the threads; there are none where nothing can be begun: the loop is open, the
+        controller works otherwise, or modes are removed from the slopes, which needs all of them.
+        """
+        controller = self._on.controller
+        if not self.closed or self._begins or self._removed_modes or not self._on.begins:
+            return ()
+        parts: Sequence[ProductPart] = controller.begin_product(self._threads, 1.0 / self._centroid_gain)
+        return parts
 
     def follow(
         self, slopes: Slopes, number: int, prior_std_px: NDArray[np.float64] | None = None
@@ -238,9 +255,7 @@ class ControlLoop:
         """
         if kind in self._ready:
             return
-        control = self.control.with_controller(kind)
-        control.rehearse()
-        self._ready[kind] = Ready.of(control)
+        self._ready[kind] = _prepared(self.control.with_controller(kind))
 
     def renew(self, model: Model) -> None:
         """Replace the model of a learnt controller.
@@ -252,9 +267,7 @@ class ControlLoop:
         InputError
             When the model is for another loop, or its commands are not finite.
         """
-        control = self.control.with_model(model)
-        control.rehearse()
-        ready = Ready.of(control)
+        ready = _prepared(self.control.with_model(model))
         if ready.takes_prior:
             self._successor = Successor(ready)
         else:
@@ -344,3 +357,12 @@ class ControlLoop:
         self.follow(Slopes(*(np.zeros(n, kind) for kind in RESULT_TYPES)), -1)
         self.closed, self._begins = False, False
         self._line.hold(held)
+
+
+def _prepared(control: Control) -> Ready:
+    """Return the controller; refuse one whose commands are not finite."""
+    control.rehearse()
+    with np.errstate(
+        all="ignore"
+    ):  # a learnt controller may not know its errors while its integrator is used
+        return Ready.of(control)

@@ -152,7 +152,7 @@ class Engine:
             self.loop, self._prediction = None, None
             if control is not None:
                 own = None if control.prediction == STREAM else prior
-                self.loop = ControlLoop(control, layout, self._streams.held_commands, own)
+                self.loop = ControlLoop(control, layout, self._streams.held_commands, own, threads)
                 if control.prediction == STREAM and prior is not None:
                     self._prediction = PredictionStream(name, prior)
             self._make_ready(interleaving)
@@ -361,12 +361,14 @@ class Engine:
             path.await_start(arrival, self._last_row_ns)
             self._prediction.fill(self._number + 1)
         slot, last_row = (self._number + 1) % ring.slots, self._last_row_ns
+        product = () if self.loop is None else self.loop.begin_product()
+        rehearse = self._rehearse if last_row else None
         whole = path.measure(
-            arrival, slot, explain=explain, after_ns=last_row, rehearse=self._rehearse if last_row else None
+            arrival, slot, explain=explain, after_ns=last_row, rehearse=rehearse, product=product
         )
         number = ring.number_of(arrival)
         if whole and number >= 0 and number != self._number + 1:  # the frame is in another slot than expected
-            whole = path.measure(arrival, number % ring.slots, explain=explain)
+            whole = path.measure(arrival, number % ring.slots, explain=explain, product=product)
         self._waiting = False
         if not whole and path.stopped:
             return False

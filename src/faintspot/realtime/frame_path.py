@@ -19,15 +19,18 @@ from faintspot.control.configuration import prior_std_px
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.groups import DENOISED, STAGE_ROWS, SlopeArrays, new_scratch
 from faintspot.kernels.host import WIDTHS, lanes_for
+from faintspot.kernels.products import NO_PRODUCT, ProductPart
 from faintspot.kernels.streaming import (
     COLD,
     LAST_ROW,
     MARGIN,
     PACE_CELLS,
+    PENDING,
     SHORTEST_NS,
     SLEEPS,
     WOKEN_LATE,
     Arrival,
+    multiply_until,
     sleep_until_due,
     streamed,
     wait_for_group,
@@ -88,7 +91,9 @@ class _Groups:
         self.settings: NDArray[np.float32] = task.settings[0]
         """Settings of every sub-aperture for the kernel: rows as in `faintspot.kernels.groups`."""
         self._work = [(pipeline.source(slot[None], slot.dtype), task) for slot in slots]
+        self._width, self._frame_rows = pipeline.width, int(last_rows_of_groups(pipeline, 1).max())
         self._kernel = Direct(streamed(pipeline.plan.prepared.kernel))
+        self._multiply = Direct(multiply_until)
         self._sleep = Direct(sleep_until_due)
         lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
         own_scratch = pipeline.plan.own_scratch
@@ -102,30 +107,37 @@ class _Groups:
         progress: Progress,
         waiting: tuple[NDArray[np.int64], NDArray[np.int64]],
         after: tuple[Any, ...],
+        part: ProductPart = NO_PRODUCT,
         rehearse: Rehearsal | None = None,
     ) -> bool:
         """Measure one share of a frame (number, slot); return whether it was completed.
 
         `waiting` has the cell that ends waiting, and the share's `Arrival.pace`. See `FramePath.measure` for
-        `rehearse`.
+        `part` and `rehearse`.
         """
         number, work = frame[0], self._work[frame[1]]
         start, last, stop = self._ranges[share]
         control, pace = waiting
         cells = progress.cells, progress.frame_cell, progress.rows_cell
         arrival = Arrival(*cells, control, STOP_CELL, pace, self._due)
-        rest = self._scratch[share], *after
+        rest = self._scratch[share], *after, part
+        pace[PENDING] = start
         if rehearse is not None:
             for group in sorted({start, last}):
                 if self._kernel(arrival, number, self._last_rows, *work, start, group, *rest) < group:
                     return False
                 start = group
-                if group < stop and self._sleep(arrival, number, self._last_rows[group], group):
+                if group == stop:
+                    break
+                rows = self._last_rows[group]
+                self._multiply(arrival, number, rows, group, self._width, after[0], part)
+                if self._sleep(arrival, number, rows, group):
                     # A frame that has passed is not waited for: only code and data come into the cache again.
                     self._kernel(arrival, -1, self._last_rows, *work, last, last + 1, *rest)
                     rehearse()
                     pace[COLD] = 0
         done: int = self._kernel(arrival, number, self._last_rows, *work, start, stop, *rest)
+        self._multiply(arrival, number, self._frame_rows, stop, self._width, after[0], part)
         return done == stop
 
     def _range(self, start: int, stop: int) -> tuple[int, int, int]:
@@ -167,6 +179,7 @@ class FramePath:
         self._check(slots)
         self._slots = len(slots)
         self._shares = 1 + (0 if workers is None else workers.count)
+        self._no_product = [NO_PRODUCT] * self._shares
         n, pixels = len(pipeline.layout), pipeline.layout.pixels
         self._results = results = SlopeArrays(*(np.zeros((1, n), dtype) for dtype in RESULT_TYPES))
         self.slopes = Slopes(*(result[0] for result in results))
@@ -229,7 +242,7 @@ class FramePath:
         if self._prior is not None:
             self._await_row(there, 0)
         for share in range(self._shares):
-            self._work(share, (0, 0), there, self._explaining, lambda: None)
+            self._work(share, (0, 0), there, self._explaining, rehearse=lambda: None)
         self.flag_doubtful()
 
     def measure(
@@ -240,6 +253,7 @@ class FramePath:
         explain: bool = False,
         after_ns: int = 0,
         rehearse: Rehearsal | None = None,
+        product: Sequence[ProductPart] = (),
     ) -> bool:
         """Measure a frame, waiting for its rows; return whether it was completed.
 
@@ -259,16 +273,21 @@ class FramePath:
         rehearse : function, optional
             Called after the last sleep, before the last rows are there. Other programs may have used the
             processor: it brings into the cache what the caller will use after the frame.
+        product : sequence of ProductPart, optional
+            A product with the slopes, a part for each thread, to be begun while the rows arrive.
         """
+        for part in product:
+            part.taken[:] = part.out[:] = 0.0
         self._pace[:, LAST_ROW] = after_ns
         if self._prior is not None and self._prior.changes != self._prior_changes:
             self._widen(self._prior)
         frame = number, number % self._slots if slot is None else slot
         after = self._explaining if explain else self._plain
+        parts = product or self._no_product
         if self._workers is None:
-            return self._work(0, frame, self._progress, after, rehearse)
-        self._workers.post(lambda share: self._work(share, frame, self._progress, after))
-        whole = self._work(0, frame, self._progress, after, rehearse)
+            return self._work(0, frame, self._progress, after, parts[0], rehearse)
+        self._workers.post(lambda share: self._work(share, frame, self._progress, after, parts[share]))
+        whole = self._work(0, frame, self._progress, after, parts[0], rehearse)
         return self._workers.wait() and whole
 
     def flag_doubtful(self) -> None:
@@ -300,15 +319,16 @@ class FramePath:
         frame: tuple[int, int],
         progress: Progress,
         after: tuple[Any, ...],
+        part: ProductPart = NO_PRODUCT,
         rehearse: Rehearsal | None = None,
     ) -> bool:
         """Measure one share of a frame's groups; the last share includes the narrow group."""
         waiting = self._control, self._pace[share]
         narrow = self._narrow if share == self._shares - 1 else None
-        whole = self._wide.measure(share, frame, progress, waiting, after, rehearse)
+        whole = self._wide.measure(share, frame, progress, waiting, after, part, rehearse)
         if narrow is None:
             return whole
-        return whole and narrow.measure(0, frame, progress, waiting, after, rehearse)
+        return whole and narrow.measure(0, frame, progress, waiting, after, rehearse=rehearse)
 
     def _widen(self, prior: Prior) -> None:
         """Set the width of the estimator's prior to the uncertainty of the prediction, where known."""

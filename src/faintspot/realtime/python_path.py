@@ -8,7 +8,7 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -19,6 +19,7 @@ from faintspot.base.errors import InputError
 from faintspot.estimators.base import Positions
 from faintspot.estimators.python import PythonPlan
 from faintspot.kernels.groups import CALIBRATED
+from faintspot.kernels.products import ProductPart
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.realtime.frame_path import FramePath, check_real_time
@@ -71,8 +72,16 @@ class PythonPath(FramePath):
         self._thread.start()
         weakref.finalize(self, self._requests.put, None)  # ends the thread
 
-    def measure(self, number: int, slot: int | None = None, *, explain: bool = False, **waiting: Any) -> bool:
-        """Measure a frame, waiting for its rows; see `FramePath.measure`."""
+    def measure(
+        self,
+        number: int,
+        slot: int | None = None,
+        *,
+        explain: bool = False,
+        product: Sequence[ProductPart] = (),
+        **waiting: Any,
+    ) -> bool:
+        """Measure a frame, waiting for its rows; see `FramePath.measure`. No product is begun."""
         if not super().measure(number, slot, explain=True, **waiting):
             return False
         found = self._find_positions() if self.fault is None else self.fault

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.commands import CommandDelayLine
+from faintspot.control.compiled import CompiledIntegrator
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.configuration import CONTROLLER, Control
 from faintspot.control.guarded import Guarded
@@ -31,6 +32,8 @@ class Ready(NamedTuple):
     """Whether it uses the width of the prior of the slopes."""
     completes: bool
     """Whether a part of each frame's work, which need not delay the command, waits for `expected`."""
+    begins: bool
+    """Whether it can begin its command while slopes are measured, by `begin_product`."""
 
     @classmethod
     def of(cls, control: Control) -> Self:
@@ -44,6 +47,7 @@ class Ready(NamedTuple):
             control.prediction == CONTROLLER,
             isinstance(controller, (Guarded, CompiledKalman)),
             isinstance(controller, (LargeGuarded, CompiledKalman)),
+            isinstance(controller, (CompiledIntegrator, LargeGuarded)),
         )
 
 
