@@ -151,14 +151,14 @@ def _of_size(across: int) -> list[Row]:
     del integrator
     none = np.zeros((0, 0))
     reconstructor = Reconstructor(interaction.T, none, none, interaction.T)
-    arrays = _random_filter(cells, rng)
+    arrays = random_filter(cells, rng)
     line = CommandDelayLine(commands, 2, 1.0)
     same = np.zeros((commands, commands))  # the residuals compare as equal: the guard keeps the filter
     guarded = LargeGuarded(line, interaction, reconstructor, same, arrays, 0.3, 0.01)
     return [*rows, _timed(f"{across} x {across}, prediction", guarded, 4 * interaction.size, 2 * n)]
 
 
-def _random_filter(cells: NDArray[np.float64], rng: np.random.Generator) -> dict[str, Any]:
+def random_filter(cells: NDArray[np.float64], rng: np.random.Generator) -> dict[str, Any]:
     """Return arrays as of a filter of three layers, with weights that let its state fade."""
     near, around = neighbours_within(cells, 1.5), neighbours_within(cells, 6.0)
     shapes = {"near": near, "around": around, "share": np.full(_LAYERS, 1 / _LAYERS)}

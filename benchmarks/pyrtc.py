@@ -112,7 +112,7 @@ def pipeline_of(layout: fs.Layout, settings: dict[str, Any]) -> fs.SlopePipeline
     return fs.SlopePipeline(layout, fs.Settings(**settings), calibration, threads=1)
 
 
-def slopes_process(name: str, functions: list[str]) -> Any:
+def slopes_process(name: str, functions: list[str], pixels: int = PIXELS) -> Any:
     """Make pyRTC's component between the streams NAME_wfs and NAME_signal; it compiles on the way."""
     from pyrtc import SlopesProcess, configure_logging  # type: ignore[import-untyped, unused-ignore]
 
@@ -123,7 +123,7 @@ def slopes_process(name: str, functions: list[str]) -> Any:
             "type": "SHWFS",
             "signal_type": "slopes",
             "centroider": "cog",
-            "sub_ap_spacing": PIXELS,
+            "sub_ap_spacing": pixels,
             "sub_ap_offset_x": 0,
             "sub_ap_offset_y": 0,
             "functions": functions,
@@ -160,7 +160,7 @@ def end_processes(processes: list[subprocess.Popen[bytes]]) -> None:
             process.wait()
 
 
-def pyrtc_kernel(component: Any, image: NDArray[np.int32]) -> Candidate:
+def pyrtc_kernel(component: Any, image: NDArray[np.int32], pixels: int = PIXELS) -> Candidate:
     """Return a call of pyRTC's compiled function, with the component's own arguments."""
     from pyrtc import slopes_process  # type: ignore[import-untyped, unused-ignore]
 
@@ -170,11 +170,11 @@ def pyrtc_kernel(component: Any, image: NDArray[np.int32]) -> Candidate:
         "slopes": slopes,
         "unaberrated_slopes": component.ref_slopes,
         "threshold": np.float32(0.0),
-        "spacing": np.float32(PIXELS),
+        "spacing": np.float32(pixels),
         "xvals": component.xvals,
         "offset_x": 0,
         "offset_y": 0,
-        "int_n": PIXELS,
+        "int_n": pixels,
     }
     return partial(slopes_process.compute_slopes_shwfs_optim_numba, **arguments)
 

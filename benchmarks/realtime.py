@@ -9,6 +9,8 @@ What the engine adds to the compiled work is measured in one thread, with frames
 thread does with one, publishing and telemetry included, less the call that measures it.
 
 The limit of iterations is tried on frames that converge slowly: strength near the images' own deviation.
+
+From the last row to the command: see frame_to_command.py.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from uuid import uuid4
 
 import numpy as np
 
+from benchmarks.frame_to_command import command_table
 from benchmarks.measuring import Row, Table, Times, median_ratio, spread
 from benchmarks.realtime_processes import SMALL, USUAL, engine_and_camera
 from faintspot import Calibration, Layout, Settings, SlopePipeline
@@ -126,5 +129,5 @@ def _tail() -> Table:
 
 
 def run() -> list[Table]:
-    """Measure streamed and whole frames, and the limit of iterations."""
-    return [_streaming(), _own(), _tail()]
+    """Measure streamed and whole frames, the limit of iterations, and the way to commands."""
+    return [_streaming(), _own(), _tail(), command_table()]
