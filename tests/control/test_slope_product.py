@@ -95,6 +95,27 @@ def test_what_is_not_finite_stays_in_its_frame() -> None:
             np.testing.assert_array_equal(product(vector), SlopeProduct(MATRIX)(vector))
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 3e38, 1e30])
+def test_a_lost_frame_leaves_nothing_that_is_not_finite(bad: float) -> None:
+    """Nor rounding errors of huge numbers. 3e38 times the scale exceeds float32."""
+    product, measured = SlopeProduct(MATRIX), Measured()
+    vector = measured.vector
+    (part,) = product.parts(1, SCALE, measured.expected)
+    measured.x[[3, 30]] = measured.y[12] = bad
+    with np.errstate(all="ignore"):
+        add_slopes(part, measured.x, measured.y, measured.flags, 0, N)
+        assert product.memory.taken.any()
+        np.testing.assert_allclose(product(vector), MATRIX @ vector, atol=TOLERANCE)
+
+
+def test_an_expectation_that_is_not_finite_stays_in_its_frame() -> None:
+    product, measured = SlopeProduct(MATRIX), Measured()
+    vector = measured.vector
+    (part,) = product.parts(1, SCALE, np.full(2 * N, np.nan))
+    add_slopes(part, measured.x, measured.y, measured.flags, 0, N)
+    np.testing.assert_allclose(product(vector), MATRIX @ vector, atol=TOLERANCE)
+
+
 def test_small_matrices_are_not_begun(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     assert not SlopeProduct(MATRIX).parts(1, SCALE)

@@ -171,6 +171,23 @@ def test_no_command_is_begun_if_modes_are_removed_from_slopes(monkeypatch: pytes
     assert not loop.begin_product()
 
 
+def test_a_controller_that_cannot_begin_opens_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing raises in the frame path."""
+    loop = ControlLoop(Control(INTERACTION, None, ControlOptions(largest_residual_px=1e30)), LAYOUT)
+    loop.close()
+    slopes = Slopes(*(np.zeros(N, kind) for kind in RESULT_TYPES))
+    loop.follow(slopes, 0)
+
+    def fail(*_: Any) -> None:
+        raise ArithmeticError("no product")
+
+    monkeypatch.setattr(loop.controller, "begin_product", fail)
+    assert not loop.begin_product()
+    assert not loop.closed
+    assert "no product" in loop.opened_because
+    assert np.isfinite(loop.follow(slopes, 1)).all()
+
+
 def run(loop: ControlLoop, stroke: float, taken: list[Slopes]) -> str:
     """Close a loop again and again, and return why it has opened."""
     reasons = ""

@@ -157,6 +157,21 @@ def test_frames_that_are_there_are_measured_before_any_product(monkeypatch: pyte
 
 
 @pytest.mark.portable
+def test_nothing_is_begun_of_a_frame_that_never_came(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The slopes of the frame before are still there."""
+    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    data, source = frames(1), Source()
+    source.write(0, data[0])
+    product = SlopeProduct(np.ones((20, 2 * len(LAYOUT))))
+    path = FramePath(pipeline("plain"), source.slots, source.progress)
+    assert path.measure(0)
+    assert path.slopes.vector.any()
+    path.stop()
+    assert not path.measure(1, product=product.parts(1, 1.0))
+    assert not product.memory.taken.any()
+
+
+@pytest.mark.portable
 def test_a_frame_that_has_passed_counts_as_there() -> None:
     data, source = frames(2), Source()
     source.write(0, data[0])

@@ -10,6 +10,8 @@ from faintspot.base.flags import INVALID
 from faintspot.kernels.compiling import compiled, inlined
 
 _INVALID = int(INVALID)
+_LARGEST_PX = 1000.0
+"""Larger slopes are not begun with: a sum from which they are taken away again would be inaccurate."""
 
 
 class ProductPart(NamedTuple):
@@ -108,6 +110,9 @@ def is_measured(x: Any, y: Any, flags: Any) -> Any:
 def add_slopes(part: Any, x: Any, y: Any, flags: Any, start: Any, stop: Any) -> None:
     """Add the product with the slopes of sub-apertures [start, stop), which have been measured.
 
+    What is not finite, or far too large, is left for `finish_product`: the sum stays finite, also that of a
+    frame which is lost.
+
     Parameters
     ----------
     part : ProductPart
@@ -118,8 +123,9 @@ def add_slopes(part: Any, x: Any, y: Any, flags: Any, start: Any, stop: Any) -> 
     for s in range(start, stop):
         along, across = x[s] * scale, y[s] * scale
         measured = is_measured(along, across, flags[s])
-        part.slopes[s] = along - part.expected[s] if measured else 0.0
-        part.slopes[n + s] = across - part.expected[n + s] if measured else 0.0
+        along, across = along - part.expected[s], across - part.expected[n + s]
+        part.slopes[s] = along if measured and abs(along) < _LARGEST_PX else 0.0
+        part.slopes[n + s] = across if measured and abs(across) < _LARGEST_PX else 0.0
     for first in (0, n):
         add_changes(part.columns, part.slopes, part.taken, part.out, first + start, first + stop)
 

@@ -102,10 +102,14 @@ class ControlLoop:
         Its parts are for the threads; there are none where nothing can be begun: the loop is open, the
         controller works otherwise, or modes are removed from the slopes, which needs all of them.
         """
-        controller = self._on.controller
-        if not self.closed or self._begins or self._removed_modes or not self._on.begins:
-            return ()
-        parts: Sequence[ProductPart] = controller.begin_product(self._threads, 1.0 / self._centroid_gain)
+        on = self._on
+        parts: Sequence[ProductPart] = ()
+        if not self.closed or self._begins or self._removed_modes or not on.begins:
+            return parts
+        try:
+            parts = on.controller.begin_product(self._threads, 1.0 / self._centroid_gain)
+        except Exception as error:  # nothing raises in the frame path
+            self._fail(error)
         return parts
 
     def follow(
@@ -118,8 +122,8 @@ class ControlLoop:
         slopes : Slopes
         number : int
             Frame number. Commands in the delay line advance by the number of lost frames, too.
-            prior_std_px : (2 n,) array, optional
-                Width of the prior around the predicted slopes that was used for these. Default: no prior.
+        prior_std_px : (2 n,) array, optional
+            Width of the prior around the predicted slopes that was used for these. Default: no prior.
         """
         line = self._line
         if number != self._number + 1 and self._number >= 0:
@@ -362,7 +366,6 @@ class ControlLoop:
 def _prepared(control: Control) -> Ready:
     """Return the controller; refuse one whose commands are not finite."""
     control.rehearse()
-    with np.errstate(
-        all="ignore"
-    ):  # a learnt controller may not know its errors while its integrator is used
+    # A learnt controller may not know its errors while its integrator is used.
+    with np.errstate(all="ignore"):
         return Ready.of(control)

@@ -137,7 +137,7 @@ class _Groups:
                     rehearse()
                     pace[COLD] = 0
         done: int = self._kernel(arrival, number, self._last_rows, *work, start, stop, *rest)
-        self._multiply(arrival, number, self._frame_rows, stop, self._width, after[0], part)
+        self._multiply(arrival, number, self._frame_rows, done, self._width, after[0], part)
         return done == stop
 
     def _range(self, start: int, stop: int) -> tuple[int, int, int]:
