@@ -50,7 +50,8 @@ def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> Fig
     right.axhline(0, color=GREY, lw=1)
     left.set(xlabel="guide-star magnitude", ylabel=label)
     left.set_ylim(bottom=0)
-    right.set(xlabel="guide-star magnitude", ylabel=f"Strehl less that of {result.labels[reference]}, paired")
+    than = f"Strehl ratio minus that of {result.labels[reference]}, paired"
+    right.set(xlabel="guide-star magnitude", ylabel=than)
     for panel in (left, right):
         label_above = "photo-electrons of a sub-aperture in a frame"
         axis_above(panel, result.magnitudes, result.photons, label_above).tick_params(labelsize=10)
