@@ -39,7 +39,7 @@ class _Frame(NamedTuple):
 
     @property
     def left(self) -> tuple[Floats, Floats]:
-        """What both controllers leave."""
+        """Residual slopes that both controllers leave."""
         return self.trust * (self.open_loop + self.by_learnt), self.trust * (self.open_loop + self.by_plain)
 
     @property
