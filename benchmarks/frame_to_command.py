@@ -71,16 +71,10 @@ def layout_of(across: int) -> fs.Layout:
 
 
 class RandomControl(Control):
-    """Control with random matrices, which takes no time to invert them.
-
-    Parameters
-    ----------
-    layout : Layout
-    predicts : bool
-        Whether the controller is the filter for large sensors.
-    """
+    """Control with random matrices, which takes no time to invert them."""
 
     predicts: bool
+    """Whether the controller is the filter for large sensors."""
     centres: NDArray[np.float64]
 
     @classmethod
@@ -182,7 +176,7 @@ class _Turns(Latencies):
         slope_product._LEAST_BYTES = self._least[way]
 
 
-def measured(across: int, kind: str, threads: int = 1) -> dict[str, NDArray[np.float64]]:
+def measured(across: int, kind: str) -> dict[str, NDArray[np.float64]]:
     """Return latencies of commands with whole products and with begun ones, and of reading as much, us."""
     layout, rate_hz = layout_of(across), RATES_HZ[across, kind]
     control = RandomControl.of(layout, predicts=kind == PREDICTION)
@@ -193,7 +187,6 @@ def measured(across: int, kind: str, threads: int = 1) -> dict[str, NDArray[np.f
         name,
         lambda each: fs.SlopePipeline(layout, each, calibration),
         fs.Settings("thresholded", threshold_e=0.0),
-        threads=threads,
         images_every=0,
         control=control,
     )

@@ -66,7 +66,8 @@ def test_windows_follow_spots_that_coma_moves(geometry: str, coma: float, seed: 
     error = centres - truth.nodes
     assert np.abs(error - error.mean()).max() < 0.2 * 20.0
     assert len(found.outside) == 0
-    # Half the pitch is left for a window where coma brings neighbours together: 0 to 3 of 100 in eight seeds.
+    # Half the pitch is left for a window where coma brings neighbours together: 3 of them on an Intel
+    # processor (hexagonal, 1.4). With seed 3 that layout fails: 67 lenslets are missed.
     assert np.count_nonzero(found.clipped | found.unlike) <= 3
     slopes = fs.SlopePipeline(found.layout, fs.Settings("brightest", keep_brightest=20))(truth.frame)
     measured = centres + (np.column_stack([slopes.x, slopes.y]) @ [1, 1j])[held.argmax(axis=1)]

@@ -42,7 +42,7 @@ def test_windows_stay_on_their_spots_at_the_edge(seed: int) -> None:
 @pytest.mark.parametrize("pitch_px", [16.0, 19.99, 12.005])
 @pytest.mark.parametrize("seed", range(5))
 def test_a_pitch_of_whole_pixels_gives_windows_of_that_many(pitch_px: float, seed: int) -> None:
-    # A spot farther than 0.27 pitches from its node is followed, with windows that move: 4.5 deviations here.
+    # Single spots 0.28 and 0.34 pitches from their nodes were followed, with smaller windows.
     start = np.random.default_rng(seed).uniform(14, 16, 2)
     at = nodes((10, 10), pitch_px, (start[0], start[1]))
     frame = spot_frame(at, (240, 240), flux_e=3000.0, spread_px=0.06 * pitch_px, seed=seed)
