@@ -14,19 +14,19 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measuring import Row, Table
-from faintspot.advice.centroid_gain import calibration_of_electrons, electrons_of, shifted_gain
-from faintspot.advice.loop_telemetry import LoopTelemetry
-from faintspot.advice.residual import residual_wavefront, wavefront_modes
-from faintspot.ao_loop import LoopConfiguration, LoopRecord, Method, load_loop, simulate_loop
-from faintspot.ao_loop.calibration import flat_psf, reference_slopes
-from faintspot.ao_loop.camera import camera_calibration
-from faintspot.ao_loop.configuration import ARCSEC
-from faintspot.ao_loop.control import prior_std_px
-from faintspot.ao_loop.telescope_model import TelescopeModel, prepare
-from faintspot.control.telemetry import without_prior
-from faintspot.experiments.statistics import paired_mean
-from faintspot.pipeline.settings import Settings
-from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.base.statistics import paired_mean
+from faintspot.loop.control.telemetry import without_prior
+from faintspot.loop.simulation import LoopConfiguration, LoopRecord, Method, load_loop, simulate_loop
+from faintspot.loop.simulation.configuration.configuration import ARCSEC
+from faintspot.loop.simulation.control import prior_std_px
+from faintspot.loop.simulation.telescope.calibration import flat_psf, reference_slopes
+from faintspot.loop.simulation.telescope.camera import camera_calibration
+from faintspot.loop.simulation.telescope.model import TelescopeModel, prepare
+from faintspot.loop.telemetry.centroid_gain import calibration_of_electrons, electrons_of, shifted_gain
+from faintspot.loop.telemetry.engine_telemetry import LoopTelemetry
+from faintspot.loop.telemetry.residual import residual_wavefront, wavefront_modes
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 
 REALISATIONS, FRAMES, TURN, IMAGES_EVERY = 4, 1600, 100, 20
 PHOTONS = 100.0, 300.0

@@ -20,23 +20,23 @@ from numpy.typing import NDArray
 
 from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
 from benchmarks.prediction import TELEMETRY_GAIN, Case
-from faintspot.ao_loop import load_loop
-from faintspot.ao_loop.control import slope_turbulence
-from faintspot.ao_loop.telescope_model import prepare
-from faintspot.control.base import Controller
-from faintspot.control.commands import CommandDelayLine
-from faintspot.control.compiled import CompiledIntegrator
-from faintspot.control.compiled_kalman import CompiledKalman
-from faintspot.control.guarded import Guarded
-from faintspot.control.kalman import SlopePredictor
-from faintspot.control.large_guarded import LargeGuarded
-from faintspot.control.learning import KALMAN, Plant, learn
-from faintspot.control.local_kalman import local_shapes
-from faintspot.control.local_model import neighbours_within
-from faintspot.control.models import SlopeModel
-from faintspot.control.predictive import Predictive, PseudoOpenLoop
-from faintspot.control.reconstructor import Reconstructor
-from faintspot.control.relearning import relearn
+from faintspot.loop.control.base import Controller
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.compiled import CompiledIntegrator
+from faintspot.loop.control.identification.learning import KALMAN, Plant, learn
+from faintspot.loop.control.identification.relearning import relearn
+from faintspot.loop.control.kalman.compiled import CompiledKalman
+from faintspot.loop.control.kalman.guarded import Guarded
+from faintspot.loop.control.kalman.large_guarded import LargeGuarded
+from faintspot.loop.control.kalman.local_model import neighbours_within
+from faintspot.loop.control.kalman.local_predictor import local_shapes
+from faintspot.loop.control.kalman.predictive import Predictive, PseudoOpenLoop
+from faintspot.loop.control.kalman.predictor import SlopePredictor
+from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.control.reconstructor import Reconstructor
+from faintspot.loop.simulation import load_loop
+from faintspot.loop.simulation.control import slope_turbulence
+from faintspot.loop.simulation.telescope.model import prepare
 
 _NOISE_PX = 0.5
 _SIZES = (72, 54), (160, 97), (640, 400)

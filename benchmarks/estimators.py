@@ -15,10 +15,10 @@ import numpy as np
 
 import faintspot as fs
 from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, pinned, ratio, spread
-from faintspot.estimators import estimator_named
-from faintspot.kernels.groups import Source, flux_of_groups, new_scratch
-from faintspot.kernels.host import lanes_for
-from faintspot.pipeline.plan import packed_calibration
+from faintspot.slopes.estimators import estimator_named
+from faintspot.slopes.kernels.compilation.host import lanes_for
+from faintspot.slopes.kernels.driver.groups import Source, flux_of_groups, new_scratch
+from faintspot.slopes.pipeline.plan import packed_calibration
 
 ITERATIONS, KEEP, NOISE_STD, FLUX_E, READ_NOISE_E = 20, 12, 0.45, 200.0, 0.1
 SHAPES = ((6, 6), (32, 32))
@@ -101,7 +101,7 @@ def _row(name: str, n: int, times: Times) -> Row:
 
 def _table(shape: tuple[int, int]) -> Table:
     layout = fs.Layout.grid(shape, pixels=16)
-    frames, _ = fs.simulate.sensor_frames(
+    frames, _ = fs.slopes.simulate.sensor_frames(
         layout.corners,
         layout.window,
         layout.frame_shape,

@@ -34,16 +34,16 @@ import faintspot as fs
 from benchmarks import pyrtc
 from benchmarks.control import random_filter
 from benchmarks.measuring import Row, Table
-from faintspot.control import slope_product
-from faintspot.control.base import Controller
-from faintspot.control.commands import CommandDelayLine
-from faintspot.control.configuration import Control, ControlOptions
-from faintspot.control.large_guarded import LargeGuarded
-from faintspot.control.reconstructor import Reconstructor
-from faintspot.realtime.engine import Engine
-from faintspot.realtime.pixel_ring import PixelRing
-from faintspot.realtime.scheduling import real_time
-from faintspot.realtime.timing import Latencies
+from faintspot.engine.engine import Engine
+from faintspot.engine.path.timing import Latencies
+from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.requests.scheduling import real_time
+from faintspot.loop.control import slope_product
+from faintspot.loop.control.base import Controller
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.configuration import Control, ControlOptions
+from faintspot.loop.control.kalman.large_guarded import LargeGuarded
+from faintspot.loop.control.reconstructor import Reconstructor
 
 PIXELS, LEVEL_ADU, READOUT, COMMANDS_PER_SUBAPERTURE = 8, 100, 0.8, 1.04
 INTEGRATOR, PREDICTION = "integrator", "prediction"
@@ -108,8 +108,8 @@ class RandomControl(Control):
 
 def stack_of(layout: fs.Layout) -> NDArray[np.uint16]:
     """Simulate raw frames."""
-    detector = fs.simulate.Detector(2.0, offset_adu=LEVEL_ADU, bits=16)
-    raw, _ = fs.simulate.sensor_frames(
+    detector = fs.slopes.simulate.Detector(2.0, offset_adu=LEVEL_ADU, bits=16)
+    raw, _ = fs.slopes.simulate.sensor_frames(
         layout.corners,
         layout.window,
         layout.frame_shape,

@@ -59,7 +59,7 @@ def _kernel_seconds(pipeline: fs.SlopePipeline, frame: NDArray[Any], launches: i
 
 
 def _stream(pipeline: fs.SlopePipeline, frame: NDArray[Any]) -> Any:
-    from faintspot.pipeline.device_stream import FrameStream
+    from faintspot.slopes.pipeline.device_stream import FrameStream
 
     stream = FrameStream(pipeline, frame.dtype)
     stream.frame[:] = frame
@@ -108,7 +108,7 @@ def _measured() -> list[Row]:
 
 def _missing() -> str | None:
     """What is missing to measure here; None where nothing is."""
-    from faintspot.cuda.availability import check_cuda, simulated
+    from faintspot.slopes.kernels.cuda.availability import check_cuda, simulated
 
     try:
         check_cuda()

@@ -20,11 +20,11 @@ import numpy as np
 
 from benchmarks.measuring import Row, Table
 from benchmarks.prediction import Case, Make, rivals
-from faintspot.ao_loop import LoopConfiguration
-from faintspot.control import learning
-from faintspot.control.learning import GAINS, MODAL, learn
-from faintspot.control.telemetry import OpenLoopTelemetry
-from faintspot.experiments.statistics import paired_mean
+from faintspot.base.statistics import paired_mean
+from faintspot.loop.control.identification import learning
+from faintspot.loop.control.identification.learning import GAINS, MODAL, learn
+from faintspot.loop.control.telemetry import OpenLoopTelemetry
+from faintspot.loop.simulation import LoopConfiguration
 
 _DENSE = os.environ.get("FAINTSPOT_DENSE", "1") != "0"
 REALISATIONS, FRAMES = 5, 400

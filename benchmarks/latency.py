@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from benchmarks.measuring import Row, Table, spread
 from benchmarks.rivals import problem
 from benchmarks.scale import settings, settings_in_words
-from faintspot.kernels.parallel import available_cpus
-from faintspot.realtime.frame_path import FramePath, Progress
-from faintspot.realtime.scheduling import real_time
-from faintspot.realtime.workers import Workers
+from faintspot.engine.path.frame_path import FramePath, Progress
+from faintspot.engine.path.workers import Workers
+from faintspot.engine.requests.scheduling import real_time
+from faintspot.slopes.kernels.parallel import available_cpus
 
 FRAMES = {36: 40_000, 1208: 5_000}
 FEWEST = 1000  # frames that say something about p99.9

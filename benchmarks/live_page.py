@@ -26,7 +26,7 @@ from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from benchmarks.measuring import Row, Table, Times, median_ratio, spread
 from benchmarks.realtime_processes import SMALL, USUAL, engine_and_camera
-from faintspot.realtime.telemetry import TelemetryReader
+from faintspot.engine.telemetry.ring import TelemetryReader
 
 RATE_HZ, TURN_S, TURNS = 300, 5.0, 8
 READING, SLOW = 4, 1

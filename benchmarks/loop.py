@@ -1,6 +1,6 @@
 """The closed loop: frames per second, where the time goes, and how best to move the air over the pupil.
 
-HCIPy's own layers are timed against the screens of `faintspot.ao_loop.atmosphere`. What the interpolation of
+HCIPy's own layers are timed against the screens of `telescope.atmosphere`. What the interpolation of
 these does is measured with true slopes, so that nothing but the air differs: steps of whole points keep all
 small structures, but the air stands still for some frames and jumps in others; linear interpolation takes
 structures off, the more the farther from the points.
@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from benchmarks.measuring import Row, Table, absolute_spread, best, interleaved, pinned
-from faintspot.ao_loop import LoopConfiguration, Method, load_loop, simulate_loop
-from faintspot.ao_loop.atmosphere import MovingLayers, make_atmosphere
-from faintspot.ao_loop.calibration import make_pipeline
-from faintspot.ao_loop.camera import make_detector
-from faintspot.ao_loop.telescope import pupil_grid, require_hcipy
-from faintspot.ao_loop.telescope_model import LoopOptics, prepare
-from faintspot.control.commands import CommandDelayLine
-from faintspot.control.integrator import Integrator
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.integrator import Integrator
+from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
+from faintspot.loop.simulation.telescope.atmosphere import MovingLayers, make_atmosphere
+from faintspot.loop.simulation.telescope.calibration import make_pipeline
+from faintspot.loop.simulation.telescope.camera import make_detector
+from faintspot.loop.simulation.telescope.model import LoopOptics, prepare
+from faintspot.loop.simulation.telescope.pupil import pupil_grid, require_hcipy
 
 TARGET_FRAMES_PER_S = 80.0
 FRAMES = 400

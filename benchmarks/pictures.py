@@ -28,10 +28,10 @@ SECONDS = 3.0
 def frames(layout: fs.Layout) -> dict[str, NDArray[np.uint16]]:
     """Return one frame a kind of light, ADU (electrons on a pedestal of 100)."""
     rng = np.random.default_rng(3)
-    camera = fs.simulate.Detector(read_noise_e=READ_NOISE_E)
+    camera = fs.slopes.simulate.Detector(read_noise_e=READ_NOISE_E)
 
     def spots(flux_e: float) -> NDArray[np.uint16]:
-        frame, _ = fs.simulate.sensor_frames(
+        frame, _ = fs.slopes.simulate.sensor_frames(
             layout.corners, layout.window, layout.frame_shape, 1, flux_e=flux_e, detector=camera, rng=rng
         )
         pixels: NDArray[np.uint16] = np.clip(np.rint(frame[0] + 100.0), 0, 65535).astype(np.uint16)

@@ -20,22 +20,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measuring import Row, Table
-from faintspot.ao_loop import LoopConfiguration, Method, load_loop
-from faintspot.ao_loop.atmosphere import MovingLayers
-from faintspot.ao_loop.calibration import make_pipeline
-from faintspot.ao_loop.control import slope_turbulence
-from faintspot.ao_loop.simulation import measure_gains
-from faintspot.ao_loop.telescope_model import TelescopeModel, prepare
-from faintspot.control.base import LEARNT, Controller, Expected
-from faintspot.control.commands import CommandDelayLine
-from faintspot.control.learning import GAINS, KALMAN, Plant, learn
-from faintspot.control.learnt import Learnt
-from faintspot.control.phase import residual_phase
-from faintspot.control.telemetry import OpenLoopTelemetry, make_telemetry
-from faintspot.control.vibrations import Vibration
-from faintspot.experiments.statistics import paired_mean
-from faintspot.pipeline.settings import Settings
-from faintspot.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.base.statistics import paired_mean
+from faintspot.loop.control.base import LEARNT, Controller, Expected
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification.learning import GAINS, KALMAN, Plant, learn
+from faintspot.loop.control.identification.model import Learnt
+from faintspot.loop.control.identification.vibrations import Vibration
+from faintspot.loop.control.phase import residual_phase
+from faintspot.loop.control.telemetry import OpenLoopTelemetry, make_telemetry
+from faintspot.loop.simulation import LoopConfiguration, Method, load_loop
+from faintspot.loop.simulation.control import slope_turbulence
+from faintspot.loop.simulation.simulation import measure_gains
+from faintspot.loop.simulation.telescope.atmosphere import MovingLayers
+from faintspot.loop.simulation.telescope.calibration import make_pipeline
+from faintspot.loop.simulation.telescope.model import TelescopeModel, prepare
+from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.slopes.pipeline.settings import Settings
 
 Floats = NDArray[np.float64]
 Make = Callable[[CommandDelayLine], Controller]

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.measuring import Candidate, Row, Table, absolute_spread, best, interleaved
 from benchmarks.rivals import problem
 from benchmarks.scale import settings as fast
-from faintspot.kernels.parallel import available_cpus
+from faintspot.slopes.kernels.parallel import available_cpus
 
 SENSORS, RATES_HZ, LIT = 6, (500.0, 1000.0), 4616
 _COPIED_BYTES = 256 * 2**20

@@ -50,9 +50,9 @@ from benchmarks.measuring import (
     ratio,
     spread,
 )
-from faintspot.realtime.control import request
-from faintspot.realtime.frame_path import FramePath, Progress
-from faintspot.realtime.private_socket import socket_path
+from faintspot.engine.path.frame_path import FramePath, Progress
+from faintspot.engine.requests.private_socket import socket_path
+from faintspot.engine.requests.requests import request
 
 SIDE, PIXELS, LEVEL_ADU, RATE_HZ = 6, 16, 100, 300.0
 ROUNDS, FRAMES_A_ROUND, BATCH = 8, 300, 64
@@ -93,8 +93,8 @@ MISSING = "pyrtcao and pyshmem are not installed: nothing to compare with"
 def frames(count: int = 8) -> tuple[fs.Layout, NDArray[np.uint16]]:
     """Simulate raw frames."""
     layout = fs.Layout.grid((SIDE, SIDE), pixels=PIXELS)
-    detector = fs.simulate.Detector(2.0, offset_adu=LEVEL_ADU, bits=16)
-    raw, _ = fs.simulate.sensor_frames(
+    detector = fs.slopes.simulate.Detector(2.0, offset_adu=LEVEL_ADU, bits=16)
+    raw, _ = fs.slopes.simulate.sensor_frames(
         layout.corners,
         layout.window,
         layout.frame_shape,

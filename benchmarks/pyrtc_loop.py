@@ -43,10 +43,10 @@ from numpy.typing import NDArray
 from benchmarks import pyrtc
 from benchmarks.measuring import Row, Table, Times, median_ratio, spread
 from benchmarks.pyrtc import LEVEL_ADU, PIXELS, RATE_HZ, SIDE
-from faintspot.control.configuration import Control
-from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
-from faintspot.realtime.pixel_ring import PixelRing
-from faintspot.realtime.private_socket import socket_path
+from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.requests.private_socket import socket_path
+from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
+from faintspot.loop.control.configuration import Control
 
 COMMANDS, GAIN, LEAK = 54, 0.4, 0.1
 ROUNDS, FRAMES_A_ROUND, SETTLE, READOUT_S = 8, 250, 10, 1e-3

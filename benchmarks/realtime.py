@@ -25,8 +25,8 @@ from benchmarks.frame_to_command import command_table
 from benchmarks.measuring import Row, Table, Times, median_ratio, spread
 from benchmarks.realtime_processes import SMALL, USUAL, engine_and_camera
 from faintspot import Calibration, Layout, Settings, SlopePipeline
-from faintspot.realtime.engine import Engine
-from faintspot.realtime.pixel_ring import PixelRing
+from faintspot.engine.engine import Engine
+from faintspot.engine.pixels.pixel_ring import PixelRing
 
 FRAMES, RATE_HZ, ROWS = 1500, 300, 112
 ROUNDS = 3

@@ -12,14 +12,14 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.measuring import Row, Table
-from faintspot.ao_loop import Method, load_loop
-from faintspot.ao_loop.calibration import make_pipeline
-from faintspot.ao_loop.simulation import measure_gains
-from faintspot.ao_loop.telescope_model import TelescopeModel
-from faintspot.control.configuration import Control, ControlOptions
-from faintspot.pipeline.settings import Settings
-from faintspot.pipeline.slopes import Slopes
-from faintspot.realtime.control_loop import ControlLoop
+from faintspot.engine.loop.control_loop import ControlLoop
+from faintspot.loop.control.configuration import Control, ControlOptions
+from faintspot.loop.simulation import Method, load_loop
+from faintspot.loop.simulation.simulation import measure_gains
+from faintspot.loop.simulation.telescope.calibration import make_pipeline
+from faintspot.loop.simulation.telescope.model import TelescopeModel
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slopes import Slopes
 
 OPEN_FRAMES, BEFORE, AFTER, REALISATIONS = 60, 200, 300, 3
 LOOPS = {("diffraction_limit", 20.0): (2.2, 0.16), ("diffraction_limit", 100.0): (2.2, 0.43)}

@@ -24,16 +24,16 @@ import numpy as np
 from benchmarks.measuring import Row, Table
 from benchmarks.realtime_processes import engine_and_telescope
 from faintspot import Calibration, Layout, Settings, SlopePipeline
-from faintspot.ao_loop import LoopConfiguration, Method, load_loop, simulate_loop
-from faintspot.ao_loop.control import slope_turbulence
-from faintspot.ao_loop.engine_files import write_engine_files
-from faintspot.ao_loop.telescope_model import prepare
-from faintspot.control.configuration import Control, ControlOptions, load_control
-from faintspot.control.learnt import CONTROLS, KALMAN, POLC, Model
-from faintspot.control.models import SlopeModel
-from faintspot.pipeline import configuration as configuration_file
-from faintspot.realtime.engine import Engine
-from faintspot.realtime.pixel_ring import PixelRing
+from faintspot.engine.engine import Engine
+from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.loop.control.configuration import Control, ControlOptions, load_control
+from faintspot.loop.control.identification.model import CONTROLS, KALMAN, POLC, Model
+from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
+from faintspot.loop.simulation.control import slope_turbulence
+from faintspot.loop.simulation.engine_files import write_engine_files
+from faintspot.loop.simulation.telescope.model import prepare
+from faintspot.slopes.pipeline import configuration as configuration_file
 
 FRAMES, COMMANDS = 2000, 66
 LOOP_FRAMES, SETTLED, REALISATIONS, RATE_HZ = 500, 150, 3, 20.0

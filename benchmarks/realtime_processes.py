@@ -13,8 +13,8 @@ from typing import Any
 from uuid import uuid4
 
 from faintspot.base.errors import InputError
-from faintspot.realtime.control import request
-from faintspot.realtime.private_socket import socket_path
+from faintspot.engine.requests.private_socket import socket_path
+from faintspot.engine.requests.requests import request
 
 CONFIGURATION = """
 [layout.grid]

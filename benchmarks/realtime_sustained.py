@@ -36,12 +36,12 @@ from benchmarks.realtime_processes import (
     resident_bytes,
 )
 from faintspot import Settings
-from faintspot.ao_loop import LoopConfiguration, Method, load_loop
-from faintspot.ao_loop.engine_files import write_engine_files
-from faintspot.pipeline import configuration as configuration_file
-from faintspot.realtime.control import request
-from faintspot.realtime.control_loop import CLOSED
-from faintspot.realtime.private_socket import TELESCOPE, socket_path
+from faintspot.engine.loop.control_loop import CLOSED
+from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
+from faintspot.engine.requests.requests import request
+from faintspot.loop.simulation import LoopConfiguration, Method, load_loop
+from faintspot.loop.simulation.engine_files import write_engine_files
+from faintspot.slopes.pipeline import configuration as configuration_file
 
 SECONDS = float(os.environ.get("FAINTSPOT_SUSTAINED_S", "300"))
 LARGE = {"across": 40, "pixels": 8, "outer_radius": 19.9, "inner_radius": 3.4}
@@ -50,7 +50,7 @@ LONG_FRAMES = int(os.environ.get("FAINTSPOT_SUSTAINED_FRAMES", "1000000"))
 LONG_RATE_HZ = float(os.environ.get("FAINTSPOT_SUSTAINED_HZ", "500"))
 BUSY_RATE_HZ, BUSY_PRIORITY, MOST_LATE = 300, 80, 1e-3
 _STREHL = 1
-"""Place of the Strehl ratio in `faintspot.realtime.telescope.TRUTH`."""
+"""Place of the Strehl ratio in `faintspot.engine.telescope.simulated_telescope.TRUTH`."""
 
 
 def _sustained(name: str, values: dict[str, Any], rate_hz: int) -> Row:

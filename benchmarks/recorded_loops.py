@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.prediction import Shaken
-from faintspot.advice.recorded_loop import RecordedLoop
-from faintspot.ao_loop import LoopConfiguration, Method, load_loop
-from faintspot.ao_loop.calibration import make_pipeline
-from faintspot.ao_loop.configuration import ARCSEC
-from faintspot.ao_loop.simulation import measure_gains
-from faintspot.ao_loop.telescope_model import TelescopeModel
-from faintspot.control.commands import CommandDelayLine
-from faintspot.control.integrator import Integrator
-from faintspot.control.vibrations import Vibration
-from faintspot.pipeline.settings import Settings
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification.vibrations import Vibration
+from faintspot.loop.control.integrator import Integrator
+from faintspot.loop.simulation import LoopConfiguration, Method, load_loop
+from faintspot.loop.simulation.configuration.configuration import ARCSEC
+from faintspot.loop.simulation.simulation import measure_gains
+from faintspot.loop.simulation.telescope.calibration import make_pipeline
+from faintspot.loop.simulation.telescope.model import TelescopeModel
+from faintspot.loop.telemetry.recorded_loop import RecordedLoop
+from faintspot.slopes.pipeline.settings import Settings
 
 Floats = NDArray[np.float64]
 

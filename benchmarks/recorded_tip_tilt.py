@@ -16,13 +16,13 @@ import numpy as np
 
 from benchmarks.measuring import Row, Table
 from benchmarks.prediction import Make, rivals
-from faintspot.advice.open_loop import open_loop_of, site_of_loop
-from faintspot.advice.recorded_loop import RecordedLoop
-from faintspot.control.learning import GAINS, KALMAN, Plant, learn
-from faintspot.control.loop_delay import LoopDelay
-from faintspot.control.reconstructor import make_reconstructor
-from faintspot.control.replay import replayed_frames
-from faintspot.experiments.statistics import mean_by_blocks
+from faintspot.base.statistics import mean_by_blocks
+from faintspot.loop.control.identification.learning import GAINS, KALMAN, Plant, learn
+from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.replay import replayed_frames
+from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.telemetry.open_loop import open_loop_of, site_of_loop
+from faintspot.loop.telemetry.recorded_loop import RecordedLoop
 
 RATE_HZ, DIAMETER_M, LEAK = 1000.0, 10.0, 0.01
 DELAYS = 2, 1, 3

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 import faintspot as fs
 from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, pinned, ratio
 from benchmarks.rival_numpy import NumpyRival, locate
-from faintspot.estimators import estimator_named
+from faintspot.slopes.estimators import estimator_named
 
 ITERATIONS, KEEP, NOISE_STD, FLUX_E = 20, 12, 0.45, 200.0
 NUMPY_BLOCKS = (64, 128, 256, 512)
@@ -90,7 +90,7 @@ def problem(
     """Simulate faint spots and put them into a frame."""
     layout = layout_of(n, pixels)
     generator = np.random.default_rng(n)
-    images, _ = fs.simulate.subapertures(n, shape=(pixels, pixels), flux_e=FLUX_E, rng=generator)
+    images, _ = fs.slopes.simulate.subapertures(n, shape=(pixels, pixels), flux_e=FLUX_E, rng=generator)
     frame = np.zeros(layout.frame_shape, np.float32)
     for (row, column), image in zip(layout.corners, images, strict=True):
         frame[row : row + pixels, column : column + pixels] = image

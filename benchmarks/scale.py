@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, ratio
 from benchmarks.rivals import GRIDS, problem
-from faintspot.kernels.parallel import available_cpus
+from faintspot.slopes.kernels.parallel import available_cpus
 
 SMALLEST, LARGEST = min(GRIDS), max(GRIDS)
 SIDES = (8, 10, 16)

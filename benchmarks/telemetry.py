@@ -16,14 +16,14 @@ import numpy as np
 
 from benchmarks.measuring import Row, Table
 from benchmarks.recorded_loops import Truth, drawn_cases, recorded, winds_of
-from faintspot.advice.loop_choices import AS_RUN, FILTER
-from faintspot.advice.loop_report import LoopReport, report_of_loop
-from faintspot.advice.measured import Measured
-from faintspot.advice.recorded_loop import RecordedLoop
-from faintspot.ao_loop import LoopRecord, Method, load_loop, simulate_loop
-from faintspot.ao_loop.configuration import ARCSEC
-from faintspot.control.learning import KALMAN
-from faintspot.pipeline.settings import Settings
+from faintspot.loop.control.identification.learning import KALMAN
+from faintspot.loop.simulation import LoopRecord, Method, load_loop, simulate_loop
+from faintspot.loop.simulation.configuration.configuration import ARCSEC
+from faintspot.loop.telemetry.choices import AS_RUN, FILTER
+from faintspot.loop.telemetry.measured import Measured
+from faintspot.loop.telemetry.recorded_loop import RecordedLoop
+from faintspot.loop.telemetry.report import LoopReport, report_of_loop
+from faintspot.slopes.pipeline.settings import Settings
 
 Pairs = dict[str, list[tuple[Measured, float]]]
 """Values of a report, each with the truth."""

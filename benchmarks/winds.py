@@ -12,14 +12,14 @@ import numpy as np
 
 from benchmarks.measuring import Row, Table
 from benchmarks.prediction import SETTLE, VIBRATION_NM, Case, Floats, Run
-from faintspot.control.base import ASSUMED, WINDS
-from faintspot.control.commands import CommandDelayLine
-from faintspot.control.guarded import HANDOVER_FRAMES
-from faintspot.control.learning import KALMAN
-from faintspot.control.learnt import Learnt
-from faintspot.control.relearning import Relearnt, relearn
-from faintspot.experiments.statistics import paired_mean
-from faintspot.realtime.successor import Ready, Successor
+from faintspot.base.statistics import paired_mean
+from faintspot.engine.loop.successor import Ready, Successor
+from faintspot.loop.control.base import ASSUMED, WINDS
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification.learning import KALMAN
+from faintspot.loop.control.identification.model import Learnt
+from faintspot.loop.control.identification.relearning import Relearnt, relearn
+from faintspot.loop.control.kalman.guarded import HANDOVER_FRAMES
 
 CASES = {
     "diffraction_limit, 20 photons": Case(20.0, 0.0),

@@ -17,9 +17,9 @@ from sphinx_gallery.scrapers import figure_rst
 from sphinx_gallery.sorting import FileNameSortKey
 
 from faintspot.cli import group
-from faintspot.control.configuration import ControlOptions
-from faintspot.estimators.documentation import all_tables, option_table
-from faintspot.pipeline.settings import SharedOptions
+from faintspot.loop.control.configuration import ControlOptions
+from faintspot.slopes.estimators.documentation import all_tables, option_table
+from faintspot.slopes.pipeline.settings import SharedOptions
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))

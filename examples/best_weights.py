@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.estimators.window import Window
-from faintspot.pipeline.images import measure_images
+from faintspot.slopes.estimators.built_in.window import Window
+from faintspot.slopes.pipeline.images import measure_images
 
 SIDE, READ_NOISE_E, FWHM_PX, BLOCKS = 16, 3.0, 1.772, 40
 SPOTS = {"near the diffraction limit": 1.14, "speckled": 2.92}
@@ -32,7 +32,7 @@ def residual_spots(n: int, d_over_r0: float, motion_px: float, seed: int) -> tup
     """Return images without noise, of unit light, and their positions."""
     rng = np.random.default_rng([seed, int(100 * d_over_r0)])
     positions = rng.normal(0.0, motion_px, (n, 2))
-    images, truth = fs.simulate.speckled_spots(
+    images, truth = fs.slopes.simulate.speckled_spots(
         n, d_over_r0=d_over_r0, shape=(SIDE, SIDE), positions=positions, rng=rng
     )
     return images, truth
@@ -40,7 +40,7 @@ def residual_spots(n: int, d_over_r0: float, motion_px: float, seed: int) -> tup
 
 def slopes_of(images: Floats, flux_e: float, seed: int, options: dict[str, Any], weights: Any) -> Floats:
     """Return slopes (n, 2) of noisy images."""
-    noisy = fs.simulate.Detector(READ_NOISE_E).expose(flux_e * images, np.random.default_rng(seed))
+    noisy = fs.slopes.simulate.Detector(READ_NOISE_E).expose(flux_e * images, np.random.default_rng(seed))
     settings = fs.Settings(Window(**options), spot_fwhm_px=FWHM_PX, flux_e=flux_e * images.sum((1, 2)).mean())
     found = measure_images(
         noisy, settings, calibration=fs.Calibration(read_noise_e=READ_NOISE_E), score=weights

@@ -11,13 +11,13 @@ import faintspot as fs
 
 # A sensor of 36 sub-apertures and a few noisy frames with known spot positions.
 layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
-frames, truth = fs.simulate.sensor_frames(
+frames, truth = fs.slopes.simulate.sensor_frames(
     layout.corners,
     layout.window,
     layout.frame_shape,
     500,
     flux_e=200,
-    detector=fs.simulate.Detector(read_noise_e=3.0),
+    detector=fs.slopes.simulate.Detector(read_noise_e=3.0),
     rng=np.random.default_rng(1),
 )
 

@@ -16,9 +16,9 @@ import numpy as np
 from laser_guide_stars import ALTITUDES, CALIBRATION, MATRIX, READ_NOISE_E, Advance, Floats, N, star_of
 
 import faintspot as fs
-from faintspot.cli.progress import progress_bar
-from faintspot.estimators.correlation import Correlation
-from faintspot.training import MeanImages, fit_sodium_profile, fit_spot
+from faintspot.cli.shared.progress import progress_bar
+from faintspot.slopes.estimators.built_in.correlation import Correlation
+from faintspot.slopes.training import MeanImages, fit_sodium_profile, fit_spot
 
 CHANGE_FLUX_E, RATE_HZ, SECONDS, STEP_S = 200.0, 1000, 70, 2
 APPEARS_S = (10.0, 40.0)

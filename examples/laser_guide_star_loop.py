@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 import faintspot as fs
-from faintspot.ao_loop import LoopConfiguration, LoopRecord, Method, load_loop, simulate_loop
-from faintspot.cli.progress import progress_bar
-from faintspot.estimators.correlation import Correlation
-from faintspot.experiments.search import FIRST_TUNING_REALISATION
+from faintspot.cli.shared.progress import progress_bar
+from faintspot.experiments.closed_loop.search import FIRST_TUNING_REALISATION
+from faintspot.loop.simulation import LoopConfiguration, LoopRecord, Method, load_loop, simulate_loop
+from faintspot.slopes.estimators.built_in.correlation import Correlation
 
 FLUXES = (60.0, 200.0)
 FRAMES, SETTLE = 160, 50

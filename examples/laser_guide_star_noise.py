@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.cli.progress import progress_bar
-from faintspot.control.kalman import SlopePredictor
-from faintspot.control.local_kalman import LocalPredictor, local_filter
-from faintspot.control.models import SlopeModel
-from faintspot.control.noise import add_noise, weighted_slopes
-from faintspot.control.phase import phase_of_commands
-from faintspot.turbulence.slope_covariance import SlopeTurbulence, phase_covariance_rad2
+from faintspot.cli.shared.progress import progress_bar
+from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter
+from faintspot.loop.control.kalman.predictor import SlopePredictor
+from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.control.noise import add_noise, weighted_slopes
+from faintspot.loop.control.phase import phase_of_commands
+from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence, phase_covariance_rad2
 
 Floats = NDArray[np.float64]
 
@@ -110,7 +110,7 @@ def spots_of(launch: Launch) -> fs.PSF:
 def measured(launch: Launch, psf: fs.PSF, flux: float, positions: Floats, seed: int) -> fs.Slopes:
     """Return slopes of spots at positions (frames, n, 2) px."""
     layout = laser.layout_of(launch.side)
-    frames, _ = fs.simulate.sensor_frames(
+    frames, _ = fs.slopes.simulate.sensor_frames(
         layout.corners, layout.window, layout.frame_shape, len(positions), flux_e=flux, psf=psf,
         detector=laser.DETECTOR, rng=np.random.default_rng(seed), positions=positions,
     )  # fmt: skip

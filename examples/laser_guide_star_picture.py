@@ -13,7 +13,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 import faintspot as fs
-from faintspot.training import fit_spot
+from faintspot.slopes.training import fit_spot
 
 
 def draw(path: str) -> None:

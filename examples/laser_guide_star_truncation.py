@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.estimators.correlation import Correlation
+from faintspot.slopes.estimators.built_in.correlation import Correlation
 
 Floats = NDArray[np.float64]
 
@@ -92,7 +92,9 @@ def table(case: Case) -> None:
     groups = np.digitize(lost, EDGES[1:-1])
     drawn = np.random.default_rng(1).poisson(FLUX_E * frame(0.0), (FRAMES, side, side * len(star)))
     noisy = drawn + np.random.default_rng(2).normal(0.0, READ_NOISE_E, drawn.shape)
-    bound = fs.cramer_rao_covariance(FLUX_E, psf, (side, side), detector=fs.simulate.Detector(READ_NOISE_E))
+    bound = fs.cramer_rao_covariance(
+        FLUX_E, psf, (side, side), detector=fs.slopes.simulate.Detector(READ_NOISE_E)
+    )
     least = np.sqrt(np.trace(bound, axis1=1, axis2=2))
     print(f"\n### {case.name}, {side} px of {case.pixel_arcsec:g} arcsec\n")
     print(f"Spots of two layers, {length.min():.1f} to {length.max():.1f} px long.\n")

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.cli.progress import progress_bar
-from faintspot.estimators.correlation import Correlation
-from faintspot.training import MeanImages, fit_spot
-from faintspot.wavefront.zernike import mean_gradients
+from faintspot.cli.shared.progress import progress_bar
+from faintspot.slopes.estimators.built_in.correlation import Correlation
+from faintspot.slopes.training import MeanImages, fit_spot
+from faintspot.slopes.wavefront.zernike import mean_gradients
 
 DIAMETER_M, LENSLETS, OBSTRUCTION_M = 8.0, 20, 1.2
 LAUNCH_M, SITE_M, ZENITH_DEG = (-5.0, 0.0), 2600.0, 30.0
@@ -69,7 +69,7 @@ def subapertures_m() -> Floats:
 
 PLACES = subapertures_m()
 N = len(PLACES)
-DETECTOR = fs.simulate.Detector(READ_NOISE_E)
+DETECTOR = fs.slopes.simulate.Detector(READ_NOISE_E)
 CALIBRATION = fs.Calibration(read_noise_e=READ_NOISE_E)
 
 
@@ -100,7 +100,7 @@ MATRIX = wavefront_matrix()
 def frames_of(psf: fs.PSF, side: int, flux: float, n: int, seed: int) -> tuple[Any, Floats]:
     """Return frames and the positions of their spots (n, N, 2)."""
     layout, rng = layout_of(side), np.random.default_rng(seed)
-    return fs.simulate.sensor_frames(
+    return fs.slopes.simulate.sensor_frames(
         layout.corners, layout.window, layout.frame_shape, n, flux_e=flux, psf=psf, detector=DETECTOR,
         rng=rng, positions=rng.normal(0.0, MOTION_PX, (n, N, 2)),
     )  # fmt: skip
@@ -247,7 +247,7 @@ def efficiency_table(case: Case, advance: Advance) -> None:
     print("|---" * 7 + "|")
     for flux in EFFICIENCY_FLUXES:
         rng = np.random.default_rng(int(flux))
-        frames, truth = fs.simulate.sensor_frames(
+        frames, truth = fs.slopes.simulate.sensor_frames(
             layout.corners, layout.window, layout.frame_shape, SPOTS, flux_e=flux, psf=psf, detector=DETECTOR,
             rng=rng, positions=rng.normal(0.0, MOTION_PX, (SPOTS, len(kept), 2)),
         )  # fmt: skip

@@ -23,8 +23,8 @@ from thinned_spots import binned, moved
 
 import faintspot as fs
 from faintspot.io import open_frames
-from faintspot.simulate import Detector
-from faintspot.training.psf_learning import LearntPSF, learn_psf_from_images
+from faintspot.slopes.simulate import Detector
+from faintspot.slopes.training.psf_learning import LearntPSF, learn_psf_from_images
 
 CASES = ((30, 0.1), (50, 0.1), (100, 0.1), (200, 0.1), (1000, 0.1), (100, 3.0), (200, 3.0), (1000, 3.0))
 SHIFTS = [(dy, dx) for dy in range(-2, 3) for dx in range(-2, 3)]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.spots.bounds import MEAN_ABSOLUTE
+from faintspot.slopes.spots.bounds import MEAN_ABSOLUTE
 
 SIDE = 8
 LENSLETS = 10  # along a side of the frame
@@ -43,9 +43,9 @@ class Scored(NamedTuple):
     """Rms of the errors over the standard errors in each sub-aperture."""
 
 
-def camera(median_e: float, spread: float, blinking: float, seed: int) -> fs.simulate.Detector:
+def camera(median_e: float, spread: float, blinking: float, seed: int) -> fs.slopes.simulate.Detector:
     """Return a camera whose read noise has few different values."""
-    drawn = fs.simulate.Detector.cmos(
+    drawn = fs.slopes.simulate.Detector.cmos(
         LAYOUT.frame_shape,
         median_e,
         spread=spread,
@@ -58,7 +58,7 @@ def camera(median_e: float, spread: float, blinking: float, seed: int) -> fs.sim
     return replace(drawn, read_noise_e=median_e * np.exp(STEP * levels))
 
 
-def frames_of(detector: fs.simulate.Detector, flux: float, n: int, seed: int) -> tuple[Any, Floats]:
+def frames_of(detector: fs.slopes.simulate.Detector, flux: float, n: int, seed: int) -> tuple[Any, Floats]:
     """Return frames and the positions of their spots (n, sub-apertures, 2)."""
     rng = np.random.default_rng(seed)
     truth = rng.uniform(-RANGE_PX, RANGE_PX, (n, len(LAYOUT), 2))
@@ -70,7 +70,7 @@ def frames_of(detector: fs.simulate.Detector, flux: float, n: int, seed: int) ->
 def bounds_px(noise: Floats, fluxes: Floats) -> Floats:
     """Return the bound of the slope error, the mean of the sub-apertures, for each flux."""
     known: dict[str, Any] = {"shape": (SIDE, SIDE), "psf": PSF, "position_range_px": RANGE_PX}
-    windows = [fs.simulate.Detector(own) for own in LAYOUT.images(noise)]
+    windows = [fs.slopes.simulate.Detector(own) for own in LAYOUT.images(noise)]
     each = [fs.cramer_rao(fluxes, detector=window, **known) for window in windows]
     return np.asarray(MEAN_ABSOLUTE * np.mean(each, axis=(0, 2)))
 

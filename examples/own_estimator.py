@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import faintspot as fs
-from faintspot.estimators import Estimator, option, register
+from faintspot.slopes.estimators import Estimator, option, register
 
 
 @register
@@ -34,8 +34,8 @@ class PowerCentroid(Estimator):
 
 
 if __name__ == "__main__":
-    images, truth = fs.simulate.subapertures(
-        2000, flux_e=1000, detector=fs.simulate.Detector(read_noise_e=1.0)
+    images, truth = fs.slopes.simulate.subapertures(
+        2000, flux_e=1000, detector=fs.slopes.simulate.Detector(read_noise_e=1.0)
     )
     found = fs.measure_images(images, fs.Settings("power", power=2.0))
     print(f"R = {np.abs(np.column_stack([found.x, found.y]) - truth).mean():.3f} px")

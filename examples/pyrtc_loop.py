@@ -61,14 +61,14 @@ class Sensor(WavefrontSensor):
     def expose(self) -> None:
         """Publish a frame, stamped with its number."""
         tilt = TILT_PX + self.commands.read()
-        frames, _ = fs.simulate.sensor_frames(
+        frames, _ = fs.slopes.simulate.sensor_frames(
             self.layout.corners,
             self.layout.window,
             self.layout.frame_shape,
             1,
             flux_e=300.0,
             positions=np.broadcast_to(tilt, (1, len(self.layout), 2)),
-            detector=fs.simulate.Detector(2.0, offset_adu=LEVEL_ADU, bits=16),
+            detector=fs.slopes.simulate.Detector(2.0, offset_adu=LEVEL_ADU, bits=16),
             rng=self.rng,
         )
         self.data = frames[0]

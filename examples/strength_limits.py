@@ -9,8 +9,8 @@ errors are smaller than those of R. docs/automatic.md has the table.
 import numpy as np
 
 import faintspot as fs
-from faintspot.algorithms.automatic import automatic_strength
-from faintspot.algorithms.noise import suggested_strength
+from faintspot.slopes.estimators.algorithms.automatic import automatic_strength
+from faintspot.slopes.estimators.algorithms.noise import suggested_strength
 
 SPOTS, SEED = 4000, 2
 FLUXES_E, READ_NOISES_E, SIDES = (20.0, 50.0, 100.0, 200.0), (1.0, 3.0), (8, 16)
@@ -34,11 +34,11 @@ def main() -> None:
     for number, (side, noise, flux) in enumerate(
         (side, noise, flux) for side in SIDES for noise in READ_NOISES_E for flux in FLUXES_E
     ):
-        images, truth = fs.simulate.subapertures(
+        images, truth = fs.slopes.simulate.subapertures(
             SPOTS,
             shape=(side, side),
             flux_e=flux,
-            detector=fs.simulate.Detector(read_noise_e=noise),
+            detector=fs.slopes.simulate.Detector(read_noise_e=noise),
             rng=np.random.default_rng((SEED, number)),
         )
         without, plain = errors(images, truth, fs.Settings("brightest"))

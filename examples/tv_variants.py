@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 import faintspot as fs
-from faintspot.algorithms.automatic import automatic_kept_pixels, automatic_strength
-from faintspot.estimators.brightest import BrightestPixels
-from faintspot.experiments.cell_methods import position_table
-from faintspot.experiments.statistics import slope_statistics
-from faintspot.experiments.sweep import Cell
-from faintspot.simulate import Detector, subapertures
+from faintspot.base.statistics import slope_statistics
+from faintspot.experiments.study.cell_methods import position_table
+from faintspot.experiments.study.sweep import Cell
+from faintspot.slopes.estimators.algorithms.automatic import automatic_kept_pixels, automatic_strength
+from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.simulate import Detector, subapertures
 
 SIDE = 16
 LENSLETS = 7  # sub-apertures along a side of the frame
@@ -165,7 +165,7 @@ def moments(positions: Floats, truth: Floats, groups: int = 1) -> Floats:
 def quantities(sums: Floats, n: int) -> Floats:
     """Return R and the gain-corrected rms (2, ...) from `moments` (8, ...) of n slopes.
 
-    As `faintspot.experiments.statistics.slope_statistics` defines them.
+    As `faintspot.base.statistics.slope_statistics` defines them.
     """
     absolute, ex, ey, tx, ty, ee, et, tt = sums
     ee, et, tt = ee - (ex**2 + ey**2) / n, et - (ex * tx + ey * ty) / n, tt - (tx**2 + ty**2) / n

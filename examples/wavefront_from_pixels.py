@@ -25,13 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import eigsh
 
-from faintspot.ao_loop import LoopConfiguration, load_loop
-from faintspot.ao_loop.control import learnt_control
-from faintspot.ao_loop.simulation import DisabledErrors, _Loop
-from faintspot.ao_loop.telescope_model import LoopOptics, TelescopeModel, prepare
-from faintspot.control.kalman import SlopePredictor
-from faintspot.experiments.loop_methods import method_kind
-from faintspot.turbulence.slope_covariance import phase_covariance_rad2
+from faintspot.experiments.closed_loop.methods import method_kind
+from faintspot.loop.control.kalman.predictor import SlopePredictor
+from faintspot.loop.simulation import LoopConfiguration, load_loop
+from faintspot.loop.simulation.control import learnt_control
+from faintspot.loop.simulation.simulation import DisabledErrors, _Loop
+from faintspot.loop.simulation.telescope.model import LoopOptics, TelescopeModel, prepare
+from faintspot.loop.turbulence.slope_covariance import phase_covariance_rad2
 
 Floats = NDArray[np.float64]
 

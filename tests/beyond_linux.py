@@ -75,7 +75,7 @@ def main(commands: list[str]) -> None:
             importlib.import_module(name)
     print(len(names), "modules")
     from faintspot.cli import main as command_line
-    from faintspot.experiments import tuning
+    from faintspot.experiments.planner import tuning
 
     tuning.tune = functools.partial(tuning.tune, realisations=256, steps=1)  # quick
     for command in commands:

@@ -34,7 +34,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture
 def coarse_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw without fine detail: pictures of reports take most of the time."""
-    from faintspot.report import drawing
+    from faintspot.base.report import drawing
 
     monkeypatch.setattr(drawing, "DOTS_PER_INCH", 20)
 
@@ -42,7 +42,7 @@ def coarse_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def undrawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compose the figures but do not draw them."""
-    from faintspot.report import drawing
+    from faintspot.base.report import drawing
 
     for name in ("png", "svg"):
         monkeypatch.setattr(drawing, name, lambda figure: b"")

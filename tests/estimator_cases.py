@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.spots.psf import PSF
-from faintspot.spots.score import TrainedScore
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import TrainedScore
 
 NEED_PSF = ("matched", "ml", "map")
 FIELDS = (
@@ -169,7 +169,7 @@ def random_case(
     if rng.random() < 0.6:
         psf = PSF(several_psfs().samples, 8, rng.integers(0, 3, n))
     noise, background = float(rng.choice([0.1, 0.3, 1.0, 3.0])), float(rng.choice([0.0, 2.0]))
-    detector = fs.simulate.Detector(
+    detector = fs.slopes.simulate.Detector(
         noise,
         background_e=background,
         em_gain=float(rng.choice([1.0, 1.0, 50.0])),

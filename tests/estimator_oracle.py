@@ -25,8 +25,8 @@ from tests.naive_estimators import Estimate, Task
 from tests.naive_spots import PHASES, Floats, Spot, spots_of
 
 import faintspot as fs
-from faintspot.estimators.spot_tables import posterior_grid
-from faintspot.spots.psf import PSF
+from faintspot.slopes.estimators.spot_tables import posterior_grid
+from faintspot.slopes.spots.psf import PSF
 
 EPS = float(np.finfo(np.float32).eps)
 ROUNDING = 30.0

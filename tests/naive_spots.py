@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import spline_filter
 
-from faintspot.spots.psf import PSF
+from faintspot.slopes.spots.psf import PSF
 
 Floats = NDArray[np.float64]
 PHASES = 16

@@ -1,4 +1,4 @@
-"""Where tests find the real frames and reference values that are not part of the project."""
+"""Where tests find the files of the project, and real frames and reference values that are not part of it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-_DEFAULT = Path(__file__).resolve().parents[2] / "shared"
+ROOT = Path(__file__).resolve().parents[1]
+"""Folder of the project."""
+_DEFAULT = ROOT.parent / "shared"
 
 
 def shared_file(name: str) -> Path:

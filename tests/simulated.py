@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from faintspot.sensor.layout import Layout
-from faintspot.simulate import sensor_frames
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.simulate import sensor_frames
 
 
 def frames_of(layout: Layout, n: int, **options: Any) -> tuple[Any, Any]:

@@ -5,9 +5,9 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from faintspot.camera.hot_pixels import find_hot_pixels
 from faintspot.data import mmt_frame
-from faintspot.sensor.found_layout import find_layout
+from faintspot.slopes.camera.hot_pixels import find_hot_pixels
+from faintspot.slopes.sensor.found_layout import find_layout
 
 
 def test_the_frame_has_the_lenslets_of_its_sensor() -> None:

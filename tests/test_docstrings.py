@@ -10,21 +10,27 @@ from typing import Any
 
 import pytest
 
-from faintspot.estimators import estimators, registry
+from faintspot.slopes.estimators import estimators, registry
 
 PAGES = Path(__file__).resolve().parents[1] / "docs/reference/modules"
-ROOMS = ["faintspot", *(f"faintspot.{page.stem}" for page in sorted(PAGES.glob("*.md")))]
+PACKAGES = [
+    "faintspot",
+    *(
+        ".".join(("faintspot", *page.relative_to(PAGES).with_suffix("").parts))
+        for page in sorted(PAGES.rglob("*.md"))
+    ),
+]
 WITHOUT_EXAMPLE = {
     "faintspot.SubapertureFlag": "in that of Slopes",
     "faintspot.Wavefront": "in that of fit_wavefront",
-    "faintspot.ao_loop.LoopRecord": "in that of simulate_loop",
+    "faintspot.loop.simulation.LoopRecord": "in that of simulate_loop",
     "faintspot.experiments.Answer": "in that of tune",
     "faintspot.io.StoredSlopes": "in that of read_slopes",
-    "faintspot.training.CentroidGain": "in that of measure_centroid_gain",
-    "faintspot.training.SodiumFit": "in that of fit_sodium_profile",
-    "faintspot.training.LearntPSF": "in that of learn_psf_from_images",
-    "faintspot.wavefront.Discrepancy": "in that of slope_discrepancy",
-    "faintspot.estimators.Sensor": "made by a pipeline, in that of Estimator",
+    "faintspot.slopes.training.CentroidGain": "in that of measure_centroid_gain",
+    "faintspot.slopes.training.SodiumFit": "in that of fit_sodium_profile",
+    "faintspot.slopes.training.LearntPSF": "in that of learn_psf_from_images",
+    "faintspot.slopes.wavefront.Discrepancy": "in that of slope_discrepancy",
+    "faintspot.slopes.estimators.Sensor": "made by a pipeline, in that of Estimator",
 }
 NEEDED = {
     "simulate_loop": ("hcipy",),
@@ -37,13 +43,13 @@ NEEDED = {
 def public_names() -> dict[str, Any]:
     """Return all classes and functions that the reference shows, by where they are shown first."""
     found: dict[int, tuple[str, Any]] = {}
-    for room in ROOMS:
-        module = importlib.import_module(room)
+    for package in PACKAGES:
+        module = importlib.import_module(package)
         for name in getattr(module, "__all__", dir(module)):
             item = getattr(module, name)
             documented = inspect.isclass(item) or inspect.isfunction(item)
             if documented and not name.startswith("_") and item.__module__.startswith("faintspot"):
-                found.setdefault(id(item), (f"{room}.{name}", item))
+                found.setdefault(id(item), (f"{package}.{name}", item))
     return dict(found.values())
 
 
@@ -60,12 +66,12 @@ def test_public_names_have_examples() -> None:
     "name", [*sorted(NAMES.keys() - WITHOUT_EXAMPLE.keys()), "faintspot.cli.examination.examine"]
 )
 def test_examples(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    room, _, short = name.rpartition(".")
+    home, _, short = name.rpartition(".")
     for package in NEEDED.get(short, ()):
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "_kinds", estimators())  # a copy: an example registers one of its own
-    item = getattr(importlib.import_module(room), short)
+    item = getattr(importlib.import_module(home), short)
     said: list[str] = []
     runner = doctest.DocTestRunner()
     found = doctest.DocTestFinder().find(item, name)

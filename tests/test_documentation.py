@@ -17,10 +17,10 @@ import pytest
 from tests.simulated import frames_of
 
 import faintspot as fs
-from faintspot.estimators import estimators, registry
+from faintspot.engine.telemetry.segment import image_type, layout_values, record_type
 from faintspot.io import read_telemetry, write_aot
-from faintspot.io.telemetry import TelemetryStore
-from faintspot.realtime.telemetry_segment import image_type, layout_values, record_type
+from faintspot.io.telemetry.recording import TelemetryStore
+from faintspot.slopes.estimators import estimators, registry
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("", "adapters", "guide", "reference", "results")
@@ -74,7 +74,7 @@ def assumed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
         rng=rng,
     )
     frames = electrons / 2.0 + 100.0
-    images, positions = fs.simulate.subapertures(500, flux_e=40.0, rng=rng)
+    images, positions = fs.slopes.simulate.subapertures(500, flux_e=40.0, rng=rng)
     settings = fs.Settings("window", flux_e=400.0, spot_fwhm_px=1.8)
     pipeline = fs.SlopePipeline(layout, settings, calibration)
     slopes = pipeline(frames)
@@ -111,7 +111,7 @@ def names(
 
 def write_slopes(path: Path, frames: Any, layout: fs.Layout, calibration: fs.Calibration) -> None:
     """Measure frames into a file, as `faintspot slopes` does."""
-    from faintspot.recorded.measuring import measure_recorded
+    from faintspot.slopes.recorded.measuring import measure_recorded
 
     toml = path.parent / "faintspot.toml"
     if not toml.exists():

@@ -26,11 +26,11 @@ from tests.estimator_oracle import assert_equals_oracle
 from tests.naive_spots import spots_of
 
 import faintspot as fs
-from faintspot.estimators import estimators
-from faintspot.kernels.groups import new_scratch
-from faintspot.pipeline.images import measure_images
-from faintspot.spots.bounds import cramer_rao
-from faintspot.spots.psf import PSF
+from faintspot.slopes.estimators import estimators
+from faintspot.slopes.kernels.driver.groups import new_scratch
+from faintspot.slopes.pipeline.images import measure_images
+from faintspot.slopes.spots.bounds import cramer_rao
+from faintspot.slopes.spots.psf import PSF
 
 SEEDS = st.integers(0, 2**32 - 1)
 EVERY = pytest.mark.parametrize("estimator", list(estimators()))
@@ -325,7 +325,7 @@ class TestPhysics:
     def simulated(self, flux: float, noise: float, psf: PSF) -> tuple[Any, Any]:
         rng = np.random.default_rng(7)
         places = rng.uniform(-1, 1, (self.N, 2))
-        detector = fs.simulate.Detector(noise)
+        detector = fs.slopes.simulate.Detector(noise)
         return detector.expose(np.maximum(psf.images(places, (12, 14), flux), 0.0), rng), places
 
     @pytest.mark.parametrize(
@@ -394,7 +394,7 @@ class TestPhysics:
         psf = PSF.analytic("gaussian", size=1.8, radius_px=26)
         rng = np.random.default_rng(7)
         places = rng.uniform(-1, 1, (self.N, 2))
-        images = fs.simulate.Detector(1.0).expose(psf.images(places, (8, 8), 2000.0).clip(0), rng)
+        images = fs.slopes.simulate.Detector(1.0).expose(psf.images(places, (8, 8), 2000.0).clip(0), rng)
         chosen = fs.Settings("ml", local_background="on", weight_floor=0.0)
         slopes = measure_images(
             images, chosen, calibration=fs.Calibration(dark=5.0, read_noise_e=1.0), psf=psf
@@ -404,7 +404,7 @@ class TestPhysics:
             2000.0 * psf.images(np.zeros((1, 2)), (8, 8)).sum(),
             psf=psf,
             shape=(8, 8),
-            detector=fs.simulate.Detector(1.0),
+            detector=fs.slopes.simulate.Detector(1.0),
             position_range_px=1.0,
             unknown_background=True,
         )

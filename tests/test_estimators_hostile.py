@@ -24,11 +24,11 @@ from tests.estimator_cases import (
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot.estimators import estimators
-from faintspot.kernels import groups
-from faintspot.pipeline.images import measure_images
-from faintspot.spots.psf import PSF
-from faintspot.spots.score import TrainedScore
+from faintspot.slopes.estimators import estimators
+from faintspot.slopes.kernels.driver import groups
+from faintspot.slopes.pipeline.images import measure_images
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import TrainedScore
 
 Flag = fs.SubapertureFlag
 SEEDS = st.integers(0, 2**32 - 1)

@@ -15,7 +15,7 @@ from tests import naive_estimators as oracle
 from tests.naive_estimators import Estimate, Task
 from tests.naive_spots import spots_of
 
-from faintspot.spots.psf import PSF
+from faintspot.slopes.spots.psf import PSF
 
 SHAPE = (11, 12)
 N = 300

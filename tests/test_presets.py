@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from faintspot import Settings
+from faintspot.base.statistics import slope_error
 from faintspot.experiments import Cell
-from faintspot.experiments.cell import realisations
-from faintspot.experiments.statistics import slope_error
-from faintspot.pipeline.images import measure_images
+from faintspot.experiments.study.cell import realisations
+from faintspot.slopes.pipeline.images import measure_images
 
 CONVERGED: dict[str, Any] = {"tolerance": 1e-4, "max_iterations": 500}
 ENOUGH, TOLERANCE = 0.01, 0.03

@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import faintspot as fs
-from faintspot.camera.hot_pixels import find_hot_pixels
 from faintspot.data import mmt_frame
-from faintspot.sensor.found_layout import find_layout
+from faintspot.slopes.camera.hot_pixels import find_hot_pixels
+from faintspot.slopes.sensor.found_layout import find_layout
 
 frame = mmt_frame()
 hot = find_hot_pixels(frame)
@@ -78,7 +78,7 @@ for axes, (title, images) in zip(figure.subplots(1, 3), steps.items(), strict=Tr
 # Zernike modes in Noll's order, fitted to the slopes. Tip and tilt are left out of the picture; without a
 # pixel scale in the layout, the unit is that of the slopes.
 
-from faintspot.wavefront.figure import wavefront_figure
+from faintspot.slopes.wavefront.figure import wavefront_figure
 
 wavefront = fs.fit_wavefront(slopes, layout)
 figure = wavefront_figure(wavefront, layout, "the frame").figure

@@ -41,7 +41,7 @@ figure = fs.experiments.tune_figure(answer)
 # How much of the sky has a star that is bright enough, near enough? From star counts (Bahcall and Soneira
 # 1980; good to about 25 %).
 
-from faintspot.experiments.loop_question import PLACES, sky_coverage
+from faintspot.experiments.closed_loop.question import PLACES, sky_coverage
 
 for magnitude in (12.0, 14.0, 16.0):
     found = {place: sky_coverage(magnitude, 30.0, latitude, "R") for place, latitude in PLACES.items()}

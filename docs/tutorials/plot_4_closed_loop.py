@@ -14,7 +14,7 @@ the same turbulence and photons, other slopes and other control.
 from matplotlib.figure import Figure
 
 import faintspot as fs
-from faintspot.ao_loop import Method, load_loop, simulate_loop
+from faintspot.loop.simulation import Method, load_loop, simulate_loop
 
 loop = load_loop("diffraction_limit").replace("camera", photons_per_subaperture=20.0)
 loop = loop.replace("run", frames=400, settle_frames=80).replace("control", telemetry_frames=1000)

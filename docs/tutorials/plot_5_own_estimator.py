@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 import faintspot as fs
-from faintspot.estimators import Estimator, option, register
+from faintspot.slopes.estimators import Estimator, option, register
 
 
 @register
@@ -53,8 +53,8 @@ except fs.InputError as error:
 
 from matplotlib.figure import Figure
 
-images, truth = fs.simulate.subapertures(
-    2000, flux_e=1000, detector=fs.simulate.Detector(read_noise_e=1.0), rng=np.random.default_rng(1)
+images, truth = fs.slopes.simulate.subapertures(
+    2000, flux_e=1000, detector=fs.slopes.simulate.Detector(read_noise_e=1.0), rng=np.random.default_rng(1)
 )
 errors_px = {}
 for settings in (

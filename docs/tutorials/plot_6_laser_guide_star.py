@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import faintspot as fs
-from faintspot.training import MeanImages, fit_sodium_profile
+from faintspot.slopes.training import MeanImages, fit_sodium_profile
 
 rng = np.random.default_rng(1)
 line = (np.arange(10) - 4.5) * 0.8
@@ -38,9 +38,9 @@ print(f"elongation {length.min():.1f} to {length.max():.1f} px")
 # 300 frames of 200 electrons in a spot, with 1 electron of read noise.
 
 layout = fs.Layout.grid((10, 10), pixels=10)
-camera = fs.simulate.Detector(1.0)
+camera = fs.slopes.simulate.Detector(1.0)
 psf = star.psf(profile)
-frames, truth = fs.simulate.sensor_frames(
+frames, truth = fs.slopes.simulate.sensor_frames(
     layout.corners,
     layout.window,
     layout.frame_shape,

@@ -18,17 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.flags import INVALID
-from faintspot.camera.calibration import Calibration
-from faintspot.estimators.base import Estimator, Need
-from faintspot.estimators.registry import estimator_named
-from faintspot.estimators.scene import Scene
-from faintspot.pipeline.settings import Settings
-from faintspot.pipeline.slope_pipeline import SlopePipeline
-from faintspot.pipeline.slopes import Slopes
-from faintspot.sensor.layout import Layout
-from faintspot.spots.psf import PSF
-from faintspot.spots.score import Score
-from faintspot.spots.shapes import spots
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.estimators.base import Estimator, Need
+from faintspot.slopes.estimators.registry import estimator_named
+from faintspot.slopes.estimators.scene import Scene
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import Score
+from faintspot.slopes.spots.shapes import spots
 
 SIDE = 16
 N = 53

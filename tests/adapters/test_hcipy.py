@@ -4,11 +4,11 @@ import importlib
 import re
 import sys
 import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.shared_data import ROOT
 
 import faintspot as fs
 from faintspot import InputError, MissingExtraError, Settings
@@ -239,9 +239,7 @@ def test_images_that_do_not_fit(optics: Any) -> None:
 
 
 def test_the_loop_of_the_manual_closes(capsys: pytest.CaptureFixture[str]) -> None:
-    text = (Path(__file__).resolve().parents[2] / "docs" / "adapters" / "hcipy.md").read_text(
-        encoding="utf-8"
-    )
+    text = (ROOT / "docs" / "adapters" / "hcipy.md").read_text(encoding="utf-8")
     script = re.search(r"```python\n(.*?)```", text, re.DOTALL)
     assert script is not None
     np.random.seed(1)  # noqa: NPY002 - HCIPy's detectors draw from this one

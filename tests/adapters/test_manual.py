@@ -8,8 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.shared_data import ROOT
 
-MANUAL = Path(__file__).resolve().parents[2] / "docs" / "adapters"
+MANUAL = ROOT / "docs" / "adapters"
 
 
 @pytest.mark.parametrize(

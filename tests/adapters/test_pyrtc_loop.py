@@ -5,22 +5,22 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
 import pytest
 from tests.adapters.adapter_cases import needs
+from tests.shared_data import ROOT
 
 import faintspot as fs
 from faintspot import InputError, MissingExtraError, Settings
 from faintspot.adapters import pyrtc
 from faintspot.adapters.pyrtc import _Frames, _Measuring
-from faintspot.realtime.pixel_segment import FOLDER
+from faintspot.engine.pixels.pixel_segment import FOLDER
 
 SHAPE, PATIENCE_S = (6, 5), 30.0
-FILES = Path(__file__).parents[2] / "examples" / "pyrtc"
+FILES = ROOT / "examples" / "pyrtc"
 pyshmem = pytest.importorskip("pyshmem")
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
 

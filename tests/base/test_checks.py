@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.algorithms.image_cases import BAD_IMAGES
 from tests.refusals import refused
+from tests.slopes.estimators.algorithms.image_cases import BAD_IMAGES
 
 from faintspot.base import checks
 

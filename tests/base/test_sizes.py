@@ -11,14 +11,14 @@ import pytest
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.base.sizes import MOST_NUMBERS, check_size
-from faintspot.estimators import spot_tables
-from faintspot.experiments.specification import StudySpecification, Sweep
+from faintspot.experiments.study.specification import StudySpecification, Sweep
 from faintspot.io import open_frames
 from faintspot.io.frames import read_array
-from faintspot.spots.psf import PSF
-from faintspot.spots.score import TrainedScore
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.slopes.estimators import spot_tables
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import TrainedScore
 
 GRID = "[layout.grid]\nshape = [3, 3]\npixels = 8\n"
 SETTINGS = '[estimator]\nname = "centroid"\n'
@@ -90,7 +90,7 @@ CASES: dict[str, tuple[Callable[[Path], Any], tuple[str, ...]]] = {
     "psfs": (lambda _: PSF.analytic(size=np.ones(99), radius_px=128, index=range(99)), ("psf.samples",)),
     "psf's side": (lambda _: PSF(np.ones((5, 5001)), 8), ("psf.samples: expected at most 4097",)),
     "image": (lambda _: PSF.analytic().images([[0, 0]], (1 << 20, 1 << 20)), ("shape = 1048576 x",)),
-    "spot": (lambda _: fs.simulate.spots([[0, 0]], shape=(1 << 20, 1 << 20)), ("shape = 1048576 x",)),
+    "spot": (lambda _: fs.slopes.simulate.spots([[0, 0]], shape=(1 << 20, 1 << 20)), ("shape = 1048576 x",)),
     "loop": (
         lambda _: LoopConfiguration().replace("sensor", subapertures=200, samples=128),
         ("subapertures x samples",),
@@ -117,11 +117,11 @@ def test_large_grids_are_quick_enough_to_make() -> None:
 
 def test_flux_beyond_the_memory_uses_the_nearest_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     """Faint and bright frames in turn: with room for few levels, all are measured, the first ones alike."""
-    from faintspot.estimators import maximum_a_posteriori
+    from faintspot.slopes.estimators.built_in import maximum_a_posteriori
 
     rng = np.random.default_rng(1)
     roomy, narrow = map_of(8, 0.8), map_of(8, 0.8)
-    place = fs.simulate.spots(np.zeros((16, 2)), shape=(8, 8), size=0.8, profile="gaussian")
+    place = fs.slopes.simulate.spots(np.zeros((16, 2)), shape=(8, 8), size=0.8, profile="gaussian")
     bright = place.reshape(4, 4, 8, 8).swapaxes(1, 2).reshape(32, 32)
     frames = rng.poisson(np.multiply.outer([30, 300, 330, 3000], bright)) + rng.normal(0, 1, (4, 32, 32))
     room: Any = narrow.plan.prepared

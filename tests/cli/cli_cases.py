@@ -17,7 +17,7 @@ import faintspot
 from faintspot import Layout, Settings, SlopePipeline, Slopes
 from faintspot.cli import main
 from faintspot.io import read_slopes
-from faintspot.simulate import Detector, sensor_frames
+from faintspot.slopes.simulate import Detector, sensor_frames
 
 LAYOUT = Layout.grid((4, 4), pixels=8)
 SETTINGS = Settings(noise_std=2.0, keep_brightest=10)

@@ -12,7 +12,7 @@ from faintspot import SlopePipeline
 from faintspot.cli.demo import comparison_table
 from faintspot.experiments.demonstration import FLUXES_E, Comparison, Scored
 from faintspot.io import read_slopes
-from faintspot.pipeline.settings import Settings
+from faintspot.slopes.pipeline.settings import Settings
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
@@ -36,7 +36,9 @@ def test_demo_twice(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
         np.testing.assert_array_equal(stored["x"], SlopePipeline.from_file(made / f"{method}.toml")(frames).x)
     assert (made / "report.html").stat().st_size > 100_000
     # The page was made once, and takes longest: the second one only has to replace it.
-    monkeypatch.setattr("faintspot.recorded.page.slopes_report", lambda *arguments, **options: "second")
+    monkeypatch.setattr(
+        "faintspot.slopes.recorded.report.page.slopes_report", lambda *arguments, **options: "second"
+    )
     second = run.ok("demo", "--frames", 40, "-o", "new/demo", "--seed", 7)
     assert second.out == first.out
     assert {path.name for path in made.iterdir()} == FILES

@@ -78,16 +78,18 @@ def test_a_check_that_fails_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_cache_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("faintspot.kernels.cached.cache_folder", lambda: tmp_path / "absent")
+    monkeypatch.setattr(
+        "faintspot.slopes.kernels.compilation.cached.cache_folder", lambda: tmp_path / "absent"
+    )
     found = named("cache")
     assert "cannot be written" in found.value
     assert "NUMBA_CACHE_DIR" in str(found.advice)
-    monkeypatch.setattr("faintspot.kernels.cached.cache_folder", lambda: None)
+    monkeypatch.setattr("faintspot.slopes.kernels.compilation.cached.cache_folder", lambda: None)
     assert "NUMBA_CACHE_DIR" in str(named("cache").advice)
 
 
 def test_a_cache_on_a_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("faintspot.kernels.cached.cache_folder", lambda: tmp_path)
+    monkeypatch.setattr("faintspot.slopes.kernels.compilation.cached.cache_folder", lambda: tmp_path)
     monkeypatch.setattr(doctor, "file_system", lambda path: "nfs4")
     assert "local disk" in str(named("cache").advice)
     monkeypatch.setattr(doctor, "file_system", lambda path: "ext4")

@@ -10,7 +10,7 @@ import pytest
 from tests.cli.cli_cases import Commands, command_line
 
 from faintspot.experiments import StudySpecification, Sweep, open_study, run
-from faintspot.experiments import built_in_studies as estimators
+from faintspot.experiments.study import built_in as estimators
 
 pytest.importorskip("zarr")
 pytest.importorskip("xarray")

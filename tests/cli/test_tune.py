@@ -8,9 +8,10 @@ from tests.cli.cli_cases import LAYOUT, Commands, simulated
 from tests.experiments.loop_answer_cases import made_up
 
 from faintspot import Calibration, SlopePipeline
-from faintspot.experiments import loop_tuning, tuning
-from faintspot.experiments.loop_answer import LoopAnswer
-from faintspot.experiments.loop_question import LoopQuestion
+from faintspot.experiments.closed_loop import tuning as loop_tuning
+from faintspot.experiments.closed_loop.answer import LoopAnswer
+from faintspot.experiments.closed_loop.question import LoopQuestion
+from faintspot.experiments.planner import tuning
 
 KNOWN = ("--read-noise-e", 3, "--pixels", 8, "--fwhm-px", "1.8", "--flux-e", 200)
 

@@ -11,8 +11,8 @@ from tests.cli.cli_cases import CONFIGURATION, Commands, simulated
 
 from faintspot import Layout
 from faintspot.io import read_slopes
-from faintspot.pipeline.slopes import Slopes
-from faintspot.wavefront import fit_wavefront
+from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.wavefront import fit_wavefront
 
 SCALES = ("--pixel-scale-arcsec", 0.4, "--diameter-m", 4.2)
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.ao_loop.configuration import LoopConfiguration, load_loop
-from faintspot.experiments.loop_answer import LoopAnswer
-from faintspot.experiments.loop_methods import LOOP_GAIN, NOISE_SCALE, MethodKind, Tunable, method_kind
-from faintspot.experiments.loop_question import LoopQuestion
-from faintspot.experiments.loop_results import MagnitudeResult
+from faintspot.experiments.closed_loop.answer import LoopAnswer
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, NOISE_SCALE, MethodKind, Tunable, method_kind
+from faintspot.experiments.closed_loop.question import LoopQuestion
+from faintspot.experiments.closed_loop.results import MagnitudeResult
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
 
 PHOTONS = (5.0, 14.0, 40.0, 100.0, 320.0)
 BRIGHT = 0.8

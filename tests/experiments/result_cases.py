@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 import faintspot as fs
-from faintspot.ao_loop import LoopConfiguration
-from faintspot.experiments.loop_results import BudgetResult, MagnitudeResult
-from faintspot.pipeline.configuration import to_text
+from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
+from faintspot.loop.simulation import LoopConfiguration
+from faintspot.slopes.pipeline.configuration import to_text
 
 NAMES = ("brightest", "tv", "ml", "ml_weighted")
 LABELS = (

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import xarray
 
-from faintspot.estimators.registry import estimator_named
 from faintspot.experiments.methods import keeps_every_k
+from faintspot.slopes.estimators.registry import estimator_named
 
 METHODS = ("brightest", "tv", "smoothed", "thresholded")
 ESTIMATOR_METHODS = ("ml", "map", "weighted")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from faintspot.base.statistics import slope_statistics
 from faintspot.experiments import StudySpecification, Sweep
-from faintspot.experiments.cell import Tuning, realisations
-from faintspot.experiments.cell_methods import CellMethods, position_table
-from faintspot.experiments.statistics import slope_statistics
+from faintspot.experiments.study.cell import Tuning, realisations
+from faintspot.experiments.study.cell_methods import CellMethods, position_table
 
 SPECIFICATION = StudySpecification(
     "s",

@@ -12,9 +12,9 @@ import pytest
 
 import faintspot as fs
 from faintspot.experiments import StudySpecification, Sweep, measure_cell
-from faintspot.experiments.cell import realisations
-from faintspot.experiments.cell_methods import CellMethods
 from faintspot.experiments.methods import score_for_scene
+from faintspot.experiments.study.cell import realisations
+from faintspot.experiments.study.cell_methods import CellMethods
 
 ESTIMATOR_METHODS = ("window", "weighted", "matched", "ml", "map", "trained")
 METHODS = ("brightest", *ESTIMATOR_METHODS)
@@ -31,7 +31,7 @@ def quick_training() -> Iterator[None]:
     """Train on fewer spots: worse by 2 % (30 e-)."""
     with pytest.MonkeyPatch.context() as patch:
         quick = functools.partial(score_for_scene, realisations=3000)
-        patch.setattr("faintspot.experiments.cell_methods.score_for_scene", quick)
+        patch.setattr("faintspot.experiments.study.cell_methods.score_for_scene", quick)
         yield
 
 

@@ -12,12 +12,17 @@ import pytest
 from tests.experiments.study_cases import cells, dataset, power_law
 from tests.shared_data import shared_file
 
-from faintspot.experiments import built_in_studies as estimators
-from faintspot.experiments.efficiency import compares_estimators, enough_photons, findings, result_sections
-from faintspot.experiments.estimator_figures import estimator_figures
-from faintspot.experiments.study_page import write_study_report
-from faintspot.experiments.sweep import Cell
-from faintspot.report import drawing
+from faintspot.base.report import drawing
+from faintspot.experiments.report.efficiency import (
+    compares_estimators,
+    enough_photons,
+    findings,
+    result_sections,
+)
+from faintspot.experiments.report.estimator_figures import estimator_figures
+from faintspot.experiments.report.page import write_study_report
+from faintspot.experiments.study import built_in as estimators
+from faintspot.experiments.study.sweep import Cell
 
 METHODS = ("brightest", "tv", "ml", "map", "weighted")
 KINDS = ("error", "photon-efficiency", "gain", "outlier-fraction")

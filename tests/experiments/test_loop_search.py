@@ -7,9 +7,9 @@ import pytest
 from tests.experiments.experiment_cases import SEARCH, small
 
 from faintspot.base.errors import InputError
-from faintspot.experiments import search as tuning
-from faintspot.experiments.loop_methods import LOOP_GAIN, method_kind
-from faintspot.experiments.search import (
+from faintspot.experiments.closed_loop import search as tuning
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, method_kind
+from faintspot.experiments.closed_loop.search import (
     FIRST_TUNING_REALISATION,
     Search,
     smoothed,

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from tests.experiments.result_cases import made_up_magnitude
 
-from faintspot.experiments.loop_results import (
+from faintspot.base.statistics import mean_by_blocks
+from faintspot.experiments.closed_loop.results import (
     differences_by_flux,
     falling,
     gains_in_magnitude,
     limiting_magnitudes,
     magnitude_gain,
 )
-from faintspot.experiments.statistics import mean_by_blocks
 
 MAGNITUDES = np.linspace(8.0, 13.0, 6)
 numbers = arrays(np.float64, st.integers(1, 12), elements=st.floats(-1, 1))

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from faintspot.experiments.budget import TERMS
-from faintspot.experiments.loop_results import BudgetResult, MagnitudeResult
-from faintspot.experiments.loop_verdict import LoopResults, loop_summary
+from faintspot.experiments.closed_loop.budget import TERMS
+from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
+from faintspot.experiments.closed_loop.verdict import LoopResults, loop_summary
 
 
 @pytest.fixture

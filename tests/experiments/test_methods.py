@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from faintspot import PSF
-from faintspot.estimators import Scene, estimators
 from faintspot.experiments.methods import Knowledge, method_for_scene, tuned_options
+from faintspot.slopes.estimators import Scene, estimators
 
 SCENE = Scene(flux_e=123.456, read_noise_e=3.0, window=(12, 12), spot_fwhm_px=1.77, position_range_px=1.0)
 WITHOUT_OPTIONS = ("centroid", "trained")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from faintspot.base.errors import InputError
-from faintspot.experiments import built_in_studies as paper
+from faintspot.experiments.study import built_in as paper
 
 
 def test_full_study_has_every_figure_of_the_paper() -> None:

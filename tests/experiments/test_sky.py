@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot.ao_loop import load_loop
-from faintspot.experiments.loop_question import PLACES, isoplanatic_angle_arcsec, sky_coverage, star_density
+from faintspot.experiments.closed_loop.question import (
+    PLACES,
+    isoplanatic_angle_arcsec,
+    sky_coverage,
+    star_density,
+)
+from faintspot.loop.simulation import load_loop
 
 
 def test_fewer_stars_far_from_the_plane_and_more_faint_ones() -> None:

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("xarray")
 
 from faintspot.experiments import StudySpecification, Sweep, run
-from faintspot.experiments.study_tables import gains_by_mode
+from faintspot.experiments.paper.tables import gains_by_mode
 
 
 def test_gains_of_every_mode_and_none_where_there_is_no_crossing() -> None:

@@ -17,7 +17,7 @@ pytest.importorskip("zarr")
 xarray = pytest.importorskip("xarray")
 
 from faintspot.experiments.store import MemoryStore  # noqa: E402
-from faintspot.experiments.study import VARIABLES, dataset_of, new_dataset, stored_units  # noqa: E402
+from faintspot.experiments.study.run import VARIABLES, dataset_of, new_dataset, stored_units  # noqa: E402
 
 OTHER = replace(SPECIFICATION, seed=2)
 

@@ -19,6 +19,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from tests.shared_data import ROOT
+
 PARTS = ("kernels", "files", "values")
 _SLOWEST_S = {"kernels": 300, "files": 60, "values": 120}  # a case, with compiling; longer is a hang
 _MEMORY_BYTES = {"kernels": 8 << 30, "files": 5 << 29, "values": 6 << 30}  # beyond what there is at the start
@@ -47,7 +49,7 @@ def main() -> int:
         command = [sys.executable, "-m", "tests.fuzz", "--here", "--part", part, "--seed", str(first)]
         command += ["--minutes", str(seconds / 60), "--widths", chosen.widths]
         command += ["--keep-going"] if chosen.keep_going else []
-        status = subprocess.run(command, cwd=Path(__file__).parents[2], check=False).returncode
+        status = subprocess.run(command, cwd=ROOT, check=False).returncode
         failed += status != 0
         print(
             f"{part}: {f'FOUND something (exit status {status})' if status else 'nothing found'}", flush=True

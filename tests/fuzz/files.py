@@ -21,14 +21,14 @@ from PIL import Image
 from tests.fuzz.refused import refused_in_one_line
 
 import faintspot as fs
-from faintspot.ao_loop.configuration import LoopConfiguration, load_loop
-from faintspot.experiments.question import read_camera
-from faintspot.experiments.specification import StudySpecification
+from faintspot.experiments.planner.question import read_camera
+from faintspot.experiments.study.specification import StudySpecification
 from faintspot.io import open_frames, read_array, read_slopes
 from faintspot.io.references import read_reference
-from faintspot.pipeline import configuration
-from faintspot.spots.psf import PSF
-from faintspot.spots.score import TrainedScore
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
+from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import TrainedScore
 
 _NUMBER = re.compile(rb"\d+(\.\d*)?([eE][-+]?\d+)?")
 _WORDS = (b"1e300", b"-1", b"nan", b"-inf", b"0", b"0.5", b"9" * 30, b'"x"', b"[]", b"{}", b"true", b"null")
@@ -139,7 +139,7 @@ def _originals() -> Path:
     from tests.io import frame_files, slope_files, telemetry_files
 
     from faintspot.io import read_telemetry, write_aot
-    from faintspot.io.telemetry import TelemetryStore
+    from faintspot.io.telemetry.recording import TelemetryStore
 
     keep = tempfile.TemporaryDirectory()
     _kept.append(keep)

@@ -30,17 +30,17 @@ from tests.fuzz.guarded import guarded, guarded_tree
 from tests.fuzz.refused import refused_in_one_line
 
 import faintspot as fs
-from faintspot.algorithms.brightest import brightest_pixels
-from faintspot.config.presets import PRESETS
-from faintspot.estimators import estimators
-from faintspot.kernels import parallel
-from faintspot.kernels.groups import STAGE_ROWS, SlopeArrays, new_scratch
-from faintspot.kernels.host import WIDTHS
-from faintspot.pipeline.slope_pipeline import kernel_frames
-from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
-from faintspot.realtime import frame_path
-from faintspot.realtime.frame_path import FramePath, Progress
-from faintspot.spots.psf import PSF
+from faintspot.base.config.presets import PRESETS
+from faintspot.engine.path import frame_path
+from faintspot.engine.path.frame_path import FramePath, Progress
+from faintspot.slopes.estimators import estimators
+from faintspot.slopes.estimators.algorithms.brightest import brightest_pixels
+from faintspot.slopes.kernels import parallel
+from faintspot.slopes.kernels.compilation.host import WIDTHS
+from faintspot.slopes.kernels.driver.groups import STAGE_ROWS, SlopeArrays, new_scratch
+from faintspot.slopes.pipeline.slope_pipeline import kernel_frames
+from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
+from faintspot.slopes.spots.psf import PSF
 
 DTYPES = ("uint16", "float32")
 _HOSTILE = (np.nan, np.inf, -np.inf, 1e38, -1e38, 0.0, 65535.0, 1e-38)

@@ -5,23 +5,22 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from tests.fuzz.__main__ import PARTS
+from tests.shared_data import ROOT
 
-from faintspot.kernels.host import lanes_for
+from faintspot.slopes.kernels.compilation.host import lanes_for
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="pages are protected as Linux does it"),
     pytest.mark.machine_time("starts other processes"),
 ]
-_ROOT = Path(__file__).parents[2]
 
 
 def python(*arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, *arguments]
-    return subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, check=False)
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.parametrize(("at_end", "place"), [(True, 10), (False, -1)])

@@ -15,15 +15,15 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
-from tests.estimators.test_python import BRIGHT, FAULTS, FRAME, pipeline, raising
+from tests.engine.loop.test_control_loop import any_control
 from tests.fuzz.refused import refused_in_one_line
-from tests.realtime.test_control_loop import any_control
+from tests.slopes.estimators.test_python import BRIGHT, FAULTS, FRAME, pipeline, raising
 
 import faintspot as fs
-from faintspot.estimators import estimators
+from faintspot.engine.page.access import Access
 from faintspot.io.frame_numbers import LARGEST_GAP, left_out
-from faintspot.live_page.access import Access
-from faintspot.pipeline.settings import option_names
+from faintspot.slopes.estimators import estimators
+from faintspot.slopes.pipeline.settings import option_names
 
 _EXAMPLES = 100
 

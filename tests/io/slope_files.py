@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tests.refusals import refused
 
 from faintspot.io import SlopeWriter, create_writer, read_slopes
-from faintspot.io.slopes_format import VARIABLES
+from faintspot.io.stored.slopes_format import VARIABLES
 
 NAMES = ["slopes.zarr", "slopes.npz", "slopes.fits", "slopes.fits.gz", "slopes.csv"]
 ATTRIBUTES = {

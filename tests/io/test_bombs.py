@@ -21,11 +21,13 @@ from tests.io.slope_files import result, write
 
 from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays
-from faintspot.camera.calibration import Calibration
-from faintspot.io import inflation, open_frames, raw, read_array, read_slopes, slopes_format
+from faintspot.io import open_frames, read_array, read_slopes
+from faintspot.io.arrays import inflation, raw
 from faintspot.io.references import read_reference
-from faintspot.spots.psf import PSF
-from faintspot.spots.score import TrainedScore
+from faintspot.io.stored import slopes_format
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import TrainedScore
 
 h5py: Any = pytest.importorskip("h5py")
 MIB = 1 << 20
@@ -38,8 +40,8 @@ def small_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (raw, inflation):
         monkeypatch.setattr(module, "MOST_WHOLE_BYTES", 8 * MIB)
     monkeypatch.setattr("faintspot.io.frames.MOST_WHOLE_BYTES", 8 * MIB)
-    monkeypatch.setattr("faintspot.io.zarr_store.MOST_WHOLE_BYTES", 8 * MIB)
-    monkeypatch.setattr("faintspot.io.hdf5_files.MOST_WHOLE_BYTES", 8 * MIB)
+    monkeypatch.setattr("faintspot.io.arrays.zarr_store.MOST_WHOLE_BYTES", 8 * MIB)
+    monkeypatch.setattr("faintspot.io.formats.hdf5_files.MOST_WHOLE_BYTES", 8 * MIB)
     monkeypatch.setattr(inflation, "_ALWAYS_BYTES", 1 * MIB)
     monkeypatch.setattr(inflation.check_inflated, "__defaults__", (8 * MIB,))
     monkeypatch.setattr(read_arrays, "__defaults__", (None, (), 8 * MIB))

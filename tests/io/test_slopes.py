@@ -23,8 +23,10 @@ from tests.io.slope_files import (
 )
 
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.io import csv_files, open_frames, read_slopes, slopes_zarr
-from faintspot.io.slopes_format import VARIABLES, Variable
+from faintspot.io import open_frames, read_slopes
+from faintspot.io.formats import csv_files
+from faintspot.io.stored import slopes_zarr
+from faintspot.io.stored.slopes_format import VARIABLES, Variable
 
 ERRORS = ("standard_error_x", "standard_error_y")
 fits = pytest.importorskip("astropy.io.fits")

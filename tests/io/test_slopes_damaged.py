@@ -11,7 +11,9 @@ import pytest
 from tests.io.slope_files import part, result, write, writer_for
 
 from faintspot.base.errors import InputError
-from faintspot.io import read_slopes, slopes_folder, slopes_writer, slopes_zarr, zarr_store
+from faintspot.io import read_slopes
+from faintspot.io.arrays import zarr_store
+from faintspot.io.stored import slopes_folder, slopes_writer, slopes_zarr
 
 fits = pytest.importorskip("astropy.io.fits")
 zarr = pytest.importorskip("zarr")

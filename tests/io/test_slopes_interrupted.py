@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.io.slope_files import NAMES, assert_stored, part, result, write, writer_for
+from tests.shared_data import ROOT
 
 import faintspot
 from faintspot.base.errors import InputError
-from faintspot.io import read_slopes, slopes_folder, slopes_writer, slopes_zarr, zarr_store
+from faintspot.io import read_slopes
+from faintspot.io.arrays import zarr_store
+from faintspot.io.stored import slopes_folder, slopes_writer, slopes_zarr
 
 pytest.importorskip("astropy")
 pytest.importorskip("zarr")
@@ -133,10 +136,9 @@ def test_killed_again_and_again(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     whole = result(4000)
     package = Path(faintspot.__file__).parents[1]
-    root = Path(__file__).resolve().parents[2]
     seen = [0]
     for attempt in range(2):
-        arguments = [sys.executable, "-c", KILLED, str(path), str(package), str(root)]
+        arguments = [sys.executable, "-c", KILLED, str(path), str(package), str(ROOT)]
         with subprocess.Popen(arguments, stdout=subprocess.PIPE) as process:
             assert process.stdout is not None
             process.stdout.readline()

@@ -11,19 +11,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, number_between
+from faintspot.base.config.tables import read_tables
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys, checked_table
-from faintspot.camera.calibration import Calibration
-from faintspot.config.tables import read_tables
-from faintspot.pipeline.configuration import Parts
-from faintspot.pipeline.mean_flux import MeanFlux
-from faintspot.pipeline.settings import Settings
-from faintspot.pipeline.slope_pipeline import SlopePipeline
-from faintspot.pipeline.slopes import Slopes
-from faintspot.sensor.layout import Layout
-from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
-from faintspot.spots.psf import PSF
-from faintspot.spots.score import Score
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.pipeline.configuration import Parts
+from faintspot.slopes.pipeline.mean_flux import MeanFlux
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import Score
 
 CALIBRATION_FLUX_E = 1000.0
 """Flux of a sub-aperture [electrons] at which noise-free frames are measured."""

@@ -11,9 +11,9 @@ from faintspot.adapters.base import AdapterOptions, ToolSlopes, largest_window, 
 from faintspot.adapters.checks import check_version, predicted
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.camera.calibration import Calibration
-from faintspot.pipeline.settings import Settings
-from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 
 try:
     import hcipy

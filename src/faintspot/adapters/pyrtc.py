@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from faintspot.adapters.base import CALIBRATION_FLUX_E, FLUX_FRAMES, ToolSlopes, layout_around, parts_of
 from faintspot.adapters.checks import check_version
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.realtime.stream import Follower
+from faintspot.engine.streams.stream import Follower
 
 TESTED = "2.1.0"
 _MOMENT_S = 0.1

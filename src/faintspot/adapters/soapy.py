@@ -12,8 +12,8 @@ from faintspot.adapters.base import ToolSlopes
 from faintspot.adapters.checks import check_version
 from faintspot.adapters.spots import SpotOptions, Spots
 from faintspot.base.errors import InputError
-from faintspot.camera.calibration import Calibration
-from faintspot.pipeline.settings import Settings
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.pipeline.settings import Settings
 
 TESTED = "0.15.0"
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from faintspot.adapters.base import AdapterOptions, ToolSlopes
 from faintspot.adapters.checks import predicted
 from faintspot.base.errors import InputError
-from faintspot.camera.calibration import Calibration
-from faintspot.pipeline.settings import Settings
-from faintspot.sensor.layout import Layout
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.sensor.layout import Layout
 
 
 class SpotOptions(AdapterOptions, total=False):

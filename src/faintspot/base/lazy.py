@@ -29,3 +29,8 @@ def lazy_attributes(package: str, homes: Mapping[str, str]) -> Callable[[str], A
         return value
 
     return get
+
+
+def lazy_packages(package: str, names: str) -> Callable[[str], Any]:
+    """Return the `__getattr__` of a package whose sub-packages (names separated by spaces) load lazily."""
+    return lazy_attributes(package, {name: f"{package}.{name}" for name in names.split()})

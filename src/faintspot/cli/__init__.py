@@ -6,13 +6,14 @@ import logging
 import os
 import sys
 import warnings
+from importlib import import_module
 from typing import Any
 
 import click
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.version import __version__
-from faintspot.cli.commands import Group
+from faintspot.cli.shared.commands import Group
 
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
@@ -32,6 +33,14 @@ _COMMANDS = {
     "wavefront": "Fit Zernike modes to slopes, and draw the wavefront.",
 }
 
+_MODULES = {
+    "layout": "layout.command",
+    "live": "realtime.live",
+    "loop": "loop.command",
+    "realtime": "realtime.command",
+}
+"""Modules of commands that are not named after them."""
+
 
 class _Interrupted(Exception):
     """Ctrl-C, under a name that click does not print anything for."""
@@ -48,7 +57,7 @@ class _LazyGroup(Group):
         """Import one command."""
         if name not in _COMMANDS:
             return None
-        command: click.Command = __import__(f"faintspot.cli.{name}", fromlist=["command"]).command
+        command: click.Command = import_module(f"faintspot.cli.{_MODULES.get(name, name)}").command
         command.name = name  # in the modules all are called "command"
         return command
 
@@ -107,7 +116,7 @@ def main(arguments: list[str] | None = None) -> Any:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     warnings.formatwarning = lambda message, *_: f"faintspot: warning: {' '.join(str(message).split())}\n"
     if sys.stderr.isatty():
-        compiling = logging.getLogger("faintspot.kernels.cached")
+        compiling = logging.getLogger("faintspot.slopes.kernels.compilation.cached")
         compiling.addHandler(_Terminal())
         compiling.setLevel(logging.INFO)
     try:

@@ -12,22 +12,22 @@ from rich.console import Console
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
-from faintspot.cli.commands import option
-from faintspot.cli.needs import can_make
-from faintspot.cli.output import results_table
-from faintspot.cli.progress import progress_bar
+from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.needs import can_make
+from faintspot.cli.shared.output import results_table
+from faintspot.cli.shared.progress import progress_bar
 from faintspot.experiments import demonstration
 from faintspot.experiments.demonstration import Comparison
 from faintspot.experiments.words import with_interval
 from faintspot.io.slopes import read_slopes
-from faintspot.pipeline import configuration
-from faintspot.pipeline.slope_pipeline import SlopePipeline
-from faintspot.recorded import measure_recorded
+from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.recorded import measure_recorded
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from faintspot.recorded.statistics import MeasuredSlopes
+    from faintspot.slopes.recorded.statistics import MeasuredSlopes
 
 
 @click.command(short_help="Simulate a faint star, measure it with and without denoising, and write a report.")
@@ -104,7 +104,7 @@ def write_files(
     folder: Path, comparison: Comparison, n_frames: int, rng: np.random.Generator
 ) -> dict[str, Any]:
     """Write new frames at one flux, measure them with and without denoising; return what it shows."""
-    from faintspot.recorded.statistics import MeasuredSlopes
+    from faintspot.slopes.recorded.statistics import MeasuredSlopes
 
     layout = demonstration.demonstration_layout()
     shown = demonstration.FLUXES_E.index(demonstration.SHOWN_FLUX_E)
@@ -131,7 +131,7 @@ def write_files(
 def write_page(folder: Path, methods: list[MeasuredSlopes], **shown: Any) -> None:
     """Make the report."""
     from faintspot.base.files import write_atomically
-    from faintspot.recorded.page import slopes_report
+    from faintspot.slopes.recorded.report.page import slopes_report
 
     facts = {
         "Source": "simulated, with known truth",

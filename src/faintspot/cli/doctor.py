@@ -7,8 +7,8 @@ from dataclasses import asdict
 
 import click
 
-from faintspot.cli.commands import option
 from faintspot.cli.examination import examine
+from faintspot.cli.shared.commands import option
 
 
 @click.command(short_help="Say what is installed, what this machine allows, and what to do.")

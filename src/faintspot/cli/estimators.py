@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import click
 
-from faintspot.estimators.documentation import allowed_in_words, needs_in_words
-from faintspot.estimators.registry import estimator_named, estimators
+from faintspot.slopes.estimators.documentation import allowed_in_words, needs_in_words
+from faintspot.slopes.estimators.registry import estimator_named, estimators
 
 
 @click.command(short_help="List the estimators, or the options of one.")
@@ -21,7 +21,7 @@ def command(name: str | None) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from faintspot.pipeline.settings import SharedOptions
+    from faintspot.slopes.pipeline.settings import SharedOptions
 
     table = Table(box=None, pad_edge=False)
     if name is None:

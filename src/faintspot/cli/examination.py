@@ -21,7 +21,7 @@ _NETWORK = ("nfs", "cifs", "smb", "lustre", "gpfs", "beegfs", "ceph", "afs", "fu
 _LITTLE_MB = 256  # of shared memory: a ring of four frames of 2048 x 2048 pixels, its streams and telemetry
 _TRY_S = 60.0
 _TRY_REAL_TIME = """
-from faintspot.realtime.scheduling import real_time
+from faintspot.engine.requests.scheduling import real_time
 with real_time(priority=1) as refused:
     pass
 print("; ".join(refused))
@@ -94,8 +94,8 @@ def _processor() -> Finding:
     """Processor that kernels are compiled for."""
     from llvmlite import binding
 
-    from faintspot.kernels.host import lanes_for
-    from faintspot.kernels.target import compile_target
+    from faintspot.slopes.kernels.compilation.host import lanes_for
+    from faintspot.slopes.kernels.compilation.target import compile_target
 
     target, host = compile_target(), binding.get_host_cpu_name()
     words = (
@@ -114,7 +114,7 @@ def _processor() -> Finding:
 
 def _cache() -> Finding:
     """Folder of compiled kernels."""
-    from faintspot.kernels.cached import cache_folder
+    from faintspot.slopes.kernels.compilation.cached import cache_folder
 
     folder, advice = cache_folder(), "set NUMBA_CACHE_DIR to a folder that can be written"
     if folder is None:
@@ -145,7 +145,7 @@ def file_system(path: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
 
 
 def _threads() -> Finding:
-    from faintspot.kernels.parallel import available_cpus
+    from faintspot.slopes.kernels.parallel import available_cpus
 
     usable, there = available_cpus(), os.cpu_count() or 1
     advice = None
@@ -156,7 +156,7 @@ def _threads() -> Finding:
 
 def _gpu() -> Finding:
     from faintspot.base.errors import InputError, MissingExtraError
-    from faintspot.cuda.availability import check_cuda, simulated
+    from faintspot.slopes.kernels.cuda.availability import check_cuda, simulated
 
     try:
         check_cuda()

@@ -6,8 +6,8 @@ from typing import Any
 
 import click
 
-from faintspot.cli.commands import Group, option
-from faintspot.cli.shared_options import REFERENCE, configuration_option
+from faintspot.cli.shared.commands import Group, option
+from faintspot.cli.shared.options import REFERENCE, configuration_option
 
 _CONFIG = configuration_option("What to export.")
 
@@ -35,7 +35,7 @@ def darc(config: str, output: str, reference: str | None, no_control: bool, form
       faintspot export darc -c faintspot.toml -o darc
       faintspot export darc --reference flat.zarr --format npy -o arrays
     """
-    from faintspot.export.darc import LIST, export_darc
+    from faintspot.adapters.export.darc import LIST, export_darc
 
     parameters = export_darc(config, output, reference=reference, control=not no_control, form=form)
     for parameter in parameters:
@@ -57,7 +57,7 @@ def weights(config: str, output: str, reference: str | None) -> None:
     Examples:
       faintspot export weights -c faintspot.toml -o weights.fits
     """
-    from faintspot.export.weights import export_weights
+    from faintspot.adapters.export.weights import export_weights
 
     click.echo(f"{output}: {', '.join(export_weights(config, output, reference=reference))}")
 

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import click
 
-from faintspot.ao_loop.files import holds_loop_results
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
-from faintspot.cli.commands import option
-from faintspot.cli.needs import needs
+from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.needs import needs
 from faintspot.experiments.store import kind_of_store
+from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.locations import split_location
-from faintspot.io.zarr_store import holds_telemetry
+from faintspot.loop.simulation.files import holds_loop_results
 
 
 @needs("web", "matplotlib", "jinja2")
@@ -45,8 +45,8 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
       faintspot report canary -o canary.html
     """
     from faintspot.base.files import write_atomically
-    from faintspot.experiments.study_page import report_of_study
-    from faintspot.recorded.report_of_stored import report_of_stored
+    from faintspot.experiments.report.page import report_of_study
+    from faintspot.slopes.recorded.report.stored import report_of_stored
 
     paths = [Path(path) for path in slopes]
     if output is not None and Path(output).resolve() in [path.resolve() for path in paths]:
@@ -58,7 +58,7 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
     for name in recording:
         split_location(name)  # refuses what is not there
     if len(paths) == 1 and holds_loop_results(paths[0]):
-        from faintspot.experiments.loop_page import write_loop_report
+        from faintspot.experiments.closed_loop.page import write_loop_report
 
         page = Path(output) if output is not None else paths[0] / "report.html"
         write_loop_report(paths[0], page)
@@ -67,7 +67,7 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
     if len(paths) == 1 and kind_of_store(paths[0]) == "study":
         html = report_of_study(paths[0])
     elif len(paths) == 1 and holds_telemetry(paths[0]):
-        from faintspot.recorded.telemetry_page import report_of_telemetry
+        from faintspot.engine.telemetry.page import report_of_telemetry
 
         html = report_of_telemetry(paths[0])
     else:

@@ -8,17 +8,17 @@ from typing import Any
 
 import click
 
+from faintspot.base.config.presets import PRESETS
+from faintspot.base.config.written_changes import parse_changes
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.flags import SubapertureFlag
-from faintspot.cli.commands import option
-from faintspot.cli.progress import progress_bar
-from faintspot.cli.shared_options import KEY, REFERENCE, configuration_option
-from faintspot.config.presets import PRESETS
-from faintspot.config.written_changes import parse_changes
-from faintspot.io.formats import slope_format
+from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.options import KEY, REFERENCE, configuration_option
+from faintspot.cli.shared.progress import progress_bar
+from faintspot.io.formats.registry import slope_format
 from faintspot.io.locations import split_location
-from faintspot.io.slopes_format import UNITS
-from faintspot.recorded import Summary, measure_recorded
+from faintspot.io.stored.slopes_format import UNITS
+from faintspot.slopes.recorded import Summary, measure_recorded
 
 
 @click.command(short_help="Turn recorded frames into slopes.")

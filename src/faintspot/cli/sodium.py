@@ -8,18 +8,18 @@ from pathlib import Path
 import click
 import numpy as np
 
+from faintspot.base.config.tables import read_tables, save_tables
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
-from faintspot.camera.calibration import Calibration
-from faintspot.cli.commands import option
-from faintspot.cli.output import picture_file, write_picture
-from faintspot.cli.progress import progress_bar
-from faintspot.cli.shared_options import KEY, configuration_option
-from faintspot.config.tables import read_tables, save_tables
+from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.options import KEY, configuration_option
+from faintspot.cli.shared.output import picture_file, write_picture
+from faintspot.cli.shared.progress import progress_bar
 from faintspot.io.frames import open_frames
-from faintspot.recorded.sodium import MOST_FRAMES, sodium_of_frames
-from faintspot.sensor.layout import Layout
-from faintspot.spots.laser_spots import LaserSpots, laser_of
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.recorded.sodium import MOST_FRAMES, sodium_of_frames
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.laser_spots import LaserSpots, laser_of
 
 _SAME_PX = 0.05  # nearer centres stay
 
@@ -92,7 +92,7 @@ def command(
                 f"  centres of [layout] moved by up to {moved:.2f} px, to the spots' centres of gravity"
             )
     if drawing is not None:
-        from faintspot.recorded.sodium_section import profile_figure
+        from faintspot.slopes.recorded.report.sodium_section import profile_figure
 
         before = {"before": known.star.focused(laser.profile)}
         write_picture(profile_figure({**before, "now": profile}).figure, drawing)

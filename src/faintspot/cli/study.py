@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from faintspot.base.files import derived
-from faintspot.cli.commands import Group, option
-from faintspot.cli.needs import needs
-from faintspot.cli.progress import progress_bar
-from faintspot.cli.shared_options import WORKERS
+from faintspot.cli.shared.commands import Group, option
+from faintspot.cli.shared.needs import needs
+from faintspot.cli.shared.options import WORKERS
+from faintspot.cli.shared.progress import progress_bar
 
 if TYPE_CHECKING:
     import xarray
 
-    from faintspot.experiments.specification import StudySpecification
+    from faintspot.experiments.study.specification import StudySpecification
 
 
 def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -66,7 +66,7 @@ def run(specification: str, output: str | None, **where: Any) -> None:
     Example:
       faintspot study run my-study.toml -o my-study.zarr
     """
-    from faintspot.experiments.specification import StudySpecification
+    from faintspot.experiments.study.specification import StudySpecification
 
     described = StudySpecification.from_file(specification)
     target = output or str(derived(specification, ".zarr"))
@@ -100,7 +100,7 @@ def paper(quick: bool, figures: tuple[str, ...], output: str | None, **where: An
       faintspot study paper -o paper.zarr
       faintspot study paper --figure fig4 --figure fig6
     """
-    from faintspot.experiments.built_in_studies import paper_study
+    from faintspot.experiments.study.built_in import paper_study
 
     target = output or "-".join(["paper", *(["quick"] if quick else []), *figures]) + ".zarr"
     _measure_and_report(paper_study(quick, figures or None), target, where)
@@ -128,7 +128,7 @@ def estimators(quick: bool, output: str | None, **where: Any) -> None:
       faintspot study estimators --quick
       faintspot study estimators -o estimators.zarr
     """
-    from faintspot.experiments.built_in_studies import estimators_study
+    from faintspot.experiments.study.built_in import estimators_study
 
     target = output or f"estimators{'-quick' if quick else ''}.zarr"
     _measure_and_report(estimators_study(quick), target, where)
@@ -136,7 +136,7 @@ def estimators(quick: bool, output: str | None, **where: Any) -> None:
 
 def _measure_and_report(described: StudySpecification, target: str, where: dict[str, Any]) -> None:
     """Run a study and write its page beside the store."""
-    from faintspot.experiments.study_page import write_study_report
+    from faintspot.experiments.report.page import write_study_report
 
     page = derived(target, ".html")
     write_study_report(_measure(described, target, **where), page)
@@ -145,7 +145,7 @@ def _measure_and_report(described: StudySpecification, target: str, where: dict[
 
 def _measure(described: StudySpecification, target: str, **options: Any) -> xarray.Dataset:
     """Run a study with a progress bar."""
-    from faintspot.experiments.study import run as run_study
+    from faintspot.experiments.study.run import run as run_study
 
     realisations, counts = described.realisations, list[int]()
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import click
 
 from faintspot.base.files import derived, write_atomically
-from faintspot.cli.commands import option
-from faintspot.cli.needs import needs
+from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.needs import needs
 
 
 @needs("web", "matplotlib", "jinja2")
@@ -31,9 +31,9 @@ def command(recording: Path, system: str | None, config: str | None, output: str
       faintspot telemetry night_aot.fits --system rate_and_unit.toml
       faintspot telemetry loop.toml -o loop.html
     """
-    from faintspot.advice.loop_page import page_of_loop
-    from faintspot.advice.loop_report import report_of_loop
-    from faintspot.advice.recorded_loop import read_recorded_loop
+    from faintspot.loop.telemetry.page import page_of_loop
+    from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
+    from faintspot.loop.telemetry.report import report_of_loop
 
     loop = read_recorded_loop(recording, system, config)
     report = report_of_loop(loop, lambda step: click.echo(f"{step} ...", err=True))

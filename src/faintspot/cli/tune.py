@@ -12,18 +12,18 @@ import numpy as np
 from rich.console import Console
 
 from faintspot.base.errors import InputError
-from faintspot.camera.calibration import Calibration
-from faintspot.cli.commands import SectionedCommand, option
-from faintspot.cli.layout_options import grid_shape
-from faintspot.cli.needs import suggested_slopes
-from faintspot.cli.output import check_target, picture_file, results_table, wrapped, write_picture
-from faintspot.cli.progress import progress_bar
-from faintspot.experiments import answer_text
-from faintspot.experiments.question import PROFILES, TABLES, read_camera
+from faintspot.cli.layout.options import grid_shape
+from faintspot.cli.shared.commands import SectionedCommand, option
+from faintspot.cli.shared.needs import suggested_slopes
+from faintspot.cli.shared.output import check_target, picture_file, results_table, wrapped, write_picture
+from faintspot.cli.shared.progress import progress_bar
+from faintspot.experiments.planner import text as answer_text
+from faintspot.experiments.planner.question import PROFILES, TABLES, read_camera
 from faintspot.io.frames import open_frames
-from faintspot.pipeline import configuration
-from faintspot.sensor.layout import Layout
-from faintspot.simulate.photometry import (
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.simulate.photometry import (
     DEFAULT_BAND,
     DEFAULT_QUANTUM_EFFICIENCY,
     DEFAULT_THROUGHPUT,
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rich.table import Table
 
-    from faintspot.experiments.answer import Answer
-    from faintspot.experiments.question import Question
+    from faintspot.experiments.planner.answer import Answer
+    from faintspot.experiments.planner.question import Question
 
 _MOST_FRAMES, _MOST_PIXELS = 200, 1 << 26
 _GIVEN = "Sources"
@@ -146,7 +146,7 @@ def command(
     given = {**known, **given, **({"layout": known["layout"]} if grid or layout_file else {})}
     with progress_bar("tuning", "steps") as advance:
         question = _question(recording, dark, key, given)
-        from faintspot.experiments.tuning import tune
+        from faintspot.experiments.planner.tuning import tune
 
         answer = tune(question, rng=np.random.default_rng(seed), progress=advance)
     console = Console(highlight=False)
@@ -236,8 +236,8 @@ def _question(
     frames: tuple[str, ...], dark: tuple[str, ...], key: str | None, given: dict[str, Any]
 ) -> Question:
     """Check what is given, and measure the rest in the frames."""
-    from faintspot.experiments.question import Question
-    from faintspot.experiments.recorded import question_from_frames
+    from faintspot.experiments.planner.question import Question
+    from faintspot.experiments.planner.recorded import question_from_frames
 
     if dark and not frames:
         raise InputError("--dark: expected --recording as well")
@@ -271,7 +271,7 @@ def _write(answer: Answer, target: Path, picture: Path | None, frames: tuple[str
     answer.save(target)
     click.echo(f"{target}: written")
     if picture is not None:
-        from faintspot.experiments.answer_figures import tune_figure
+        from faintspot.experiments.planner.figures import tune_figure
 
         write_picture(tune_figure(answer), picture)
     if answer.question.layout is None:

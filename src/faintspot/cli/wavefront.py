@@ -10,14 +10,14 @@ import click
 
 from faintspot.base.errors import InputError
 from faintspot.base.extras import require
-from faintspot.cli.commands import SectionedCommand, option
-from faintspot.cli.output import picture_file, write_picture
-from faintspot.cli.shared_options import DIAMETER, PIXEL_SCALE, SUBAPERTURE
-from faintspot.pipeline.slopes import Slopes
-from faintspot.recorded.stored_run import open_run
-from faintspot.wavefront import Wavefront, fit_wavefront, save_wavefront
-from faintspot.wavefront.files import check_ending
-from faintspot.wavefront.words import mode_table, remarks, rms_table
+from faintspot.cli.shared.commands import SectionedCommand, option
+from faintspot.cli.shared.options import DIAMETER, PIXEL_SCALE, SUBAPERTURE
+from faintspot.cli.shared.output import picture_file, write_picture
+from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.recorded.stored_run import open_run
+from faintspot.slopes.wavefront import Wavefront, fit_wavefront, save_wavefront
+from faintspot.slopes.wavefront.files import check_ending
+from faintspot.slopes.wavefront.words import mode_table, remarks, rms_table
 
 
 @click.command(cls=SectionedCommand, short_help="Fit Zernike modes to slopes, and draw the wavefront.")
@@ -75,7 +75,7 @@ def command(
         save_wavefront(name, wavefront)
         click.echo(name)
     if drawing is not None:
-        from faintspot.wavefront.figure import wavefront_figure
+        from faintspot.slopes.wavefront.figure import wavefront_figure
 
         write_picture(wavefront_figure(wavefront, layout, Path(slopes).name).figure, drawing)
 

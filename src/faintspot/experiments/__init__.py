@@ -7,42 +7,42 @@ from typing import TYPE_CHECKING
 from faintspot.base.lazy import lazy_attributes
 
 if TYPE_CHECKING:
-    from faintspot.experiments.answer import Answer as Answer
-    from faintspot.experiments.answer_figures import loop_figure as loop_figure
-    from faintspot.experiments.answer_figures import tune_figure as tune_figure
-    from faintspot.experiments.budget import run_budget as run_budget
-    from faintspot.experiments.cell import measure_cell as measure_cell
-    from faintspot.experiments.loop_answer import LoopAnswer as LoopAnswer
-    from faintspot.experiments.loop_question import LoopQuestion as LoopQuestion
-    from faintspot.experiments.loop_tuning import tune_loop as tune_loop
-    from faintspot.experiments.magnitude import run_magnitude as run_magnitude
-    from faintspot.experiments.promise import Promise as Promise
-    from faintspot.experiments.promise import check_promises as check_promises
-    from faintspot.experiments.question import Question as Question
-    from faintspot.experiments.recorded import question_from_frames as question_from_frames
-    from faintspot.experiments.specification import StudySpecification as StudySpecification
-    from faintspot.experiments.study import open_study as open_study
-    from faintspot.experiments.study import run as run
-    from faintspot.experiments.sweep import Cell as Cell
-    from faintspot.experiments.sweep import Sweep as Sweep
-    from faintspot.experiments.tuning import tune as tune
+    from faintspot.experiments.closed_loop.answer import LoopAnswer as LoopAnswer
+    from faintspot.experiments.closed_loop.budget import run_budget as run_budget
+    from faintspot.experiments.closed_loop.magnitude import run_magnitude as run_magnitude
+    from faintspot.experiments.closed_loop.question import LoopQuestion as LoopQuestion
+    from faintspot.experiments.closed_loop.tuning import tune_loop as tune_loop
+    from faintspot.experiments.planner.answer import Answer as Answer
+    from faintspot.experiments.planner.figures import loop_figure as loop_figure
+    from faintspot.experiments.planner.figures import tune_figure as tune_figure
+    from faintspot.experiments.planner.promise import Promise as Promise
+    from faintspot.experiments.planner.promise import check_promises as check_promises
+    from faintspot.experiments.planner.question import Question as Question
+    from faintspot.experiments.planner.recorded import question_from_frames as question_from_frames
+    from faintspot.experiments.planner.tuning import tune as tune
+    from faintspot.experiments.study.cell import measure_cell as measure_cell
+    from faintspot.experiments.study.run import open_study as open_study
+    from faintspot.experiments.study.run import run as run
+    from faintspot.experiments.study.specification import StudySpecification as StudySpecification
+    from faintspot.experiments.study.sweep import Cell as Cell
+    from faintspot.experiments.study.sweep import Sweep as Sweep
 
 _NAMES = {
-    "answer": "Answer",
-    "answer_figures": "loop_figure tune_figure",
-    "budget": "run_budget",
-    "cell": "measure_cell",
-    "loop_answer": "LoopAnswer",
-    "loop_question": "LoopQuestion",
-    "loop_tuning": "tune_loop",
-    "magnitude": "run_magnitude",
-    "promise": "Promise check_promises",
-    "question": "Question",
-    "recorded": "question_from_frames",
-    "specification": "StudySpecification",
-    "study": "open_study run",
-    "sweep": "Cell Sweep",
-    "tuning": "tune",
+    "planner.answer": "Answer",
+    "planner.figures": "loop_figure tune_figure",
+    "closed_loop.budget": "run_budget",
+    "study.cell": "measure_cell",
+    "closed_loop.answer": "LoopAnswer",
+    "closed_loop.question": "LoopQuestion",
+    "closed_loop.tuning": "tune_loop",
+    "closed_loop.magnitude": "run_magnitude",
+    "planner.promise": "Promise check_promises",
+    "planner.question": "Question",
+    "planner.recorded": "question_from_frames",
+    "study.specification": "StudySpecification",
+    "study.run": "open_study run",
+    "study.sweep": "Cell Sweep",
+    "planner.tuning": "tune",
 }
 _HOMES = {name: f"{__name__}.{module}" for module, names in _NAMES.items() for name in names.split()}
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.experiments.statistics import Estimate, magnitudes
+from faintspot.base.statistics import Estimate, magnitudes
 
 Floats = NDArray[np.float64]
 

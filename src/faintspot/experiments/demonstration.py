@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.algorithms.noise import suggested_strength
 from faintspot.base.checks import number_between
-from faintspot.camera.calibration import Calibration
+from faintspot.base.statistics import Estimate, absolute_errors
 from faintspot.experiments.curves import Curve, Gain, gain_at_flux
 from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV
-from faintspot.experiments.statistics import Estimate, absolute_errors
-from faintspot.pipeline.settings import Settings
-from faintspot.pipeline.slope_pipeline import SlopePipeline
-from faintspot.sensor.layout import Layout
-from faintspot.simulate import Detector, sensor_frames
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.estimators.algorithms.noise import suggested_strength
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.simulate import Detector, sensor_frames
 
 FLUXES_E = (15.0, 30.0, 60.0, 120.0, 240.0, 480.0)
 SHOWN_FLUX_E = 60.0

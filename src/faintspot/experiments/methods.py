@@ -9,21 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.ao_loop.methods import Method
-from faintspot.camera.detector import Detector
-from faintspot.config.options import AUTO
-from faintspot.estimators.base import Estimator, Need, Style
-from faintspot.estimators.brightest import BrightestPixels
-from faintspot.estimators.gravity import KeepingBrightest
-from faintspot.estimators.registry import estimators
-from faintspot.estimators.scene import Scene
-from faintspot.estimators.smoothed import Smoothed
-from faintspot.estimators.thresholded import Thresholded
-from faintspot.estimators.total_variation import TotalVariation
-from faintspot.pipeline.settings import Settings
-from faintspot.spots.psf import PSF
-from faintspot.spots.score import Score, TrainedScore
-from faintspot.spots.shapes import FWHM_OF_SIZE_1_PX
+from faintspot.base.config.options import AUTO
+from faintspot.loop.simulation.methods import Method
+from faintspot.slopes.camera.detector import Detector
+from faintspot.slopes.estimators.base import Estimator, Need, Style
+from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.estimators.built_in.gravity import KeepingBrightest
+from faintspot.slopes.estimators.built_in.smoothed import Smoothed
+from faintspot.slopes.estimators.built_in.thresholded import Thresholded
+from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
+from faintspot.slopes.estimators.registry import estimators
+from faintspot.slopes.estimators.scene import Scene
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import Score, TrainedScore
+from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
 
 
 class Knowledge(IntEnum):
@@ -98,7 +98,7 @@ def score_for_scene(
         Default: half the window.
     realisations : int
     """
-    from faintspot.training.simulation import train_estimator
+    from faintspot.slopes.training.simulation import train_estimator
 
     return train_estimator(
         flux_e=scene.flux_e if flux_e is None else flux_e,

@@ -20,7 +20,7 @@ from typing import Any
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.experiments.store import Arrays, UnitStore
-from faintspot.kernels.parallel import available_cpus
+from faintspot.slopes.kernels.parallel import available_cpus
 
 Progress = Callable[[int, int], None]
 Advance = Callable[[int], None]

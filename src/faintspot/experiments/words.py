@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from faintspot.experiments.statistics import Estimate
+from faintspot.base.statistics import Estimate
 
 NOTHING = "–"
 

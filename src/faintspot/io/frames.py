@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
 from faintspot.base.sizes import check_bytes, check_size
-from faintspot.io.formats import frame_format
+from faintspot.io.arrays.raw import MOST_WHOLE_BYTES
+from faintspot.io.formats.registry import frame_format
 from faintspot.io.locations import StoredArray, one_line, split_location
-from faintspot.io.raw import MOST_WHOLE_BYTES
 
 _MOST_PIXELS = 1 << 26  # in a frame: 8192 x 8192
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.io.formats import slope_endings, slope_format
+from faintspot.io.formats.registry import slope_endings, slope_format
 from faintspot.io.frames import read_array
 from faintspot.io.locations import split_location
 from faintspot.io.slopes import read_slopes
-from faintspot.io.slopes_format import StoredSlopes
+from faintspot.io.stored.slopes_format import StoredSlopes
 
 
 def read_reference(location: str | Path) -> NDArray[Any]:

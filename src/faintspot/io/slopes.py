@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from faintspot.base.checks import finite_array, number_between, one_of
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import check_regular, output_errors
-from faintspot.io.file_format import FileFormat
-from faintspot.io.formats import slope_format
+from faintspot.io.formats.file_format import FileFormat
+from faintspot.io.formats.registry import slope_format
+from faintspot.io.formats.zarr_files import Zarr
 from faintspot.io.locations import one_line
-from faintspot.io.output_lock import OutputLock
-from faintspot.io.slopes_folder import is_partial, partial_folder, read_partial
-from faintspot.io.slopes_format import (
+from faintspot.io.stored.output_lock import OutputLock
+from faintspot.io.stored.slopes_folder import is_partial, partial_folder, read_partial
+from faintspot.io.stored.slopes_format import (
     RESERVED_ATTRIBUTES,
     UNITS,
     VARIABLES,
@@ -29,8 +30,7 @@ from faintspot.io.slopes_format import (
     pixels_in,
     scaled_positions,
 )
-from faintspot.io.slopes_writer import BlockWriter, FinishedWriter
-from faintspot.io.zarr_files import Zarr
+from faintspot.io.stored.slopes_writer import BlockWriter, FinishedWriter
 
 _What = TypeVar("_What")
 
@@ -134,7 +134,7 @@ def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
     --------
     >>> import numpy as np, faintspot as fs
     >>> from faintspot.io import read_slopes
-    >>> from faintspot.recorded import measure_recorded
+    >>> from faintspot.slopes.recorded import measure_recorded
     >>> fs.Layout.grid((4, 4), pixels=8).save("faintspot.toml")
     >>> fs.Settings("centroid").save("faintspot.toml")
     >>> np.save("frames.npy", np.ones((5, 32, 32)))

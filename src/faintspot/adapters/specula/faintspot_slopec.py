@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintspot.adapters.base import CALIBRATION_FLUX_E, FLUX_FRAMES, AdapterOptions, ToolSlopes, parts_of
 from faintspot.adapters.checks import check_matrix, check_version
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.sensor.layout import Layout
+from faintspot.slopes.sensor.layout import Layout
 
 try:
     from specula import cpuArray

@@ -1,0 +1,367 @@
+"""faintspot layout: find the sub-apertures in a frame."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.cli.layout import grid as layout_grid
+from faintspot.cli.layout import options as layout_options
+from faintspot.cli.layout.darks import measured_darks, with_measured_pixels
+from faintspot.cli.layout.options import plain
+from faintspot.cli.shared.commands import SectionedCommand, option
+from faintspot.cli.shared.needs import suggested_slopes
+from faintspot.cli.shared.options import DIAMETER, KEY, PIXEL_SCALE, SUBAPERTURE
+from faintspot.cli.shared.output import picture_file
+from faintspot.io.frames import FrameSource, open_frames
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.camera.hot_pixels import find_hot_pixels
+from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, FirstSettings, first_settings
+from faintspot.slopes.sensor.found_layout import FoundLayout, find_layout
+from faintspot.slopes.sensor.known_grid import KnownGrid
+from faintspot.slopes.sensor.layout import GEOMETRIES, Layout
+
+_MOST_FRAMES = 200  # averaged to find the spots
+_MOST_NAMED = 12  # sub-apertures in one line
+_FIRST_FRAMES = 20  # measured for the settings
+_FEWEST_E = 10.0  # electrons of a spot that is seen in a single frame
+_array = partial(option, section="Lenslet array")
+_windows = partial(option, section="Windows")
+_camera = partial(option, section="Camera")
+_CALIBRATION = ("dark", "flat", "bad_pixels", "gain_e_per_adu", "read_noise_e")
+_OPTICS = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
+# What the finder calls what these options give.
+_OPTIONS = {
+    "pitch_px": "--pitch-px",
+    "illuminated_fraction": "--illuminated-fraction",
+    "bad_pixels": "--bad-pixels",
+}
+
+
+@click.command(
+    cls=SectionedCommand, short_help="Find the sub-apertures in a frame and write a configuration."
+)
+@click.argument("frames", nargs=-1, required=True, metavar="FRAME...")
+@_array("--geometry", type=click.Choice(["auto", *GEOMETRIES]), default="auto", help="Packing.")
+@_array("--pitch-px", type=float, metavar="PX", help="Distance of neighbouring lenslets.")
+@_array(
+    "--grid",
+    metavar="ROWSxCOLUMNS",
+    help="Rows and columns of an array that fills the frame or --roi, such as quad cells; then only which "
+    "lenslets are illuminated is searched for.",
+)
+@_array(
+    "--roi",
+    metavar="X0,Y0,X1,Y1",
+    help="Look only at columns X0 to X1 - 1 and rows Y0 to Y1 - 1 of the frame.",
+)
+@_array(
+    "--illuminated-fraction",
+    type=float,
+    metavar="PART",
+    help="Least flux of an illuminated lenslet, as a part of the median.",
+    show_default="where fewest are, 0.18 to 0.5; with --grid 0.3",
+)
+@_array(
+    "--pupil",
+    metavar="X,Y,R[,INNER]",
+    help="Centre and radius [px] of the disk, or annulus, whose lenslets are taken, illuminated or not.",
+)
+@_array(
+    "--exclude",
+    metavar="LIST",
+    help="Sub-apertures to leave out, such as 3,17,40-45: their numbers in the picture drawn without this.",
+)
+@_windows(
+    "--pixels",
+    metavar="N|NY,NX",
+    help="Side of a window, or its height and width [px].",
+    show_default="the largest without overlap",
+)
+@_windows(
+    "--move-windows",
+    is_flag=True,
+    help="Move all windows alike, off their spots, to keep lenslets at the frame's edge.",
+)
+@_camera(
+    "--dark",
+    metavar="FILE|ADU",
+    help="Dark frame, or several (averaged), as FILE[:ARRAY], or a number of ADU. From 10 frames on, the "
+    "read noise of each pixel is measured, and pixels that blink or are hot are masked.",
+)
+@_camera("--flat", metavar="FILE", help="Flat field, or several (averaged), divided by its mean.")
+@_camera(
+    "--bad-pixels", metavar="FILE", help="Map that is not 0 where a pixel is bad, or rows of row, column."
+)
+@_camera(
+    "--mask-hot-pixels",
+    is_flag=True,
+    help="Enter isolated bright pixels and pairs as bad pixels. Not for spots sharper than Nyquist sampling.",
+)
+@_camera(
+    "--gain-e-per-adu",
+    type=float,
+    metavar="E/ADU",
+    help="Electrons per ADU.",
+    show_default="1, frames in electrons",
+)
+@_camera(
+    "--read-noise-e", metavar="E|FILE", help="Read noise, a number or a map of each pixel as FILE[:ARRAY]."
+)
+@PIXEL_SCALE
+@SUBAPERTURE
+@DIAMETER
+@KEY
+@option("--output", "-o", metavar="TOML", default="faintspot.toml", help="Configuration to write.")
+@option(
+    "--picture", metavar="PNG", help="Picture of frame and grid to write.", show_default="beside the output"
+)
+@option(
+    "--overwrite",
+    is_flag=True,
+    help="Replace the layout and settings of an existing configuration; its calibration stays.",
+)
+def command(
+    frames: tuple[str, ...],
+    output: str,
+    picture: str | None,
+    grid: str | None,
+    exclude: str | None,
+    mask_hot_pixels: bool,
+    key: str | None,
+    overwrite: bool,
+    **options: Any,
+) -> None:
+    """Find the sub-apertures in a frame and write a configuration.
+
+    FRAME is a file with spots, from one frame to many of the same field (the first 200 are averaged). Square
+    and hexagonal lenslet arrays are found without hints: pitch, angle, offset, and which lenslets are
+    illuminated.
+    Spots of quad cells (2 x 2 pixels) overlap and cannot be found; --grid gives the array. A picture shows
+    the frame with the windows that were found: look at it. --illuminated-fraction, --pupil, --exclude correct
+    it.
+
+    A configuration with settings but no layout, as `faintspot tune` writes it without frames, keeps them.
+    Else the settings written beside the layout are a start: a centre of gravity under a weight that follows
+    the spot, or under a fixed window where the flux is too low for that. They suit the noise, flux, spot
+    width and displacements of the first 20 frames, which must be typical of the frames to come.
+    `faintspot tune` finds better ones.
+
+    \b
+    Examples:
+      faintspot layout flat_wavefront.fits -o faintspot.toml
+      faintspot layout cube.npz --dark dark.fits --gain-e-per-adu 1.9 --pixels 16
+      faintspot layout eye.fits --pupil 512,498,320,40 --exclude 0-3,57
+      faintspot layout quad_cells.fits --grid 40x40 --dark dark.fits
+    """
+    target = Path(output)
+    keeps_settings = configuration.has(target, "settings") and not configuration.has(target, "layout")
+    if target.exists() and not overwrite and not keeps_settings:
+        raise InputError(f"{output}: already exists; --overwrite replaces its layout and settings")
+    for name, counts, expected in (
+        ("pupil", (3, 4), "X,Y,R or X,Y,R,INNER in pixels"),
+        ("roi", (4,), "X0,Y0,X1,Y1 in pixels"),
+        ("pixels", (1, 2), "a number of pixels, or height and width, such as 12,16"),
+    ):
+        options[name] = layout_options.numbers(f"--{name}", options[name], counts, expected)
+    if options["pixels"] is not None and len(options["pixels"]) == 1:
+        (options["pixels"],) = options["pixels"]
+    optics = layout_options.optics(target, {name: options.pop(name) for name in _OPTICS})
+    of_camera = {name: options.pop(name) for name in _CALIBRATION}
+    drawing = picture_file(target, picture, ".png")
+    with open_frames(frames, key=key) as source:
+        calibration = layout_options.calibration(target, of_camera)
+        mean = _mean_frame(source, calibration)
+        hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
+        mean[tuple(hot.T)] = np.nan
+        found: FoundLayout | KnownGrid
+        if grid is not None:
+            found = layout_grid.illuminated(source.description, mean, grid, calibration, options)
+        else:
+            found = _found(source.description, mean, options)
+        kept = layout_options.kept(len(found.layout), exclude)
+        layout = replace(found.layout[kept], **optics)
+        first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
+    calibration, notes = _completed(calibration, found, layout, mean, hot)
+    unit = "ADU" if of_camera["gain_e_per_adu"] is None and calibration.gain_e_per_adu == 1.0 else "e-"
+    seen = first_settings(layout, calibration, first)
+    if unit == "ADU" and 0 < seen.flux < _FEWEST_E:
+        likely = float(f"{(calibration.typical_read_noise_e or ASSUMED_NOISE_E) / seen.noise:.3g}")
+        notes.append(f"  gain: 1 would leave {plain(seen.flux)} electrons of a spot; {likely:g} is assumed")
+        calibration = replace(calibration, gain_e_per_adu=likely)
+        unit, seen = "e-", first_settings(layout, calibration, first)
+    if (measured := measured_darks(of_camera["dark"])) is not None:
+        keeps_noise = of_camera["read_noise_e"] is not None
+        calibration, lines = with_measured_pixels(calibration, measured, keeps_noise=keeps_noise)
+        notes += lines
+    settings = configuration.load(target, "settings") if keeps_settings else seen.settings
+    if keeps_settings:
+        notes.append(f"  the settings that {output} has are kept")
+    marks: dict[str, Any] = {}
+    if isinstance(found, FoundLayout):
+        marks = {"outside": found.outside, "doubtful": (found.clipped | found.unlike)[kept]}
+    if drawing is not None:
+        from faintspot.slopes.recorded.layout_picture import layout_picture
+
+        layout_picture(np.where(np.isnan(mean), np.nanmedian(mean), mean), layout, drawing, **marks)
+    # The layout last: it may be long, and whatever is saved after it reads it again.
+    for item in (settings, calibration, layout):
+        configuration.save(target, item)
+    if isinstance(found, KnownGrid):
+        lines = layout_grid.describe(output, found, layout, calibration)
+    else:
+        lines = _describe(output, found[kept], layout)
+    for line in [*lines, *_describe_settings(settings, layout, seen, unit), *notes]:
+        click.echo(line)
+    if unit == "ADU":
+        click.echo(
+            "  gain unknown (--gain-e-per-adu): these settings do not depend on it, standard errors do"
+        )
+    if drawing is not None:
+        click.echo(f"  picture: {drawing}")
+    arguments = [*frames, *(["--key", key] if key else []), "--config", output, "-o", suggested_slopes()]
+    click.echo(f"Next: faintspot slopes {shlex.join(arguments)}")
+
+
+def _found(description: str, mean: NDArray[np.float64], options: dict[str, Any]) -> FoundLayout:
+    """Find the layout, and say in an error where, and which option changes it."""
+    bad = np.isnan(mean)
+    try:
+        return find_layout(np.where(bad, 0, mean), bad_pixels=bad, **options)
+    except InputError as error:
+        text = str(error)
+        for name, option in _OPTIONS.items():
+            text = text.replace(name, option)
+        if "found no" in text:
+            text += "; --grid is for an array that is known, such as quad cells"
+        raise InputError(f"{description}: {text}") from None
+
+
+def _describe_settings(settings: Settings, layout: Layout, seen: FirstSettings, unit: str) -> list[str]:
+    """Describe noise and flux of the spots, and the settings."""
+    estimator, reach = settings.estimator, settings.search_range_px
+    within = "" if reach is None else f", slopes within {np.max(reach):g} px"
+    lines = [
+        f"  background noise {plain(seen.noise)} {unit}, flux of a spot {plain(seen.flux)} {unit}",
+        f"  {estimator.name}: {estimator.in_words(len(layout), layout.pixels)}{within}",
+    ]
+    if seen.response < 1:
+        lines.append(
+            f"  the flux of single frames is too low for full slopes: they show {seen.response:.2f} of the "
+            "displacements; `faintspot tune --recording` says what is possible"
+        )
+    return lines
+
+
+def _describe(output: str, found: FoundLayout, layout: Layout) -> list[str]:
+    """Describe the lenslets that were found and those left out."""
+    rows, columns = np.ptp(layout.cells, axis=0) + 1
+    height, width = layout.window
+    lines = [
+        f"{output}: {len(layout)} sub-apertures lit of a {layout.geometry} array of {rows} x {columns}, "
+        f"pitch {layout.pitch_px:.2f} px, angle {layout.angle_deg:.2f} deg, windows of {height} x {width} px"
+    ]
+    lines += layout_options.largest_window_note(layout)
+    if found.lenslets.doubt:
+        lines.append(f"  doubtful: {found.lenslets.doubt} (see the picture; try --pitch-px, --pupil)")
+    if len(found.cut):
+        lines.append(
+            f"  {len(found.cut)} lit lenslets at the frame's edge left out, their windows do not fit: "
+            f"{_sides(found)}; smaller windows (--pixels) or --move-windows take more"
+        )
+    lines += _doubtful_spots(found)
+    moved = np.abs(np.median(layout.offsets, axis=0))
+    if moved.max() > 1:
+        lines.append(
+            f"  windows moved off the spots by ({moved[0]:.1f}, {moved[1]:.1f}) px: "
+            "centres of gravity are worse in them"
+        )
+    return lines
+
+
+def _doubtful_spots(found: FoundLayout) -> list[str]:
+    """Describe spots outside all windows, far from their lattice, or doubtful."""
+    lines = []
+    if (count := len(found.outside)) > 0:
+        size = np.array(found.layout.frame_shape[::-1])
+        depth = np.minimum(found.outside, size - 1 - found.outside).min(axis=1)
+        at_edge = np.count_nonzero(depth < 0.5 * found.lenslets.pitch_px)
+        where = f", {at_edge} of them at the frame's edge" if at_edge else ""
+        spots = "1 bright spot lies" if count == 1 else f"{count} bright spots lie"
+        lines.append(f"  {spots} outside all windows{where}: see the circles in the picture")
+    if (drift := np.linalg.norm(found.lenslets.drifts, axis=1).max()) > 0:
+        lines.append(
+            f"  the windows follow spots that lie up to {drift:.1f} px from the regular lattice, which stays "
+            "the reference"
+        )
+    for reason, doubtful in (
+        ("at their window's edge, which cuts them", found.clipped),
+        ("displaced unlike those of all neighbours", found.unlike),
+    ):
+        if doubtful.any():
+            numbers = np.flatnonzero(doubtful)
+            named = ", ".join(map(str, numbers[:_MOST_NAMED])) + (
+                ", ..." if len(numbers) > _MOST_NAMED else ""
+            )
+            lines.append(f"  doubtful slopes of {named} ({len(numbers)}): spots {reason}")
+    return lines
+
+
+def _sides(found: FoundLayout) -> str:
+    """Count the lenslets left out at each side of the frame, such as '7 at small x'."""
+    height, width = found.layout.frame_shape
+    x, y = found.cut.T
+    distances = np.stack([x, width - 1 - x, y, height - 1 - y])
+    counts = np.bincount(distances.argmin(axis=0), minlength=4)
+    names = ("at small x", "at large x", "at small y", "at large y")
+    return ", ".join(f"{count} {name}" for count, name in zip(counts, names, strict=True) if count)
+
+
+def _mean_frame(source: FrameSource, calibration: Calibration) -> NDArray[np.float64]:
+    """Mean of the first frames in electrons, of what is finite; NaN where nothing is."""
+    total, count = np.zeros(source.shape), np.zeros(source.shape, int)
+    for _, block in source.blocks(0, min(_MOST_FRAMES, source.n_frames), _FIRST_FRAMES):
+        finite = np.isfinite(block)
+        total += np.where(finite, block, 0).sum(axis=0, dtype=np.float64)
+        count += finite.sum(axis=0)
+    if not count.any():
+        raise InputError(f"{source.description}: expected a frame with spots, every pixel is NaN or infinite")
+    dark, electrons_per_adu = calibration.maps(source.shape)
+    mean = np.divide(total, count, where=count > 0, out=np.full(source.shape, np.nan))
+    electrons: NDArray[np.float64] = (mean - dark) * electrons_per_adu
+    return electrons
+
+
+def _completed(
+    calibration: Calibration,
+    found: FoundLayout | KnownGrid,
+    layout: Layout,
+    mean: NDArray[np.float64],
+    hot: NDArray[np.int64],
+) -> tuple[Calibration, list[str]]:
+    """Add the frame's background as dark level where none is known, and hot pixels; say so."""
+    notes = []
+    edges = layout.images(mean)[:, [0, -1]]
+    if isinstance(found, KnownGrid) and (len(found.unlit) or layout_grid.is_quad_cell(layout)):
+        edges = found.unlit if len(found.unlit) else np.zeros(1)
+    level = float(np.nanmedian(edges)) * calibration.em_gain / calibration.gain_e_per_adu
+    spread = float(np.nanmedian(np.abs(edges - np.nanmedian(edges))))
+    if calibration.dark is None and level > spread > 0:
+        calibration = replace(calibration, dark=float(f"{level:.7g}"), rough_dark=True)
+        notes.append(
+            f"  dark {calibration.dark:g} ADU, the frame's background; --dark gives the camera's own"
+        )
+    if len(hot):
+        calibration = calibration.with_bad_pixels(hot)
+        notes.append(f"  {len(hot)} hot pixels masked")
+    return calibration, notes

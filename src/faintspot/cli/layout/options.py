@@ -1,0 +1,126 @@
+"""Parse the options of `faintspot layout`: numbers, ranges of numbers, and maps of the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.config.tables import read_tables
+from faintspot.base.errors import InputError
+from faintspot.slopes.camera.calibration import Calibration, read_map
+from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.sensor.window_size import LARGEST_WINDOW
+
+
+def numbers(option: str, text: str | None, counts: tuple[int, ...], expected: str) -> list[float] | None:
+    """Return the numbers of a text such as 1,2.5,3; InputError when they are not so many."""
+    if text is None:
+        return None
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in counts or not np.isfinite(values).all():
+        raise InputError(f"{option} {text}: expected {expected}")
+    return values
+
+
+def grid_shape(text: str) -> tuple[int, int]:
+    """Return rows and columns of a text such as 7x7."""
+    rows, _, columns = text.lower().partition("x")
+    if not (rows.isdecimal() and columns.isdecimal() and int(rows) * int(columns) > 0):
+        raise InputError(f"--grid {text}: expected rows and columns of lenslets, such as 7x7")
+    return int(rows), int(columns)
+
+
+def kept(count: int, text: str | None) -> NDArray[np.bool_]:
+    """Return which of so many sub-apertures a text such as 3,17,40-45 does not exclude."""
+    kept = np.ones(count, dtype=bool)
+    if text is None:
+        return kept
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        if not first.isdecimal() or not (last.isdecimal() or not dash):
+            raise InputError(
+                f"--exclude {text}: expected numbers and ranges of sub-apertures, such as 3,17,40-45"
+            )
+        low, high = int(first), int(last or first)
+        if not low <= high < count:
+            raise InputError(f"--exclude {part.strip()}: expected sub-apertures from 0 to {count - 1}")
+        kept[low : high + 1] = False
+    if not kept.any():
+        raise InputError(f"--exclude {text}: no sub-aperture is left of {count}")
+    return kept
+
+
+def calibration(target: Path, given: Mapping[str, Any]) -> Calibration:
+    """Return the calibration that the configuration has already, with what was given now (None: nothing)."""
+    known: Calibration = configuration.load(target, "calibration") if target.exists() else Calibration()
+    maps: dict[str, Callable[[str], Any]] = {
+        "dark": partial(number_or_map, "dark"),
+        "read_noise_e": partial(number_or_map, "read_noise_e"),
+        "flat": flat_field,
+        "bad_pixels": partial(read_map, "bad_pixels"),
+    }
+    changes = {
+        name: maps[name](value) if name in maps else value
+        for name, value in given.items()
+        if value is not None
+    }
+    if "dark" in changes:
+        changes["rough_dark"] = False
+    return replace(known, **changes)
+
+
+def optics(target: Path, given: Mapping[str, float | None]) -> dict[str, Any]:
+    """Return the scales of a layout that were given, or else those that the configuration has already."""
+    known = read_tables(target).get("layout", {}) if target.exists() else {}
+    return {name: known.get(name) if value is None else value for name, value in given.items()}
+
+
+def largest_window_note(layout: Layout) -> list[str]:
+    """Return a line that says so where windows are limited and leave out much of a sub-aperture."""
+    side = max(layout.window)
+    if side < LARGEST_WINDOW or layout.pitch_px is None or layout.pitch_px < side + 1:
+        return []
+    return [
+        f"  windows stop at {LARGEST_WINDOW} px, of a pitch of {layout.pitch_px:.0f} px: spots farther than "
+        f"{LARGEST_WINDOW // 2} px from their centre are missed; bin the frames if they move so far"
+    ]
+
+
+def number_or_map(name: str, text: str) -> Any:
+    """Return a value of the calibration: a number, or the map in a file."""
+    return float(text) if is_number(text) else read_map(name, text)
+
+
+def is_number(text: str) -> bool:
+    """Return whether a value is a number; otherwise it names a file."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def flat_field(text: str) -> NDArray[np.float64]:
+    """Return the relative response of the pixels: a frame, or the mean of several, divided by its mean."""
+    flat = read_map("flat", text)
+    usable = np.isfinite(flat) & (flat > 0)
+    if not usable.any():
+        raise InputError(f"{text}: expected a flat field, no pixel is above 0")
+    return np.asarray(flat / flat[usable].mean())
+
+
+def plain(value: Any) -> str:
+    """Format a number to three digits, never as 6.7e+02; return other values unchanged."""
+    if not isinstance(value, float | int):
+        return str(value)
+    return np.format_float_positional(float(f"{value:.3g}"), trim="-")

@@ -1,0 +1,1 @@
+"""The command `realtime`, one file for each of its own, and `live`."""

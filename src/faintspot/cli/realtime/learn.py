@@ -1,0 +1,121 @@
+"""faintspot realtime learn: control that learns from a recording of the closed loop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from faintspot.base.errors import InputError
+from faintspot.base.extras import require_linux
+from faintspot.base.files import derived
+from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.needs import needs
+from faintspot.cli.shared.options import ENGINE_NAME, configuration_option
+from faintspot.cli.shared.progress import progress_bar
+
+
+@needs("realtime", "zarr")
+@click.command("learn", short_help="Have a controller learn from a recording of the closed loop.")
+@click.argument("store", type=click.Path(path_type=Path), metavar="STORE", required=False)
+@configuration_option("Configuration with [control].")
+@option(
+    "--every",
+    type=click.FloatRange(0, min_open=True),
+    metavar="S",
+    help="Instead of from STORE, learn from the running engine, whenever this many seconds have passed.",
+)
+@ENGINE_NAME
+@option(
+    "--control",
+    "kind",
+    type=click.Choice(["modal", "polc", "kalman"]),
+    default="kalman",
+    help="Controller that learns.",
+)
+@option(
+    "--winds",
+    type=click.Choice(["learnt", "none"]),
+    default="learnt",
+    help="Measure the winds, or take them from all directions alike.",
+)
+@option(
+    "--layer",
+    "layers",
+    type=(float, float, float),
+    multiple=True,
+    metavar="SPEED DIRECTION STRENGTH",
+    help="Assume a layer with this wind, m/s and degrees from +x to +y; repeatable.",
+)
+def learn(
+    store: Path | None,
+    config: str,
+    every: float | None,
+    name: str,
+    kind: str,
+    winds: str,
+    layers: tuple[tuple[float, float, float], ...],
+) -> None:
+    """Have a controller learn from a recording of the loop, closed with an integrator, and put it into TOML.
+
+    STORE is what `faintspot realtime record` wrote while the engine ran with TOML, at least 200 frames
+    without a gap; 2000 are better. The layout must know subaperture_m or diameter_m. Takes up to some
+    minutes; writes TOML's name with .model.npz, and controller and model of [control].
+
+    With --every, learn a Kalman filter again from a running engine until it ends. A new filter is compared
+    with the running one on frames that neither learnt from; the engine takes it if it is better beyond the
+    error. The engine does this by itself, see learn_every_s of [control]. Nothing is written.
+
+    \b
+    Examples:
+      faintspot realtime record night.zarr --seconds 10
+      faintspot realtime learn night.zarr --control kalman
+      faintspot realtime learn night.zarr --layer 6 20 0.6 --layer 14 150 0.4
+      faintspot realtime learn --every 10
+    """
+    if (store is None) == (every is None):
+        raise InputError("learn: expected either STORE or --every")
+    if store is None and every is not None:
+        _learn_repeatedly(name, config, every)
+    elif store is not None:
+        _learn_from(store, config, kind, winds, layers)
+
+
+def _learn_repeatedly(name: str, config: str, every_s: float) -> None:
+    """Learn from a running engine again and again."""
+    require_linux("realtime learn --every")
+    from faintspot.engine.background.learning import learn_repeatedly
+
+    learn_repeatedly(name, config, every_s, click.echo)
+
+
+def _learn_from(
+    store: Path, config: str, kind: str, winds: str, layers: tuple[tuple[float, float, float], ...]
+) -> None:
+    """Learn from a recording."""
+    from faintspot.io import read_telemetry
+    from faintspot.loop.control.base import ASSUMED
+    from faintspot.loop.control.configuration import load_control, prior_std_px, save_control
+    from faintspot.loop.control.identification.learning import learn as learnt_by
+    from faintspot.loop.telemetry.recording import site_of, telemetry_of_recording
+    from faintspot.slopes.pipeline.settings import Settings
+    from faintspot.slopes.sensor.layout import Layout
+
+    control = load_control(config)
+    if control is None:
+        raise InputError(f"{config}: expected a table [control], which calibrate writes")
+    layout, night = Layout.load(config), read_telemetry(store, images=False)
+    prior = prior_std_px(Settings.load(config), layout)
+    telemetry, rate_hz = telemetry_of_recording(night, control, prior)
+    known = site_of(layout, layers), rate_hz, ASSUMED if layers else winds
+    with progress_bar("Filter", "steps") as show:
+        learnt = learnt_by(kind, control.plant, telemetry, *known, progress=show)
+    path = derived(config, ".model.npz")
+    learnt.model.save(path)
+    save_control(config, controller=kind, model=path.name)
+    left = learnt.model.left
+    click.echo(
+        f"{len(telemetry)} frames at {rate_hz:.0f} a second: {kind} leaves {left[0] / left[1]:.2f} of the "
+        f"phase variance that the integrator with gain {learnt.model.plain_gain:g} leaves"
+    )
+    click.echo(f"{learnt.model.description}; {path} and [control] of {config} written")

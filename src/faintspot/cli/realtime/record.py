@@ -1,0 +1,108 @@
+"""faintspot realtime record, export: telemetry of a running engine to files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from faintspot.base.errors import InputError
+from faintspot.base.extras import require
+from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.needs import needs
+from faintspot.cli.shared.options import ENGINE_NAME
+
+if TYPE_CHECKING:
+    from faintspot.engine.telemetry.recorder import RecordingReport
+
+_MODES = click.Choice(["SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO"])
+_AO_MODE = option("--ao-mode", type=_MODES, default="SCAO", help="What an AOT file says the sensor serves.")
+
+
+@needs("realtime", "zarr")
+@click.command("record", short_help="Record the telemetry of a running engine.")
+@click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
+@ENGINE_NAME
+@option("--frames", type=click.IntRange(1), help="Stop after so many.")
+@option("--seconds", type=click.FloatRange(0, min_open=True), help="Stop after so long.")
+@_AO_MODE
+def record(out: Path, name: str, frames: int | None, seconds: float | None, ao_mode: str) -> None:
+    """Record slopes, fluxes, times, images and changes of settings of a running engine until Ctrl-C.
+
+    OUT is a Zarr store (.zarr), which grows as frames come and is whole at any time, or an AOT file (.fits),
+    which is written at the end from the store of the same name beside it. The engine never waits: where
+    reading or the disk is too slow, frames are lost to the record, and counted.
+
+    \b
+    Example:
+      faintspot realtime record night.zarr --seconds 60
+    """
+    from faintspot.cli.realtime.camera import stop_on_signal
+    from faintspot.cli.shared.progress import progress_bar
+    from faintspot.engine.telemetry.recorder import Recorder
+
+    if out.suffix not in (".zarr", ".fits"):
+        raise InputError(f"{out}: expected a name that ends in .zarr or .fits")
+    if out.suffix == ".fits" and out.exists():
+        raise InputError(f"{out}: already exists; choose another name")
+    if out.suffix == ".fits":
+        require("realtime", "aotpy", purpose="Writing an AOT file")
+    store = out.with_suffix(".zarr")
+    recorder = Recorder(name, store)
+    total: Any = frames  # None, where it is not known, makes the bar a moving one
+    with stop_on_signal() as stop, progress_bar(f"{store.name}") as advance:
+        report = recorder.run(
+            n_frames=frames, seconds=seconds, stop=stop, progress=lambda done: advance(done, total)
+        )
+    click.echo(f"{store}: {_summary(report)}")
+    if out.suffix == ".fits" and report.frames:
+        _export(store, out, ao_mode)
+
+
+@needs("realtime", "zarr", "aotpy")
+@click.command("export", short_help="Turn recorded telemetry into an AOT file.")
+@click.argument("store", type=click.Path(path_type=Path), metavar="STORE")
+@click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
+@_AO_MODE
+def export(store: Path, out: Path, ao_mode: str) -> None:
+    """Turn a Zarr store of telemetry into a file of the Adaptive Optics Telemetry standard (AOT, FITS).
+
+    \b
+    Example:
+      faintspot realtime export night.zarr night.fits
+    """
+    if out.suffix != ".fits":
+        raise InputError(f"{out}: expected a name that ends in .fits")
+    _export(store, out, ao_mode)
+
+
+def _export(store: Path, out: Path, ao_mode: str) -> None:
+    """Write the AOT file."""
+    from faintspot.io import read_telemetry, write_aot
+
+    telemetry = read_telemetry(store)
+    write_aot(out, telemetry, ao_mode=ao_mode)
+    click.echo(f"{out}: {len(telemetry.frame)} frames, {len(telemetry.image_frame)} images")
+
+
+def _summary(report: RecordingReport) -> str:
+    """Describe what was recorded and what was lost."""
+    ended = {
+        "frames": "all that were asked for",
+        "seconds": "time is over",
+        "stopped": "stopped",
+        "engine ended": "the engine has ended",
+    }[report.ended_because]
+    text = (
+        f"{report.frames} frames in {report.seconds:.1f} s, {report.images} with images, changes of "
+        f"settings: {report.changes} ({ended})"
+    )
+    lost = report.dropped + report.dropped_images + report.dropped_changes
+    if not lost:
+        return f"{text}; nothing dropped"
+    return (
+        f"{text}\n  dropped: {report.dropped} frames, {report.dropped_images} images, "
+        f"{report.dropped_changes} changes, overwritten in shared memory before they were read: this process "
+        f"or the disk was too slow (the longest write took {report.longest_write_s:.2f} s)"
+    )

@@ -1,0 +1,185 @@
+"""faintspot realtime run: the engine itself."""
+
+from __future__ import annotations
+
+import os
+import threading
+from contextlib import nullcontext
+from functools import partial
+from typing import Any
+
+import click
+
+from faintspot.cli.realtime.camera import stop_on_signal
+from faintspot.cli.realtime.live import page_beside
+from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.engine_requests import summary
+from faintspot.cli.shared.needs import needs
+from faintspot.cli.shared.options import FRAMES, configuration_option, name_option
+from faintspot.engine.requests.private_socket import socket_path
+
+
+@needs("realtime", "pyshmem")
+@click.command("run", short_help="Measure frames as they arrive and publish their slopes.")
+@configuration_option("Configuration.")
+@name_option("Name of the pixel ring, the streams and the engine.")
+@option("--stream", metavar="NAME", help="Take whole frames from a stream: pyshmem's, isio:NAME or dao:FILE.")
+@option("--threads", type=click.IntRange(1), default=1, help="Worker threads.")
+@option("--cpus", metavar="LIST", help="Processors to run on, such as 2,3 or 4-7.")
+@option(
+    "--priority",
+    type=click.IntRange(0, 99),
+    default=0,
+    help="Priority of SCHED_FIFO, with locked memory.",
+    show_default="the ordinary scheduler",
+)
+@option(
+    "--poll",
+    "polls",
+    is_flag=True,
+    help="Poll for rows all the time, on processors that nobody else uses; see the guide.",
+)
+@option(
+    "--interleave",
+    metavar="METHODS",
+    help="Alternate between settings, and controllers, such as none,tv or ml+integrator,map+kalman.",
+)
+@option("--every", type=click.IntRange(1), default=50, help="Frames for each in turn.")
+@option(
+    "--deadline-us",
+    metavar="US",
+    type=click.FloatRange(0, min_open=True),
+    default=1000.0,
+    help="Latency limit after the last row, above which slopes count as late.",
+)
+@option(
+    "--images-every",
+    type=click.IntRange(0),
+    default=100,
+    help="Telemetry keeps the images of every N-th frame; 0: of none.",
+)
+@option("--close-loop", is_flag=True, help="Close the loop with the first frame; see control.")
+@option("--no-control", is_flag=True, help="Compute no commands, although the configuration has [control].")
+@option(
+    "--flux-frames",
+    "mean_flux",
+    type=click.FloatRange(1),
+    metavar="FRAMES",
+    help="Give estimators the flux of every sub-aperture, averaged over this number of frames.",
+)
+@FRAMES
+@option("--live", is_flag=True, help="Serve the web page as well: faintspot live.")
+def run(
+    config: str,
+    name: str,
+    stream: str | None,
+    cpus: str | None,
+    priority: int,
+    interleave: str | None,
+    every: int,
+    deadline_us: float,
+    close_loop: bool,
+    no_control: bool,
+    frames: int | None,
+    live: bool,
+    **options: Any,
+) -> None:
+    """Measure the frames of a pixel ring and publish their slopes until Ctrl-C.
+
+    Frames come from the shared-memory pixel ring NAME, which a camera's process writes row by row, or whole
+    from another program's stream; the engine waits for it, and for its return. Each group of sub-apertures
+    is measured as soon as its last row is there. Slopes go out as the pyshmem streams NAME_slopes (all x,
+    then all y, px), NAME_details and NAME_marks, each stamped with the frame's number; `faintspot realtime
+    record` keeps them. Where the configuration has [control], commands follow from them as NAME_commands.
+
+    \b
+    On sky, with and without, 50 frames each (NAME_marks says which):
+      faintspot realtime run --interleave none,tv --every 50
+      faintspot realtime run --close-loop --interleave window+integrator,map+kalman --every 250
+    """
+    from faintspot.base.config.written_changes import parse_subapertures
+    from faintspot.base.errors import InputError
+    from faintspot.engine.engine import Engine
+    from faintspot.engine.path.pipeline_maker import PipelineMaker
+    from faintspot.engine.request_handlers import LENGTHY, commands_of
+    from faintspot.engine.requests.requests import ControlServer
+    from faintspot.engine.requests.scheduling import real_time
+    from faintspot.engine.settings.interleaving import Interleaving
+    from faintspot.loop.control.configuration import load_control
+    from faintspot.slopes.pipeline import configuration
+
+    layout, settings, calibration, psf, score = configuration.load_all(config)
+    control = None if no_control else load_control(config)
+    if close_loop and control is None:
+        raise InputError(f"--close-loop: expected [control] in {config}, which says what makes commands")
+    processors = parse_subapertures(cpus) if cpus else None
+    engine = Engine(
+        name,
+        PipelineMaker(layout, calibration, psf, score, None if control is None else control.reference),
+        settings,
+        cpus=processors,
+        source=None if stream is None else _followed(stream, name),
+        interleaving=None if interleave is None else Interleaving.parse(interleave, every),
+        deadline_s=deadline_us * 1e-6,
+        control=control,
+        **options,
+    )
+    if engine.loop is not None and close_loop:
+        engine.loop.close()
+    server = ControlServer(socket_path(name), commands_of(engine), lengthy=LENGTHY)
+    learns = nullcontext() if interleave else _learning(engine, config)
+    page = page_beside(name) if live else nullcontext()
+    # Processes beside the engine start first: otherwise they would have its processors and priority.
+    with (
+        server,
+        stop_on_signal() as stop,
+        learns,
+        _following(engine, config),
+        page,
+        real_time(processors, priority) as refused,
+    ):
+        engine.refused = refused
+        for line in refused:
+            click.echo(f"not permitted, going on without: {line}", err=True)
+        click.echo(
+            f"{name}: {len(layout)} sub-apertures, estimator {settings.estimator.name}; waiting for frames, "
+            "Ctrl-C stops"
+        )
+        threading.Thread(target=_stop_when_set, args=(stop, engine), daemon=True).start()
+        engine.run(frames)
+    click.echo(summary(engine.status()))
+
+
+def _learning(engine: Any, config: str) -> Any:
+    """The process that learns for the engine, as a context, if it can learn and shall."""
+    from faintspot.engine.background.learning import learning_beside
+    from faintspot.loop.control.identification.model import KALMAN
+
+    options = None if engine.loop is None else engine.loop.control.options
+    if options is None or options.controller != KALMAN or not options.learn_every_s:
+        return nullcontext()
+    return learning_beside(engine, config, options.learn_every_s, partial(click.echo, err=True))
+
+
+def _following(engine: Any, config: str) -> Any:
+    """The process that follows a laser guide star's profile, as a context, if the configuration wants it."""
+    from faintspot.engine.background.sodium import following_beside
+    from faintspot.slopes.spots.laser_spots import load_laser
+
+    laser = load_laser(config)
+    if laser is None or not laser.follow_every_s:
+        return nullcontext()
+    return following_beside(engine, config, partial(click.echo, err=True))
+
+
+def _followed(stream: str, name: str) -> Any:
+    """The stream as the engine's own source, which keeps a processor busy as waiting for rows would."""
+    from faintspot.engine.streams.bridge import StreamBridge
+
+    return StreamBridge(stream, name, say=partial(click.echo, err=True), spins=(os.cpu_count() or 1) > 1)
+
+
+def _stop_when_set(stop: threading.Event, engine: Any) -> None:
+    """Pass a signal on to the engine."""
+    stop.wait()
+    engine.stop()

@@ -1,0 +1,161 @@
+"""faintspot realtime telescope run, set, status: a simulated telescope."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import click
+
+from faintspot.cli.realtime.camera import published, stop_on_signal
+from faintspot.cli.shared.commands import Group, option
+from faintspot.cli.shared.engine_requests import as_text
+from faintspot.cli.shared.options import AS_JSON, FRAMES, READOUT_FRACTION, SLOTS, name_option
+from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
+from faintspot.engine.requests.requests import request, since
+
+_NAME = name_option("Name of the telescope.")
+
+
+@click.group("telescope", cls=Group, short_help="Simulate a telescope whose mirror follows a command stream.")
+def telescope() -> None:
+    """Simulate a telescope whose mirror follows a command stream."""
+
+
+@telescope.command("run", short_help="Run the simulated telescope until Ctrl-C.")
+@click.argument("configuration", metavar="[CONFIG]", default="canary")
+@name_option("Name of the pixel ring and the streams.")
+@option(
+    "--frame-rate-hz",
+    type=float,
+    metavar="HZ",
+    help="Frame rate; winds are scaled with it, so that the turbulence moves as far in a frame.",
+    show_default="CONFIG",
+)
+@option(
+    "--write-config", metavar="FOLDER", help="Write what an engine needs: faintspot.toml and two matrices."
+)
+@option(
+    "--control",
+    default="integrator",
+    metavar="KIND",
+    help="Control that --write-config prepares: integrator; modal, polc or kalman, which learn for a minute.",
+)
+@READOUT_FRACTION
+@option(
+    "--rows-per-block",
+    type=int,
+    metavar="K",
+    help="Rows published together.",
+    show_default="a sub-aperture's",
+)
+@SLOTS
+@FRAMES
+@option(
+    "--seed", type=click.IntRange(0), help="Seed of turbulence and noise.", show_default="the configuration's"
+)
+@option(
+    "--realisation",
+    type=click.IntRange(0),
+    default=0,
+    help="Number of the realisation; each has other turbulence and noise.",
+)
+def run(
+    configuration: str,
+    name: str,
+    frame_rate_hz: float | None,
+    write_config: str | None,
+    control: str,
+    frames: int | None,
+    **options: Any,
+) -> None:
+    """Simulate a telescope: turbulence, mirror, Shack-Hartmann sensor and camera, at a camera's pace.
+
+    CONFIG is a TOML file or the name of a shipped configuration, as of `faintspot loop`; default: canary.
+    Rows go into the pixel ring NAME. When an exposure begins, the mirror takes the newest commands of the
+    pyshmem stream NAME_commands [nm]; whole frames are published as NAME_frames, and the true Strehl ratio
+    and wavefront error as NAME_truth. Needs the extras `loop` and `realtime`.
+
+    \b
+    In three terminals:
+      faintspot realtime telescope run canary --frame-rate-hz 250 --write-config bench
+      faintspot realtime run --config bench/faintspot.toml
+      faintspot realtime telescope set photons=50 seeing_arcsec=1.2
+    """
+    from faintspot.engine.requests.requests import ControlServer
+    from faintspot.engine.requests.scheduling import real_time
+    from faintspot.engine.telescope.simulated_telescope import LENGTHY, SimulatedTelescope, commands_of
+    from faintspot.loop.simulation.configuration.configuration import load_loop
+    from faintspot.loop.simulation.engine_files import write_engine_files
+
+    observed = load_loop(configuration)
+    if frame_rate_hz is not None:
+        observed = observed.slowed_to(frame_rate_hz)
+    if write_config is not None:
+        click.echo(f"{name}: {write_engine_files(observed, write_config, control)} written")
+    say = partial(click.echo, err=True)
+    with SimulatedTelescope(observed, name, say=lambda line: say(f"{name}: {line}"), **options) as simulated:
+        optics = simulated.telescope_model.optics
+        rows, columns = optics.sensor.layout.frame_shape
+        server = ControlServer(socket_path(name, TELESCOPE), commands_of(simulated), lengthy=LENGTHY)
+        with server, real_time(), stop_on_signal() as stop:
+            click.echo(
+                f"{name}: {observed.name}, {rows} x {columns} pixels, {len(optics.sensor.layout)} "
+                f"sub-apertures, {optics.mirror.commands} commands, {observed.control.frame_rate_hz:g} "
+                "frames/s; Ctrl-C stops"
+            )
+            report = simulated.run(frames, stop)
+    click.echo(f"{name}: {published(report)}")
+
+
+@telescope.command("set", short_help="Change the star or the turbulence.")
+@_NAME
+@click.argument("changes", nargs=-1, required=True, metavar="NAME=VALUE...")
+def telescope_set(name: str, changes: tuple[str, ...]) -> None:
+    """Change the star or the turbulence from the next exposure on.
+
+    \b
+    photons        photo-electrons of a fully lit sub-aperture in a frame, or
+    magnitude      of the star, in the configuration's band
+    r0_m           Fried parameter at 500 nm; two values: the ends of its drift, or
+    seeing_arcsec  0.976 x 500 nm / r0
+    wind_factor    all winds, as a multiple of the configuration's
+
+    \b
+    Example:
+      faintspot realtime telescope set magnitude=11 seeing_arcsec=1.2 wind_factor=1.5
+    """
+    from faintspot.base.config.written_changes import parse_changes
+
+    reply = request(socket_path(name, TELESCOPE), "set", changes=parse_changes(changes))
+    click.echo(f"{since(reply['frame'])}: {_in_words(reply['conditions'])}")
+
+
+@telescope.command("status", short_help="Show what the telescope sees, and whether it keeps its pace.")
+@_NAME
+@AS_JSON
+def telescope_status(name: str, as_json: bool) -> None:
+    """Show what the telescope sees, and whether it keeps its pace."""
+    reply = request(socket_path(name, TELESCOPE), "status")
+    if as_json:
+        click.echo(as_text(reply))
+        return
+    commands, truth = reply["commands"], reply["truth"]
+    click.echo(
+        f"{name}: {reply['configuration']}, {reply['frames']} frames at {reply['frame_rate_hz']:g} a second, "
+        f"{reply['late']} late, {reply['overruns']} frame times without a frame"
+    )
+    click.echo(f"  {_in_words(reply['conditions'])}")
+    state = commands["obstacle"] or f"{commands['taken']} taken, {commands['refused']} refused"
+    click.echo(f"  {commands['stream']}: {state}")
+    if truth is not None:
+        click.echo(
+            f"  frame {truth['frame']:.0f}: Strehl ratio {truth['strehl']:.3f}, {truth['rms_nm']:.0f} nm"
+        )
+
+
+def _in_words(conditions: dict[str, Any]) -> str:
+    low, high = sorted(conditions["r0_m"])
+    r0 = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+    photons, winds = conditions["photons"], conditions["wind_factor"]
+    return f"{photons:g} photons, r0 {r0} m, winds x {winds:g}"

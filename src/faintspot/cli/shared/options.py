@@ -1,0 +1,69 @@
+"""Options that several commands have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from faintspot.cli.shared.commands import option
+
+Option = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+
+def configuration_option(what: str) -> Option:
+    """Return --config: a configuration, and what it is to the command."""
+    return option("-c", "--config", default="faintspot.toml", metavar="TOML", help=what)
+
+
+def name_option(what: str) -> Option:
+    """Return --name: what has it."""
+    return option("--name", default="faintspot", help=what)
+
+
+ENGINE_NAME = name_option("Name of the engine.")
+AS_JSON = option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+KEY = option("--key", metavar="NAME", help="Which array to read of files that hold several.")
+FRAMES = option(
+    "--frames", type=click.IntRange(1), help="Stop after this number of frames.", show_default="at Ctrl-C"
+)
+SLOTS = option("--slots", type=int, default=4, help="Frames in the ring.")
+READOUT_FRACTION = option(
+    "--readout-fraction",
+    type=float,
+    metavar="PART",
+    default=0.8,
+    help="Read-out, as a part of the frame time.",
+)
+PORT = option(
+    "--port", type=click.IntRange(0, 65535), default=8642, help="Port of the page; 0: any that is free."
+)
+WORKERS = option(
+    "--workers",
+    type=click.IntRange(0),
+    help="Processes on this machine; 0: this process alone.",
+    show_default="all processors",
+)
+PIXEL_SCALE = option(
+    "--pixel-scale-arcsec",
+    type=float,
+    metavar="ARCSEC",
+    help="Side of a pixel on the sky: for slopes in arcsec and wavefronts.",
+    section="Telescope",
+)
+SUBAPERTURE = option(
+    "--subaperture-m",
+    type=float,
+    metavar="M",
+    help="Side of a sub-aperture in the telescope's pupil.",
+    section="Telescope",
+)
+DIAMETER = option(
+    "--diameter-m", type=float, metavar="M", help="Diameter of the telescope's pupil.", section="Telescope"
+)
+REFERENCE = option(
+    "--reference",
+    metavar="FILE",
+    help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE[:ARRAY].",
+)

@@ -1,0 +1,170 @@
+"""Learning beside a running engine: a process of its own takes telemetry and offers better filters.
+
+The engine loses no time with it: the process has the lowest priority and one thread, and a new filter is
+prepared in another thread than that which measures. If the process ends or hangs, the loop goes on.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.engine.background.background_process import BesideEngine, process_beside
+from faintspot.engine.engine import Engine
+from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
+from faintspot.io.telemetry.recording import Telemetry, stored_names
+from faintspot.loop.control.configuration import Control, load_control, prior_std_px
+from faintspot.loop.control.identification.model import KALMAN
+from faintspot.loop.control.identification.relearning import FEWEST_FRAMES, Relearnt, relearn
+from faintspot.loop.telemetry.recording import CLOSED, site_of, telemetry_of_recording
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.sensor.layout import Layout
+
+_FROM_NOTHING_EVERY = 6  # learnings, as a search from known layers finds no new one
+
+
+class LearningBeside(BesideEngine):
+    """Learner of a running engine's Kalman filter, in another process than the engine.
+
+    Parameters
+    ----------
+    name : str
+        Name of the engine.
+    config : path
+        Configuration of the engine.
+    every_s : float
+        Seconds of telemetry, with a closed loop, for each learning; at least `FEWEST_FRAMES` frames.
+
+    Raises
+    ------
+    InputError
+        When the configuration has no Kalman filter or no size of a sub-aperture, or there is no engine.
+    """
+
+    look_s = 0.5  # the ring keeps some seconds
+    patience_s = 300.0
+    failed = "not learnt"
+
+    def __init__(self, name: str, config: str | Path, every_s: float) -> None:
+        control = load_control(config)
+        if control is None or control.options.controller != KALMAN:
+            raise InputError(f'{config}: expected controller = "kalman" in [control], to learn it again')
+        layout = Layout.load(config)
+        self._control: Control = control
+        self._site, self._layout = site_of(layout), layout
+        super().__init__(name)
+        self._every_s = every_s
+        self._cursor, self._records = self._reader.records.written, list[NDArray[Any]]()
+        self._last: Relearnt | None = None
+        self._count = 0
+
+    def take(self) -> bool:
+        """Take the records that have come; return whether they are enough to learn from."""
+        records, self._cursor, dropped = self._reader.records.since(self._cursor)
+        closed = records["loop"] == CLOSED
+        if dropped or not closed.all():
+            self._records.clear()
+        elif len(records):
+            self._records.append(records)
+        while len(self._records) > 1 and self._are_enough(2):  # learning took long
+            del self._records[0]
+        return self._are_enough(1)
+
+    def _are_enough(self, times: int) -> bool:
+        """Return whether the records that wait are enough for a number of learnings."""
+        frames = sum(map(len, self._records))
+        return self._seconds >= times * self._every_s and frames >= times * FEWEST_FRAMES
+
+    @property
+    def _seconds(self) -> float:
+        """Length of the records that wait."""
+        if not self._records:
+            return 0.0
+        first, last = (self._records[end]["last_row_time_ns"][end] for end in (0, -1))
+        return (int(last) - int(first)) / 1e9
+
+    def answer(self) -> str:
+        """See `BesideEngine`: learn, and offer the filter."""
+        found, taken = self.learn()
+        return f"{found.summary()}; {'taken' if taken else 'not taken'}"
+
+    def learn(self) -> tuple[Relearnt, bool]:
+        """Learn from the records since the last time; return the result and whether the engine took it.
+
+        Raises
+        ------
+        InputError
+            When the frames cannot be learnt from, or the engine does not answer.
+        """
+        records, self._records = np.concatenate(self._records), []
+        if len(np.unique(records["method"])) > 1:
+            raise InputError("telemetry: expected frames of a single method, got interleaved ones")
+        arrays = {field: records[field] for field in stored_names(records.dtype)}
+        images: dict[str, Any] = dict.fromkeys(("image_frame", "raw", "denoised"), np.zeros(0))
+        recording = Telemetry(**arrays, **images, changes=[], attributes=dict(self._reader.description))
+        telemetry, rate_hz = telemetry_of_recording(recording, self._control, self._prior_std_px())
+        anew = self._last is None or self._count % _FROM_NOTHING_EVERY == 0
+        start = None if anew or self._last is None else self._last.learnt.found
+        self._last = found = relearn(
+            self._control.plant, self._control.model, telemetry, self._site, rate_hz, start
+        )
+        self._count += 1
+        self._report(found)
+        if found.is_better:
+            self._control = self._control.with_model(found.learnt.model)
+        return found, found.is_better
+
+    def _prior_std_px(self) -> NDArray[np.float64] | None:
+        """Return the prior of the engine's present estimator; None without one."""
+        values = request(self._path, "get")["settings"]
+        given = {name: value for name, value in values.items() if value is not None}
+        return prior_std_px(Settings(given.pop("estimator"), **given), self._layout)
+
+    def _report(self, found: Relearnt) -> None:
+        """Tell the engine what was found, and hand the new filter to it if it is better."""
+        with tempfile.TemporaryDirectory(prefix="faintspot-learn-") as folder:
+            path = Path(folder) / "model.npz"
+            if found.is_better:
+                found.learnt.model.save(path)
+            request(
+                self._path,
+                "learnt",
+                timeout_s=LENGTHY_TIMEOUT_S,
+                found=found.summary(),
+                model=f"{path}" if found.is_better else None,
+            )
+
+
+def learn_repeatedly(name: str, config: str | Path, every_s: float, say: Callable[[str], None]) -> None:
+    """Learn from a running engine again and again until it ends; `say` takes a line each time.
+
+    A learning that takes five minutes of processor time ends this process.
+
+    Raises
+    ------
+    InputError
+        See `LearningBeside`.
+    """
+    LearningBeside(name, config, every_s).run(say)
+
+
+@contextmanager
+def learning_beside(
+    engine: Engine, config: str | Path, every_s: float, say: Callable[[str], None]
+) -> Iterator[None]:
+    """Run the process that learns for an engine within a context; `say` takes a line if it ends."""
+
+    def fault(text: str) -> None:
+        engine.learning = {"fault": text}
+        say(f"winds are not learnt again, the loop goes on: {text}")
+
+    known = "--config", f"{config}", "--name", engine.name, "--every", f"{every_s:g}"
+    with process_beside("learn", known, fault):
+        yield

@@ -1,0 +1,225 @@
+"""Following a sodium layer beside a running engine: a separate process fits the profile to its frames.
+
+The engine loses no time with it: the process has the lowest priority and one thread, reads the images that
+telemetry keeps, and makes the spots; the engine prepares them in another thread than that which measures. If
+the process ends or hangs, the engine goes on with the last profile.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.base.flags import INVALID
+from faintspot.engine.background.background_process import BesideEngine, process_beside
+from faintspot.engine.engine import Engine
+from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
+from faintspot.loop.control.configuration import load_control
+from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.spots.laser_spots import load_laser, matched_filter
+from faintspot.slopes.spots.sodium import SodiumProfile
+from faintspot.slopes.training.known_sodium import KnownSodium, calibrated_images, dark_variance_e2
+from faintspot.slopes.training.sodium import MeanImages
+
+Floats = NDArray[np.float64]
+
+_FEWEST_IMAGES = 20
+_LEAST_VALID = 0.5  # of the sub-apertures
+_SPOT_EVERY = 20  # fits: the width of the spot changes with the seeing
+_LEAST_CHANGE = 0.02  # of the flux at other altitudes
+_LEAST_FLUX_CHANGE = 0.2
+
+
+class SodiumFollower(BesideEngine):
+    """Follower of the sodium layer that a running engine's laser guide star shows.
+
+    Parameters
+    ----------
+    name : str
+        Name of the engine.
+    config : path
+        Configuration of the engine, with [laser].
+
+    Raises
+    ------
+    InputError
+        When the configuration has no laser that is followed, the layout no angles, or there is no engine.
+    """
+
+    look_s = 0.1  # the ring keeps 2 to 16 images
+    patience_s = 120.0
+    failed = "not followed"
+
+    def __init__(self, name: str, config: str | Path) -> None:
+        laser = load_laser(config)
+        if laser is None or not laser.follow_every_s:
+            raise InputError(f"{config}: expected [laser] with follow_every_s > 0, to follow its profile")
+        self._laser = laser
+        self._layout, _, self._calibration, _, _ = configuration.load_all(config)
+        self._star = laser.star_of(self._layout)
+        self._dark = dark_variance_e2(self._layout, self._calibration)
+        self._profile: SodiumProfile = self._star.focused(laser.profile)
+        control = load_control(config)
+        reference = np.zeros((2, len(self._layout)))
+        if control is not None and control.reference is not None:
+            reference = np.reshape(control.reference, reference.shape)
+        self._zero = self._layout.offsets + reference.T
+        super().__init__(name)
+        self._cursors = [self._reader.records.written, self._reader.images.written]
+        self._mean: MeanImages | None = None
+        self._known: KnownSodium | None = None
+        self._handed: KnownSodium | None = None
+        self._fits, self._count, self._times_s = 0, 0, [0.0, 0.0]
+        self._due_s = time.monotonic() + laser.follow_every_s
+
+    def take(self) -> bool:
+        """Take the images that have come into the running mean; return whether a fit is due."""
+        images, self._cursors[1], _ = self._reader.images.since(self._cursors[1])
+        records, self._cursors[0], _ = self._reader.records.since(self._cursors[0])
+        row_of = {int(frame): row for row, frame in enumerate(records["frame"])}
+        for image in images:
+            row = row_of.get(int(image["image_frame"]))
+            if row is not None:
+                self._add(image["raw"], records[row])
+        return self._count >= _FEWEST_IMAGES and time.monotonic() >= self._due_s
+
+    def _add(self, raw: NDArray[np.float32], record: NDArray[Any]) -> None:
+        """Add an image and its slopes to the running mean."""
+        valid = record["flags"] & int(INVALID) == 0
+        if valid.mean() < _LEAST_VALID:
+            return
+        electrons, _ = calibrated_images(raw, self._layout, self._calibration)
+        slopes = np.stack([record["x"], record["y"]], axis=1).astype(np.float64)
+        slopes[~valid] = 0.0
+        self._times_s[1] = float(record["last_row_time_ns"]) / 1e9
+        if self._mean is None:
+            self._mean, self._times_s[0] = MeanImages(electrons, slopes + self._zero), self._times_s[1]
+        else:
+            elapsed = max(self._times_s[1] - self._times_s[0], 1e-6)
+            within = self._laser.follow_time_constant_s * self._count / elapsed
+            self._mean = replace(self._mean, time_constant_frames=max(within, 1.0))
+            self._mean = self._mean.updated(electrons, slopes + self._zero)
+        self._count += 1
+
+    def fit(self) -> KnownSodium:
+        """Fit the profile to the running mean, and from time to time the width of the spot.
+
+        Raises
+        ------
+        InputError
+            When the images show no spots that a profile fits.
+        """
+        assert self._mean is not None
+        self._due_s = time.monotonic() + self._laser.follow_every_s
+        if self._known is None or self._fits % _SPOT_EVERY == 0:
+            self._known = KnownSodium.learnt(self._mean, self._star, self._profile, self._dark)
+        else:
+            self._known = self._known.updated(self._mean)
+        self._fits += 1
+        self._profile = self._known.fit.profile
+        return self._known
+
+    def answer(self) -> str | None:
+        """See `BesideEngine`: fit the profile, and hand it over if it is new."""
+        known = self.fit()
+        if not self.is_new(known):
+            return None
+        frame = self.hand_over(known)
+        return f"{known.fit.profile}, spot {known.spot_fwhm_arcsec:.2f} arcsec, from frame {frame} on"
+
+    def is_new(self, known: KnownSodium) -> bool:
+        """Return whether profile, spot or flux differ from what the engine has."""
+        last = self._handed
+        if last is None:
+            return True
+        flux, before = known.fit.flux_e, np.maximum(last.fit.flux_e, 1e-3)
+        return (
+            known.star is not last.star
+            or moved_part(known.fit.profile, last.fit.profile) > _LEAST_CHANGE
+            or float(np.median(np.abs(flux / before - 1.0))) > _LEAST_FLUX_CHANGE
+        )
+
+    def hand_over(self, known: KnownSodium) -> int | None:
+        """Give the engine the spots of a profile; return the first frame measured with them.
+
+        Raises
+        ------
+        InputError
+            When the engine refuses them, or does not answer.
+        """
+        before = self._star.focused(self._laser.profile) if self._handed is None else self._handed.fit.profile
+        psf = known.psf(self._layout.window)
+        with tempfile.TemporaryDirectory(prefix="faintspot-follow-") as folder:
+            files = {"psf": f"{folder}/psf.npz", "score": None}
+            psf.save(f"{folder}/psf.npz")
+            if self._laser.matched_filter:
+                flux = np.maximum(known.fit.flux_e, 1.0)
+                files["score"] = f"{folder}/score.npz"
+                matched_filter(psf, self._layout, self._calibration, flux).save(f"{folder}/score.npz")
+            answer = request(
+                self._path,
+                "spots",
+                timeout_s=LENGTHY_TIMEOUT_S,
+                **files,
+                sodium=_as_values(known, before),
+            )
+        self._handed = known
+        frame: int | None = answer["frame"]
+        return frame
+
+
+def moved_part(profile: SodiumProfile, other: SodiumProfile) -> float:
+    """Return the part of the flux that comes from other altitudes than in another profile."""
+    altitudes = np.union1d(profile.altitudes_m, other.altitudes_m)
+    density, before = (
+        np.interp(altitudes, each.altitudes_m, each.density, 0.0, 0.0) for each in (profile, other)
+    )
+    return 0.5 * float(np.trapezoid(np.abs(density - before), altitudes))
+
+
+def _as_values(known: KnownSodium, before: SodiumProfile) -> dict[str, Any]:
+    """Return a profile and the one before as plain values: altitudes [km], flux per km."""
+    profile = known.fit.profile
+    earlier = np.interp(profile.altitudes_m, before.altitudes_m, before.density, 0.0, 0.0)
+    return {
+        "mean_km": round(profile.mean_m / 1e3, 2),
+        "std_km": round(profile.std_m / 1e3, 2),
+        "spot_fwhm_arcsec": round(known.spot_fwhm_arcsec, 3),
+        "altitude_km": (profile.altitudes_m / 1e3).round(3).tolist(),
+        "flux_per_km": (1e3 * profile.density).round(5).tolist(),
+        "before_per_km": (1e3 * earlier).round(5).tolist(),
+    }
+
+
+def follow_repeatedly(name: str, config: str | Path, say: Callable[[str], None]) -> None:
+    """Follow the sodium layer of a running engine until it ends; `say` takes a line for each new profile.
+
+    A fit that takes two minutes of processor time ends this process.
+
+    Raises
+    ------
+    InputError
+        See `SodiumFollower`.
+    """
+    SodiumFollower(name, config).run(say)
+
+
+@contextmanager
+def following_beside(engine: Engine, config: str | Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Run the process that follows the profile within a context; `say` takes a line if it ends."""
+
+    def fault(text: str) -> None:
+        engine.sodium = {**(engine.sodium or {}), "fault": text}
+        say(f"the sodium profile is not followed, the engine goes on with the last one: {text}")
+
+    with process_beside("follow", ("--config", f"{config}", "--name", engine.name), fault):
+        yield

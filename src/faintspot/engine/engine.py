@@ -1,0 +1,531 @@
+"""The engine: read frames row by row, publish slopes, and change settings between frames."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from faintspot.base.errors import InputError
+from faintspot.engine.loop.control_loop import CLOSED, OPEN, STATES, ControlLoop
+from faintspot.engine.path.frame_path import FramePath
+from faintspot.engine.path.lateness import CAUSES, IN_TIME, INCOMPLETE, WORKER, Lateness
+from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.timing import Counters, Latencies
+from faintspot.engine.path.workers import Workers
+from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.settings.estimators import EngineEstimators
+from faintspot.engine.settings.flux_following import FluxFollower
+from faintspot.engine.settings.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
+from faintspot.engine.settings.plan import EnginePlan, SettingsPreparer
+from faintspot.engine.settings.running_settings import Change, LiveSettings
+from faintspot.engine.streams.prediction_stream import PredictionStream
+from faintspot.engine.streams.slope_streams import SlopeStreams
+from faintspot.engine.telemetry.ring import TelemetryRing
+from faintspot.io.frame_numbers import left_out
+from faintspot.loop.control.configuration import NONE, STREAM, Control
+from faintspot.slopes.pipeline.configuration import packed, to_text
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+
+_WATCH_S = 0.02  # between two checks of the watcher
+_LOOKS_BETWEEN_STALE = 10  # asking the operating system whether the source is alive takes longer
+DEADLINE_S = 1e-3
+IMAGES_EVERY = 100
+
+
+class FrameSource(Protocol):
+    """Source that brings frames into the ring in the engine's own thread."""
+
+    def step(self) -> bool:
+        """Wait a moment for a frame; return whether one has come."""
+        ...
+
+    def close(self) -> None:
+        """Release all resources."""
+        ...
+
+
+class Engine:
+    """Real-time engine: measures the frames of a pixel ring and publishes slopes and commands until stopped.
+
+    Parameters
+    ----------
+    name : str
+        Name of the pixel ring and of the streams of slopes.
+    make_pipeline : function
+        Function that makes a pipeline from settings.
+    settings : Settings
+        Initial settings.
+    threads : int
+        Number of threads that measure.
+    cpus : sequence of int, optional
+        Processors to pin threads to; the first one is for the thread that calls `run`.
+    interleaving : Interleaving, optional
+        Configurations that take turns: changes of the settings, and controllers.
+    deadline_s : float
+        Latency from a frame's last row beyond which slopes count as late.
+    source : FrameSource, optional
+        Brings frames into the ring in the thread that measures them, e.g. a `StreamBridge`. Default: another
+        process writes into the ring.
+    images_every : int
+        Interval, in frames of one configuration, at which telemetry keeps images; 0: no images.
+    control : Control, optional
+        Computes commands from slopes; the loop starts open. Default: no commands. The reference slopes are
+        for the pipelines.
+    mean_flux : float, optional
+        Number of frames over which the flux of each sub-aperture is averaged, for estimators that use it.
+        Default: they keep `flux_e`.
+    polls : bool
+        Whether threads poll for rows all the time. Default: they sleep until shortly before rows are due.
+
+    Attributes
+    ----------
+    loop : ControlLoop or None
+
+    Raises
+    ------
+    InputError
+        When the settings do not fit, or another process publishes under that name.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        make_pipeline: Callable[[Settings], SlopePipeline],
+        settings: Settings,
+        *,
+        threads: int = 1,
+        cpus: Sequence[int] | None = None,
+        interleaving: Interleaving | None = None,
+        source: FrameSource | None = None,
+        deadline_s: float = DEADLINE_S,
+        images_every: int = IMAGES_EVERY,
+        control: Control | None = None,
+        mean_flux: float | None = None,
+        polls: bool = False,
+    ) -> None:
+        self.name, self._deadline_ns, self._images_every = name, round(deadline_s * 1e9), images_every
+        interleaving = Interleaving() if interleaving is None else interleaving
+        self.counters, self.latencies = Counters(), Latencies()
+        self._lateness = Lateness()
+        self.late_because: dict[str, int] = {}
+        """Number of late frames by cause; see `faintspot.engine.path.lateness`."""
+        self.lost_because: dict[str, int] = {}
+        """Number of lost frames by cause."""
+        self._lost = 0, IN_TIME  # since the last measured frame: their number, and the last one's cause
+        self.refused: list[str] = []
+        """Parts of the real-time scheduling that were not permitted."""
+        self.advice: list[str] = []
+        """Latest advice, shown in the status."""
+        self.learning: dict[str, Any] | None = None
+        """Result of the latest learning beside the engine, or the fault that ended it, for the status."""
+        self.sodium: dict[str, Any] | None = None
+        """Sodium profile fitted beside the engine, or the fault that ended it, for the status."""
+        self._source, self._incompatible = source, ""
+        self._path: FramePath | None = None
+        self._waiting = False
+        self._arrival, self._number = 0, -1  # of the last measured frame
+        # Frames of an own source are complete when they are measured: there is nothing to sleep for.
+        self._sleeps, self._last_row_ns = source is None and not polls, 0
+        self._measured: dict[int, int] = {}  # frames, by configuration
+        self._stopping = threading.Event()
+        self._workers = Workers(threads - 1, cpus) if threads > 1 else None
+        prior = None if control is None else Prior(len(control.interaction) // 2)
+        self.preparer = SettingsPreparer(make_pipeline, interleaving, self._workers, deadline_s, prior)
+        self.live: LiveSettings[EnginePlan] = LiveSettings(self.preparer.prepare, settings)
+        self.estimators = EngineEstimators(self.live, self.preparer)
+        self._flux = None if mean_flux is None else FluxFollower(self.live, mean_flux)
+        layout = self.live.running.layout
+        self._raw = np.zeros(layout.frame_shape, np.float32)
+        if control is not None:
+            control.check_fits(len(layout))
+            control.check_errors(self.live.running.pipelines[0].calibration)
+        if prior is not None:
+            prior.largest_px = max(layout.frame_shape)
+        commands = 0 if control is None else control.commands
+        self._streams = SlopeStreams(name, len(layout), commands)
+        try:
+            self.loop, self._prediction = None, None
+            if control is not None:
+                own = None if control.prediction == STREAM else prior
+                self.loop = ControlLoop(control, layout, self._streams.held_commands, own, threads)
+                if control.prediction == STREAM and prior is not None:
+                    self._prediction = PredictionStream(name, prior)
+            self._make_ready(interleaving)
+            first = self.live.running.pipelines[0]
+            self._telemetry = TelemetryRing.create(
+                name,
+                layout,
+                settings=to_text(settings),
+                methods=interleaving.labels,
+                commands=commands,
+                reference=None if control is None else control.reference,
+                parts=packed(first.calibration, *first.spot),
+            )
+        except InputError:
+            self._streams.close()
+            raise
+
+    # Any thread -------------------------------------------------------------------------------------
+
+    def stop(self) -> None:
+        """End the run after the present frame; callable from any thread."""
+        self._stopping.set()
+
+    def status(self) -> dict[str, Any]:
+        """Return counters and latencies as plain values."""
+        ring, interleaving = self.preparer.ring, self.live.running.interleaving
+        return {
+            "name": self.name,
+            "source": None if ring is None else {"pid": ring.creator_pid, "frame": ring.progress()[0]},
+            "source_refused": self._incompatible or None,
+            "preparing": self.live.preparing,
+            "counters": self.counters.as_dict(),
+            "late_because": dict(self.late_because),
+            "lost_because": dict(self.lost_because),
+            "latency": self.latencies.as_dict(),
+            "estimator": self.live.settings.estimator.name,
+            "subapertures": len(self.live.running.layout),
+            "methods": interleaving.labels,
+            "every": interleaving.every,
+            "loaded": {name: str(file.path) for name, file in self.estimators.loaded.items()},
+            "estimator_fault": self.estimators.fault,
+            "not_permitted": list(self.refused),
+            "advice": self.advice,
+            "loop": self.loop_status(),
+            "learning": self.learning,
+            "sodium": self.sodium,
+            "prediction": None if self._prediction is None else self._prediction.status(),
+        }
+
+    def loop_status(self) -> dict[str, Any]:
+        """Return the state of the loop as plain values."""
+        if self.loop is None:
+            return {"state": NONE}
+        return {**self.loop.status(), "obstacle": self._streams.commands_obstacle()}
+
+    def interleave(self, text: str, every: int) -> Change:
+        """Replace the configurations that take turns; see `Interleaving.parse`. For one thread at a time.
+
+        Raises
+        ------
+        InputError
+            When the text is refused; nothing changes then.
+        """
+        before = self.preparer.interleaving
+        new = Interleaving.parse(text, every, before.first + len(before.methods))
+        self._make_ready(new)
+        self.preparer.interleaving = new
+        try:
+            return self.live.renew({METHODS: new.labels, FIRST_METHOD: new.first, EVERY: new.every})
+        except BaseException:
+            self.preparer.interleaving = before
+            raise
+
+    def renew_spots(
+        self, make_pipeline: Callable[[Settings], SlopePipeline], changes: Mapping[str, Any]
+    ) -> Change:
+        """Replace what pipelines know of the spots; `changes` names it. For one thread at a time.
+
+        Raises
+        ------
+        InputError
+            When the settings do not fit; nothing changes then.
+        """
+        before = self.preparer.make_pipeline
+        self.preparer.make_pipeline = make_pipeline
+        try:
+            return self.live.renew(changes)
+        except BaseException:
+            self.preparer.make_pipeline = before
+            raise
+
+    def _make_ready(self, interleaving: Interleaving) -> None:
+        """Prepare the controllers of all configurations, or refuse them."""
+        for method in interleaving.methods:
+            if method.control is None:
+                continue
+            try:
+                if self.loop is None:
+                    raise InputError("this engine makes no commands; add [control] to its configuration")
+                self.loop.control.check_errors(self.live.running.pipelines[0].calibration, method.control)
+                self.loop.make_ready(method.control)
+            except InputError as error:
+                raise InputError(f"interleave: {method.label!r}: {error}") from None
+
+    # The engine's thread ----------------------------------------------------------------------------
+
+    def run(self, n_frames: int | None = None) -> None:
+        """Measure frames until `stop` or for `n_frames`; wait while there is no source."""
+        watcher = threading.Thread(target=self._watch, name="faintspot-watcher", daemon=True)
+        watcher.start()
+        if self._flux is not None:
+            self._flux.start()
+        waited = False
+        try:
+            with self._streams.held(), np.errstate(all="ignore"):  # a warning takes time and is not shown
+                while not self._done(n_frames):
+                    ring = self._attached()
+                    if ring is None:
+                        self._await_ring()
+                    else:
+                        # All frames of a ring that was waited for count; else only those from now on.
+                        self._arrival, self._number = (
+                            (0, -1) if waited else (ring.arrivals, ring.progress()[0])
+                        )
+                        self.preparer.ring = ring
+                        try:
+                            self._follow(ring, n_frames)
+                        finally:
+                            ring.unfollow()
+                        self.preparer.ring = None
+                    waited = True
+        finally:
+            self._stopping.set()
+            watcher.join()
+            if self._flux is not None:
+                self._flux.close()
+            if self._prediction is not None:
+                self._prediction.close()
+            if self._workers is not None:
+                self._workers.close()
+            if self._source is not None:
+                self._source.close()
+            self._streams.close()
+            self._telemetry.close()
+
+    def _done(self, n_frames: int | None) -> bool:
+        return self._stopping.is_set() or (n_frames is not None and self.counters.processed >= n_frames)
+
+    def _await_ring(self) -> None:
+        """Wait a moment for the source to make a ring."""
+        if self._source is None:
+            self._stopping.wait(_WATCH_S)
+        else:
+            self._source.step()
+
+    def _attached(self) -> PixelRing | None:
+        """Return the source's ring; None if there is none that is alive and fits."""
+        try:
+            ring = PixelRing.attach(self.name, follows=True)
+        except InputError:
+            self._incompatible = ""
+            return None
+        if ring.stale or ring.closed:
+            return None
+        shape, wanted = ring.shape, self.live.running.layout.frame_shape
+        fits = shape == wanted and ring.dtype in (np.uint16, np.float32)
+        self._incompatible = ""
+        if not fits:
+            self._incompatible = (
+                f"frames of {shape[0]} x {shape[1]} pixels, {ring.dtype}; "
+                f"expected {wanted[0]} x {wanted[1]}, uint16 or float32"
+            )
+        return ring if fits else None
+
+    def _follow(self, ring: PixelRing, n_frames: int | None) -> None:
+        """Measure the frames of a ring until it ends."""
+        self._take(ring)  # prepared before waiting for the first frame
+        lost_before = self.counters.dropped
+        ring.follow(self._arrival)
+        if self._workers is not None:
+            self._workers.wake()
+        while not self._done(n_frames):
+            # Frames in the ring come first: otherwise every later frame would wait for its successor.
+            behind = ring.arrivals > self._arrival
+            if self._source is not None and not behind and not self._source.step():
+                if ring.closed:
+                    self.counters.source_restarts += 1
+                    break
+            elif not self._measure_next(ring):
+                if self._stopping.is_set() or ring.closed or ring.stale:
+                    self.counters.source_restarts += not self._stopping.is_set()
+                    break
+                if self._path is not None:
+                    self._path.go_on()
+            ring.follow(self._arrival, self.counters.dropped - lost_before)
+        if self._workers is not None:
+            self._workers.park()
+
+    def _measure_next(self, ring: PixelRing) -> bool:
+        """Measure and publish the next frame; return False when the wait for it was ended."""
+        path, method = self._take(ring)
+        self._path, self._waiting = path, True
+        arrival = self._arrival + 1
+        explain = self._images_every > 0 and self._measured.get(method, 0) % self._images_every == 0
+        if self._prediction is not None:
+            path.await_start(arrival, self._last_row_ns)
+            self._prediction.fill(self._number + 1)
+        slot, last_row = (self._number + 1) % ring.slots, self._last_row_ns
+        product = () if self.loop is None else self.loop.begin_product()
+        rehearse = self._rehearse if last_row else None
+        whole = path.measure(
+            arrival, slot, explain=explain, after_ns=last_row, rehearse=rehearse, product=product
+        )
+        number = ring.number_of(arrival)
+        if whole and number >= 0 and number != self._number + 1:  # the frame is in another slot than expected
+            whole = path.measure(arrival, number % ring.slots, explain=explain, product=product)
+        self._waiting = False
+        if not whole and path.stopped:
+            return False
+        self._end_frame(ring, path, method, arrival, number if whole else -1, explain)
+        return True
+
+    def _rehearse(self) -> None:
+        """Do what comes between a frame's last row and its slopes, without effect."""
+        ring, number = self.preparer.ring, self._number
+        if ring is not None and self._path is not None:
+            ring.last_row_time_ns(ring.number_of(self._arrival), self._arrival)
+            self._streams.rehearse(self._path.slopes, number)
+            time.monotonic_ns()
+
+    def _take(self, ring: PixelRing) -> tuple[FramePath, int]:
+        """Return the next frame's path and configuration; changes of settings take effect here."""
+        prepared = self.live.take(self._number + 1)
+        place = prepared.interleaving.method_of(self.counters.processed)
+        path = prepared.paths(ring)[place]
+        if path.fault is not None and prepared.fallback is not None:
+            self.estimators.fall_back(prepared.fallback, path.fault)
+            return self._take(ring)
+        if self.loop is not None:
+            self.loop.take_turn(prepared.interleaving.methods[place].control)
+        return path, prepared.interleaving.first + place
+
+    def _end_frame(
+        self, ring: PixelRing, path: FramePath, method: int, arrival: int, number: int, explained: bool
+    ) -> None:
+        """Publish the slopes first, then the details, unless the frame was overwritten meanwhile."""
+        counters, slopes = self.counters, path.slopes
+        moment = ring.last_row_time_ns(number, arrival) if number >= 0 else 0
+        if not moment:
+            self._lose(ring, path, arrival, number)
+            return
+        self._streams.publish_slopes(slopes, number)
+        published = time.monotonic_ns()
+        latency = published - moment
+        loop, state, commands = self.loop, 0, None
+        if loop is not None:
+            was_closed = loop.closed
+            commands = loop.follow(slopes, number, path.prior_std_px)
+            self._streams.publish_commands(commands, number)
+            loop.latencies.add(time.monotonic_ns() - moment)
+            state = STATES.index(CLOSED if was_closed else OPEN)
+            loop.look_after(slopes.flux)
+        self.latencies.add(latency)
+        path.flag_doubtful()
+        change = self.live.change_number
+        self._streams.publish_marks((number, method, change, moment, published))
+        invalid, limited, iterations = self._streams.publish_details(slopes, number)
+        late = latency > self._deadline_ns
+        cause = self._cause(late, path)
+        causes = cause, *self._lost
+        self._telemetry.write(
+            number, method, change, moment, published, slopes, causes=causes, loop=state, commands=commands
+        )
+        self._lost = 0, IN_TIME
+        if self._flux is not None:
+            self._flux.take(slopes.flux)
+        if self._streams.commands_lost:
+            counters.commands_renewed += self._streams.renew_commands()
+        if explained:
+            np.copyto(self._raw, ring.slot(number))
+            if ring.intact(number, arrival):
+                self._telemetry.write_images(number, self._raw, path.denoised)
+        counters.frames_in += 1
+        counters.processed += 1
+        counters.invalid_subapertures += invalid
+        counters.at_iteration_limit += limited
+        counters.iterations += iterations
+        counters.late += late
+        if late:
+            _count(self.late_because, cause)
+        counters.estimator_failures += path.failed
+        if self._arrival and number != self._number + 1:
+            skipped = left_out(self._number, number)
+            counters.skipped += max(skipped, 0)
+            counters.repeated += number <= self._number
+            counters.source_restarts += skipped < 0 and number > self._number
+        self._measured[method] = self._measured.get(method, 0) + 1
+        self._arrival, self._number = arrival, number
+        self._last_row_ns = moment if self._sleeps else 0
+
+    def _lose(self, ring: PixelRing, path: FramePath, arrival: int, number: int) -> None:
+        """Count a frame that cannot be published, and find the next one."""
+        counters, cause, passed_over = self.counters, self._cause(True, path), 0
+        self._last_row_ns = 0
+        if number >= 0 and ring.intact(number, arrival):  # the next one began before its last row arrived
+            counters.short += 1
+            self._number, cause = number, INCOMPLETE
+        elif ring.number_of(arrival) >= 0:  # complete, but a worker died and its share is missing
+            self._number, cause = ring.number_of(arrival), WORKER
+        else:  # overwritten: continue with the newest frame
+            newest = ring.arrivals
+            passed_over = max(newest - 1 - arrival, 0)
+            counters.torn += 1
+            counters.passed_over += passed_over
+            self._number = ring.number_of(newest) - 1
+        self._arrival = arrival + passed_over
+        counters.frames_in += 1 + passed_over
+        counters.dropped += 1 + passed_over
+        _count(self.lost_because, cause, 1 + passed_over)
+        self._lost = self._lost[0] + 1 + passed_over, cause
+
+    def _cause(self, late: bool, path: FramePath) -> int:
+        """Return why a frame was late or lost, if it was."""
+        return self._lateness.cause(late, self.live.preparing is not None, path.woken_late, path.sleeps)
+
+    # The watcher's thread ---------------------------------------------------------------------------
+
+    def _watch(self) -> None:
+        """End the engine's waiting when it is to stop or its source has gone.
+
+        Also do all that takes time: write changes to telemetry, replace dead workers, check streams.
+        """
+        looks = told = 0
+        loop_assumed: dict[str, Any] = {}
+        while True:
+            stopping = self._stopping.wait(_WATCH_S)
+            looks += 1
+            ring, path = self.preparer.ring, self._path
+            if ring is not None and path is not None and self._waiting:
+                gone = ring.closed or (looks % _LOOKS_BETWEEN_STALE == 0 and ring.stale)
+                if stopping or gone:
+                    path.stop()
+            if self._workers is not None:
+                self.counters.worker_restarts += self._workers.replace_dead()
+            self.live.let_go()
+            if self._prediction is not None:
+                self._prediction.look_after()
+            if looks % _LOOKS_BETWEEN_STALE == 0:
+                self._streams.look_after_commands()
+            loop_assumed = self._tell_of_loop(loop_assumed)
+            self.counters.settings_changes = self.live.change_number
+            for change in self.live.taken(after=told):
+                self._telemetry.write_change(*change)
+                told = change[1]
+            if stopping and (ring is None or not self._waiting):
+                return
+
+    def _tell_of_loop(self, told: dict[str, Any]) -> dict[str, Any]:
+        """Write to telemetry when the loop was opened, and why, or closed, or its gain changed."""
+        if self.loop is None:
+            return told
+        loop = self.loop
+        now = {
+            "loop": loop.state,
+            "gain": loop.gain,
+            "opened_because": loop.opened_because,
+            "closed_again_because": loop.closed_again_because,
+        }
+        if now != told:
+            self._telemetry.write_change(self._number, self.live.change_number, now, None)
+        return now
+
+
+def _count(causes: dict[str, int], cause: int, frames: int = 1) -> None:
+    """Count frames of a cause."""
+    causes[CAUSES[cause]] = causes.get(CAUSES[cause], 0) + frames

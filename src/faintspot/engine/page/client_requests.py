@@ -1,0 +1,165 @@
+"""Requests that a client may make, and their answers."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from faintspot.base.config.written_changes import parse_changes, parse_subapertures
+from faintspot.base.errors import InputError
+from faintspot.engine.requests.private_socket import socket_path
+from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request, since
+from faintspot.engine.telemetry.recorder import Recorder
+
+ClientRequest = Callable[[dict[str, Any]], Mapping[str, Any]]
+_FILE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,90}\.zarr")
+_MOST_CHANGES = 100
+
+
+class ClientRequests(Protocol):
+    """Requests that a page may make, by name; a refused request raises InputError."""
+
+    def known(self) -> Mapping[str, ClientRequest]:
+        """Return the functions of the requests, by name."""
+        ...
+
+
+def answered(client_requests: ClientRequests, asked: dict[str, Any]) -> dict[str, Any]:
+    """Carry out a request; always return an answer."""
+    known = client_requests.known()
+    try:
+        wish = known.get(asked["do"])
+        if wish is None:
+            raise InputError(f"do = {asked['do']!r:.40}: expected one of {', '.join(known)}")
+        return {"ok": True, **wish(asked)}
+    except InputError as error:
+        return {"ok": False, "error": str(error)}
+    except Exception as error:  # a fault in a request must not end the server
+        return {"ok": False, "error": " ".join(f"{type(error).__name__}: {error}".split())[:500]}
+
+
+class EngineRequests:
+    """Requests passed on to an engine's control channel, which checks them; and recording of telemetry.
+
+    Parameters
+    ----------
+    name : str
+        Name of the engine.
+    folder : path
+        Folder of recordings.
+    """
+
+    def __init__(self, name: str, folder: str | Path) -> None:
+        self._name, self._path = name, socket_path(name)
+        self.recording = Recording(name, Path(folder))
+
+    def known(self) -> Mapping[str, ClientRequest]:
+        """Return the functions of the requests, by name."""
+        return {
+            "set": self._set,
+            "interleave": self._interleave,
+            "loop": self._loop,
+            "record": lambda asked: self.recording.start(asked.get("file")),
+            "stop_recording": lambda asked: self.recording.stop(),
+        }
+
+    def close(self) -> None:
+        """End a recording."""
+        self.recording.stop()
+
+    def _set(self, asked: dict[str, Any]) -> Mapping[str, Any]:
+        """Change settings: "changes" (a list of NAME=VALUE) and "subapertures" ("" for all)."""
+        texts, where = asked.get("changes"), asked.get("subapertures") or ""
+        if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
+            raise InputError("changes: expected a list of NAME=VALUE")
+        if len(texts) > _MOST_CHANGES or not isinstance(where, str):
+            raise InputError(
+                f"changes: expected at most {_MOST_CHANGES}, and sub-apertures such as 4,5,10-20"
+            )
+        changes = parse_changes(texts)
+        places = parse_subapertures(where) if where.strip() else None
+        reply = self._ask("set", changes=changes, where=places)
+        return {"text": since(reply["frame"])}
+
+    def _interleave(self, asked: dict[str, Any]) -> Mapping[str, Any]:
+        """Interleave configurations as `faintspot realtime interleave`."""
+        reply = self._ask("interleave", methods=asked.get("methods"), every=asked.get("every"))
+        return {"text": since(reply.get("frame"))}
+
+    def _loop(self, asked: dict[str, Any]) -> Mapping[str, Any]:
+        """Control the loop: "action" open, close, flat or gain, with "gain"."""
+        fields = {name: asked[name] for name in ("action", "gain") if asked.get(name) is not None}
+        loop = self._ask("loop", **fields)["loop"]
+        gain = "" if loop.get("gain") is None else f", gain {loop['gain']:g}"
+        return {"text": f"{loop['state']}{gain}"}
+
+    def _ask(self, command: str, **fields: Any) -> dict[str, Any]:
+        return request(self._path, command, timeout_s=LENGTHY_TIMEOUT_S, **fields)
+
+
+class Recording:
+    """Recordings, one at a time, in a separate thread.
+
+    Parameters
+    ----------
+    name : str
+        Name of the engine.
+    folder : Path
+    """
+
+    def __init__(self, name: str, folder: Path) -> None:
+        self._name, self._folder = name, folder
+        self._lock = threading.Lock()
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._said: dict[str, Any] = {"running": False}
+
+    def start(self, file: Any) -> Mapping[str, Any]:
+        """Start a recording to a new store.
+
+        Raises
+        ------
+        InputError
+            When the file name does not end in .zarr, the store already exists, there is no engine, or a
+            recording is running.
+        """
+        if not isinstance(file, str) or not _FILE.fullmatch(file):
+            raise InputError(f"file = {file!r:.80}: expected a name such as night.zarr, without a folder")
+        with self._lock:
+            if self._thread is not None and self._thread.is_alive():
+                raise InputError("file: a recording is already running; stop it first")
+            recorder = Recorder(self._name, self._folder / file)
+            self._stopping.clear()
+            self._said = {"running": True, "file": file, "frames": 0}
+            self._thread = threading.Thread(
+                target=self._record, args=(recorder, file), name="faintspot-recording", daemon=True
+            )
+            self._thread.start()
+        return {"text": f"recording to {file}"}
+
+    def stop(self) -> Mapping[str, Any]:
+        """End the recording, if there is one."""
+        with self._lock:
+            self._stopping.set()
+            if self._thread is not None:
+                self._thread.join()
+        return {"text": self.status().get("text", "nothing is being recorded")}
+
+    def status(self) -> dict[str, Any]:
+        """Return the state of the present or last recording."""
+        return dict(self._said)
+
+    def _record(self, recorder: Recorder, file: str) -> None:
+        def progress(frames: int) -> None:
+            self._said["frames"] = frames
+
+        try:
+            report = recorder.run(stop=self._stopping, progress=progress)
+        except InputError as error:
+            self._said = {"running": False, "error": str(error)}
+            return
+        text = f"{file}: {report.frames} frames in {report.seconds:.0f} s, {report.dropped} dropped"
+        self._said = {"running": False, "text": f"{text} ({report.ended_because})"}

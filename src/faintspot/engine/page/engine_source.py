@@ -1,0 +1,115 @@
+"""Data of a running engine, read from shared memory."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from faintspot.base.errors import InputError
+from faintspot.engine.page.batch import Batch, Picture
+from faintspot.engine.streams.stream import Follower
+from faintspot.engine.telemetry.ring import TelemetryReader
+from faintspot.engine.telescope.simulated_telescope import TRUTH
+from faintspot.slopes.sensor.layout import Layout
+
+_STALE_S = 0.25  # between two checks whether the engine is alive
+_TRUTH_FIELDS = tuple(TRUTH.index(name) for name in ("strehl", "rms_nm"))
+
+
+class EngineSource:
+    """Telemetry of an engine, with the truth and commands if available.
+
+    It waits for the engine to start, and to restart.
+
+    Parameters
+    ----------
+    name : str
+        Name of the engine.
+
+    Raises
+    ------
+    MissingExtraError
+        When pyshmem is not installed.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.layout: Layout | None = None
+        self.methods: list[str] = []
+        self._reader: TelemetryReader | None = None
+        self._truth, self._commands = Follower(f"{name}_truth"), Follower(f"{name}_commands")
+        self._cursors = [0, 0, 0]  # records, images, changes
+        self._asked_s = 0.0
+
+    def read(self) -> Batch | None:
+        """Return the data since the last call; None while there is no engine."""
+        anew = self._reader is None and self._attached()
+        reader = self._reader
+        if reader is None:
+            return None
+        truth = self._newest_truth()
+        # Images first: each image's record was written before it, so it is among these records or older ones.
+        images, self._cursors[1], _ = reader.images.since(max(self._cursors[1], reader.images.written - 1))
+        records, self._cursors[0], missed = reader.records.since(self._cursors[0])
+        changes, self._cursors[2], _ = reader.changes_since(self._cursors[2])
+        picture = None
+        if len(images):
+            newest = images[-1]
+            picture = Picture(int(newest["image_frame"]), newest["raw"], newest["denoised"])
+        if not len(records):
+            self._let_go_if_stale(reader)
+        commands = self._commands.newest()
+        return Batch(
+            records,
+            missed,
+            picture,
+            truth=truth,
+            commands=None if commands is None else commands.values.astype(np.float64),
+            changes=changes,
+            anew=anew,
+        )
+
+    def place(self) -> dict[str, Any]:
+        """Return the engine's name and whether it is running."""
+        there = self._reader is not None
+        return {"kind": "engine", "name": self.name, "there": there}
+
+    def close(self) -> None:
+        """Close the shared memory."""
+        self._truth.close()
+        self._commands.close()
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    def _attached(self) -> bool:
+        """Look for the engine's telemetry; return whether it is available."""
+        try:
+            reader = TelemetryReader.attach(self.name)
+        except InputError:
+            return False
+        if reader.stale:
+            reader.close()
+            return False
+        self._reader, self.layout = reader, reader.layout
+        self.methods = reader.description["methods"]
+        self._cursors = [reader.records.written, max(0, reader.images.written - 1), 0]
+        return True
+
+    def _let_go_if_stale(self, reader: TelemetryReader) -> None:
+        """Close the telemetry of an engine that has ended, after reading all of it."""
+        if time.monotonic() - self._asked_s < _STALE_S:
+            return
+        self._asked_s = time.monotonic()
+        if reader.stale:
+            reader.close()
+            self._reader = None
+
+    def _newest_truth(self) -> tuple[int, float, float] | None:
+        truth = self._truth.newest()
+        if truth is None or len(truth.values) != len(TRUTH):
+            return None
+        strehl, rms_nm = truth.values[list(_TRUTH_FIELDS)]
+        return (truth.number, float(strehl), float(rms_nm)) if np.isfinite([strehl, rms_nm]).all() else None

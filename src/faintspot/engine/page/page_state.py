@@ -1,0 +1,255 @@
+"""Data that the page shows: the newest frame, and a few numbers of each frame of the last minute."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.flags import INVALID, SubapertureFlag
+from faintspot.engine.page.batch import Batch, Floats
+from faintspot.engine.settings.interleaving import methods_after
+from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
+from faintspot.io.frame_numbers import all_left_out
+
+STRIP_S = 30.0
+"""Time span of the strip charts [s]."""
+FRAMES_S = 60.0
+"""Time span of percentiles, the histogram and the comparison of methods [s]."""
+_MOST_FRAMES = 1 << 17  # limit for very fast cameras
+_MOST_CHANGES = 20  # kept for display
+_MEAN_FRAMES = 500  # time constant of a sub-aperture's mean slope, about which the rms is taken
+_FEWEST_FRAMES = 10  # needed for a mean
+_STRIP = ("time_s", "latency_us", "longest_us", "rms_px", "flux_e", "lost", "strehl", "rms_nm")
+"""Row of the strip charts: result of one read of the telemetry."""
+_FRAME = ("time_s", "method", "latency_us", "rms_px", "flux_e", "valid", "strehl")
+"""Row of the last frames."""
+_BIN_EDGES_US = 2.0 ** (np.arange(0, 20 * 4 + 1) / 4)  # 1 us to 1 s, four bins in a factor of 2
+_COMPARED = {
+    "rms of slopes (px)": ("rms_px", 1.0),
+    "flux (e-)": ("flux_e", 1.0),
+    "valid (%)": ("valid", 100.0),
+    "latency (µs)": ("latency_us", 1.0),
+    "Strehl ratio": ("strehl", 1.0),
+}
+
+
+class PageState:
+    """Statistics of the frames of one engine or recording.
+
+    Parameters
+    ----------
+    methods : list of str
+        Names of the interleaved configurations; none or one without interleaving.
+    """
+
+    def __init__(self, methods: list[str]) -> None:
+        self.methods = list(methods)
+        self.newest: NDArray[Any] | None = None
+        """Record of the newest frame."""
+        self.changes: list[dict[str, Any]] = []
+        self.seen = self.lost = self.missed = 0
+        """Numbers of frames, of missing frame numbers, and of records for which the page was too slow."""
+        self.commands: Floats | None = None
+        self._strip: deque[tuple[float, ...]] = deque()
+        self._frames: deque[Floats] = deque()
+        self._first_method = 0  # number of the first method of the present interleaving
+        self._means: dict[int, Floats] = {}  # mean slopes by method, and their numbers of frames
+        self._seen_of: defaultdict[int, int] = defaultdict(int)
+        # The last ones: a frame's truth may be known before its record.
+        self._truths: deque[tuple[int, float, float]] = deque(maxlen=4)
+        self._last: NDArray[Any] | None = None  # records of the previous read
+
+    def add(self, batch: Batch) -> None:
+        """Add the data of a batch."""
+        self.changes = (self.changes + batch.changes)[-_MOST_CHANGES:]
+        self.methods, self._first_method = methods_after(self.methods, batch.changes, self._first_method)
+        self.missed += batch.missed
+        if batch.commands is not None:
+            self.commands = batch.commands
+        if batch.truth is not None:
+            self._truths.append(batch.truth)
+        records = batch.records
+        if not len(records):
+            return
+        rows = self._rows(records)
+        for frame, strehl, _ in self._truths:  # known for a few frames only
+            rows[records["frame"] == frame, _FRAME.index("strehl")] = strehl
+        lost = self._lost_in(records)
+        self.seen, self.lost = self.seen + len(records), self.lost + lost
+        self.newest, self._last = records[-1].copy(), records
+        self._frames.append(rows)
+        self._strip.append(self._strip_row(rows, lost, batch))
+        self._forget(rows[-1, 0])
+
+    def record_of(self, frame: int) -> NDArray[Any] | None:
+        """Return the record of a frame from the last read; None if it is older."""
+        if self._last is None:
+            return None
+        places = np.flatnonzero(self._last["frame"] == frame)
+        return self._last[places[-1]] if len(places) else None
+
+    # Messages to the page ------------------------------------------------------------------------------
+
+    def now(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Return values and arrays of the newest frame and of the strip charts."""
+        newest = self.newest
+        strip = np.array(self._strip, np.float64).reshape(-1, len(_STRIP))
+        if len(strip):
+            strip[:, 0] -= strip[-1, 0]
+        values: dict[str, Any] = {
+            "strip": _STRIP,
+            "strip_s": STRIP_S,
+            "seen": self.seen,
+            "lost": self.lost,
+            "missed": self.missed,
+        }
+        arrays: dict[str, NDArray[Any]] = {"strip": strip.astype(np.float32)}
+        if newest is not None:
+            values |= {"frame": int(newest["frame"]), "method": self._method_name(int(newest["method"]))}
+            arrays |= {name: newest[name] for name in ("x", "y", "flux", "flags")}
+        if self.commands is not None:
+            arrays["commands"] = self.commands.astype(np.float32)
+        return values, arrays
+
+    def figures(self) -> dict[str, Any]:
+        """Return rate, percentiles, histogram and changes; takes milliseconds."""
+        frames = self._all_frames()
+        if not len(frames):
+            return {"frames": 0}
+        latency = frames[:, _FRAME.index("latency_us")]
+        counts, _ = np.histogram(np.clip(latency, _BIN_EDGES_US[0], _BIN_EDGES_US[-1]), _BIN_EDGES_US)
+        used = np.flatnonzero(counts)
+        shown = slice(max(used[0] - 1, 0), used[-1] + 2)
+        seconds = frames[-1, 0] - frames[0, 0]
+        return {
+            "frames": len(frames),
+            "seconds": seconds,
+            "rate_hz": (len(frames) - 1) / seconds if seconds > 0 else None,
+            "percentiles_us": dict(
+                zip(("50", "99", "99.9"), np.percentile(latency, (50, 99, 99.9)), strict=True)
+            ),
+            "longest_us": latency.max(),
+            "histogram": {"from_us": _BIN_EDGES_US[:-1][shown], "counts": counts[shown]},
+            "changes": self.changes,
+        }
+
+    def methods_compared(self) -> list[dict[str, Any]]:
+        """Return the figures of the present methods, with errors; empty if there is only one.
+
+        Takes some 50 ms, most of it for the bootstrap of the errors.
+        """
+        frames = self._all_frames()
+        frames = frames[frames[:, _FRAME.index("method")] >= self._first_method]
+        method = frames[:, _FRAME.index("method")].astype(np.int64)
+        present = np.unique(method)
+        if len(present) < 2:
+            return []
+        names = [self._method_name(place) for place in present]
+        rows: list[dict[str, Any]] = [
+            {"method": name, "frames": int(np.sum(method == place)), "figures": {}}
+            for name, place in zip(names, present, strict=True)
+        ]
+        for title, (column, factor) in _COMPARED.items():
+            values = factor * frames[:, _FRAME.index(column)]
+            if np.isfinite(values).any():
+                for row, compared in zip(rows, compared_methods(method, names, values), strict=True):
+                    row["figures"][title] = _in_plain(compared)
+        return rows
+
+    # One read -----------------------------------------------------------------------------------------
+
+    def _rows(self, records: NDArray[Any]) -> Floats:
+        """Return a row of `_FRAME` for each record."""
+        valid = (records["flags"] & INVALID) == 0
+        count = valid.sum(axis=1)
+        some = np.where(count > 0, count, np.nan)
+        rows = np.full((len(records), len(_FRAME)), np.nan)
+        columns: Mapping[str, Any] = {
+            "time_s": records["last_row_time_ns"] / 1e9,
+            "method": records["method"],
+            "latency_us": (records["published_time_ns"] - records["last_row_time_ns"]) / 1e3,
+            "rms_px": self._rms(records, valid, some),
+            "flux_e": np.where(valid, records["flux"], 0.0).sum(axis=1) / some,
+            "valid": valid.mean(axis=1),
+        }
+        for name, values in columns.items():
+            rows[:, _FRAME.index(name)] = values
+        return rows
+
+    def _rms(self, records: NDArray[Any], valid: NDArray[np.bool_], some: Floats) -> Floats:
+        """Return the rms of each frame's slopes about the sub-apertures' running means for its method."""
+        squares = np.full(len(records), np.nan)
+        for method in np.unique(records["method"]):
+            own = records["method"] == method
+            self._seen_of[int(method)] += own.sum()
+            used = valid[own]
+            slopes = np.stack([records["x"][own], records["y"][own]]).astype(np.float64)
+            mean = np.where(used, slopes, 0.0).sum(axis=1) / np.maximum(used.sum(axis=0), 1)
+            before = self._means.get(int(method), mean)
+            weight = min(1.0, own.sum() / _MEAN_FRAMES)
+            self._means[int(method)] = before + weight * (mean - before)
+            if self._seen_of[int(method)] < _FEWEST_FRAMES:
+                continue
+            deviation = np.where(used, slopes - self._means[int(method)][:, None], 0.0)
+            squares[own] = np.sum(deviation**2, axis=(0, 2))
+        return np.asarray(np.sqrt(squares / (2 * some)))
+
+    def _lost_in(self, records: NDArray[Any]) -> int:
+        """Return the number of missing frame numbers; 0 if the camera restarted its numbering."""
+        frames = records["frame"]
+        if self.newest is not None:
+            frames = np.concatenate([[self.newest["frame"]], frames])
+        return int(np.maximum(all_left_out(frames), 0).sum())
+
+    def _strip_row(self, rows: Floats, lost: int, batch: Batch) -> tuple[float, ...]:
+        latency, rms, flux = (rows[:, _FRAME.index(name)] for name in ("latency_us", "rms_px", "flux_e"))
+        return (
+            rows[-1, 0],
+            float(np.median(latency)),
+            float(latency.max()),
+            _mean(rms),
+            _mean(flux),
+            float(lost + batch.missed),
+            *(self._truths[-1][1:] if self._truths else (np.nan, np.nan)),
+        )
+
+    def _forget(self, now_s: float) -> None:
+        """Discard old data."""
+        while self._strip and not now_s - STRIP_S <= self._strip[0][0] <= now_s:
+            self._strip.popleft()
+        most = sum(len(rows) for rows in self._frames)
+        while self._frames and (self._frames[0][-1, 0] < now_s - FRAMES_S or most > _MOST_FRAMES):
+            most -= len(self._frames.popleft())
+
+    def _all_frames(self) -> Floats:
+        return np.concatenate([np.empty((0, len(_FRAME))), *self._frames])
+
+    def _method_name(self, method: int) -> str:
+        return self.methods[method] if method < len(self.methods) else f"method {method}"
+
+
+def flag_names() -> list[dict[str, Any]]:
+    """Return the possible flags of a sub-aperture, for the page's legend."""
+    return [
+        {"bit": int(flag), "name": str(flag.name).lower().replace("_", " "), "invalid": bool(flag & INVALID)}
+        for flag in SubapertureFlag
+    ]
+
+
+def _in_plain(compared: MethodDifference) -> dict[str, Any]:
+    """Return a figure with half its confidence interval, and its difference from the first method's."""
+    mean, difference = compared.mean, compared.difference
+    row: dict[str, Any] = {"mean": mean.value, "half": (mean.high - mean.low) / 2}
+    if difference is not None:
+        row |= {"difference": difference.value, "difference_half": (difference.high - difference.low) / 2}
+        row["decided"] = difference.decided
+    return row
+
+
+def _mean(values: Floats) -> float:
+    kept = values[np.isfinite(values)]
+    return float(kept.mean()) if len(kept) else np.nan

@@ -1,0 +1,1 @@
+"""One frame's path: from rows of pixels to slopes, on worker threads."""

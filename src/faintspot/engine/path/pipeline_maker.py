@@ -1,0 +1,32 @@
+"""Pipelines of an engine, made from settings; what is known of the spots may change while it runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import Score
+
+
+@dataclass(frozen=True, eq=False)
+class PipelineMaker:
+    """Parts of a pipeline but its settings; other processes can be given it."""
+
+    layout: Layout
+    calibration: Calibration
+    psf: PSF | None = None
+    score: Score | None = None
+    reference: NDArray[Any] | None = None
+    """Reference slopes, as for `SlopePipeline`."""
+
+    def __call__(self, settings: Settings) -> SlopePipeline:
+        """Return the pipeline with settings."""
+        known = self.layout, settings, self.calibration, self.reference
+        return SlopePipeline(*known, psf=self.psf, score=self.score)

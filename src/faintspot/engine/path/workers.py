@@ -1,0 +1,117 @@
+"""Long-lived threads that measure parts of a frame and wait in compiled code, without the GIL."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from faintspot.slopes.kernels.compilation.ordered import load, store
+from faintspot.slopes.kernels.driver import streaming
+
+_LINE = 16  # int64 numbers from one cell to the next: no two share a cache line
+_POSTED = 0
+_STOP_CELL = 0
+
+Task = Callable[[int], bool]
+"""Function that does the share of one worker, numbered from 1; returns whether it was completed."""
+
+
+class Workers:
+    """Threads that do a task together with the caller, each its own share.
+
+    While awake they poll, so that a task begins within a microsecond; `park` lets them sleep.
+
+    Parameters
+    ----------
+    count : int
+        Number of threads in addition to the caller's.
+    cpus : sequence of int, optional
+        Processors to pin them to, cyclically. Default: not pinned.
+    """
+
+    def __init__(self, count: int, cpus: Sequence[int] | None = None) -> None:
+        self.count, self._cpus = count, list(cpus or ())
+        self._cells = np.zeros((1 + count) * _LINE, np.int64)
+        self._control = np.zeros(1, np.int64)
+        self._whole = [False] * (1 + count)
+        self._task: Task | None = None
+        self.fault: str | None = None
+        """Error of the last worker that died."""
+        self._awake, self._closed = threading.Event(), False
+        self._awake.set()
+        self._threads = [self._started(number) for number in range(1, 1 + count)]
+
+    def post(self, task: Task) -> None:
+        """Start a task on all threads; call `wait` before the next one."""
+        self._task = task
+        store(self._cells, _POSTED, load(self._cells, _POSTED) + 1)
+
+    def wait(self) -> bool:
+        """Wait until all shares are done; return whether all were completed."""
+        job = self._cells[_POSTED]
+        for number in range(1, 1 + self.count):
+            cell = number * _LINE
+            streaming.wait_for_rows(self._cells, cell, cell + 1, job, 0, _NEVER, _STOP_CELL)
+        return all(self._whole[1:])
+
+    def park(self) -> None:
+        """Let the threads sleep between two tasks."""
+        self._awake.clear()
+        self._control[_STOP_CELL] = 1
+
+    def wake(self) -> None:
+        """Wake the threads."""
+        self._control[_STOP_CELL] = 0
+        self._awake.set()
+
+    def replace_dead(self) -> int:
+        """Restart dead threads and abandon their shares; return how many. For any one other thread."""
+        dead = [index for index, thread in enumerate(self._threads) if not thread.is_alive()]
+        for index in dead:
+            number = index + 1
+            self._whole[number] = False
+            store(self._cells, number * _LINE, load(self._cells, _POSTED))
+            self._threads[index] = self._started(number)
+        return len(dead)
+
+    def close(self) -> None:
+        """End the threads."""
+        self._closed = True
+        self.park()
+        self._awake.set()
+        for thread in self._threads:
+            thread.join()
+
+    def _started(self, number: int) -> threading.Thread:
+        name = f"faintspot-worker-{number}"
+        thread = threading.Thread(target=self._serve, args=(number,), name=name, daemon=True)
+        thread.start()
+        return thread
+
+    def _serve(self, number: int) -> None:
+        """Do the share of every task."""
+        if self._cpus:
+            with suppress(OSError):  # already reported for the caller's own processors
+                os.sched_setaffinity(0, {self._cpus[number % len(self._cpus)]})
+        cells = self._cells
+        done = int(cells[number * _LINE])
+        while not self._closed:
+            if not streaming.wait_for_rows(cells, 0, 1, done + 1, 0, self._control, _STOP_CELL):
+                self._awake.wait()
+                continue
+            task = self._task
+            try:
+                self._whole[number] = task is not None and task(number)
+            except BaseException as error:
+                self.fault = f"{type(error).__name__}: {error}".split("\n")[0]
+                return
+            done += 1
+            store(cells, number * _LINE, done)
+
+
+_NEVER = np.zeros(1, np.int64)
+"""Cell that never ends a wait: shares are completed, or abandoned for a dead worker."""

@@ -1,0 +1,1 @@
+"""Pixels in shared memory: the ring, its segments, the simulated camera, replay."""

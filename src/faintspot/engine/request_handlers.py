@@ -1,0 +1,136 @@
+"""Commands of a running engine's control channel."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from faintspot.base.checks import number_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.engine.engine import Engine
+from faintspot.engine.path.pipeline_maker import PipelineMaker
+from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
+from faintspot.loop.control.identification.model import Model
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import load_score
+from faintspot.slopes.training.known_sodium import SODIUM
+
+LENGTHY = ("set", "interleave", "load", "swap", "unload", "learnt", "spots")
+"""Commands that prepare something new and may compile; other commands are answered meanwhile."""
+_USUAL_TURN = 50  # frames
+_MOST_LINES, _LONGEST_LINE = 40, 400  # of advice
+LOOP_ACTIONS = ("status", "open", "close", "gain", "flat")
+
+
+def commands_of(engine: Engine) -> dict[str, Handler]:
+    """Return the commands of the control channel by name."""
+    estimators = engine.estimators
+    return {
+        "status": lambda fields: engine.status(),
+        "get": lambda fields: {"settings": engine.live.get(fields.get("names"))},
+        "set": partial(_set, engine),
+        "interleave": partial(_interleave, engine),
+        "loop": partial(loop_command, engine),
+        "advice": partial(_advise, engine),
+        "learnt": partial(_take_learnt, engine),
+        "spots": partial(_take_spots, engine),
+        "stop": partial(_stop, engine),
+        "load": lambda fields: estimators.load(_text(fields, "source")),
+        "swap": lambda fields: estimators.load(_text(fields, "source"), swap=True),
+        "unload": lambda fields: estimators.unload(_text(fields, "estimator")),
+    }
+
+
+def _set(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+    try:
+        change = engine.live.propose(changes_of(fields), fields.get("where"))
+    except InputError:
+        engine.counters.settings_refused += 1
+        raise
+    return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
+
+
+def _interleave(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+    every = int(number_between("every", fields.get("every", _USUAL_TURN), 1, integer=True))
+    change = engine.interleave(_text(fields, "methods"), every)
+    return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
+
+
+def _stop(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+    engine.stop()
+    return {}
+
+
+def _advise(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+    lines = fields.get("lines")
+    if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
+        raise InputError(f"lines = {lines!r:.80}: expected a list of texts")
+    engine.advice = [line[:_LONGEST_LINE] for line in lines[:_MOST_LINES]]
+    return {}
+
+
+def _take_learnt(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+    """Note what was learnt beside the engine, and take the new model, if one is handed over."""
+    known: dict[str, Any] = {"found": _text(fields, "found"), "unix_time_s": time.time(), "taken": False}
+    engine.learning = known
+    if fields.get("model") is None:
+        return {}
+    if engine.loop is None:
+        raise InputError("learnt: this engine makes no commands; add [control] to its configuration")
+    try:
+        engine.loop.renew(Model.load(_text(fields, "model"), engine.loop.control.plant))
+    except InputError as error:
+        engine.learning = {**known, "fault": f"{error}"}
+        raise
+    engine.learning = {**known, "taken": True}
+    return {}
+
+
+def _take_spots(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+    """Measure with the PSF and the fixed weights of a sodium profile from the next frame on."""
+    known = fields.get("sodium")
+    if not isinstance(known, Mapping):
+        raise InputError(f"sodium = {known!r:.80}: expected a profile")
+    if not isinstance(maker := engine.preparer.make_pipeline, PipelineMaker):
+        raise InputError("spots: this engine does not know how its pipelines are made")
+    changes: dict[str, Any] = {"psf": PSF.load(_text(fields, "psf"))}
+    if fields.get("score") is not None:
+        changes["score"] = load_score(_text(fields, "score"))
+    change = engine.renew_spots(replace(maker, **changes), {SODIUM: known})
+    engine.sodium = {**known, "unix_time_s": time.time()}
+    return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
+
+
+def _text(fields: dict[str, Any], name: str) -> str:
+    value = fields.get(name)
+    if not isinstance(value, str) or not value:
+        raise InputError(f"{name} = {value!r:.80}: expected a text")
+    return value
+
+
+def loop_command(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+    """Open or close the loop, change its gain or flatten the mirror; return the loop's part of the status.
+
+    Raises
+    ------
+    InputError
+        When the action is unknown, there is no loop, the gain is out of range, or the loop is closed for
+        "flat".
+    """
+    action, loop = one_of("action", fields.get("action"), LOOP_ACTIONS), engine.loop
+    if action == "status":
+        return {"loop": engine.loop_status()}
+    if loop is None:
+        raise InputError("loop: this engine makes no commands; add [control] to its configuration")
+    if action == "open":
+        loop.open()
+    elif action == "close":
+        loop.close()
+    elif action == "gain":
+        loop.gain = number_between("gain", fields.get("gain"), 0, 2)
+    elif action == "flat":
+        loop.flatten()
+    return {"loop": engine.loop_status()}

@@ -1,0 +1,1 @@
+"""Settings and estimators that change while the engine runs."""

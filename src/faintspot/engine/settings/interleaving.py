@@ -1,0 +1,137 @@
+"""Interleaved configurations: comparisons on sky, where conditions change quickly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from faintspot.base.checks import number_between
+from faintspot.base.config.written_changes import parse_changes
+from faintspot.base.errors import InputError
+from faintspot.engine.settings.running_settings import check_names
+from faintspot.loop.control.identification.model import CONTROLS
+from faintspot.slopes.estimators.registry import estimators
+from faintspot.slopes.pipeline.settings import Settings, without_denoising
+
+_SET, _NONE = "set", "none"
+METHODS, FIRST_METHOD, EVERY = "methods", "first_method", "every"
+"""Keys of a change of the interleaving in telemetry: names, number of the first, frames per turn."""
+
+
+@dataclass(frozen=True)
+class InterleavedMethod:
+    """A configuration that takes turns: its changes of the settings, and its name."""
+
+    label: str
+    changes: dict[str, Any]
+    denoises: bool = True
+    """Whether the estimator's denoising is used."""
+    control: str | None = None
+    """Controller; None: the configured one."""
+
+    def of(self, settings: Settings) -> Settings:
+        """Return the settings with this configuration's changes.
+
+        Raises
+        ------
+        InputError
+            When the changes do not fit, or the estimator has no denoising to leave out.
+        """
+        if self.changes:
+            settings = settings.replace(**self.changes)
+        return settings if self.denoises else without_denoising(settings, f"interleave: {self.label!r}")
+
+
+@dataclass(frozen=True)
+class Interleaving:
+    """Configurations that take turns.
+
+    Parameters
+    ----------
+    methods : tuple of InterleavedMethod
+    every : int
+        Number of frames per turn.
+    first : int
+        Number of the first configuration in telemetry; those of earlier interleavings keep theirs.
+    """
+
+    methods: tuple[InterleavedMethod, ...] = (InterleavedMethod("set", {}),)
+    every: int = 1
+    first: int = 0
+
+    def __post_init__(self) -> None:
+        number_between("every", self.every, 1, integer=True)
+        if not self.methods:
+            raise InputError("interleave: expected at least one method, got none")
+
+    def method_of(self, count: int) -> int:
+        """Return the index of the configuration whose turn it is after `count` frames."""
+        return count // self.every % len(self.methods)
+
+    @property
+    def labels(self) -> list[str]:
+        """Names of the configurations."""
+        return [method.label for method in self.methods]
+
+    @classmethod
+    def parse(cls, text: str, every: int = 1, first: int = 0) -> Interleaving:
+        """Parse a text such as "none,tv" or "noise_std=1,noise_std=2+keep_brightest=20,ml".
+
+        Each configuration is "set" (the present settings), "none" (the same without denoising), the name of
+        an estimator, or new values of settings, NAME=VALUE, joined with "+". A controller may follow after
+        another "+", as in "map+kalman".
+
+        Raises
+        ------
+        InputError
+            When the text is anything else.
+        """
+        return cls(tuple(_parsed_method(part.strip()) for part in text.split(",")), every, first)
+
+
+def methods_after(
+    methods: Sequence[str], changes: Iterable[Mapping[str, Any]], first: int = 0
+) -> tuple[list[str], int]:
+    """Return the names of all configurations by number in telemetry, and the first active number.
+
+    Parameters
+    ----------
+    methods : sequence of str
+        Names at the start.
+    changes : iterable of mapping
+        Changes from telemetry; those of other settings are ignored.
+    first : int
+        Number of the first active configuration before the changes.
+    """
+    names = list(methods)
+    for change in changes:
+        values = change.get("changes", {})
+        number, new = values.get(FIRST_METHOD), values.get(METHODS)
+        if isinstance(number, int) and 0 <= number <= len(names) and isinstance(new, list):
+            names[number : number + len(new)] = map(str, new)
+            first = number
+    return names, first
+
+
+def _parsed_method(text: str) -> InterleavedMethod:
+    measured, _, control = text.rpartition("+")
+    if measured and control in CONTROLS:
+        return replace(_parsed_settings(measured), label=text, control=control)
+    return _parsed_settings(text)
+
+
+def _parsed_settings(text: str) -> InterleavedMethod:
+    if text in (_SET, _NONE):
+        return InterleavedMethod(text, {}, denoises=text == _SET)
+    if text in estimators():
+        return InterleavedMethod(text, {"estimator": text})
+    if "=" in text:
+        changes = parse_changes(text.split("+"))
+        check_names(list(changes))
+        return InterleavedMethod(text, changes)
+    known = ", ".join([_SET, _NONE, *estimators()])
+    raise InputError(
+        f"interleave: {text!r}: expected {known}, or NAME=VALUE with + between several, perhaps "
+        f"followed by + and one of {', '.join(CONTROLS)}"
+    )

@@ -1,0 +1,187 @@
+"""Settings prepared for their first frame: pipelines, and frame paths through them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.engine.path.frame_path import FramePath, Progress, check_real_time
+from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.python_path import PythonPath, tried
+from faintspot.engine.path.time_limit import call_within
+from faintspot.engine.path.workers import Workers
+from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.pixels.pixel_segment import ARRIVALS, ROWS
+from faintspot.engine.settings.interleaving import Interleaving
+from faintspot.slopes.estimators.base import Estimator
+from faintspot.slopes.estimators.registry import estimator_named
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+
+TRIAL_LIMIT_S = 60.0  # long enough for an estimator that compiles
+
+
+class EnginePlan:
+    """Settings and all that is prepared from them: a pipeline and a frame path for every configuration.
+
+    Parameters
+    ----------
+    pipelines : sequence of SlopePipeline
+        One for each configuration that takes turns.
+    settings : Settings
+        Settings that the configurations' changes are added to.
+    interleaving : Interleaving
+        The configurations that take turns.
+    new_path : function
+        Makes the frame path of a pipeline, compiled and warmed up, from the memory and progress of frames.
+    fallback : EnginePlan, optional
+        Replacement when a user-defined estimator fails.
+    """
+
+    def __init__(
+        self,
+        pipelines: Sequence[SlopePipeline],
+        settings: Settings,
+        interleaving: Interleaving,
+        new_path: Callable[[SlopePipeline, NDArray[Any], Progress], FramePath],
+        fallback: EnginePlan | None = None,
+    ) -> None:
+        self.settings, self.layout, self.interleaving = settings, pipelines[0].layout, interleaving
+        self.pipelines, self.fallback, self._new_path = tuple(pipelines), fallback, new_path
+        self._ring: PixelRing | None = None
+        self._paths: tuple[FramePath, ...] = ()
+
+    @property
+    def estimator_names(self) -> set[str]:
+        """Names of the estimators of all configurations."""
+        return {pipeline.settings.estimator.name for pipeline in self.pipelines}
+
+    def paths(self, ring: PixelRing) -> tuple[FramePath, ...]:
+        """Return the paths of a ring's frames, one for each configuration, compiled and warmed up."""
+        if ring is not self._ring:
+            if self.fallback is not None:
+                self.fallback.paths(ring)
+            cells, pixels = writable_view(ring.cells), writable_view(ring.pixels)
+            columns = ring.cells.shape[1]
+            # Frames are identified by their arrival, which counts up even if frame numbers repeat.
+            progress = Progress(cells, ARRIVALS * columns, ROWS * columns)
+            self._paths = tuple(self._new_path(pipeline, pixels, progress) for pipeline in self.pipelines)
+            self._ring = ring
+        return self._paths
+
+    def warm_up(self) -> None:
+        """Compile all that measures frames while their type is not yet known."""
+        if self.fallback is not None:
+            self.fallback.warm_up()
+        progress = Progress(np.zeros((2, 1), np.int64), 0, 1)
+        for dtype in (np.uint16, np.float32):
+            for pipeline in self.pipelines:
+                self._new_path(pipeline, np.zeros((1, *self.layout.frame_shape), dtype), progress)
+
+
+class SettingsPreparer:
+    """Preparation of settings while the engine runs.
+
+    Parameters
+    ----------
+    make_pipeline : function
+        Function that makes a pipeline from settings.
+    interleaving : Interleaving
+    workers : Workers, optional
+    budget_s : float
+        Time limit for one frame of an estimator in NumPy.
+    prior : Prior, optional
+        Predicted slopes; see `FramePath`.
+    """
+
+    def __init__(
+        self,
+        make_pipeline: Callable[[Settings], SlopePipeline],
+        interleaving: Interleaving,
+        workers: Workers | None,
+        budget_s: float,
+        prior: Prior | None = None,
+    ) -> None:
+        self.make_pipeline = make_pipeline
+        self.interleaving = interleaving
+        """Interleaving of all settings that are prepared from now on."""
+        self._workers, self._budget_s, self._prior = workers, budget_s, prior
+        self.ring: PixelRing | None = None
+        """Ring whose frames are being measured, if any."""
+        self._built_in: Estimator = estimator_named("brightest")()
+
+    def prepare(self, settings: Settings) -> EnginePlan:
+        """Prepare settings for a ring's frames or, without a ring, for frames of any type.
+
+        Raises
+        ------
+        InputError
+            When the settings or those of a configuration do not fit, or an estimator fails its trial.
+        """
+        each_settings = [method.of(settings) for method in self.interleaving.methods]
+        pipelines = [self._pipeline(each) for each in each_settings]
+        for pipeline in pipelines:
+            check_real_time(pipeline)
+        own = all(is_built_in(each.estimator) for each in each_settings)
+        prepared = EnginePlan(
+            pipelines, settings, self.interleaving, self._new_path, None if own else self._fallback(settings)
+        )
+        if self.ring is None:
+            prepared.warm_up()
+        else:
+            prepared.paths(self.ring)
+        if is_built_in(settings.estimator):
+            self._built_in = settings.estimator
+        return prepared
+
+    def built_in(self, settings: Settings) -> Settings:
+        """Return settings in which the last built-in estimator replaces a user-defined one."""
+        own = is_built_in(settings.estimator)
+        return settings if own else settings.replace(estimator=self._built_in)
+
+    def _fallback(self, settings: Settings) -> EnginePlan:
+        """Prepare the same settings with a built-in estimator and no interleaving."""
+        settings, turns = self.built_in(settings), self.interleaving
+        alone = turns if len(turns.methods) == 1 else Interleaving(first=turns.first + len(turns.methods))
+        return EnginePlan([self.make_pipeline(settings)], settings, alone, self._new_path)
+
+    def _new_path(self, pipeline: SlopePipeline, pixels: NDArray[Any], progress: Progress) -> FramePath:
+        made_for = pipeline, pixels, progress
+        path = (
+            PythonPath(*made_for, workers=self._workers, prior=self._prior, budget_s=self._budget_s)
+            if pipeline.plan.prepared.in_python
+            else FramePath(*made_for, workers=self._workers, prior=self._prior)
+        )
+        path.warm_up()
+        return path
+
+    def _pipeline(self, settings: Settings) -> SlopePipeline:
+        if is_built_in(settings.estimator):
+            return self.make_pipeline(settings)
+        title = f"estimator {settings.estimator.name!r}"
+        return call_within(TRIAL_LIMIT_S, title, tried, self.make_pipeline, settings, self._budget_s)
+
+
+def is_built_in(estimator: Estimator) -> bool:
+    """Return whether an estimator is part of this package."""
+    return type(estimator).__module__.startswith(f"{__package__.partition('.')[0]}.")
+
+
+class _WritableMemory:
+    """Memory of an array, declared writable; one class for all, because classes need garbage collection."""
+
+    def __init__(self, array: NDArray[Any]) -> None:
+        self._array = array
+        interface = array.__array_interface__
+        self.__array_interface__ = {**interface, "data": (interface["data"][0], False)}
+
+
+def writable_view(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a writable array of the same memory, of the type that kernels are compiled for.
+
+    The kernels do not write to it; this avoids compiling each of them again for read-only memory.
+    """
+    return np.asarray(_WritableMemory(array))

@@ -1,0 +1,1 @@
+"""Streams that other software reads or writes: images, slopes, commands."""

@@ -1,0 +1,376 @@
+"""Streams of ImageStreamIO (milk, cacao) and dao in shared memory: frames in, slopes and commands out."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import mmap
+import os
+import stat
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.engine.pixels.pixel_segment import identity_of, new_memory
+from faintspot.engine.pixels.processes import process_start
+from faintspot.engine.streams.image_layout import (
+    COUNTER,
+    DAO,
+    ISIO,
+    KEYWORD,
+    MATH_DATA,
+    METADATA,
+    MOST_POSTED,
+    SEMAPHORES,
+    TRACES,
+    TYPES,
+    VERSION,
+    WRITING,
+    IncompatibleStreamError,
+    Places,
+    checked,
+    path_of,
+    places_of,
+)
+from faintspot.engine.streams.publication import LARGEST_NUMBER, Publication
+from faintspot.engine.streams.semaphores import BYTES as SEMAPHORE_BYTES
+from faintspot.engine.streams.semaphores import Semaphore
+from faintspot.slopes.kernels.compilation.ordered import fence, load, store
+
+_NAP_S = 5e-4
+_OPEN = os.O_NONBLOCK | os.O_CLOEXEC  # never block on a named pipe
+
+
+class _Mapped:
+    """A memory-mapped stream, with its parts as arrays."""
+
+    def __init__(self, kind: str, memory: mmap.mmap, places: Places, shape: tuple[int, ...]) -> None:
+        self.fields = np.ndarray((), METADATA[kind], memory)
+        """Metadata as arrays, which change when other processes write."""
+        self.memory, self.places = memory, places
+        self.counter = np.ndarray((1,), np.int64, memory, COUNTER[kind])
+        self.writing = np.ndarray((), np.uint8, memory, WRITING[kind])
+        dtype = np.dtype(TYPES[int(self.fields["datatype"])])
+        self.values: NDArray[Any] = np.ndarray(shape, dtype, memory, places.values)
+        self.address = np.frombuffer(memory, np.uint8).ctypes.data
+
+    def pids(self, offset: int) -> NDArray[np.int32]:
+        """Return the process numbers, one for each semaphore."""
+        return np.ndarray((int(self.fields["sem"]),), np.int32, self.memory, offset)
+
+    def semaphore(self, number: int) -> int:
+        """Return the address of a semaphore in memory."""
+        return self.address + self.places.semaphores + SEMAPHORE_BYTES * number
+
+
+class ImageStream:
+    """A stream that another program writes, with the interface of `faintspot.engine.streams.stream.Stream`.
+
+    To wait, it takes a free semaphore of ImageStreamIO. dao's semaphores have no owner, so for dao it only
+    polls the counter. A publication's number is the counter minus one.
+
+    Parameters
+    ----------
+    kind : {"isio", "dao"}
+    name : str
+        See `path_of`.
+
+    Raises
+    ------
+    FileNotFoundError
+        When the stream does not exist.
+    IncompatibleStreamError
+        When the file is not a usable stream.
+    InputError
+        When the name is not valid.
+    """
+
+    def __init__(self, kind: str, name: str) -> None:
+        self._path = path_of(kind, name)
+        try:
+            descriptor = os.open(self._path, os.O_RDWR | _OPEN)
+            writable = True
+        except PermissionError:
+            descriptor, writable = os.open(self._path, os.O_RDONLY | _OPEN), False
+        try:
+            status = os.fstat(descriptor)
+            size, head = status.st_size, METADATA[kind]
+            if not stat.S_ISREG(status.st_mode) or size <= head.itemsize:
+                raise IncompatibleStreamError(f"{self._path} is not a stream")
+            metadata = np.frombuffer(os.pread(descriptor, head.itemsize, 0), head)[0]
+            places, self.shape, self.dtype, self._circular = checked(kind, metadata, size)
+            access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
+            memory = mmap.mmap(descriptor, size, access=access)
+        except BaseException:
+            os.close(descriptor)
+            raise
+        self._descriptor, self._size, self._identity = descriptor, size, identity_of(status)
+        whole = (int(metadata["size"][2]), *self.shape) if self._circular else self.shape
+        self._mapped = _Mapped(kind, memory, places, whole)
+        self._maker = int(metadata["creatorPID"]) if kind == ISIO else 0
+        self._turn = self._claimed() if kind == ISIO and writable else None
+
+    @property
+    def count(self) -> int:
+        """Number of publications."""
+        count: int = load(self._mapped.counter, 0) % 2**64  # unsigned in the file
+        return count
+
+    @property
+    def number(self) -> int:
+        """Number of the newest frame."""
+        return _number(self.count)
+
+    @property
+    def maker(self) -> str:
+        """Process that made the stream, in words."""
+        return f"pid {self._maker}" if self._maker else str(self._path)
+
+    def maker_lives(self) -> bool | None:
+        """Return whether that process is alive; None if it is not known."""
+        return process_start(self._maker) >= 0 if self._maker else None
+
+    def same(self) -> bool | None:
+        """Return whether the name still leads to this stream; None if it leads nowhere."""
+        try:
+            status = self._path.stat()
+        except OSError:
+            return None
+        return identity_of(status) == self._identity and status.st_size == self._size
+
+    def wait(self, after: int, limit_s: float) -> bool:
+        """Wait up to `limit_s` until more than `after` publications exist; return whether they do.
+
+        The counter is also polled every half millisecond, because not every program posts semaphores.
+        """
+        end = time.monotonic() + limit_s
+        while self.count == after:
+            if time.monotonic() >= end:
+                return False
+            if self._turn is None:
+                time.sleep(_NAP_S)
+            else:
+                Semaphore(self._mapped.semaphore(self._turn)).wait(_NAP_S)
+        return True
+
+    def read(self, out: NDArray[Any] | None = None, limit_s: float = 0.0) -> Publication | None:
+        """Return the newest publication, or None when no complete one can be read in time."""
+        mapped, end = self._mapped, time.monotonic() + limit_s
+        target = np.empty(self.shape, self.dtype) if out is None else out
+        while os.fstat(self._descriptor).st_size == self._size:  # reading beyond a file's end is fatal
+            count, writing = self.count, bool(mapped.writing)
+            fence()
+            if not writing:
+                newest = mapped.values[int(mapped.fields["cnt1"]) % len(mapped.values)]
+                np.copyto(target, newest if self._circular else mapped.values, casting="unsafe")
+                fence()
+                if not mapped.writing and self.count == count:
+                    return Publication(target, _number(count), count)
+            if time.monotonic() >= end:
+                break
+        return None
+
+    def close(self) -> None:
+        """Release the semaphore and close the stream."""
+        if self._turn is not None:
+            self._mapped.pids(self._mapped.places.readers)[self._turn] = 0
+            self._turn = None
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _claimed(self) -> int | None:
+        """Register this process as the reader of a semaphore that no living process has."""
+        readers = self._mapped.pids(self._mapped.places.readers)
+        for number, pid in enumerate(readers.tolist()):
+            if pid <= 0 or process_start(pid) < 0:
+                readers[number] = os.getpid()
+                return number
+        return None
+
+
+class ImageStreamWriter:
+    """A stream that faintspot writes for programs of ImageStreamIO or dao.
+
+    Each publication increments `cnt0` and posts all semaphores. The keyword FRAME is the frame's number;
+    times are those of publication (TAI; for dao Unix time). An existing dao stream of the same size and type
+    is reused, as dao's programs do; a stream of ImageStreamIO is always recreated.
+
+    Parameters
+    ----------
+    kind : {"isio", "dao"}
+    name : str
+        See `path_of`.
+    shape : (int,) or (int, int)
+        Shape of the values; a vector becomes an image of one row.
+    dtype : dtype
+
+    Raises
+    ------
+    InputError
+        When a living process made a stream of that name, the file is something else, or it cannot be made.
+    """
+
+    def __init__(self, kind: str, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> None:
+        self.kind, self.path = kind, path_of(kind, name)
+        self.shape = (1, *shape) if len(shape) == 1 else shape
+        head = self._head(np.dtype(dtype))
+        places = places_of(kind, head)
+        there = _there(kind, self.path)
+        if kind == DAO and there is not None:
+            memory = self._joined(head, *there)
+            places = places_of(kind, np.ndarray((), METADATA[kind], memory))
+            self._mapped = _Mapped(kind, memory, places, self.shape)
+        else:
+            self._mapped = self._made(head, places)
+        self._identity = identity_of(self.path.stat())
+        self._keyword = self._keywords()
+        self._semaphores = self._posted()
+
+    def publish(self, values: NDArray[Any], number: int) -> None:
+        """Publish the values of a frame."""
+        mapped, fields = self._mapped, self._mapped.fields
+        mapped.writing[...] = 1
+        fence()
+        mapped.values[...] = values.reshape(self.shape)
+        if self._keyword is not None:
+            self._keyword["value"] = number
+        if self.kind == ISIO:
+            self._keyword["cnt"] += 1
+            fields["atime"] = fields["writetime"] = _clock()
+        else:
+            fields["atime"][1] = time.time_ns()
+        store(mapped.counter, 0, load(mapped.counter, 0) + 1)
+        fence()
+        mapped.writing[...] = 0
+        for semaphore in self._semaphores:
+            semaphore.post(MOST_POSTED[self.kind])
+
+    def close(self) -> None:
+        """Remove the stream, unless another process has replaced it."""
+        with contextlib.suppress(OSError):
+            if identity_of(self.path.stat()) == self._identity:
+                self.path.unlink()
+                if self.kind == DAO:
+                    for name in self._names():
+                        Semaphore.unlink(name)
+
+    def _made(self, head: NDArray[Any], places: Places) -> _Mapped:
+        """Make the stream's file."""
+        try:
+            with new_memory(self.path, places.total, 0o666) as (memory, hidden):
+                if self.kind == ISIO:
+                    head["inode"] = hidden.stat().st_ino
+                memory[: head.nbytes] = head.tobytes()
+                mapped = _Mapped(self.kind, memory, places, self.shape)
+                if self.kind == ISIO:
+                    for number in range(SEMAPHORES):
+                        Semaphore.made(mapped.semaphore(number))
+                    Semaphore.made(mapped.address + places.log_semaphore)
+                    mapped.pids(places.readers)[:] = -1
+                    mapped.pids(places.writers)[:] = os.getpid()
+                os.replace(hidden, self.path)
+                return mapped
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: this stream cannot be made: {places.total} bytes ({error.strerror})"
+            ) from None
+
+    def _head(self, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Return the metadata of a new stream."""
+        head = np.zeros((), METADATA[self.kind])
+        code = next(code for code, each in TYPES.items() if np.dtype(each) == dtype)
+        head["naxis"], head["size"] = 2, (*self.shape[::-1], 0)
+        head["nelement"], head["datatype"] = math.prod(self.shape), code
+        head["shared"], head["sem"], head["NBkw"] = 1, SEMAPHORES, 1
+        if self.kind == DAO:
+            head["name"] = str(self.path).encode()
+            return head
+        head["name"] = self.path.name.removesuffix(".im.shm").encode()
+        head["version"], head["imagetype"], head["location"] = VERSION, MATH_DATA, -1
+        head["NBproctrace"], head["creatorPID"] = TRACES, os.getpid()
+        head["imdatamemsize"] = math.prod(self.shape) * dtype.itemsize
+        head["creationtime"] = head["lastaccesstime"] = _clock()
+        return head
+
+    def _joined(self, wanted: NDArray[Any], there: NDArray[Any], memory: mmap.mmap) -> mmap.mmap:
+        """Return the memory of an existing stream if it has the size and type that are needed."""
+        sizes = [each["size"][: int(each["naxis"])].tolist() for each in (wanted, there)]
+        if sizes[0] != sizes[1] or wanted["datatype"] != there["datatype"]:
+            raise InputError(
+                f"{self.kind}:{self.path}: expected a stream of {sizes[0]} float32 values, or none, found "
+                f"{sizes[1]} of type {TYPES[int(there['datatype'])]}; remove it or choose another name"
+            )
+        return memory
+
+    def _keywords(self) -> Any:
+        """The keyword FRAME; None if another program's stream has no keywords."""
+        mapped = self._mapped
+        if not mapped.fields["NBkw"]:
+            return None
+        keyword = np.ndarray((), KEYWORD[self.kind], mapped.memory, mapped.places.keywords)
+        keyword["name"], keyword["type"] = b"FRAME", b"L"
+        return keyword
+
+    def _posted(self) -> list[Semaphore]:
+        """Semaphores that a publication posts."""
+        if self.kind == DAO:
+            found = [Semaphore.named(name) for name in self._names()]
+            return [each for each in found if each is not None]
+        mapped = self._mapped
+        numbers = range(int(mapped.fields["sem"]))
+        log = Semaphore(mapped.address + mapped.places.log_semaphore)
+        return [*(Semaphore(mapped.semaphore(number)) for number in numbers), log]
+
+    def _names(self) -> list[str]:
+        """Names of dao's semaphores."""
+        local = self.path.name.split(".")[0]
+        count = int(self._mapped.fields["sem"])
+        return [*(f"{local}_sem{number:02d}" for number in range(count)), f"{local}_semlog"]
+
+
+def _number(count: int) -> int:
+    """Return the number of the last published frame."""
+    return max(count - 1, 0) & LARGEST_NUMBER
+
+
+def _there(kind: str, path: Path) -> tuple[NDArray[Any], mmap.mmap] | None:
+    """Return metadata and memory of a stream that may be replaced or reused; None without one.
+
+    Raises
+    ------
+    InputError
+        When the file is something else, or its maker is alive.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDWR | _OPEN)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise InputError(f"{kind}:{path}: cannot be opened ({error.strerror})") from None
+    try:
+        status, layout = os.fstat(descriptor), METADATA[kind]
+        if not stat.S_ISREG(status.st_mode) or status.st_size <= layout.itemsize:
+            raise IncompatibleStreamError("is not a stream")
+        head = np.frombuffer(os.pread(descriptor, layout.itemsize, 0), layout)[0]
+        checked(kind, head, status.st_size)
+        memory = mmap.mmap(descriptor, status.st_size)
+    except IncompatibleStreamError as error:
+        raise InputError(f"{kind}:{path}: {error}; remove it or choose another name") from None
+    finally:
+        os.close(descriptor)
+    maker = int(head["creatorPID"]) if kind == ISIO else 0
+    if maker not in (0, os.getpid()) and process_start(maker) >= 0:
+        raise InputError(
+            f"{kind}:{path}: a living process made this stream (pid {maker}); stop it or choose another name"
+        )
+    return np.array(head), memory
+
+
+def _clock() -> tuple[int, int]:
+    """Return seconds and nanoseconds of the clock that ImageStreamIO uses."""
+    return divmod(time.clock_gettime_ns(time.CLOCK_TAI), 10**9)

@@ -1,0 +1,1 @@
+"""Telemetry of an engine: ring, recorder, report."""

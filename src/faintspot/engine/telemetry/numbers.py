@@ -1,0 +1,175 @@
+"""The numbers of a recorded night: rates, latencies, lost frames, and methods in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.statistics import Estimate, mean_by_blocks
+from faintspot.io.frame_numbers import all_left_out
+from faintspot.io.telemetry.recording import Telemetry
+
+Floats = NDArray[np.float64]
+
+PERCENTILES = (50.0, 99.0, 99.9, 100.0)
+_LONGEST = 80  # text of a changed value
+_TURNS_TOGETHER = 10  # neighbouring turns of the bootstrap's blocks: the turbulence changes slowly
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When frames came and how long they took."""
+
+    rate_hz: float
+    """Frame rate: one over the median interval between consecutive frames; NaN without any."""
+    longest_interval_s: float
+    """Between consecutive numbers."""
+    latency_s: Floats
+    """At `PERCENTILES`."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Frames that are not in the record."""
+
+    after_frame: int
+    lost: int
+
+
+@dataclass(frozen=True)
+class MethodDifference:
+    """A quantity in one method, and by how much it differs from the first method, turn by turn."""
+
+    method: str
+    mean: Estimate
+    difference: Estimate | None
+    """None of the first method."""
+
+
+def timing(telemetry: Telemetry) -> Timing:
+    """Return the timing of the frames recorded."""
+    interval = np.diff(telemetry.last_row_time_ns)[np.diff(telemetry.frame) == 1] / 1e9
+    some = interval.size > 0
+    return Timing(
+        float(1 / np.median(interval)) if some and np.median(interval) > 0 else np.nan,
+        float(interval.max()) if some else np.nan,
+        np.percentile(telemetry.latency_s, PERCENTILES),
+    )
+
+
+def gaps(telemetry: Telemetry) -> list[Gap]:
+    """Return where frame numbers are missing; none are where the camera began anew."""
+    lost = all_left_out(telemetry.frame)
+    return [Gap(int(telemetry.frame[i]), int(lost[i])) for i in np.flatnonzero(lost > 0)]
+
+
+def restarts(telemetry: Telemetry) -> int:
+    """Return how often the camera's frame numbers began anew."""
+    return int(np.count_nonzero(all_left_out(telemetry.frame) < 0))
+
+
+def method_names(telemetry: Telemetry) -> list[str]:
+    """Return the names of the methods that have frames in the record, by number; one without interleaving."""
+    names = telemetry.attributes.get("methods") or ["slopes"]
+    return [
+        names[method] if method < len(names) else f"method {method}" for method in np.unique(telemetry.method)
+    ]
+
+
+def quantities(telemetry: Telemetry) -> dict[str, Floats]:
+    """Return what methods are compared in, by its name with unit, a number for each frame; NaN where none is.
+
+    The rms of slopes is taken about each sub-aperture's mean in the method, which differs between methods.
+    """
+    valid = telemetry.valid
+    count = valid.sum(axis=1)
+    squares = np.zeros(len(valid))
+    for method in np.unique(telemetry.method):
+        rows = telemetry.method == method
+        used = valid[rows]
+        for axis in (telemetry.x, telemetry.y):
+            values = np.where(used, axis[rows], 0.0).astype(np.float64)
+            mean = values.sum(axis=0) / np.maximum(used.sum(axis=0), 1)
+            squares[rows] += np.sum(np.where(used, values - mean, 0.0) ** 2, axis=1)
+    some = np.where(count > 0, count, np.nan)
+    flux = np.where(valid, telemetry.flux, 0.0).sum(axis=1) / some
+    return {
+        "rms of slopes about their mean (px)": np.sqrt(squares / (2 * some)),
+        "flux (e-)": flux,
+        "valid (%)": 100.0 * valid.mean(axis=1),
+        "latency (µs)": 1e6 * telemetry.latency_s,
+    }
+
+
+def methods_in_turn(telemetry: Telemetry, values: Floats) -> list[MethodDifference]:
+    """Compare the methods in a number for each frame; see `compared_methods`."""
+    return compared_methods(telemetry.method, method_names(telemetry), values)
+
+
+def compared_methods(
+    methods: NDArray[np.int64], names: Sequence[str], values: Floats
+) -> list[MethodDifference]:
+    """Compare alternating methods in a number for each frame; each turn with the first method's same turn.
+
+    Intervals come from a bootstrap of blocks of ten neighbouring turns.
+
+    Parameters
+    ----------
+    methods : (n,) array
+        Of each frame.
+    names : sequence of str
+        Of the methods that have frames, by number.
+    values : (n,) array
+        NaN: not known of that frame.
+    """
+    by_turn = [_by_turn(methods, method, values) for method in np.unique(methods)]
+    first = by_turn[0]
+    compared = []
+    for place, (name, own) in enumerate(zip(names, by_turn, strict=True)):
+        length = min(len(own), len(first))
+        difference = None if place == 0 else _mean(own[:length] - first[:length], len(by_turn) - 1)
+        compared.append(MethodDifference(name, _mean(own), difference))
+    return compared
+
+
+def _by_turn(methods: NDArray[np.int64], method: int, values: Floats) -> Floats:
+    """Return the mean of each turn of a method: of frames of its, one after the other; NaN without any."""
+    number = np.cumsum(np.concatenate([[0], np.diff(methods) != 0]))[methods == method]
+    own = values[methods == method]
+    _, turn = np.unique(number, return_inverse=True)
+    kept = np.isfinite(own)
+    count = np.bincount(turn, weights=kept)
+    sums = np.bincount(turn, weights=np.where(kept, own, 0.0))
+    return np.asarray(np.divide(sums, count, out=np.full(len(count), np.nan), where=count > 0))
+
+
+def _mean(values: Floats, comparisons: int = 1) -> Estimate:
+    kept = values[np.isfinite(values)]
+    return mean_by_blocks(kept, _TURNS_TOGETHER, comparisons=comparisons) if kept.size else Estimate(np.nan)
+
+
+def change_rows(telemetry: Telemetry) -> Sequence[tuple[int, float, str, str]]:
+    """Return frame, seconds from the first frame, what and where of every change; NaN before the first."""
+    rows = []
+    start = telemetry.last_row_time_ns[0]
+    for change in telemetry.changes:
+        place = int(np.searchsorted(telemetry.frame, change["frame"]))
+        inside = place < len(telemetry.frame) and change["frame"] >= telemetry.frame[0]
+        seconds = float(telemetry.last_row_time_ns[place] - start) / 1e9 if inside else np.nan
+        what = ", ".join(f"{name} = {_shortened(value)}" for name, value in change["changes"].items())
+        where = change["where"]
+        shown = "all" if where is None else where if isinstance(where, str) else ", ".join(map(str, where))
+        rows.append((int(change["frame"]), seconds, what, shown))
+    return rows
+
+
+def _shortened(value: Any) -> str:
+    """Return a value as text; of a table, such as a sodium profile, what is no list."""
+    text = str(value)
+    if isinstance(value, Mapping):
+        text = ", ".join(f"{name} {item}" for name, item in value.items() if not isinstance(item, list))
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."

@@ -1,0 +1,227 @@
+"""Recording of the engine's telemetry to a Zarr store, in a separate process.
+
+The engine is independent of it: a recorder that is too slow, or whose disk is full, loses records and delays
+nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
+from faintspot.engine.pixels.camera import StopEvent
+from faintspot.engine.settings.interleaving import methods_after
+from faintspot.engine.telemetry.ring import TelemetryReader
+from faintspot.io.telemetry.recording import TelemetryStore
+
+_POLL_S = 0.01
+_FLUSH_S = 1.0
+_FLUSH_BYTES = 1 << 26  # amount of buffered data that is written at once
+_STALE_S = 0.25  # between two checks whether the engine is alive
+_MOST_RECORDS, _MOST_IMAGES = 1024, 4  # read at once
+
+
+@dataclass(frozen=True)
+class RecordingReport:
+    """Result of a recording.
+
+    Attributes
+    ----------
+    frames, images, changes : int
+        Numbers in the store.
+    dropped, dropped_images, dropped_changes : int
+        Numbers overwritten in shared memory before they were read: reading or writing was too slow.
+    seconds : float
+    longest_write_s : float
+        Longest single write to the disk; nothing is read meanwhile.
+    ended_because : str
+        "frames", "seconds", "stopped" or "engine ended".
+    """
+
+    frames: int
+    images: int
+    changes: int
+    dropped: int
+    dropped_images: int
+    dropped_changes: int
+    seconds: float
+    longest_write_s: float
+    ended_because: str
+
+
+@dataclass
+class _Waiting:
+    """Data read but not yet stored, and the positions in the rings."""
+
+    record_cursor: int
+    image_cursor: int
+    change_cursor: int = 0  # from the first one, to know the settings at the start
+    records: list[NDArray[Any]] = field(default_factory=list)
+    images: list[NDArray[Any]] = field(default_factory=list)
+    changes: list[dict[str, Any]] = field(default_factory=list)
+    dropped: int = 0
+    dropped_images: int = 0
+    dropped_changes: int = 0
+    frames_read: int = 0
+    n_bytes: int = 0
+
+    def read(self, reader: TelemetryReader, limit: int) -> bool:
+        """Read what is available, up to `limit` frames in total; return whether there was anything."""
+        most = min(limit - self.frames_read, _MOST_RECORDS)
+        records, self.record_cursor, dropped = reader.records.since(self.record_cursor, most)
+        images, self.image_cursor, dropped_images = reader.images.since(self.image_cursor, _MOST_IMAGES)
+        changes, self.change_cursor, dropped_changes = reader.changes_since(self.change_cursor)
+        self.dropped += dropped
+        self.dropped_images += dropped_images
+        self.dropped_changes += dropped_changes
+        self.changes += changes
+        for items, kept in ((records, self.records), (images, self.images)):
+            if len(items):
+                kept.append(items)
+                self.n_bytes += items.nbytes
+        self.frames_read += len(records)
+        return bool(len(records) or len(images))
+
+    def taken(self, reader: TelemetryReader) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the buffered records and images, and clear the buffers."""
+        records = np.concatenate([np.empty(0, reader.records.kind), *self.records])
+        images = np.concatenate([np.empty(0, reader.images.kind), *self.images])
+        self.records, self.images, self.n_bytes = [], [], 0
+        return records, images
+
+    def attributes(self, reader: TelemetryReader) -> dict[str, Any]:
+        """Return the store's attributes."""
+        return {
+            "methods": methods_after(reader.description["methods"], self.changes)[0],
+            "changes": self.changes,
+            "dropped_records": self.dropped,
+            "dropped_images": self.dropped_images,
+            "dropped_changes": self.dropped_changes,
+        }
+
+
+class Recorder:
+    """Recorder of a running engine's telemetry to a new Zarr store.
+
+    Parameters
+    ----------
+    name : str
+        Name of the engine.
+    path : path
+        Path of the store, a directory that does not exist yet.
+
+    Raises
+    ------
+    InputError
+        When no such engine publishes telemetry, or the store cannot be made.
+    """
+
+    def __init__(self, name: str, path: str | Path) -> None:
+        self._reader = reader = TelemetryReader.attach(name)
+        self._waiting = _Waiting(reader.records.written, reader.images.written)
+        attributes = {
+            "name": name,
+            "layout": reader.description["layout"],
+            "settings": reader.settings,
+            "reference": reader.description.get("reference"),
+            "parts": reader.description.get("parts"),
+            **self._waiting.attributes(reader),
+        }
+        self._store = TelemetryStore(path, reader.records.kind, reader.images.kind, attributes)
+        self._longest_write_s = self._written_at = self._asked_at = 0.0
+
+    def run(
+        self,
+        *,
+        n_frames: int | None = None,
+        seconds: float | None = None,
+        stop: StopEvent | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> RecordingReport:
+        """Record until a limit is reached, `stop` is set or the engine ends.
+
+        At the end everything that was read is in the store; while it runs, all but the last second.
+
+        Parameters
+        ----------
+        n_frames : int, optional
+        seconds : float, optional
+        stop : event, optional
+        progress : function, optional
+            Called with the number of frames so far.
+
+        Raises
+        ------
+        InputError
+            When a limit is out of its range, or the disk is full or not writable. Data written before remain
+            readable.
+        """
+        limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
+        duration = np.inf if seconds is None else number_between("seconds", seconds, 0, low_open=True)
+        start = self._written_at = time.monotonic()
+        waiting, ended, gone = self._waiting, "", False
+        while not ended:
+            something = waiting.read(self._reader, sys.maxsize if limit is None else limit)
+            if limit is not None and waiting.frames_read >= limit:
+                ended = "frames"
+            elif time.monotonic() - start >= duration:
+                ended = "seconds"
+            elif stop is not None and stop.is_set():
+                ended = "stopped"
+            elif gone and not something:  # all remaining data has been read
+                ended = "engine ended"
+            if progress is not None:
+                progress(waiting.frames_read)
+            self._write_in_turn()
+            if not (something or ended):
+                gone = self._gone()
+                time.sleep(_POLL_S)
+        self._write({"complete": True, "ended_because": ended})
+        self._reader.close()
+        return self._report(time.monotonic() - start, ended)
+
+    def _gone(self) -> bool:
+        """Return whether the engine has ended; checks only now and then."""
+        if time.monotonic() - self._asked_at < _STALE_S:
+            return False
+        self._asked_at = time.monotonic()
+        return self._reader.stale
+
+    def _write_in_turn(self) -> None:
+        """Write the buffered data if it is time, or if there is much of it."""
+        if time.monotonic() - self._written_at > _FLUSH_S or self._waiting.n_bytes > _FLUSH_BYTES:
+            self._write({})
+            self._written_at = time.monotonic()
+
+    def _write(self, attributes: dict[str, Any]) -> None:
+        """Write the buffered data."""
+        start = time.monotonic()
+        records, images = self._waiting.taken(self._reader)
+        try:
+            self._store.append(records, images, {**self._waiting.attributes(self._reader), **attributes})
+        except InputError as error:
+            raise InputError(f"{error}; {self._store.frames} frames are in the store") from None
+        self._longest_write_s = max(self._longest_write_s, time.monotonic() - start)
+
+    def _report(self, seconds: float, ended: str) -> RecordingReport:
+        waiting, store = self._waiting, self._store
+        return RecordingReport(
+            store.frames,
+            store.images,
+            len(waiting.changes),
+            waiting.dropped,
+            waiting.dropped_images,
+            waiting.dropped_changes,
+            seconds,
+            self._longest_write_s,
+            ended,
+        )

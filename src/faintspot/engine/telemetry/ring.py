@@ -1,0 +1,339 @@
+"""Telemetry: the engine's data of each frame, passed through shared memory to recorders and displays.
+
+The engine's thread writes; any number of processes of the same user read. The writer never waits. A reader
+that is too slow loses the oldest records and gets their number. One segment, NAME_telemetry, holds three
+rings: a record for every frame, pixel images of some frames, and changes of settings.
+
+The segment is a pixel ring with a single slot of bytes (see `engine.pixels.pixel_segment`), so that it
+is created, recognised as stale and replaced in the same way. The slot holds::
+
+    magic, length and checksum of the description; the description, JSON text
+    three counts, 128 bytes apart: records, images, changes ever written
+        the three rings; item k of a ring is in place k % length
+
+An item is written first and counted afterwards (`kernels.compilation.ordered`). The next item overwrites the
+oldest, so a reader already counts the oldest as lost.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import struct
+import time
+import zlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import number_between
+from faintspot.base.closing import Closing
+from faintspot.base.errors import InputError
+from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.pixels.pixel_segment import Header, create_segment, segment_path
+from faintspot.engine.pixels.processes import process_start
+from faintspot.engine.telemetry.segment import (
+    CHANGE_BYTES,
+    CHANGE_SLOTS,
+    PAGE,
+    Rings,
+    image_type,
+    kinds_of,
+    layout_values,
+    plain,
+    record_type,
+    up_to_pages,
+)
+from faintspot.slopes.kernels.compilation.ordered import fence
+from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.sensor.layout import Layout
+
+__all__ = ["TelemetryReader", "TelemetryRing"]
+
+_MAGIC = b"fstelem1"
+_START = struct.Struct("<8sII")
+_HEAD = struct.Struct("<10q")
+_BYTE = np.dtype(np.uint8)
+_RECORD_BYTES, _IMAGE_BYTES = 1 << 25, 1 << 24  # small enough for a container's 64 MiB of shared memory
+
+
+class TelemetryRing(Closing):
+    """Writer of an engine's telemetry, made by `create`. As a context manager it closes itself.
+
+    Records, images and changes may be written from three threads, each kind from one thread only.
+
+    Attributes
+    ----------
+    name : str
+        Name of the engine.
+    """
+
+    def __init__(self, name: str, ring: PixelRing, begin: int, description: Mapping[str, Any]) -> None:
+        """Use `create` instead."""
+        self.name, self._ring = name, ring
+        self._memory = ring.pixels[0, 0].data
+        self._rings = rings = Rings(ring.pixels[0, 0], begin, description)
+        self._written = 0
+        items = rings.records.items
+        self._places, self._itemsize, self._begin = len(items), items.itemsize, rings.first_record
+        # One array per field; each row is the target of one copy, without temporary objects.
+        self._x, self._y, self._flux = items["x"], items["y"], items["flux"]
+        self._error_x, self._error_y = items["standard_error_x"], items["standard_error_y"]
+        self._covariance_xy = items["covariance_xy"]
+        self._iterations, self._flags = items["iterations"], items["flags"]
+        if description["commands"]:
+            self._loop, self._commands = items["loop"], items["commands"]
+
+    @classmethod
+    def create(
+        cls,
+        name: str,
+        layout: Layout,
+        *,
+        settings: str = "",
+        methods: Sequence[str] = (),
+        commands: int = 0,
+        reference: ArrayLike | None = None,
+        parts: Mapping[str, str] | None = None,
+        records: int | None = None,
+        image_slots: int | None = None,
+    ) -> TelemetryRing:
+        """Create the rings of an engine.
+
+        Parameters
+        ----------
+        name : str
+            Name of the engine; the segment is /dev/shm/NAME_telemetry.
+        layout : Layout
+        settings : str
+            The initial settings, for readers: TOML text (`faintspot.slopes.pipeline.configuration.to_text`).
+        methods : sequence of str, optional
+            Names of the interleaved configurations, for readers.
+        commands : int
+            Number of the mirror's commands; 0: none.
+        reference : (2 n,) array, optional
+            Reference slopes that were subtracted, px, for readers.
+        parts : mapping, optional
+            Calibration, PSF and score, for readers (`faintspot.slopes.pipeline.configuration.packed`).
+        records : int, optional
+            Number of records, about 60 + 29 n bytes each: a reader may lag by one frame less. Default: as
+            many as fit into 32 MiB, up to 4096.
+        image_slots : int, optional
+            Number of images. Default: as many as fit into 16 MiB, 2 to 16.
+
+        Raises
+        ------
+        InputError
+            When a living process writes telemetry of that name, shared memory is short, or a value is out of
+            range.
+        """
+        n = len(layout)
+        if records is None:
+            records = min(4096, max(2, _RECORD_BYTES // record_type(n, commands).itemsize))
+        if image_slots is None:
+            size = image_type(layout.frame_shape, n, layout.window).itemsize
+            image_slots = min(16, max(2, _IMAGE_BYTES // size))
+        description = {
+            "layout": layout_values(layout),
+            "settings": settings,
+            "methods": list(methods),
+            "commands": commands,
+            "reference": None if reference is None else np.asarray(reference).tolist(),
+            "parts": parts,
+            "records": int(number_between("records", records, 2, 1 << 24, integer=True)),
+            "image_slots": int(number_between("image_slots", image_slots, 2, 1 << 16, integer=True)),
+            "change_slots": CHANGE_SLOTS,
+        }
+        ring, begin = _segment(name, description)
+        return cls(name, ring, begin, description)
+
+    def write(
+        self,
+        frame: int,
+        method: int,
+        change: int,
+        last_row_ns: int,
+        published_ns: int,
+        slopes: Slopes,
+        *,
+        causes: tuple[int, int, int] = (0, 0, 0),
+        loop: int = 0,
+        commands: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Write the record of one frame: takes a few microseconds, never waits, checks nothing.
+
+        Parameters
+        ----------
+        frame : int
+            Frame number of the camera.
+        method, change : int
+            Numbers of the interleaved configuration and of the last change of settings that applies.
+        last_row_ns, published_ns : int
+            Times of CLOCK_MONOTONIC, ns.
+        slopes : Slopes
+            Slopes of one frame; copied.
+        causes : (int, int, int)
+            Cause of lateness, number of frames lost before this one, and the cause, as in `record_type`.
+        loop : int
+            State of the loop, as in `record_type`.
+        commands : (commands,) array, optional
+            Commands that follow from the slopes; needed if the telemetry has commands.
+        """
+        written = self._written
+        place = written % self._places
+        _HEAD.pack_into(
+            self._memory,
+            self._begin + place * self._itemsize,
+            written,
+            frame,
+            method,
+            change,
+            last_row_ns,
+            published_ns,
+            time.time_ns() - time.monotonic_ns(),
+            *causes,
+        )
+        self._x[place], self._y[place], self._flux[place] = slopes.x, slopes.y, slopes.flux
+        self._error_x[place], self._error_y[place] = slopes.standard_error_x, slopes.standard_error_y
+        self._covariance_xy[place] = slopes.covariance_xy
+        self._iterations[place], self._flags[place] = slopes.iterations, slopes.flags
+        if commands is not None:
+            self._loop[place], self._commands[place] = loop, commands
+        self._written = written = written + 1
+        self._rings.records.count(written)
+
+    def write_images(self, frame: int, raw: ArrayLike, denoised: ArrayLike) -> None:
+        """Write images of one frame: the frame itself (h, w), ADU, and denoised (n, ny, nx), electrons."""
+        ring = self._rings.images
+        written = ring.written
+        item = ring.items[written % len(ring.items)]
+        item["sequence"], item["image_frame"] = written, frame
+        item["raw"][...] = raw
+        item["denoised"][...] = denoised
+        ring.count(written + 1)
+
+    def write_change(
+        self, frame: int, number: int, changes: Mapping[str, Any], where: Sequence[int] | None
+    ) -> None:
+        """Write a change of settings that has taken effect.
+
+        If the change is longer than 4 KiB, only its names are written, and a note that it was too long.
+
+        Parameters
+        ----------
+        frame : int
+            First frame that was measured with it.
+        number : int
+            Number of the change, as in `write`.
+        changes : mapping
+            New values by name.
+        where : sequence of int, optional
+            Indices of the sub-apertures; None: all.
+        """
+        place = {"frame": int(frame), "number": int(number)}
+        whole = {**place, "changes": dict(changes), "where": where}
+        text = json.dumps(whole, default=plain).encode()
+        if len(text) > CHANGE_BYTES - 8:
+            names = dict.fromkeys(list(changes)[:20], "too long")
+            short = {**place, "changes": names, "where": "too long", "too_long_bytes": len(text)}
+            text = json.dumps(short).encode()
+        ring = self._rings.changes
+        written = ring.written
+        item = ring.items[written % len(ring.items)]
+        item["length"] = len(text)
+        item["text"][: len(text)] = np.frombuffer(text, np.uint8)
+        ring.count(written + 1)
+
+    def close(self) -> None:
+        """Remove the segment's name and notify readers of the end. Repeated calls do nothing."""
+        self._ring.close()
+
+
+class TelemetryReader:
+    """Reader of an engine's telemetry, made by `attach`.
+
+    Attributes
+    ----------
+    name : str
+        Name of the engine.
+    records, images : Ring
+        Records of all frames, and images of some; see `record_type` and `image_type`.
+    layout : Layout
+    settings : str
+        Initial settings of the engine: TOML text.
+    description : dict
+        The writer's description of itself, as plain values.
+    """
+
+    def __init__(self, name: str, ring: PixelRing, begin: int, description: dict[str, Any]) -> None:
+        """Use `attach` instead."""
+        self.name, self._ring, self.description = name, ring, description
+        self.layout = Layout(**description["layout"])
+        self.settings: str = description["settings"]
+        rings = Rings(ring.pixels[0, 0], begin, description)
+        self.records, self.images, self._changes = rings.records, rings.images, rings.changes
+
+    @classmethod
+    def attach(cls, name: str) -> TelemetryReader:
+        """Open the telemetry of an engine.
+
+        Raises
+        ------
+        InputError
+            When there is no such telemetry, or it is not of this version and user.
+        """
+        path = segment_path(f"{name}_telemetry")
+        if not path.exists():
+            raise InputError(f"{path}: no telemetry of {name!r}; start the engine first")
+        ring = PixelRing.attach(path.name)
+        memory = ring.pixels[0, 0]
+        magic, length, checksum = _START.unpack_from(memory) if len(memory) >= _START.size else (b"", 0, 0)
+        text = memory[_START.size : _START.size + length].tobytes()
+        if magic != _MAGIC or zlib.crc32(text) != checksum:
+            raise InputError(f"{path}: expected telemetry of this version of faintspot")
+        return cls(name, ring, up_to_pages(_START.size + length), json.loads(text))
+
+    @property
+    def stale(self) -> bool:
+        """Whether no more data come: the engine has ended or died, or another one has taken its name.
+
+        Existing data can still be read.
+        """
+        return self._ring.closed or self._ring.stale
+
+    def changes_since(self, cursor: int) -> tuple[list[dict[str, Any]], int, int]:
+        """Return the changes of settings from a cursor on, as `Ring.since` does.
+
+        Each has frame, number, changes (values by name) and where (sub-apertures, None for all).
+        """
+        items, cursor, dropped = self._changes.since(cursor)
+        changes = [json.loads(item["text"][: item["length"]].tobytes()) for item in items]
+        return changes, cursor, dropped
+
+    def close(self) -> None:
+        """Close the segment."""
+        self._ring.close()
+
+
+def _segment(name: str, description: Mapping[str, Any]) -> tuple[PixelRing, int]:
+    """Create the segment, with its description and empty rings; return it and the offset of the rings."""
+    text = json.dumps(description).encode()
+    begin = up_to_pages(_START.size + len(text))
+    rings = sum(up_to_pages(kind.itemsize * places) for kind, places in kinds_of(description))
+    pid, segment = os.getpid(), f"{name}_telemetry"
+    size = begin + PAGE + rings
+    header = Header(pid, process_start(pid), secrets.randbits(64), 1, size, 1, _BYTE.str)
+    try:
+        memory, identity = create_segment(segment_path(segment), header)
+    except InputError as error:
+        raise InputError(f"telemetry of {name}: {error}") from None
+    ring = PixelRing(segment, memory, header, identity)
+    slot = ring.pixels[0, 0]
+    slot[::PAGE] = 0  # touch every page before the first frame
+    slot[_START.size : _START.size + len(text)] = np.frombuffer(text, np.uint8)
+    fence()
+    _START.pack_into(slot.data, 0, _MAGIC, len(text), zlib.crc32(text))  # last: from here on it can be read
+    return ring, begin

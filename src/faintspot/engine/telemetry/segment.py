@@ -1,0 +1,148 @@
+"""Layout of a telemetry segment: the types of its three rings, and reading and writing them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.slopes.kernels.compilation.ordered import fence, load, store
+from faintspot.slopes.sensor.layout import Layout
+
+CHANGE_BYTES = 4096
+"""Bytes per place in the ring of changes: the length of the text (8 bytes), then the text."""
+CHANGE_SLOTS = 256
+PAGE = 4096
+_CELL_BYTES = 128  # distance of the counts, so that no two share a cache line or a prefetched pair
+
+
+def record_type(n: int, commands: int = 0) -> np.dtype[np.void]:
+    """Return the type of a record of n sub-apertures; units as in `faintspot.Slopes`.
+
+    `sequence` counts the records from 0, `frame` is the camera's number, `method` the number of the
+    interleaved configuration, `change` that of the last change of settings that applies. Times are of
+    CLOCK_MONOTONIC, ns; `clock_offset_ns` added to them gives Unix time by the wall clock at that moment.
+    `late` is 0 for a frame in time, else the cause (`faintspot.engine.path.lateness.CAUSES`). `lost` is the
+    number of frames lost since the record before, and `lost_because` the cause.
+    With commands, the record also has those that follow from the frame, in the interaction matrix's unit, and
+    the loop's state `loop`: 1 open, 2 closed.
+    """
+    numbers = ("sequence", "frame", "method", "change", "last_row_time_ns", "published_time_ns")
+    head = [(name, np.int64) for name in (*numbers, "clock_offset_ns", "late", "lost", "lost_because")]
+    floats = ("x", "y", "flux", "standard_error_x", "standard_error_y", "covariance_xy")
+    body = [(name, np.float32, (n,)) for name in floats]
+    control = [("loop", np.int64), ("commands", np.float32, (commands,))] if commands else []
+    return np.dtype(
+        [*head, *body, ("iterations", np.int32, (n,)), ("flags", np.uint8, (n,)), *control], align=True
+    )
+
+
+def image_type(frame_shape: tuple[int, int], n: int, window: tuple[int, int]) -> np.dtype[np.void]:
+    """Return the type of an item of the ring of images: the frame, ADU, and denoised images, electrons."""
+    return np.dtype(
+        [
+            ("sequence", np.int64),
+            ("image_frame", np.int64),
+            ("raw", np.float32, frame_shape),
+            ("denoised", np.float32, (n, *window)),
+        ],
+        align=True,
+    )
+
+
+class Ring:
+    """One of the rings: its places, and the count of items ever written.
+
+    Attributes
+    ----------
+    items : structured array
+        Places in shared memory.
+    kind : dtype
+        Type of an item.
+    """
+
+    def __init__(self, cells: NDArray[np.int64], row: int, items: NDArray[Any]) -> None:
+        self.items, self.kind, self._cell = items, items.dtype, cells[row]
+
+    @property
+    def written(self) -> int:
+        """Number of items ever written, which is the cursor after the newest."""
+        count: int = load(self._cell, 0)
+        return count
+
+    def count(self, written: int) -> None:
+        """Set the number of items written."""
+        store(self._cell, 0, written)
+        fence()  # before the next item overwrites the oldest
+
+    def since(self, cursor: int, most: int | None = None) -> tuple[NDArray[Any], int, int]:
+        """Return copies of the items from a cursor on, in order.
+
+        Parameters
+        ----------
+        cursor : int
+            Number of the next item to read; 0: from the oldest one available.
+        most : int, optional
+            Maximum number of items; the oldest are returned. Default: all available.
+
+        Returns
+        -------
+        items : structured array, (m,)
+        cursor : int
+            Cursor for the next call.
+        dropped : int
+            Items that were overwritten before they could be copied.
+        """
+        places, written = len(self.items), self.written
+        first = max(cursor, written - places + 1)  # one place may be in use by the writer
+        last = max(first, written if most is None else min(written, first + most))
+        copies = self.items[np.arange(first, last) % places]
+        fence()  # before checking what was overwritten meanwhile
+        overwritten = min(max(self.written - places + 1 - first, 0), len(copies))
+        return copies[overwritten:], last, first - cursor + overwritten
+
+
+class Rings:
+    """The three rings in the segment's memory."""
+
+    def __init__(self, memory: NDArray[np.uint8], begin: int, description: Mapping[str, Any]) -> None:
+        cells = memory[begin : begin + PAGE].view(np.int64).reshape(-1, _CELL_BYTES // 8)
+        begin += PAGE
+        self.first_record = begin
+        rings = []
+        for row, (kind, places) in enumerate(kinds_of(description)):
+            size = kind.itemsize * places
+            rings.append(Ring(cells, row, memory[begin : begin + size].view(kind)))
+            begin += up_to_pages(size)
+        self.records, self.images, self.changes = rings
+
+
+def kinds_of(description: Mapping[str, Any]) -> list[tuple[np.dtype[np.void], int]]:
+    """Return the type and number of places of each of the three rings."""
+    layout = description["layout"]
+    n, shape, window = len(layout["corners"]), tuple(layout["frame_shape"]), tuple(layout["window"])
+    change = np.dtype([("length", np.int64), ("text", np.uint8, (CHANGE_BYTES - 8,))])
+    return [
+        (record_type(n, description.get("commands", 0)), description["records"]),
+        (image_type(shape, n, window), description["image_slots"]),
+        (change, description["change_slots"]),
+    ]
+
+
+def layout_values(layout: Layout) -> dict[str, Any]:
+    """Return a layout as plain values, from which `Layout` can be rebuilt."""
+    return {
+        name: plain(value) if isinstance(value, np.ndarray) else value for name, value in vars(layout).items()
+    }
+
+
+def plain(value: Any) -> Any:
+    """Convert NumPy's numbers and arrays to plain values, and other objects to text."""
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
+
+
+def up_to_pages(size: int) -> int:
+    """Round a number of bytes up to whole pages."""
+    return -(-size // PAGE) * PAGE

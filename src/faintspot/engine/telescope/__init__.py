@@ -1,0 +1,1 @@
+"""The simulated telescope of an engine."""

@@ -1,0 +1,271 @@
+"""A simulated telescope at a camera's pace, which reads commands and publishes pixels and truth."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.closing import Closing
+from faintspot.base.errors import InputError
+from faintspot.engine.pixels.camera import CameraReport, Readout, StopEvent, readout_type
+from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
+from faintspot.engine.streams.command_stream import CommandStream
+from faintspot.engine.streams.shared_streams import create_stream, held
+from faintspot.engine.telescope.orders import Conditions
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.telescope.camera import make_detector
+from faintspot.loop.simulation.telescope.model import TelescopeModel
+
+TRUTH = ("frame", "strehl", "rms_nm", "r0_m", "time_s", "begun_s", "command_frame", "photons")
+"""Values of NAME_truth for a frame, float64.
+
+Strehl ratio and rms of the residual wavefront, r0, the middle of the exposure on the atmosphere's clock, the
+start of the exposure (CLOCK_MONOTONIC), the frame number stamped on the commands in use (-1: none yet), and
+photo-electrons per fully illuminated sub-aperture.
+"""
+LENGTHY = ("set",)
+"""Commands that wait for the next exposure; other commands are answered meanwhile."""
+_BETWEEN_COMPLAINTS_S = 10.0
+
+
+@dataclass(eq=False)
+class Order:
+    """Requested change of the observing conditions."""
+
+    conditions: Conditions
+    frame: int = -1
+    """First frame with them."""
+    in_effect: threading.Event = field(default_factory=threading.Event)
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """A frame, and its truth as in `TRUTH`."""
+
+    pixels: NDArray[Any]
+    truth: tuple[float, ...]
+
+
+class SimulatedTelescope(Readout, Closing):
+    """Telescope that observes as `simulate_loop` does, with the commands of a stream.
+
+    The exposure takes one frame time, the read-out a part of the next one. At the start of an exposure the
+    mirror takes the newest commands of the stream NAME_commands and holds them until its end. Frame k equals
+    that of `simulate_loop` with the same commands, seed and realisation; late frames delay the atmosphere,
+    too. Simulation and read-out run in separate threads.
+
+    Rows go into the pixel ring NAME. After the last one, the stream NAME_truth gets the truth (`TRUTH`) and
+    NAME_frames the whole frame, both stamped with its number.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+        Its frame rate is that of the camera.
+    name : str
+        Name of the pixel ring and of the streams.
+    seed : int, optional
+        Default: the configuration's.
+    realisation : int
+    readout_fraction : float
+        Part of the frame time in which the rows arrive, 0 to 1.
+    rows_per_block : int, optional
+        Rows that are published together. Default: the rows of a sub-aperture.
+    slots : int
+        Frames in the ring.
+    say : function, optional
+        Called with a one-line message about the commands, and when the pace cannot be kept.
+
+    Attributes
+    ----------
+    telescope_model : TelescopeModel
+    commands : CommandStream
+
+    Raises
+    ------
+    InputError
+        When a value is out of its range, parts do not fit together, or the ring or a stream cannot be made.
+    MissingExtraError
+        When HCIPy or pyshmem is not installed.
+    """
+
+    def __init__(
+        self,
+        configuration: LoopConfiguration,
+        name: str,
+        *,
+        seed: int | None = None,
+        realisation: int = 0,
+        readout_fraction: float = 0.8,
+        rows_per_block: int | None = None,
+        slots: int = 4,
+        say: Callable[[str], None] | None = None,
+    ) -> None:
+        if configuration.camera.rolling_shutter:
+            raise InputError("camera.rolling_shutter: expected 0, as this telescope knows no later commands")
+        self.configuration, self.name, self._say = configuration, name, say or (lambda _: None)
+        self._conditions = Conditions.of(configuration)
+        start = configuration.run.seed if seed is None else seed
+        self.telescope_model = telescope_model = TelescopeModel(configuration, start, realisation)
+        self._wind = telescope_model.atmosphere.velocity
+        layout, mirror = telescope_model.optics.sensor.layout, telescope_model.optics.mirror
+        dtype = readout_type(make_detector(configuration))
+        with ExitStack() as undo:
+            ring = undo.enter_context(PixelRing.create(name, layout.frame_shape, dtype, slots=slots))
+            super().__init__(
+                ring,
+                layout.frame_shape,
+                dtype,
+                frame_rate_hz=configuration.control.frame_rate_hz,
+                readout_fraction=readout_fraction,
+                rows_per_block=layout.window[0] if rows_per_block is None else rows_per_block,
+                spins=False,  # the simulation needs the processor
+            )
+            self._frames = create_stream(f"{name}_frames", layout.frame_shape, dtype)
+            undo.callback(self._frames.unlink)
+            self._truth = create_stream(f"{name}_truth", (len(TRUTH),), np.float64)
+            undo.callback(self._truth.unlink)
+            self.commands = CommandStream(f"{name}_commands", mirror.commands, self._say)
+            undo.callback(self.commands.close)
+            self._resources = undo.pop_all()
+        self._worker = ThreadPoolExecutor(1, "faintspot-exposure")
+        self._resources.callback(self._worker.shutdown)
+        self._underway: Future[Exposure] | None = None
+        self._last: Exposure | None = None
+        self._orders = threading.Lock()
+        self._order: Order | None = None
+        self._complained_s, self._complained_of = -np.inf, 0
+
+    def close(self) -> None:
+        """Remove the ring and the streams; repeated calls do nothing."""
+        self._resources.close()
+
+    def run(
+        self,
+        n_frames: int | None = None,
+        stop: StopEvent | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> CameraReport:
+        """Observe until `n_frames` are out or `stop` is set; a later call continues.
+
+        Raises
+        ------
+        InputError
+            When `n_frames` is not a whole number of at least 1, or another process holds a stream's lock.
+        """
+        self._complained_of = 0
+        with held(self._frames, self._truth):
+            return super().run(n_frames, stop, progress)
+
+    def order(self, changes: dict[str, Any]) -> Order:
+        """Change conditions from the next exposure on; see `telescope_orders.ORDERS`.
+
+        Raises
+        ------
+        InputError
+            When a name or value is not valid; nothing changes then.
+        """
+        with self._orders:
+            before = self._conditions if self._order is None else self._order.conditions
+            self._order = Order(before.ordered(self.configuration, changes))
+            return self._order
+
+    def status(self) -> dict[str, Any]:
+        """Return the telescope's counters and conditions, for the control channel."""
+        last = self._last
+        return {
+            "name": self.name,
+            "configuration": self.configuration.name,
+            "frame_rate_hz": self.configuration.control.frame_rate_hz,
+            "frames": self._next,
+            "late": self.late,
+            "overruns": self.overruns,
+            "truth": None if last is None else dict(zip(TRUTH, last.truth, strict=True)),
+            "conditions": asdict(self._conditions),
+            "commands": {
+                "stream": self.commands.stream,
+                "length": self.telescope_model.optics.mirror.commands,
+                "obstacle": self.commands.state,
+                **asdict(self.commands.counters),
+            },
+        }
+
+    # ---- frame by frame
+
+    def _frame(self) -> NDArray[Any]:
+        """Return frame number `_next`, whose exposure began a frame time ago (except for the first one)."""
+        if self._underway is None:
+            self._underway = self._begin(self._next)
+        self._last = self._underway.result()
+        return self._last.pixels
+
+    def _publish(self, moment: int, frame: NDArray[Any]) -> None:
+        """Read out one frame while the exposure of the next one begins."""
+        number, exposure = self._next, self._last
+        assert exposure is not None
+        self._underway = self._begin(number + 1)
+        super()._publish(moment, frame)
+        self._truth.write_locked(np.array(exposure.truth), frame_id=number)
+        self._frames.write_locked(frame, frame_id=number)
+        self._complain()
+
+    def _begin(self, number: int) -> Future[Exposure]:
+        """Begin an exposure with the present conditions and commands."""
+        begun_s = time.monotonic()
+        self.commands.take()
+        time_s = (number + 0.5) / self.configuration.control.frame_rate_hz
+        with self._orders:
+            order, self._order = self._order, None
+            if order is not None:
+                self._set(order.conditions, time_s)
+                order.frame = number
+                order.in_effect.set()
+        stamps = begun_s, float(self.commands.frame), self._conditions.photons
+        return self._worker.submit(self._expose, number, time_s, self.commands.commands_nm, stamps)
+
+    def _set(self, conditions: Conditions, time_s: float) -> None:
+        """Change flux and turbulence; the phase screens stay where the wind has moved them."""
+        atmosphere = self.telescope_model.atmosphere.blown(self._wind * conditions.wind_factor, time_s)
+        self.telescope_model.atmosphere = replace(atmosphere, r0_range_m=conditions.r0_m)
+        self.telescope_model.photons = conditions.photons
+        self._conditions = conditions
+
+    def _expose(
+        self, number: int, time_s: float, commands_nm: NDArray[np.float64], stamps: tuple[float, ...]
+    ) -> Exposure:
+        """Simulate one frame; runs in a separate thread."""
+        after, seen = self.telescope_model.wavefronts(time_s, commands_nm)
+        truth = self.telescope_model.truth(time_s, after)
+        known = (float(number), truth.strehl, truth.rms_nm, truth.r0_m, time_s)
+        return Exposure(self.telescope_model.frame(number, seen), known + stamps)
+
+    def _complain(self) -> None:
+        """Report, at intervals, that the pace cannot be kept."""
+        now = time.monotonic()
+        if self.overruns <= self._complained_of or now - self._complained_s < _BETWEEN_COMPLAINTS_S:
+            return
+        rate = self.configuration.control.frame_rate_hz
+        self._say(
+            f"cannot keep {rate:g} frames/s: {self.overruns} frame times went by without a frame, "
+            f"{self.late} frames were late"
+        )
+        self._complained_of, self._complained_s = self.overruns, now
+
+
+def commands_of(telescope: SimulatedTelescope) -> dict[str, Handler]:
+    """Return the commands of the control channel: status and set."""
+
+    def change(fields: dict[str, Any]) -> Mapping[str, Any]:
+        order = telescope.order(changes_of(fields))
+        frame = order.frame if order.in_effect.wait(EFFECT_TIMEOUT_S) else None
+        return {"frame": frame, "conditions": asdict(order.conditions)}
+
+    return {"status": lambda fields: telescope.status(), "set": change}

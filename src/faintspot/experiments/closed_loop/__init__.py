@@ -1,0 +1,1 @@
+"""Methods compared in a simulated closed loop."""

@@ -1,0 +1,311 @@
+"""Methods that closed-loop experiments compare: an estimator, and how the loop uses its slopes."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from faintspot.base.checks import one_of
+from faintspot.base.config.options import AUTO, Option
+from faintspot.base.errors import InputError
+from faintspot.experiments.methods import score_for_scene
+from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, KALMAN
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.configuration.sections import CLOSED, RunLength
+from faintspot.loop.simulation.methods import PRIOR, Method
+from faintspot.loop.simulation.telescope.camera import make_detector
+from faintspot.slopes.estimators.base import Estimator, Need
+from faintspot.slopes.estimators.built_in.correlation import Correlation
+from faintspot.slopes.estimators.built_in.maximum_a_posteriori import MaximumAPosteriori
+from faintspot.slopes.estimators.built_in.window import Window
+from faintspot.slopes.estimators.registry import estimator_named, estimators
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import TrainedScore
+
+Choice = Mapping[str, Any]
+"""Values of what is tuned, by name: `LOOP_GAIN` and options of the estimator."""
+
+LOOP_GAIN = "loop_gain"
+NOISE_SCALE = "noise_scale"
+_NOISE_SCALES = (0.35, 0.6, 1.0)
+_FIRST_NOISE_SCALES = (0.6,)
+_LOOP_GAINS = (0.05, 0.07, 0.1, 0.13, 0.17, 0.22, 0.28, 0.35, 0.43, 0.52, 0.62, 0.73, 0.85)
+_FIRST_LOOP_GAINS = (0.17, 0.35, 0.62)
+# Of control that learns it is only the gain at which telemetry is taken, which takes long.
+_TELEMETRY_GAINS = (0.05, 0.1, 0.2, 0.3, 0.4)
+_FIRST_TELEMETRY_GAINS = (0.2,)
+# How far spots are from where a prior expects them is the loop's to say: parts of their range.
+_PRIORS = (0.1, 0.175, 0.25, 0.35, 0.5, 0.75)
+_METHODS_OF_LASER = (
+    "window",
+    "correlation",
+    "window_filter",
+    "window_filter_followed",
+    "ml_followed",
+    "map_predicted_followed",
+)
+_STEPS_BEYOND = 2  # in the ratio of an end to its neighbour
+_FEWEST_TO_WIDEN = 4
+_FIRST_VALUES = (3, 2)  # of a method's first option, and of each further one
+_TRAINING_SPOTS = 8000
+_TRAINING_SEED = 4
+
+
+@dataclass(frozen=True)
+class Tunable:
+    """Something of a method that is tuned."""
+
+    values: tuple[Any, ...]
+    """Allowed values, in order."""
+    first: tuple[Any, ...]
+    """Those of the first look."""
+
+    def nearest(self, value: float) -> Tunable:
+        """Return only the value that is nearest to another one."""
+        near = min(self.values, key=lambda each: abs(each - value))
+        return Tunable((near,), (near,))
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Variants of a method's use in a loop."""
+
+    label: str
+    meaning: str
+    changes: Mapping[str, bool]
+    """Of the method."""
+
+
+VARIANTS = {
+    "_predicted": Variant(
+        "predicted",
+        "the estimator's prior, or where it starts, is what the loop predicts",
+        # What stays near the prediction has no gain of its own, and is measured without one.
+        {"predict_prior": True, "correct_gain": False},
+    ),
+    "_weighted": Variant(
+        "weighted reconstructor", "slopes count by their standard errors", {"weighted_reconstructor": True}
+    ),
+    "_uncorrected": Variant(
+        "gain not corrected", "slopes are not divided by the centroid gain", {"correct_gain": False}
+    ),
+    "_filter": Variant(
+        "matched filter",
+        "its weights are the linear matched filter of a laser guide star's spots",
+        {"matched_weights": True},
+    ),
+    "_followed": Variant(
+        "profile followed", "the sodium profile of a laser guide star is followed", {"follows_profile": True}
+    ),
+}
+"""By what follows the estimator's name in that of a method: "map_predicted_weighted"."""
+_PREDICTED = "_predicted"
+_OF_LASER = _FILTER, _FOLLOWED = "_filter", "_followed"
+CONTROL_SIGN = "+"
+"""Between a method's slopes and its control: "map+kalman"."""
+
+
+@dataclass(frozen=True)
+class MethodKind:
+    """An estimator and what the loop does with it; values are still to be chosen."""
+
+    estimator: type[Estimator]
+    variants: tuple[str, ...] = ()
+    """Variants, in the order of `VARIANTS`."""
+    control: str = INTEGRATOR
+
+    @property
+    def name(self) -> str:
+        """Name in commands and results."""
+        # The Kalman filter always predicts.
+        variants = [each for each in self.variants if each != _PREDICTED or self.control != KALMAN]
+        slopes = "".join([self.estimator.name, *variants])
+        return slopes if self.control == INTEGRATOR else f"{slopes}{CONTROL_SIGN}{self.control}"
+
+    @property
+    def is_predicted(self) -> bool:
+        """Whether its prior is the loop's prediction."""
+        return _PREDICTED in self.variants
+
+    @property
+    def label(self) -> str:
+        """Name in reports."""
+        parts = [self.estimator.label, *(VARIANTS[name].label for name in self.variants)]
+        return ", ".join(parts if self.control == INTEGRATOR else [*parts, CONTROLS[self.control]])
+
+    def tuned(self, configuration: LoopConfiguration) -> dict[str, Tunable]:
+        """Return what is tuned for a configuration's flux: the loop gain and options of the estimator."""
+        estimator = self._untuned(configuration)
+        declared = estimator.declared()
+        options = {
+            name: _wider(values, declared[name])
+            for name, values in estimator.tuned(configuration.scene).items()
+        }
+        if PRIOR in declared:
+            reach = configuration.position_range_px(predicted=_PREDICTED in self.variants)
+            options[PRIOR] = [part * reach for part in _PRIORS]
+        if self.control == KALMAN:
+            options.pop(PRIOR, None)  # the filter knows it
+        if _FILTER in self.variants:
+            options = {}  # the spots determine it
+        tuned = {LOOP_GAIN: Tunable(_LOOP_GAINS, _FIRST_LOOP_GAINS)}
+        if self.control != INTEGRATOR:
+            tuned[LOOP_GAIN] = Tunable(_TELEMETRY_GAINS, _FIRST_TELEMETRY_GAINS)
+        if self.control == KALMAN and self.estimator.takes_prior:
+            tuned[NOISE_SCALE] = Tunable(_NOISE_SCALES, _FIRST_NOISE_SCALES)
+        for number, (name, values) in enumerate(options.items()):
+            tuned[name] = _spread(values, _FIRST_VALUES[min(number, len(_FIRST_VALUES) - 1)])
+        return tuned
+
+    def method(self, configuration: LoopConfiguration, choice: Choice) -> Method:
+        """Return the method with tuned values, for the configuration's own flux.
+
+        The PSF of those that need one is that of a flat wavefront; the score is trained on simulated spots
+        of the same strength of turbulence, flux and camera.
+
+        Raises
+        ------
+        InputError
+            When a value is missing.
+        """
+        for name in self.tuned(configuration):
+            if name not in choice:
+                raise InputError(f"choice: expected a value for {name!r} of the method {self.name!r}")
+        of_loop = (LOOP_GAIN, NOISE_SCALE)
+        options = {name: value for name, value in choice.items() if name not in of_loop}
+        estimator = self._untuned(configuration).replaced(options)
+        laser, needs_psf = configuration.laser is not None, Need.PSF in estimator.required
+        if not laser and any(each in self.variants for each in _OF_LASER):
+            raise InputError(f"method = {self.name!r}: expected a configuration with a laser")
+        changes = {key: value for name in self.variants for key, value in VARIANTS[name].changes.items()}
+        return Method(
+            self.label,
+            Settings(
+                estimator, search_range_px=configuration.position_range_px() if laser and needs_psf else None
+            ),
+            float(choice[LOOP_GAIN]),
+            control=self.control,
+            noise_scale=float(choice.get(NOISE_SCALE, 1.0)),
+            psf=_flat_psf(configuration) if needs_psf and not laser else None,
+            score=_trained_score(_without_runs(configuration)) if Need.SCORE in estimator.required else None,
+            **changes,
+        )
+
+    def _untuned(self, configuration: LoopConfiguration) -> Estimator:
+        automatic = {name: AUTO for name, each in self.estimator.declared().items() if each.automatic}
+        return self.estimator(**automatic).for_scene(configuration.scene)
+
+
+def method_kind(name: str) -> MethodKind:
+    """Return a method by its name: that of an estimator, of variants and of control, as "ml_weighted+polc".
+
+    With the Kalman filter, estimators that take a prior are given its prediction.
+
+    Raises
+    ------
+    InputError
+        For an unknown estimator or control, or a prediction for one that takes none.
+    """
+    slopes, _, control = name.partition(CONTROL_SIGN)
+    control = one_of("control of the method", control or INTEGRATOR, list(CONTROLS))
+    base, variants = slopes, set()
+    while base not in _estimators():
+        ending = next((ending for ending in VARIANTS if base.endswith(ending)), None)
+        if ending is None:
+            break
+        base = base.removesuffix(ending)
+        variants.add(ending)
+    try:
+        estimator = _estimators().get(base) or estimator_named(base)
+    except InputError as error:
+        text = str(error).removeprefix("estimator")
+        raise InputError(f"method{text}; after it may follow {', '.join(VARIANTS)}") from None
+    if _PREDICTED in variants and not estimator.takes_prior:
+        raise InputError(f"method = {name!r}: expected an estimator that takes a prior, {base!r} takes none")
+    if _FILTER in variants and estimator is not Window:
+        raise InputError(f"method = {name!r}: expected estimator {Window.name!r} for {_FILTER!r}")
+    if control == KALMAN and estimator.takes_prior:
+        variants.add(_PREDICTED)
+    return MethodKind(estimator, tuple(variant for variant in VARIANTS if variant in variants), control)
+
+
+def _estimators() -> dict[str, type[Estimator]]:
+    """Return all estimators by name, with the one that is compared for laser guide stars only."""
+    return {**estimators(), Correlation.name: Correlation}
+
+
+def default_methods(configuration: LoopConfiguration) -> list[str]:
+    """Return the names of the methods that are compared where none are asked for.
+
+    Every estimator, as far as it suits; those that take a prior also with the loop's prediction, and those
+    that weigh pixels by their noise also with a weighted reconstructor. A score is trained for spots that
+    turbulence speckles: not where the source is elongated. In closed loop, the strongest usual estimator and
+    the one that gains most from a prior also with the Kalman filter. In open loop, where an error of the
+    centroid gain is not fed back, those that know nothing of the spot also without its correction.
+    With a laser guide star, those that suit elongated spots, with the profile learnt before and followed.
+    """
+    if configuration.laser is not None:
+        return list(_METHODS_OF_LASER)
+    names = []
+    for name, kind in estimators().items():
+        if Need.SCORE in kind.needs and configuration.sensor.spot_elongation > 1:
+            continue
+        names.append(name)
+        predicted = f"{name}{_PREDICTED}" if kind.takes_prior else name
+        names += [predicted] if kind.takes_prior else []
+        names += [f"{predicted}_weighted"] if Need.READ_NOISE in kind.needs else []
+        if configuration.control.mode != CLOSED and not kind.needs:
+            names.append(f"{name}_uncorrected")
+    kalman = [Window.name, MaximumAPosteriori.name] if configuration.control.mode == CLOSED else []
+    return names + [f"{name}{CONTROL_SIGN}{KALMAN}" for name in kalman]
+
+
+def _wider(values: Sequence[Any], option: Option) -> Sequence[Any]:
+    """Return values with some beyond both ends: in loops the best may be beyond."""
+    if option.choices or option.whole or len(values) < _FEWEST_TO_WIDEN or min(values) <= 0:
+        return values
+    low, below, *_ = ordered = sorted(set(values))
+    *_, above, high = ordered
+    for step in range(1, _STEPS_BEYOND + 1):
+        ordered += [low * (low / below) ** step, high * (high / above) ** step]
+    return [value for value in ordered if option.low < value <= option.high]
+
+
+def _spread(values: Sequence[Any], count: int) -> Tunable:
+    """Return values in their order, and some of them, evenly spread, for a first look."""
+    ordered = sorted(set(values))
+    if len(ordered) <= count:
+        return Tunable(tuple(ordered), tuple(ordered))
+    middles = (2 * np.arange(count) + 1) / (2 * count) * (len(ordered) - 1)
+    return Tunable(tuple(ordered), tuple(ordered[int(place + 0.5)] for place in middles))
+
+
+def _flat_psf(configuration: LoopConfiguration) -> PSF:
+    sensor = configuration.sensor
+    return _psf(configuration.spot_width_px / 2, sensor.spot_elongation, float(sensor.pixels))
+
+
+@functools.lru_cache(maxsize=4)
+def _psf(size: float, elongation: float, radius_px: float) -> PSF:
+    return PSF.analytic(size=size, elongation=elongation, radius_px=radius_px)
+
+
+def _without_runs(configuration: LoopConfiguration) -> LoopConfiguration:
+    """Return the configuration without what no score depends on, so that one serves runs of any length."""
+    return replace(configuration, run=RunLength(seed=configuration.run.seed))
+
+
+@functools.lru_cache(maxsize=4)
+def _trained_score(configuration: LoopConfiguration) -> TrainedScore:
+    """Train the score on spots of the weakest seeing: when unsure, the larger d / r0 is better."""
+    scene = configuration.scene
+    # Spots are elongated along another direction in each sub-aperture; it is trained on round ones.
+    scene = replace(scene, elongation=1.0, spot_fwhm_px=scene.spot_fwhm_px / math.sqrt(scene.elongation))
+    rng = np.random.default_rng([configuration.run.seed, _TRAINING_SEED])
+    return score_for_scene(scene, make_detector(configuration), rng, realisations=_TRAINING_SPOTS)

@@ -1,0 +1,361 @@
+"""Searches for settings: along each axis in turn, and, in closed loops, from the best of a coarse grid."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import theilslopes
+
+from faintspot.base.checks import number_between
+from faintspot.base.statistics import slope_statistics
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Choice, MethodKind, Tunable
+from faintspot.experiments.running import Advance
+from faintspot.loop.control.identification.learning import INTEGRATOR
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.simulation import simulate_loop
+
+_ROUNDS = 2  # of looking along each axis in turn
+_LEARNING_FRAMES = 3000  # that take as long as learning from telemetry
+_FEWEST_FLUXES = 3  # for a line
+
+Axes = Mapping[str, Sequence[Any]]
+"""Values of each option; the usual one first."""
+
+
+def coordinate_search(axes: Axes, badness: Callable[[Choice, str, Sequence[Any]], Sequence[float]]) -> Choice:
+    """Look along each axis in turn, from the first values, and again along those for which others changed.
+
+    Parameters
+    ----------
+    axes : mapping
+    badness : callable
+        Called with a choice, the name of an option and values of it; returns how bad the choice is with each
+        of them.
+
+    Returns
+    -------
+    dict
+        The choice where the search ends.
+    """
+    best: Choice = {name: values[0] for name, values in axes.items()}
+    looked: dict[str, Choice] = {}
+    for name in list(axes) * (_ROUNDS if len(axes) > 1 else 1):
+        others = {key: value for key, value in best.items() if key != name}
+        if looked.get(name) != others:  # else nothing has changed since
+            looked[name] = others
+            best = {**best, name: axes[name][int(np.argmin(badness(best, name, axes[name])))]}
+    return best
+
+
+def corrected_badness(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> float:
+    """Return the gain-corrected rms; where nothing is measured, the rms, behind all that measure."""
+    found = slope_statistics(x, y, truth)
+    corrected = found.corrected_rms.value
+    return corrected if math.isfinite(corrected) else 1e6 + found.rms.value
+
+
+FIRST_TUNING_REALISATION = 1000
+"""Realisations of the air from this one on are tuned on; those before are scored."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """Extent of a search for settings.
+
+    Parameters
+    ----------
+    coarse_frames : int
+        Of every combination of the coarse values, with one realisation of the air.
+    frames : int
+        Of the settings around the best ones, with every realisation; also of the final choice.
+    settle_frames : int
+        Of these, not scored.
+    realisations : int
+        Of the refined search.
+    finalists : int
+        Coarse combinations that are looked at again.
+    climbs : int
+        Finalists from which steps are taken, the best ones: the best of all may stand on the lower hill.
+    rounds : int
+        Most steps away from each of them; 0: none.
+
+    Raises
+    ------
+    InputError
+        For numbers out of range.
+    """
+
+    coarse_frames: int = 250
+    frames: int = 400
+    settle_frames: int = 60
+    realisations: int = 2
+    finalists: int = 4
+    climbs: int = 2
+    rounds: int = 5
+
+    def __post_init__(self) -> None:
+        lowest = {"coarse_frames": self.settle_frames + 1, "frames": self.settle_frames + 1, "rounds": 0}
+        for each in fields(self):
+            value = getattr(self, each.name)
+            number_between(f"search.{each.name}", value, lowest.get(each.name, 1), 10**6, integer=True)
+
+
+QUICK = Search(coarse_frames=160, frames=160, settle_frames=40, realisations=1, finalists=1, rounds=0)
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Result of a search."""
+
+    choice: Choice
+    strehl: float
+    """Mean of the tuning runs; the best of many, so higher than that of other runs."""
+    tried: int
+    """Settings that were looked at."""
+
+
+def tune(
+    kind: MethodKind,
+    configuration: LoopConfiguration,
+    search: Search | None = None,
+    advance: Advance | None = None,
+    *,
+    slopes: Choice | None = None,
+) -> Tuned:
+    """Find the settings of a method that give the highest Strehl ratio at the configuration's flux.
+
+    All combinations of a few values of each option first, then steps from the best ones to
+    neighbouring values of one option at a time, as long as that helps. Then each positive number goes to the
+    top of the parabola through the best value and those beside it, which scatters less than the best value.
+    Where control learns from telemetry, which takes much longer than a run, the estimator's options and the
+    gain at which telemetry is taken are those that are best with the integrator, and only the control's own
+    options are searched. All have the same turbulence and noise; realisations are those from
+    `FIRST_TUNING_REALISATION` on, which are not scored.
+
+    Parameters
+    ----------
+    kind : MethodKind
+    configuration : LoopConfiguration
+    search : Search, optional
+    advance : callable, optional
+        Told the number of frames simulated, after every run.
+    slopes : mapping, optional
+        Settings of the slopes with the integrator, of which only the loop gain is searched again, from the
+        given one. Default: searched; for control that learns, first.
+    """
+    search = Search() if search is None else search
+    if slopes is None and kind.control != INTEGRATOR:
+        slopes = tune(with_integrator(kind), configuration, search, advance).choice
+    search, tuned = _searched(kind, configuration, search, slopes)
+    return _sought(kind, configuration, search, tuned, advance)
+
+
+def _searched(
+    kind: MethodKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None
+) -> tuple[Search, dict[str, Tunable]]:
+    """Return the search and what it tunes where the settings of the slopes are known, or None."""
+    tuned = kind.tuned(configuration)
+    if slopes is None:
+        return search, tuned
+    for name in tuned.keys() & slopes.keys():
+        value = slopes[name]
+        if name != LOOP_GAIN:
+            tuned[name] = Tunable((value,), (value,))
+        elif kind.control == INTEGRATOR:
+            tuned[name] = replace(tuned[name], first=tuned[name].nearest(value).first)
+        else:
+            tuned[name] = tuned[name].nearest(value)
+    return replace(search, finalists=1), tuned
+
+
+def with_integrator(kind: MethodKind) -> MethodKind:
+    """Return the method with the same slopes whose control need not learn."""
+    return replace(kind, control=INTEGRATOR)
+
+
+def _sought(
+    kind: MethodKind,
+    configuration: LoopConfiguration,
+    search: Search,
+    tuned: Mapping[str, Tunable],
+    advance: Advance | None,
+) -> Tuned:
+    """Return the best of the values that are tuned."""
+    if all(len(each.values) == 1 for each in tuned.values()):
+        return Tuned({name: each.values[0] for name, each in tuned.items()}, math.nan, 0)
+    trials = _Trials(kind, configuration, search, advance)
+    coarse = [
+        dict(zip(tuned, values, strict=True))
+        for values in itertools.product(*(each.first for each in tuned.values()))
+    ]
+    ranked = sorted(coarse, key=lambda choice: -trials.coarse(choice))
+    if search.rounds == 0:
+        return Tuned(ranked[0], trials.coarse(ranked[0]), trials.tried)
+    finalists = sorted(ranked[: search.finalists], key=trials.fine, reverse=True)
+    tops = [_climbed(start, tuned, trials, search.rounds) for start in finalists[: search.climbs]]
+    best = max(tops, key=trials.fine)
+    return Tuned(_between(best, tuned, trials), trials.fine(best), trials.tried)
+
+
+def _climbed(
+    start: dict[str, Any], tuned: Mapping[str, Tunable], trials: _Trials, rounds: int
+) -> dict[str, Any]:
+    """Return where steps to the best neighbour end."""
+    best = start
+    for _ in range(rounds):
+        better = max(_neighbours(best, tuned), key=trials.fine, default=best)
+        if trials.fine(better) <= trials.fine(best):
+            break
+        best = better
+    return best
+
+
+def _between(best: Choice, tuned: Mapping[str, Tunable], trials: _Trials) -> dict[str, Any]:
+    """Return the best choice with each positive number at the top of the parabola through its neighbours."""
+    found = dict(best)
+    for name, each in tuned.items():
+        near = [best, *(other for other in _neighbours(best, tuned) if other[name] != best[name])]
+        if len(near) < 3 or not _is_scale(each.values):
+            continue
+        strehl = [trials.fine(choice) for choice in near]
+        place = np.log([choice[name] for choice in near])
+        bend, slope, _ = np.polyfit(place - place[0], strehl, 2)
+        if bend < 0:
+            top = np.clip(place[0] - slope / (2 * bend), place.min(), place.max())
+            found[name] = float(f"{math.exp(top):.3g}")
+    return found
+
+
+def _is_scale(values: Sequence[Any]) -> bool:
+    """Return whether an option's values are positive numbers, between which it may be."""
+    return all(isinstance(value, float) and value > 0 for value in values)
+
+
+def tuning_unit(
+    kind: MethodKind,
+    configuration: LoopConfiguration,
+    search: Search,
+    slopes: Choice | None,
+    advance: Advance,
+) -> dict[str, NDArray[Any]]:
+    """Return what `tune` found, as arrays that can be stored."""
+    tuned = tune(kind, configuration, search, advance, slopes=slopes)
+    return {
+        "choice": np.asarray(json.dumps(dict(tuned.choice))),
+        "strehl": np.asarray(tuned.strehl),
+        "tried": np.asarray(tuned.tried),
+    }
+
+
+def smoothed(
+    kind: MethodKind, stars: Sequence[LoopConfiguration], choices: Sequence[Choice]
+) -> list[dict[str, Any]]:
+    """Return the choices at several fluxes, with numbers among the options that are a power of the flux.
+
+    The Strehl ratio hardly depends on an option near its best value, so that the best one of a few short runs
+    scatters from flux to flux. The power law is the median line (Theil 1950) through all fluxes, within the
+    values on offer. Loop gain, whole numbers and options that may be 0 stay as they are, and with fewer than
+    three fluxes everything.
+    """
+    if len(stars) < _FEWEST_FLUXES:
+        return [dict(choice) for choice in choices]
+    tuned, declared = [kind.tuned(star) for star in stars], kind.estimator.declared()
+    flux = np.log([star.photons for star in stars])
+    found = [dict(choice) for choice in choices]
+    for name in tuned[0].keys() & declared.keys():
+        offered = [each[name].values for each in tuned]
+        if declared[name].whole or not all(_is_scale(values) for values in offered):
+            continue
+        line = theilslopes(np.log([choice[name] for choice in choices]), flux, method="joint")
+        for choice, log_flux, each in zip(found, flux, offered, strict=True):
+            value = float(np.clip(math.exp(line.intercept + line.slope * log_flux), min(each), max(each)))
+            choice[name] = float(f"{value:.3g}")
+    return found
+
+
+def stored(result: Mapping[str, NDArray[Any]]) -> Tuned:
+    """Return what `tuning_unit` stored."""
+    return Tuned(json.loads(str(result["choice"])), float(result["strehl"]), int(result["tried"]))
+
+
+def tuning_frames(
+    kind: MethodKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None = None
+) -> int:
+    """Return about how many frames `tune` simulates, with `slopes` for control that learns."""
+    search, tuned = _searched(kind, configuration, search, slopes)
+    combinations = math.prod(len(each.first) for each in tuned.values())
+    several = sum(len(each.values) > 1 for each in tuned.values())
+    if several == 0:
+        return 0
+    climbs = min(search.climbs, search.finalists)
+    looks = search.finalists + 2 * several * climbs * min(2, search.rounds) if search.rounds else 0
+    simulated = combinations * search.coarse_frames + looks * search.frames * search.realisations
+    return simulated + learning_frames(kind, configuration)
+
+
+def learning_frames(kind: MethodKind, configuration: LoopConfiguration) -> int:
+    """Return about how many frames could be simulated while a method's control learns."""
+    if kind.control == INTEGRATOR:
+        return 0
+    return configuration.control.telemetry_frames + _LEARNING_FRAMES
+
+
+class _Trials:
+    """Strehl ratios of the settings that were looked at."""
+
+    def __init__(
+        self, kind: MethodKind, configuration: LoopConfiguration, search: Search, advance: Advance | None
+    ) -> None:
+        self._kind, self._search = kind, search
+        self._advance, self._frames = advance, 0
+        self._configuration = configuration
+        self._coarse: dict[tuple[Any, ...], float] = {}
+        self._fine: dict[tuple[Any, ...], float] = {}
+
+    @property
+    def tried(self) -> int:
+        return len(self._coarse.keys() | self._fine.keys())
+
+    def coarse(self, choice: Choice) -> float:
+        """Return the Strehl ratio in one short run."""
+        key = tuple(choice.values())
+        if key not in self._coarse:
+            self._coarse[key] = self._strehl(choice, self._search.coarse_frames, 1)
+        return self._coarse[key]
+
+    def fine(self, choice: Choice) -> float:
+        """Return the mean Strehl ratio of longer runs."""
+        key = tuple(choice.values())
+        if key not in self._fine:
+            self._fine[key] = self._strehl(choice, self._search.frames, self._search.realisations)
+        return self._fine[key]
+
+    def _strehl(self, choice: Choice, frames: int, realisations: int) -> float:
+        short = self._configuration.replace("run", frames=frames, settle_frames=self._search.settle_frames)
+        method = self._kind.method(short, choice)
+        runs = range(FIRST_TUNING_REALISATION, FIRST_TUNING_REALISATION + realisations)
+        strehl = float(
+            np.mean([simulate_loop(short, [method], realisation=run).mean_strehl() for run in runs])
+        )
+        self._frames += frames * realisations
+        if self._advance is not None:
+            self._advance(self._frames)
+        return strehl
+
+
+def _neighbours(choice: Choice, tuned: Mapping[str, Tunable]) -> list[dict[str, Any]]:
+    """Return the choices one step away in one option."""
+    near = []
+    for name, each in tuned.items():
+        place = each.values.index(choice[name])
+        for other in (place - 1, place + 1):
+            if 0 <= other < len(each.values):
+                near.append({**choice, name: each.values[other]})
+    return near

@@ -1,0 +1,169 @@
+"""Sentences and tables of text on closed-loop results."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from faintspot.base.errors import InputError
+from faintspot.base.statistics import Estimate
+from faintspot.experiments.closed_loop.methods import VARIANTS
+from faintspot.experiments.closed_loop.question import REFERENCES
+from faintspot.experiments.closed_loop.results import (
+    BudgetResult,
+    MagnitudeResult,
+    differences_by_flux,
+    gains_in_magnitude,
+)
+from faintspot.experiments.closed_loop.tables import budget_table, in_columns, strehl_table
+from faintspot.experiments.words import with_interval
+from faintspot.loop.simulation.files import BUDGET_FILE, MAGNITUDE_FILE
+from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
+
+NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
+
+
+@dataclass(frozen=True, eq=False)
+class LoopResults:
+    """Results in a folder; None: not run."""
+
+    magnitude: MagnitudeResult | None = None
+    budget: BudgetResult | None = None
+
+    @classmethod
+    def load(cls, folder: str | Path) -> LoopResults:
+        """Read the results in a folder.
+
+        Raises
+        ------
+        InputError
+            When there are none, or one cannot be read.
+        """
+        folder = Path(folder)
+        results = cls(
+            MagnitudeResult.load(folder / MAGNITUDE_FILE) if (folder / MAGNITUDE_FILE).exists() else None,
+            BudgetResult.load(folder / BUDGET_FILE) if (folder / BUDGET_FILE).exists() else None,
+        )
+        if results.magnitude is None and results.budget is None:
+            raise InputError(f"{folder}: no results of a loop: expected {MAGNITUDE_FILE} or {BUDGET_FILE}")
+        return results
+
+
+def loop_verdict(results: LoopResults) -> list[str]:
+    """Return what the results say about TV, and then about the other ways to measure slopes."""
+    if results.magnitude is None:
+        return []
+    lines = _magnitude_lines(results.magnitude)
+    # What the denoising itself does: against the same without it.
+    tv, reference = tv_method(results.magnitude), reference_methods(results.magnitude)[-1]
+    if tv is None or tv == reference:
+        return lines
+    return [_headline(differences_by_flux(results.magnitude, tv, reference)), *lines]
+
+
+def reference_methods(result: MagnitudeResult) -> list[int]:
+    """Return the methods to compare others with: those of `REFERENCES` that are present, else the first."""
+    return [result.names.index(name) for name in REFERENCES if name in result.names] or [0]
+
+
+def tv_method(result: MagnitudeResult) -> int | None:
+    """Return the method with TV, or None."""
+    return result.names.index(TotalVariation.name) if TotalVariation.name in result.names else None
+
+
+def options_that_may_pay(result: MagnitudeResult) -> list[tuple[str, int, int]]:
+    """Return the options that methods differ by, the method with it and the one without, for `VARIANTS`."""
+    names = result.names
+    return [
+        (variant.label, method, names.index(name.replace(ending, "")))
+        for ending, variant in VARIANTS.items()
+        for method, name in enumerate(names)
+        if ending in name and name.replace(ending, "") in names
+    ]
+
+
+def better_and_worse(result: MagnitudeResult, method: int, reference: int) -> tuple[str, str]:
+    """Return at which fluxes a method's Strehl is above and below another's beyond its error, in words.
+
+    "" for none.
+    """
+    decided = [each.decided for each in differences_by_flux(result, method, reference)]
+    if decided == [1] * len(decided):
+        return "all fluxes", ""
+    if decided == [-1] * len(decided):
+        return "", "all fluxes"
+    above, below = (
+        ", ".join(
+            f"{photons:.3g}" for photons, sign in zip(result.photons, decided, strict=True) if sign == wanted
+        )
+        for wanted in (1, -1)
+    )
+    unit = " photo-electrons"
+    return above and above + unit, below and below + unit
+
+
+def _headline(comparisons: list[Estimate]) -> str:
+    known = [each for each in comparisons if np.isfinite(each.low)]
+    if not known:
+        return "Too few measurements to say whether TV raises the Strehl ratio."
+    gains, losses = (sum(each.decided == sign for each in known) for sign in (1, -1))
+    if gains:
+        first = f"TV raises the Strehl ratio beyond its error in {gains} of {len(known)} comparisons"
+    else:
+        first = NOWHERE
+    return (
+        f"{first}; it lowers it beyond its error in {losses} of {len(known)} comparisons."
+        if losses
+        else f"{first}."
+    )
+
+
+def _magnitude_lines(result: MagnitudeResult) -> list[str]:
+    references, lines = reference_methods(result), []
+    for place, reference in enumerate(references):
+        others = [method for method in range(len(result.labels)) if method not in references[: place + 1]]
+        lines += [_comparison(result, method, reference) for method in others]
+    for option, method, without in options_that_may_pay(result):
+        above, below = better_and_worse(result, method, without)
+        found = f"pays at {above}" if above else "pays nowhere beyond its error"
+        found += f", costs at {below}" if below else ""
+        lines.append(f"{result.labels[method]} against {result.labels[without]}: {option} {found}.")
+    return lines
+
+
+def _comparison(result: MagnitudeResult, method: int, reference: int) -> str:
+    above, below = better_and_worse(result, method, reference)
+    parts = [f"more Strehl beyond its error at {above}"] if above else []
+    parts += [f"less Strehl beyond its error at {below}"] if below else []
+    found = "; ".join(parts) if parts else "no difference beyond its error at any flux"
+    gain = _gain_in_magnitude(result, method, reference)
+    return f"Magnitudes, {result.labels[method]} against {result.labels[reference]}: {found}{gain}."
+
+
+def _gain_in_magnitude(result: MagnitudeResult, method: int, reference: int) -> str:
+    """Return the gain at the middle one of the Strehl ratios at which there is one."""
+    every = gains_in_magnitude(result, method, reference)
+    gains = [
+        (level, each) for level, each in every.items() if np.isfinite(each.value) and not np.isnan(each.low)
+    ]
+    if not gains:
+        return ""
+    level, middle = gains[len(gains) // 2]
+    return f"; limiting magnitude at Strehl {level:g}: {with_interval(middle, 2)} mag"
+
+
+_WIDTH = 100
+
+
+def loop_summary(results: LoopResults) -> str:
+    """Return the main tables of results and the verdict as text."""
+    tables = []
+    if results.magnitude is not None:
+        tables.append(in_columns(strehl_table(results.magnitude)))
+    if results.budget is not None:
+        tables.append(in_columns(budget_table(results.budget), 4))
+    verdict = [textwrap.fill(line, _WIDTH, subsequent_indent="  ") for line in loop_verdict(results)]
+    return "\n\n".join([*tables, *(["\n".join(verdict)] if verdict else [])])

@@ -1,0 +1,1 @@
+"""Basden et al. (2015): claims, verdicts, figures and tables."""

@@ -1,0 +1,1 @@
+"""The planner: which estimator and settings for a camera and a star."""

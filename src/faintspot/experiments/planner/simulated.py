@@ -1,0 +1,147 @@
+"""Simulated spots with known positions, to choose settings on and to score them on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.generators import spawn
+from faintspot.experiments.planner.question import Question
+from faintspot.loop.simulation.methods import Method
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.shapes import spots
+from faintspot.slopes.spots.speckled import speckled_spots
+
+Floats = NDArray[np.float64]
+
+SPOTS_PER_FRAME = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Frames of one flux, and the truth."""
+
+    frames: NDArray[Any]
+    """(n_frames, rows, columns): windows on top of each other, electrons at the camera's output."""
+    truth: Floats
+    """(n_frames, SPOTS_PER_FRAME, 2), px."""
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedSpots:
+    """Noiseless spots, to be exposed at any flux: the same positions and speckles at every one."""
+
+    question: Question
+    layout: Layout
+    calibration: Calibration
+    choosing: tuple[Floats, Floats]
+    every_k: tuple[Floats, Floats]
+
+    @classmethod
+    def of(cls, question: Question, realisations: int, rng: np.random.Generator) -> SimulatedSpots:
+        """Simulate `realisations` spots to score on, and half as many to choose on (whole frames)."""
+        first, second = spawn(rng, 2)
+        n_frames = max(2, -(-realisations // SPOTS_PER_FRAME))
+        background = question.background_e * question.em_gain
+        calibration = Calibration(
+            dark=background,
+            em_gain=question.em_gain,
+            read_noise_e=question.read_noise_e,
+            background_e=question.background_e,
+        )
+        return cls(
+            question,
+            Layout.grid((SPOTS_PER_FRAME, 1), pixels=question.shape),
+            calibration,
+            unit_spots(question, -(-n_frames // 2) * SPOTS_PER_FRAME, first),
+            unit_spots(question, n_frames * SPOTS_PER_FRAME, second),
+        )
+
+    def exposed(self, flux_e: float, rng: np.random.Generator) -> tuple[Sample, Sample]:
+        """Return frames to choose on and frames to score on at a flux."""
+        camera, (ny, nx) = self.question.detector, self.layout.window
+        samples = []
+        for (images, truth), noise in zip((self.choosing, self.every_k), spawn(rng, 2), strict=True):
+            frames = camera.expose(flux_e * images, noise).reshape(-1, SPOTS_PER_FRAME * ny, nx)
+            samples.append(Sample(frames, truth.reshape(-1, SPOTS_PER_FRAME, 2)))
+        return samples[0], samples[1]
+
+    @cached_property
+    def _pipelines(self) -> dict[str, SlopePipeline]:
+        return {}
+
+    def measure(self, sample: Sample, method: Method) -> Slopes:
+        """Measure the spots of a sample as the user's own frames would be."""
+        # What knows the spot takes time to prepare, and often has the same settings at every flux.
+        key = f"{method.settings} {id(method.psf)} {id(method.score)}"
+        if key not in self._pipelines:
+            self._pipelines[key] = SlopePipeline(
+                self.layout, method.settings, self.calibration, **method.parts
+            )
+        return self._pipelines[key](sample.frames)
+
+    def measure_each(
+        self, sample: Sample, method: Method, name: str, values: Sequence[Any]
+    ) -> list[tuple[NDArray[Any], NDArray[Any]]]:
+        """Return x and y, (n_frames, SPOTS_PER_FRAME), for each value of one of a method's options.
+
+        Where sub-apertures may have values of their own, the values share one pipeline.
+        """
+        if not method.estimator.declared()[name].per_subaperture:
+            slopes = [self.measure(sample, method.with_options({name: value})) for value in values]
+            return [(each.x, each.y) for each in slopes]
+        count = len(values)
+        layout = Layout.grid((count * SPOTS_PER_FRAME, 1), pixels=self.layout.window)
+        each = method.settings.replace(**{name: np.repeat(values, SPOTS_PER_FRAME)})
+        pipeline = SlopePipeline(layout, each, self.calibration, **method.parts)
+        found = pipeline(np.tile(sample.frames, (1, count, 1)))
+        x, y = (part.reshape(len(part), count, SPOTS_PER_FRAME).swapaxes(0, 1) for part in (found.x, found.y))
+        return list(zip(x, y, strict=True))
+
+
+def unit_spots(question: Question, n: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return images (n, ny, nx) of spots and their positions (n, 2), px.
+
+    A spot that is not speckled and in the middle of its window leaves 1 e- in it, on average where
+    sub-apertures differ in their flux.
+    """
+    images, positions = _even_spots(question, n, rng)
+    if question.relative_flux is not None:
+        images = images * spawn(rng, 1)[0].choice(question.relative_flux, n)[:, None, None]
+    return images, positions
+
+
+def _even_spots(question: Question, n: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return such spots, all of the same flux."""
+    position_rng, phase_rng = spawn(rng, 2)
+    half, shape = question.search_range_px, question.shape
+    positions = position_rng.uniform(-half, half, (n, 2))
+    middle = np.zeros((1, 2))
+    if question.psf is not None:
+        which = phase_rng.integers(0, len(question.psf.samples), n)
+        images = question.psf.images(positions, shape, which=which)
+        flux = question.psf.images(np.repeat(middle, n, axis=0), shape, which=which).sum(axis=(1, 2))
+        # A learnt PSF's wings may be a little negative; light is not.
+        return np.maximum(images / flux[:, None, None], 0.0), positions
+    form: dict[str, Any] = {"shape": shape, "profile": question.profile, "size": question.size}
+    flux = spots(middle, **form).sum()
+    if question.d_over_r0:
+        images, _ = speckled_spots(
+            n,
+            d_over_r0=question.d_over_r0,
+            shape=shape,
+            size=question.size,
+            positions=positions,
+            rng=phase_rng,
+        )
+    else:
+        images = spots(positions, **form)
+    return images / flux, positions

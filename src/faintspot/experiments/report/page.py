@@ -1,0 +1,191 @@
+"""The report page of a Monte-Carlo study: one HTML text that needs nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from faintspot.base.errors import InputError
+from faintspot.base.report.figure_data import FigureWithData
+from faintspot.base.report.page import Page, Section, configuration_section, html_of, write_page
+from faintspot.base.report.texts import Texts
+from faintspot.experiments.paper.claims import fixed_mode, guidance, verdicts
+from faintspot.experiments.paper.figures import (
+    baselines_figure,
+    kept_pixels_figure,
+    sweep_figure,
+    triple_picture,
+)
+from faintspot.experiments.paper.tables import (
+    baselines_section,
+    cases_section,
+    gains_section,
+    mode_in_words,
+    verdicts_section,
+)
+from faintspot.experiments.report.efficiency import compares_estimators, findings, result_sections
+from faintspot.experiments.report.estimator_figures import estimator_figures
+from faintspot.experiments.study.specification import StudySpecification
+from faintspot.experiments.study.sweep import PARAMETERS
+from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
+
+if TYPE_CHECKING:
+    import xarray
+
+
+_TEXT = Texts("faintspot.experiments")
+_KEPT_PIXELS = "fig5"
+
+
+def report_of_study(path: str | Path) -> str:
+    """Return the report page (HTML) of a stored study, finished or not.
+
+    Raises
+    ------
+    InputError
+        When there is no study, or none of its cells is finished.
+    MissingExtraError
+        When xarray, zarr, matplotlib or jinja2 is not installed.
+    """
+    from faintspot.experiments.study.run import open_study
+
+    return study_report(open_study(path))
+
+
+def study_report(dataset: xarray.Dataset) -> str:
+    """Return the report page of a study as HTML: self-contained, without scripts.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        What a run of a study returned; it may be unfinished, which the page says.
+
+    Raises
+    ------
+    InputError
+        When no cell is finished.
+    MissingExtraError
+        When matplotlib or jinja2 is not installed.
+    """
+    return html_of(_page(_checked(dataset)))
+
+
+def write_study_report(dataset: xarray.Dataset, path: str | Path) -> list[Path]:
+    """Write the page of a study, checked as by `study_report`, as `write_page` does."""
+    return write_page(_page(_checked(dataset)), path)
+
+
+def study_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
+    """Yield the figures of a study, as far as its cells are finished.
+
+    A sweep is drawn by the first word of its name, so that several make one figure. The paper's pictures
+    (figures 1 and 5) come with the paper's sweeps only. A study with methods that know the spot has the
+    figures of `faintspot.experiments.report.estimator_figures` instead.
+    """
+    if compares_estimators(dataset):
+        yield from estimator_figures(dataset)
+        return
+    groups = _cells_by_figure(dataset)
+    if _is_paper(groups):
+        yield triple_picture()
+    for name, cells in groups.items():
+        if name == _KEPT_PIXELS:
+            figure = kept_pixels_figure(dataset)
+            if figure is not None:
+                yield figure
+        elif cells:
+            yield sweep_figure(dataset, cells, name, _TEXT["paper"].get(name, name))
+    for profile in sorted({str(name) for name in dataset["profile"].values}):
+        figure = baselines_figure(dataset, profile)
+        if figure is not None:
+            yield figure
+
+
+def _checked(dataset: xarray.Dataset) -> xarray.Dataset:
+    if not bool(dataset["done"].any()):
+        raise InputError(f"study: none of its {dataset.sizes['cell']} cells is finished: run it first")
+    return dataset.load()
+
+
+def _cells_by_figure(dataset: xarray.Dataset) -> dict[str, list[int]]:
+    """Return the finished cells of each figure: of all sweeps with the same first word."""
+    specification = StudySpecification.from_text(str(dataset.attrs["specification"]))
+    columns = [dataset[name].values.tolist() for name in PARAMETERS]
+    done = dataset["done"].values
+    place = {values: i for i, values in enumerate(zip(*columns, strict=True)) if done[i]}
+    groups: dict[str, dict[int, None]] = {}
+    for sweep in specification.sweeps:
+        group = groups.setdefault(sweep.name.split()[0], {})
+        for cell in sweep.cells():
+            values = tuple(getattr(cell, name) for name in PARAMETERS)
+            if values in place:
+                group[place[values]] = None
+    return {name: list(group) for name, group in sorted(groups.items())}
+
+
+def _is_paper(names: Iterable[str]) -> bool:
+    return all(name in _TEXT["paper"] or name == _KEPT_PIXELS for name in names)
+
+
+def _widths_in_words(specification: StudySpecification) -> str:
+    widths = {profile: f"{fwhm:.2f} s" for profile, fwhm in FWHM_OF_SIZE_1_PX.items()}
+    said = "FWHM in px: " + ", ".join(f"{width} ({profile})" for profile, width in widths.items())
+    largest = 2 * FWHM_OF_SIZE_1_PX["diffraction"]
+    if _is_paper(sweep.name.split()[0] for sweep in specification.sweeps):
+        said += _TEXT("study.widths", largest=largest)
+    return said
+
+
+def _page(dataset: xarray.Dataset) -> Page:
+    attributes = dataset.attrs
+    done, total = int(dataset["done"].sum()), dataset.sizes["cell"]
+    specification = StudySpecification.from_text(str(attributes["specification"]))
+    of_estimators = compares_estimators(dataset)
+    subject = "Slope errors of the estimators" if of_estimators else "Slope errors with and without TV"
+    values = {
+        "done": done,
+        "total": total,
+        "n": attributes["n"],
+        "widths": _widths_in_words(specification),
+        "seed": attributes["seed"],
+        "version": attributes.get("faintspot_version", "unknown"),
+    }
+    return Page(
+        title=f"{subject}: study “{specification.name}”",
+        facts={name: _TEXT(f"study.facts.{name}", **values) for name in _TEXT["study.facts"]},
+        sections=[
+            *(_of_estimators(dataset) if of_estimators else _of_claims(dataset)),
+            configuration_section(str(attributes["specification"]), "Specification"),
+        ],
+        warnings=[_TEXT("study.unfinished", missing=total - done)] if done < total else [],
+        warnings_title="This study is not finished",
+        remark=_TEXT["study.remark"],
+    )
+
+
+def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
+    found = findings(dataset)
+    missing = "" if found else _TEXT["study.no_findings"]
+    return [
+        Section("findings", "What was found", points=found, missing=missing),
+        *_figure_sections(dataset),
+        *result_sections(dataset),
+        baselines_section(dataset),
+    ]
+
+
+def _of_claims(dataset: xarray.Dataset) -> list[Section]:
+    judged = verdicts(dataset)
+    return [
+        verdicts_section(judged, mode_in_words(fixed_mode(dataset))),
+        Section("guidance", "When to use TV", text=guidance(dataset)),
+        baselines_section(dataset),
+        gains_section(dataset),
+        *_figure_sections(dataset),
+        cases_section(judged),
+    ]
+
+
+def _figure_sections(dataset: xarray.Dataset) -> list[Section]:
+    return [Section(figure.name, figure.title, figures=[figure]) for figure in study_figures(dataset)]

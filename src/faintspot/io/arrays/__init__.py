@@ -1,0 +1,1 @@
+"""Arrays in files, read in parts: raw bytes, FITS units, compressed data, Zarr stores."""

@@ -1,0 +1,148 @@
+"""Zarr stores on the disk: opening, checks, codecs and damaged chunks."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.base.files import check_regular, parse_json, read_bytes, replace_file
+from faintspot.base.sizes import MOST_TEXT_BYTES, check_bytes
+from faintspot.io.arrays.inflation import check_inflated
+from faintspot.io.arrays.raw import MOST_WHOLE_BYTES
+from faintspot.io.locations import one_line
+from faintspot.io.optional_packages import load_zarr
+
+TELEMETRY = "faintspot telemetry"
+"""Format attribute of a telemetry store."""
+_MARKS = ("zarr.json", ".zgroup", ".zarray")
+_METADATA = (*_MARKS, ".zattrs", ".zmetadata")
+_COMPRESSORS = ("blosc", "bz2", "gzip", "lz4", "lzma", "zlib", "zstd")
+
+
+def is_store(path: Path) -> bool:
+    """Return whether a directory is a Zarr group or array."""
+    return any((path / mark).is_file() for mark in _MARKS)
+
+
+def open_store(path: Path, key: str = "") -> Any:
+    """Open a group or an array of a store for reading.
+
+    On access, it refuses a pipe or a device in place of a file, and a chunk that inflates to more than
+    `MOST_WHOLE_BYTES`.
+
+    Raises
+    ------
+    Exception
+        On broken metadata zarr raises many kinds of errors.
+    """
+    zarr = load_zarr()
+    local: Any = zarr.storage.LocalStore
+
+    class Checked(local):  # type: ignore[misc]  # Any, as zarr is imported here
+        async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
+            file = self.root / key
+            try:
+                size = check_regular(file)
+            except OSError:
+                return None
+            described = Path(key).name in _METADATA
+            if described or byte_range is None:
+                what = "metadata" if described else "a chunk"
+                check_bytes(file, size, MOST_TEXT_BYTES if described else MOST_WHOLE_BYTES, what)
+            found = await super().get(key, prototype, byte_range)
+            if found is not None and not described:
+                check_inflated(str(file), found.to_bytes())
+            return found
+
+    return zarr.open(store=Checked(path, read_only=True), mode="r", path=key, use_consolidated=False)
+
+
+def check_array(name: str, array: Any) -> None:
+    """Refuse an array of Python objects, or with chunks that are too large unpacked or compressed twice.
+
+    Raises
+    ------
+    InputError
+        When the array is refused.
+    """
+    codecs = [
+        getattr(codec, "codec_id", type(codec).__name__) for codec in (*array.filters, *array.compressors)
+    ]
+    if "pickle" in codecs:
+        raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
+    inflating = [codec for codec in codecs if codec.lower().removesuffix("codec") in _COMPRESSORS]
+    if len(inflating) > 1:
+        raise InputError(f"{name}: expected chunks compressed once, got {' and '.join(inflating)}")
+    check_bytes(name, math.prod(array.chunks) * array.dtype.itemsize, MOST_WHOLE_BYTES, "a chunk")
+
+
+def stored_attributes(path: Path) -> dict[str, Any]:
+    """Return the attributes of a store that is a group.
+
+    Raises
+    ------
+    OSError, ValueError, KeyError, TypeError
+        When it is not a group of format 3.
+    """
+    text = read_bytes(path / "zarr.json", "metadata", MOST_TEXT_BYTES)
+    attributes: dict[str, Any] = parse_json(text)["attributes"]
+    return attributes
+
+
+def holds_telemetry(path: Path) -> bool:
+    """Return whether a path is a telemetry store written by `faintspot.io.telemetry.recording`."""
+    try:
+        return bool(stored_attributes(path)["format"] == TELEMETRY)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def replace_attributes(path: Path, changed: Mapping[str, Any]) -> None:
+    """Replace attributes of a group in one step, which the store's own setter does not guarantee."""
+    metadata = parse_json((path / "zarr.json").read_text(encoding="utf-8"))
+    metadata["attributes"].update(changed)
+    replace_file(path / "zarr.json", json.dumps(metadata, indent=2))
+
+
+def checked_codecs() -> tuple[Any, ...]:
+    """Return the codecs for compressed chunks with a checksum."""
+    zarr = load_zarr()
+    return zarr.codecs.ZstdCodec(level=0), zarr.codecs.Crc32cCodec()
+
+
+def read_items(path: Path, array: Any, start: int, stop: int) -> NDArray[Any]:
+    """Return items of an array; a missing chunk is an error here, while zarr would return its fill value.
+
+    Raises
+    ------
+    InputError
+        When a chunk is damaged or missing.
+    """
+    for number, file in enumerate(chunk_files(path, array, start, stop), start // array.chunks[0]):
+        if not file.is_file():
+            raise InputError(
+                f"{path}: the store is damaged: {array.basename} of frame {number * array.chunks[0]} "
+                "(counted from 0) and later is lost"
+            )
+    check_array(f"{path}: {array.basename}", array)
+    try:
+        return np.asarray(array[start:stop])
+    except Exception as error:  # each codec raises its own kind of error on broken chunks
+        raise InputError(
+            f"{path}: the store is damaged: {array.basename} cannot be read ({one_line(error)})"
+        ) from None
+
+
+def chunk_files(path: Path, array: Any, start: int, stop: int) -> Iterator[Path]:
+    """Yield the files of the chunks with items `start` to `stop`; a chunk spans all later axes."""
+    length = array.chunks[0]
+    rest = (0,) * (array.ndim - 1)
+    numbers = range(start // length, -(-stop // length))
+    return (path / array.basename / array.metadata.encode_chunk_key((number, *rest)) for number in numbers)

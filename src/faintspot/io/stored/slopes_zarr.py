@@ -1,0 +1,233 @@
+"""Slopes in a Zarr store (format 3) that xarray can read, even while it is being written.
+
+A chunk holds a number of frames and is written once, as a whole and with a checksum (crc32c). After chunks
+are on the disk, the mark `finished_frames` in the group's attributes is replaced. However the program ends,
+the store is valid and the mark counts complete frames only.
+"""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.base.files import sync_file, sync_folder
+from faintspot.io.arrays.zarr_store import (
+    checked_codecs,
+    chunk_files,
+    is_store,
+    open_store,
+    read_items,
+    replace_attributes,
+    stored_attributes,
+)
+from faintspot.io.locations import one_line
+from faintspot.io.optional_packages import load_zarr
+from faintspot.io.stored.slopes_format import (
+    COORDINATE_UNITS,
+    VARIABLES,
+    RecordingHeader,
+    StoredSlopes,
+    check_stated,
+    unit_of,
+    with_absent,
+)
+from faintspot.io.stored.slopes_writer import ExistingOutput
+
+zarr = load_zarr()
+_MARK = "finished_frames"
+_COMPLETE = "complete"
+_COORDINATES = "coordinates"
+_AT_ONCE = 16
+_CHUNK_NUMBERS = 1 << 16
+# As "c.12.0" instead of a folder for each: folders must be synchronised, too.
+_CHUNK_NAMES: dict[str, Any] = {"name": "default", "separator": "."}
+
+
+class StoreStorage:
+    """Storage of slopes in the Zarr store that is the output.
+
+    Parameters
+    ----------
+    path : Path
+        Store.
+    run : Run
+        Description of its contents.
+    """
+
+    def __init__(self, path: Path, run: RecordingHeader) -> None:
+        self.place = path
+        self.chunk = 1
+        self._run = run
+        self._arrays: dict[str, Any] = {}
+        self._not_synchronised: set[Path] = set()
+
+    def begun(self) -> ExistingOutput | None:
+        """Return the description of the existing store, or None."""
+        return describe_store(self.place)
+
+    def remove(self) -> None:
+        """Move the store away in one step, then delete it."""
+        aside = self.place.with_name(f".{self.place.name}.old")
+        shutil.rmtree(aside, ignore_errors=True)
+        self.place.rename(aside)
+        shutil.rmtree(aside)
+
+    def create(self) -> None:
+        """Create the store under a hidden name and rename it."""
+        hidden = self.place.with_name(f".{self.place.name}.new")
+        shutil.rmtree(hidden, ignore_errors=True)
+        hidden.mkdir()
+        _create_arrays(hidden, self._run)
+        with warnings.catch_warnings():
+            # Consolidated metadata are not yet in the standard of Zarr; xarray warns when they are missing.
+            warnings.simplefilter("ignore")
+            zarr.consolidate_metadata(str(hidden))
+        for file in (*hidden.rglob("*"), hidden):
+            (sync_folder if file.is_dir() else sync_file)(file)
+        hidden.rename(self.place)
+        sync_folder(self.place.parent)
+
+    def open(self) -> None:
+        """Open the arrays, and remove the remains of an interrupted replacement of the mark."""
+        for leftover in self.place.glob(".*.new"):
+            leftover.unlink()
+        group: Any = zarr.open_group(str(self.place), mode="r+", use_consolidated=False)
+        try:
+            # Write chunks of zeros, too, so that a missing chunk means lost data.
+            with zarr.config.set({"array.write_empty_chunks": True}):
+                self._arrays = {name: group[name] for name in VARIABLES}
+        except (KeyError, ValueError) as error:
+            raise InputError(
+                f"{self.place}: damaged, cannot be resumed; delete it ({one_line(error)})"
+            ) from None
+        self.chunk = int(self._arrays["x"].chunks[0])
+
+    def marked(self) -> tuple[str, int]:
+        """Return the fingerprint and the number of complete frames."""
+        attributes = _stored_attributes(self.place)
+        return attributes["fingerprint"], attributes[_MARK]
+
+    def mark(self, finished: int) -> None:
+        """Wait for the disk, then write the number of complete frames."""
+        with ThreadPoolExecutor(_AT_ONCE) as threads:  # several times faster than one after another
+            list(threads.map(sync_file, self._not_synchronised))
+        for folder in {file.parent for file in self._not_synchronised}:
+            sync_folder(folder)
+        self._not_synchronised.clear()
+        replace_attributes(self.place, {_MARK: finished, _COMPLETE: finished == self._run.n_frames})
+
+    def read(self, start: int, stop: int) -> dict[str, NDArray[Any]]:
+        """Return stored frames."""
+        return {name: read_items(self.place, array, start, stop) for name, array in self._arrays.items()}
+
+    def write(self, start: int, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Store whole chunks."""
+        for name, values in arrays.items():
+            array = self._arrays[name]
+            array[start : start + len(values)] = values
+            self._not_synchronised.update(chunk_files(self.place, array, start, start + len(values)))
+
+    def finish(self) -> None:
+        """Do nothing: the mark is sufficient."""
+
+
+def describe_store(path: Path) -> ExistingOutput | None:
+    """Return the description of a store of slopes; None if the path does not exist.
+
+    Raises
+    ------
+    InputError
+        When the path is something else.
+    """
+    if not path.exists():
+        return None
+    try:
+        attributes = _stored_attributes(path)
+    except (OSError, ValueError, KeyError):
+        raise InputError(
+            f"{path}: expected slopes or nothing, found other data; choose another name"
+        ) from None
+    sizes = (attributes["n_frames"], attributes["n_subapertures"])
+    return ExistingOutput(attributes["fingerprint"], sizes, attributes[_COMPLETE])
+
+
+def read_store(path: Path) -> StoredSlopes:
+    """Read the finished frames of a Zarr store of slopes.
+
+    Raises
+    ------
+    InputError
+        When it is not a store of slopes, or a chunk is damaged or missing.
+    """
+    if not is_store(path):
+        raise InputError(f"{path}: expected a Zarr store of slopes, got another directory")
+    attributes = _stored_attributes(path)
+    finished, complete = int(attributes.pop(_MARK)), bool(attributes.pop(_COMPLETE))
+    coordinates = attributes.pop(_COORDINATES, "").split()
+    for size in ("n_frames", "n_subapertures"):
+        del attributes[size]
+    group: Any = open_store(path)
+    stored = [name for name in (*VARIABLES, *coordinates) if name in group]
+    check_stated(path, {name: group[name].shape for name in stored}, finished)
+    return StoredSlopes(
+        variables=with_absent(
+            {name: read_items(path, group[name], 0, finished) for name in VARIABLES if name in group}
+        ),
+        coordinates={name: read_items(path, group[name], 0, group[name].shape[0]) for name in coordinates},
+        attributes=attributes,
+        complete=complete,
+        n_finished=finished,
+    )
+
+
+def _create_arrays(path: Path, run: RecordingHeader) -> None:
+    attributes = {
+        **run.attributes,
+        "n_frames": run.n_frames,
+        "n_subapertures": run.n_subapertures,
+        _MARK: 0,
+        _COMPLETE: False,
+        _COORDINATES: " ".join(run.coordinates),
+    }
+    group = zarr.create_group(str(path), zarr_format=3, attributes=attributes)
+    chunk = min(run.n_frames, max(1, _CHUNK_NUMBERS // run.n_subapertures))
+    for name, variable in VARIABLES.items():
+        group.create_array(
+            name,
+            shape=(run.n_frames, run.n_subapertures),
+            chunks=(chunk, run.n_subapertures),
+            dtype=variable.dtype,
+            compressors=checked_codecs(),
+            chunk_key_encoding=_CHUNK_NAMES,
+            fill_value=np.nan if variable.dtype == "float32" else 0,
+            dimension_names=("frame", "subaperture"),
+            attributes={"units": unit_of(name, run.attributes), "long_name": variable.long_name},
+        )
+    for name, values in run.coordinates.items():
+        array = group.create_array(
+            name,
+            shape=values.shape,
+            dtype=values.dtype,
+            compressors=checked_codecs(),
+            chunk_key_encoding=_CHUNK_NAMES,
+            dimension_names=("subaperture",),
+            attributes={"units": COORDINATE_UNITS[name]} if name in COORDINATE_UNITS else {},
+            config={"write_empty_chunks": True},
+        )
+        array[:] = values
+
+
+def _stored_attributes(path: Path) -> dict[str, Any]:
+    """Return the attributes of a store of slopes; raise KeyError if it is something else."""
+    attributes = stored_attributes(path)
+    for name in (_MARK, _COMPLETE, "fingerprint", "n_frames", "n_subapertures"):
+        attributes[name]
+    return attributes

@@ -1,0 +1,1 @@
+"""Recorded telemetry: our own recordings, and AOT files."""

@@ -1,0 +1,371 @@
+"""Reading sensors from files of the Adaptive Optics Telemetry standard (AOT, FITS), with aotpy.
+
+Where the standard is not specific, faintspot's conventions apply: rows of an image are its vertical axis,
+positions are counted from 0, slopes are in px from the centre of a sub-aperture's window.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.checks import finite_array
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.files import parse_json
+from faintspot.base.sizes import check_bytes, memory_bytes
+from faintspot.io.arrays.fits_units import AOT_VERSION, units_of, whole_units
+from faintspot.io.locations import one_line
+
+_PIXELS = ("pix", "pixel", "px")
+
+
+NOISE = "SLOPES_NOISE"
+"""Name of the table with the noise of slopes, in files written by faintspot."""
+NOISE_COLUMNS = "VAR_X", "VAR_Y", "COV_XY"
+
+
+@dataclass(frozen=True, eq=False)
+class AotLoop:
+    """A control loop of an AOT file that a sensor drives; missing data are None."""
+
+    is_closed: bool
+    commands: NDArray[np.float64] | None
+    """(t, commands)"""
+    control_matrix: NDArray[np.float64] | None
+    """(commands, 2 n): slopes all x, then all y."""
+    frame_rate_hz: float | None
+    delay_frames: float | None
+    """From the middle of an exposure to the middle of its command."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class AotSensor:
+    """A Shack-Hartmann sensor of an AOT file, with the data that the file holds; missing data are None.
+
+    Examples
+    --------
+    >>> from faintspot.io import read_aot
+    >>> sensor = read_aot("night.fits")  # doctest: +SKIP
+    >>> sensor.n, sensor.unit  # doctest: +SKIP
+    """
+
+    path: Path
+    name: str
+    """Unique identifier (UID)."""
+    n: int
+    """Number of sub-apertures."""
+    layout: Mapping[str, Any] | None
+    """Arguments of `faintspot.Layout`."""
+    tables: Mapping[str, Any]
+    """Tables [estimator] and [settings] of a faintspot.toml, in files written by faintspot."""
+    parts: Mapping[str, str] | None
+    """Calibration, PSF and score in such files, for `faintspot.slopes.pipeline.configuration.unpacked`."""
+    reference: NDArray[np.float64] | None
+    """Slopes that are to be or were subtracted, (2 n,): px from the layout's centres, all x, then all y."""
+    pixels: str | None
+    """Name of the image with the frames: `open_frames` reads "file:pixels"."""
+    image_frame: NDArray[np.float64]
+    """Numbers of those frames; empty if the file has none."""
+    slopes: NDArray[Any] | None
+    """Slopes as stored, (t, 2, n): x and y, in `unit`."""
+    unit: str
+    noise: NDArray[Any] | None
+    """Variances of x and y and their covariance, px^2, (t, 3, n), in files written by faintspot."""
+    frame: NDArray[np.float64]
+    """Frame numbers of the slopes; empty if the file has none."""
+    unix_time_s: NDArray[np.float64]
+    """Times of the slopes; empty if the file has none."""
+    flux: NDArray[Any] | None
+    """Flux as stored, (t, n)."""
+    interaction: NDArray[np.float64] | None
+    """Interaction matrix of the first loop with one, (2 n, commands): all x, then all y, per unit command."""
+    loop: AotLoop | None
+    """First loop with commands, else the first one."""
+    cells: NDArray[np.int64] | None
+    """(n, 2): row and column of each sub-aperture."""
+    diameter_m: float | None
+    """Diameter of the telescope's pupil."""
+    pixel_scale_arcsec: float | None
+
+    def __repr__(self) -> str:
+        """Return the name, the number of sub-apertures and the available data."""
+        what = [name for name in ("layout", "pixels", "slopes", "reference", "interaction") if self.has(name)]
+        return f"AotSensor({self.name!r}, {self.n} sub-apertures, {', '.join(what) or 'no data'})"
+
+    def has(self, name: str) -> bool:
+        """Return whether the file holds a quantity."""
+        return getattr(self, name) is not None
+
+
+def is_aot(path: str | Path) -> bool:
+    """Return whether a file is a FITS file of the AOT standard."""
+    try:
+        return AOT_VERSION in next(units_of(Path(path))).header
+    except (
+        InputError,
+        MissingExtraError,
+        OSError,
+    ):  # another or a damaged file; its reader gives the reason
+        return False
+
+
+def frames_of_aot(path: Path, sensor: str | None) -> str:
+    """Return the name of the image that holds a sensor's frames; see `read_aot`.
+
+    Raises
+    ------
+    InputError
+        When the sensor has no pixels, and as `read_aot`.
+    """
+    found = read_aot(path, sensor)
+    if found.pixels is None:
+        raise InputError(
+            f"{path}: sensor {found.name!r}: expected frames (pixel_intensities of its detector), found none"
+        )
+    return found.pixels
+
+
+def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
+    """Read a Shack-Hartmann sensor from an AOT file.
+
+    Parameters
+    ----------
+    path : path
+    sensor : str, optional
+        UID of the sensor, or name of the image with its frames. Default: the only sensor, or the only one
+        with pixels.
+
+    Raises
+    ------
+    InputError
+        When the file is not valid AOT, has no such sensor, or its data are inconsistent.
+    MissingExtraError
+        When aotpy is not installed.
+
+    Examples
+    --------
+    >>> from faintspot.io import read_aot
+    >>> sensor = read_aot("night.fits")  # doctest: +SKIP
+    >>> sensor.n, sensor.unit  # doctest: +SKIP
+    """
+    path = Path(path)
+    try:
+        import aotpy
+        from aotpy.io.fits import AOTFITSReader
+    except ImportError:
+        raise MissingExtraError("aotpy", "realtime", "Reading an AOT file") from None
+    if not path.exists():
+        raise InputError(f"{path}: no such file or directory")
+    if not is_aot(path):
+        raise InputError(f"{path}: expected an AOT file, whose header has {AOT_VERSION}")
+    total = sum(unit.data_bytes for unit in whole_units(path))
+    check_bytes(path, total, memory_bytes() // 2, "telemetry")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about data that faintspot does not read
+        try:
+            # By default aotpy would ask for external images in a dialogue, or fetch them.
+            system = AOTFITSReader(path, externals="ignore").get_system()
+            noise = _noise(path)
+        except Exception as error:  # aotpy raises many kinds of errors on damaged files
+            raise InputError(f"{path}: the AOT file is not valid ({one_line(error)})") from None
+    sensors = [each for each in system.wavefront_sensors if isinstance(each, aotpy.ShackHartmann)]
+    found = _chosen(path, sensors, sensor)
+    loops = [
+        each for each in system.loops if isinstance(each, aotpy.ControlLoop) and each.input_sensor is found
+    ]
+    try:
+        return _sensor(path, found, system, loops, noise)
+    except InputError as error:
+        raise InputError(f"{path}: sensor {found.uid!r}: {error}") from None
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+        raise InputError(f"{path}: sensor {found.uid!r}: not valid AOT ({one_line(error)})") from None
+
+
+def _chosen(path: Path, sensors: list[Any], name: str | None) -> Any:
+    """Return the selected sensor."""
+    listed = ", ".join(str(each.uid) for each in sensors) or "none"
+    if name is not None:
+        sensors = [each for each in sensors if name in (each.uid, _pixels_of(each))]
+    elif len(sensors) > 1:
+        sensors = [each for each in sensors if _pixels_of(each) is not None]
+    if len(sensors) != 1:
+        wanted = f"a Shack-Hartmann sensor {name!r}" if name else "one Shack-Hartmann sensor with pixels"
+        hint = "; name one" if len(sensors) > 1 else ""
+        raise InputError(f"{path}: expected {wanted}, it has: {listed}{hint}")
+    return sensors[0]
+
+
+def _pixels_of(sensor: Any) -> str | None:
+    """Return the name of the image with a sensor's frames."""
+    image = None if sensor.detector is None else sensor.detector.pixel_intensities
+    return None if image is None or image.data is None else str(image.name)
+
+
+def _sensor(path: Path, found: Any, system: Any, loops: list[Any], noise: Any) -> AotSensor:
+    n = int(found.n_valid_subapertures)
+    name, size = _pixels_of(found), None
+    pixels = None if name is None else found.detector.pixel_intensities
+    if pixels is not None:
+        if pixels.data.ndim not in (2, 3):
+            shape = pixels.data.shape
+            raise InputError(f"pixel_intensities: expected (frames, height, width), got shape {shape}")
+        size = int(pixels.data.shape[-2]), int(pixels.data.shape[-1])
+    own = _own(found.ref_measurements)
+    layout = own["LAYOUT"] if "LAYOUT" in own else _layout(found, n, size)
+    if "SUBTRACT" in own:
+        reference = None if own["SUBTRACT"] is None else np.asarray(own["SUBTRACT"], np.float64)
+    else:
+        reference = _reference(found, n)
+    slopes, flux = _data_of(found, "measurements"), _data_of(found, "subaperture_intensities")
+    if slopes is not None and slopes.shape[1:] != (2, n):
+        raise InputError(f"measurements: expected shape (t, 2, {n}), got {slopes.shape}")
+    if noise is not None and (slopes is None or noise.shape != (len(slopes), 3, n)):
+        raise InputError(f"{NOISE}: expected as many variances and covariances as slopes, got {noise.shape}")
+    numbers, times = _time_of(found.measurements)
+    scale = _number(found.detector, "pixel_scale")
+    return AotSensor(
+        path,
+        str(found.uid),
+        n,
+        layout,
+        _tables(system),
+        own.get("PARTS"),
+        reference,
+        name,
+        _time_of(pixels)[0],
+        slopes,
+        "" if slopes is None else str(found.measurements.unit or ""),
+        noise,
+        numbers,
+        times,
+        flux,
+        _interaction([each for each in loops if each.interaction_matrix], n),
+        _loop(loops, n),
+        _cells(found, n),
+        _number(system.main_telescope, "enclosing_diameter"),
+        None if scale is None else scale * 180 / np.pi * 3600,
+    )
+
+
+def _loop(loops: list[Any], n: int) -> AotLoop | None:
+    """Return the first loop with commands, else the first one."""
+    if not loops:
+        return None
+    found = next((each for each in loops if _data_of(each, "commands") is not None), loops[0])
+    commands, control = (_data_of(found, name) for name in ("commands", "control_matrix"))
+    if commands is not None and commands.ndim != 2:
+        raise InputError(f"commands: expected shape (t, commands), got {commands.shape}")
+    if control is not None and control.shape[1:] != (2, n):
+        raise InputError(f"control_matrix: expected shape (commands, 2, {n}), got {control.shape}")
+    return AotLoop(
+        bool(found.closed),
+        None if commands is None else commands.astype(np.float64),
+        None if control is None else control.reshape(len(control), -1).astype(np.float64),
+        _number(found, "framerate"),
+        _number(found, "delay"),
+    )
+
+
+def _number(owner: Any, name: str) -> float | None:
+    """Return a positive number, or None."""
+    value = None if owner is None else getattr(owner, name)
+    return float(value) if value is not None and np.isfinite(value) and value > 0 else None
+
+
+def _layout(found: Any, n: int, size: tuple[int, int] | None) -> dict[str, Any] | None:
+    """Return arguments of a layout, in AOT a grid of squares of pixels; None if data for it are missing."""
+    cells = _cells(found, n)
+    if cells is None or not found.mask_offsets or found.subaperture_size is None:
+        return None
+    if len(found.mask_offsets) != 1:
+        raise InputError(f"mask_offsets: expected one, got {len(found.mask_offsets)}")
+    side, offset = float(found.subaperture_size), found.mask_offsets[0]
+    first = np.array([float(offset.y), float(offset.x)])
+    corners = np.rint(finite_array("mask_offsets", first) + cells * side).astype(np.int64)
+    window = int(side)
+    if size is None:
+        bottom, right = (corners + window).max(axis=0).tolist()
+        size = bottom, right
+    return {"frame_shape": size, "window": (window, window), "corners": corners, "cells": cells}
+
+
+def _cells(found: Any, n: int) -> NDArray[np.int64] | None:
+    """Return row and column of the sub-apertures, (n, 2); None without a mask."""
+    mask = _data_of(found, "subaperture_mask")
+    if mask is None:
+        return None
+    numbers = mask[mask >= 0]
+    if not np.array_equal(np.sort(numbers), np.arange(n)):
+        raise InputError(f"subaperture_mask: expected the numbers 0 to {n - 1}, each once, got other numbers")
+    return np.argwhere(mask >= 0)[np.argsort(numbers)]
+
+
+def _reference(found: Any, n: int) -> NDArray[np.float64] | None:
+    """Return the reference slopes if they are in pixels."""
+    values = _data_of(found, "ref_measurements")
+    if values is None or str(found.ref_measurements.unit).lower() not in _PIXELS:
+        return None
+    if values.shape != (2, n):
+        raise InputError(f"ref_measurements: expected shape (2, {n}), got {values.shape}")
+    return finite_array("ref_measurements", values).astype(np.float64).reshape(-1)
+
+
+def _interaction(loops: list[Any], n: int) -> NDArray[np.float64] | None:
+    """Return the interaction matrix, (2 n, commands)."""
+    if not loops:
+        return None
+    values = np.asarray(loops[0].interaction_matrix.data)
+    if values.ndim != 3 or values.shape[:2] != (n, 2):
+        raise InputError(f"interaction_matrix: expected shape ({n}, 2, commands), got {values.shape}")
+    matrix: NDArray[np.float64] = values.swapaxes(0, 1).reshape(2 * n, -1).astype(np.float64)
+    return matrix
+
+
+def _data_of(owner: Any, name: str) -> Any:
+    """Return an image's data in native byte order, or None."""
+    image = None if owner is None else getattr(owner, name)
+    if image is None or image.data is None:
+        return None
+    data = np.asarray(image.data)
+    return data.astype(data.dtype.newbyteorder("="), copy=False)
+
+
+def _noise(path: Path) -> NDArray[np.float32] | None:
+    """Return the noise of slopes in files written by faintspot, (t, 3, n), or None."""
+    from astropy.io import fits
+
+    with fits.open(path) as units:
+        if NOISE not in units:
+            return None
+        table = units[NOISE].data
+        return np.stack([np.asarray(table[name], np.float32) for name in NOISE_COLUMNS], axis=1)
+
+
+def _time_of(image: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return frame numbers and times of an image; empty if it has none."""
+    time = None if image is None else image.time
+    values = ([], []) if time is None else (time.frame_numbers, time.timestamps)
+    numbers, stamps = (np.asarray([] if each is None else each, np.float64) for each in values)
+    return numbers, stamps
+
+
+def _own(image: Any) -> dict[str, Any]:
+    """Return the data that faintspot has written with the references."""
+    if image is None:
+        return {}
+    values = {item.key: item.value for item in image.metadata}
+    return {name: parse_json(values[name]) for name in ("LAYOUT", "SUBTRACT", "PARTS") if name in values}
+
+
+def _tables(system: Any) -> dict[str, Any]:
+    """Return estimator and settings of a file written by faintspot."""
+    if not any(item.key == "ORIGIN" and item.value == "faintspot" for item in system.metadata):
+        return {}
+    tables = parse_json(system.config)
+    return tables if isinstance(tables.get("settings", {}), dict) else {}

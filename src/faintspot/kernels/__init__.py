@@ -1,1 +1,0 @@
-"""Fast versions of `faintspot.algorithms` and of the estimators: sub-apertures in SIMD lanes."""

@@ -1,0 +1,187 @@
+"""Compiled integrator: from a frame's slopes to a command, in preallocated memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.loop.control.base import Expected
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.slope_product import SlopeProduct
+from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
+from faintspot.slopes.kernels.driver.products import ProductPart, add_products, finish_product, is_measured
+
+Floats = NDArray[np.float64]
+
+_compiled = partial(compiled_with, source=__file__)
+
+INVALID_PART, MEAN_SQUARE = range(2)
+"""Summary of a frame from `true_slopes`: fraction of invalid sub-apertures; of the valid ones, the mean
+square of a slope along one axis, px^2."""
+
+
+@_compiled
+def true_slopes(
+    x: Any,
+    y: Any,
+    flags: Any,
+    error_x: Any,
+    error_y: Any,
+    covariance_xy: Any,
+    gain: Any,
+    slopes: Any,
+    errors: Any,
+    covariance: Any,
+    said: Any,
+) -> None:
+    """Write slopes [true px], all x, then all y, their errors and covariances; invalid: 0, infinite and 0.
+
+    Parameters
+    ----------
+    x, y, flags, error_x, error_y, covariance_xy : (n,) arrays
+        As in `faintspot.Slopes`.
+    gain : float
+        Centroid gain.
+    slopes, errors : (2 n,) float64 arrays
+    covariance : (n,) float64 array
+        Covariances of x and y.
+    said : (2,) float64 array
+        `INVALID_PART`, `MEAN_SQUARE`.
+    """
+    n, scale = x.shape[0], 1.0 / gain
+    invalid, square = 0, 0.0
+    for s in range(n):
+        along, across = x[s] * scale, y[s] * scale
+        if is_measured(along, across, flags[s]):
+            slopes[s], slopes[n + s] = along, across
+            errors[s], errors[n + s] = error_x[s] * scale, error_y[s] * scale
+            covariance[s] = covariance_xy[s] * scale * scale
+            square += along * along + across * across
+        else:
+            slopes[s] = slopes[n + s] = 0.0
+            errors[s] = errors[n + s] = np.inf
+            covariance[s] = 0.0
+            invalid += 1
+    said[INVALID_PART] = invalid / n
+    said[MEAN_SQUARE] = square / (2 * max(n - invalid, 1))
+
+
+FLUX, DISPLACEMENT, FLUX_TIMES_DISPLACEMENT = range(3)
+"""Summary of a frame from `displaced_flux`: means over the sub-apertures."""
+
+
+@_compiled
+def displaced_flux(commands: Any, flux: Any, columns: Any, work: Any, said: Any) -> None:
+    """Write means of the flux, of the squared displacement by the mirror, and of their product.
+
+    Parameters
+    ----------
+    commands : (commands,) float64 array
+        Commands that acted in the frame.
+    flux : (n,) float32 array
+        What is not finite counts as 0.
+    columns : (commands, 2 n) float32 array
+        The interaction matrix, transposed, see `add_products`.
+    work : tuple of (1, commands) and (1, 2 n) float32 arrays
+        Commands, and displacements: all x, then all y.
+    said : (3,) float64 array
+        `FLUX`, `DISPLACEMENT` (px^2), `FLUX_TIMES_DISPLACEMENT`.
+    """
+    n = flux.shape[0]
+    acting, displaced = work
+    for c in range(commands.shape[0]):
+        acting[0, c] = commands[c]
+    displaced[:] = 0.0
+    add_products(columns, acting, displaced)
+    said[:] = 0.0
+    for s in range(n):
+        square = displaced[0, s] * displaced[0, s] + displaced[0, n + s] * displaced[0, n + s]
+        seen = flux[s] if np.isfinite(flux[s]) else 0.0
+        said[FLUX] += seen / n
+        said[DISPLACEMENT] += square / n
+        said[FLUX_TIMES_DISPLACEMENT] += seen * square / n
+
+
+@_compiled
+def integrate(
+    slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, place: Any, memory: Any
+) -> float:
+    """Write the next command: `keep` times the latest minus `gain` times the wavefront, clipped.
+
+    Return the command's sum before it was clipped.
+
+    Parameters
+    ----------
+    slopes : (m,) float64 array
+        Finite.
+    columns : (m, commands) float32 array, contiguous
+        The reconstructor, transposed, see `add_products`. Reading it takes most of the time of large sensors.
+    gain, keep, largest : float
+    rows : (delay + 1, commands) float64 array
+        Of a `CommandDelayLine`.
+    place : int
+        Which row to write; the latest command is in the one before.
+    memory : ProductMemory
+        Of the wavefront.
+    """
+    latest, out = rows[(place or rows.shape[0]) - 1], rows[place]
+    finish_product(columns, slopes, memory)
+    total = 0.0
+    for c in range(out.shape[0]):
+        wanted = keep * latest[c] - gain * memory.result[c]
+        total += wanted
+        out[c] = min(max(wanted, -largest), largest)
+    return total
+
+
+_INTEGRATE = Direct(integrate)
+
+
+class CompiledIntegrator:
+    """Compiled `control.integrator.Integrator` with equal weights of all slopes.
+
+    Parameters
+    ----------
+    line : CommandDelayLine
+    interaction : (m, commands) array
+        Slopes in px that a unit of each command adds.
+    reconstruct : (commands, m) array
+        The wavefront from slopes, as commands that cause it; with a gain for each mode where there is one.
+    gain : float
+        May be changed between two frames.
+    leak : float
+        Part of the command that is forgotten in every frame.
+    """
+
+    undoes_prior = False
+
+    def __init__(
+        self, line: CommandDelayLine, interaction: Floats, reconstruct: Floats, gain: float, leak: float
+    ) -> None:
+        self._line, self._interaction = line, interaction
+        self._wavefront = SlopeProduct(reconstruct)
+        self.gain, self._keep = float(gain), 1.0 - leak
+
+    def expected(self) -> Expected:
+        """See `Controller`."""
+        return Expected(self._interaction @ (self._line.acting - self._line.latest), None)
+
+    def begin(self) -> None:
+        """See `Controller`; the delay line is the only state."""
+
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
+        """See `Controller`; invalid slopes are 0, and all count the same."""
+        line, product = self._line, self._wavefront
+        numbers = self.gain, self._keep, line.largest
+        total = _INTEGRATE(slopes_px, product.columns, *numbers, line.rows, line.place, product.memory)
+        line.sent(total)
+
+    def begin_product(self, threads: int, scale: float) -> Sequence[ProductPart]:
+        """Return the parts of the next frame's product with its slopes; see `SlopeProduct.parts`."""
+        return self._wavefront.parts(threads, scale)

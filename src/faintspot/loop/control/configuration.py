@@ -1,0 +1,413 @@
+"""Table [control] of faintspot.toml: controller, matrices and limits that turn slopes into commands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.checks import finite_array
+from faintspot.base.config.options import Options, option
+from faintspot.base.config.tables import errors_of_table, read_tables, save_tables
+from faintspot.base.errors import InputError
+from faintspot.base.toml_files import check_keys
+from faintspot.io.frames import read_array
+from faintspot.loop.control.base import Controller
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.compiled import CompiledIntegrator
+from faintspot.loop.control.identification.model import (
+    CONTROLS,
+    INTEGRATOR,
+    KALMAN,
+    MODAL,
+    POLC,
+    Learnt,
+    Model,
+    Plant,
+)
+from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
+from faintspot.loop.control.removed_modes import REMOVED_MODES, TIP_TILT_FOCUS, RemovedModes
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.sensor.layout import Layout
+
+Floats = NDArray[np.float64]
+
+TABLE = "control"
+INTERACTION, REFERENCE = "interaction_matrix", "reference_slopes"
+MODEL = "model"
+FILES = (INTERACTION, REFERENCE, MODEL)
+NONE, CONTROLLER, STREAM = "none", "controller", "stream"
+"""Sources of predictions."""
+PRIOR = "prior_std_px"
+_LARGEST_SLOPE_PX = 1e4
+_BEYOND_ALL = 1e30  # of commands without a limit: finite in float32, too
+_setting = partial(option, per_subaperture=False)
+
+
+@dataclass(frozen=True, eq=False)
+class ControlOptions(Options):
+    """Options of the table [control]."""
+
+    controller: str = _setting(
+        INTEGRATOR,
+        "Controller that turns slopes into commands; all but the integrator need a `model`.",
+        choices=tuple(CONTROLS),
+    )
+    gain: float = _setting(0.4, "Loop gain of the integrator.", low=0, high=2)
+    leak: float = _setting(0.01, "Fraction by which commands decay in each frame.", low=0, high=1)
+    delay_frames: int = _setting(
+        2,
+        "Delay: the command computed from frame k first acts during the exposure of frame k + delay_frames.",
+        low=1,
+        high=100,
+        whole=True,
+    )
+    largest_command: float | None = _setting(
+        None,
+        "Stroke limit, in the unit of the interaction matrix; clipped commands do not accumulate "
+        "(anti-windup). Default: no limit.",
+        low=0,
+        high=_BEYOND_ALL,
+        low_open=True,
+    )
+    largest_condition: float = _setting(
+        30.0,
+        "Largest condition number of the reconstructor: modes of the mirror with smaller singular values are "
+        "not controlled.",
+        low=1,
+        high=1e6,
+    )
+    centroid_gain: float = _setting(
+        1.0,
+        "Centroid gain relative to the interaction matrix; slopes are divided by it. 1 for a matrix measured "
+        "with the same estimator at the same flux.",
+        low=0.01,
+        high=100,
+    )
+    removed_modes: str = _setting(
+        REMOVED_MODES[0],
+        'Modes that slopes of a laser guide star do not show: "tip_tilt" or "tip_tilt_focus". They are '
+        "removed before reconstruction and are not controlled; for integrators.",
+        choices=REMOVED_MODES,
+    )
+    prediction: str | None = _setting(
+        None,
+        'Source of the predicted slopes for estimators with a prior: "controller"; "stream", another program '
+        'by the stream NAME_prediction; or "none". Default: "controller" for a Kalman filter, else "none".',
+        choices=(NONE, CONTROLLER, STREAM),
+    )
+    learn_every_s: float = _setting(
+        10.0,
+        "Time between two learnings of a Kalman filter while the engine runs, each from the telemetry since "
+        "the one before; 0: never.",
+        unit="s",
+        low=0,
+        high=3600,
+    )
+    guard_frames: int = _setting(
+        50,
+        "Number of frames over which the guard averages.",
+        low=1,
+        high=1_000_000,
+        whole=True,
+    )
+    most_invalid: float = _setting(
+        0.5,
+        "Fraction of invalid slopes above which the guard opens the loop; 1: never.",
+        low=0,
+        high=1,
+    )
+    largest_residual_px: float | None = _setting(
+        None,
+        "Rms of the slopes above which the guard opens the loop. Default: 1.25 times the open-loop rms, if "
+        "the loop was open for `guard_frames` before; else a quarter of a window's side.",
+        unit="px",
+        low=0,
+        high=_BEYOND_ALL,
+        low_open=True,
+    )
+    most_at_limit: float = _setting(
+        0.5,
+        "Fraction of commands at `largest_command` above which the guard opens the loop; 1: never.",
+        low=0,
+        high=1,
+    )
+    proven_frames: int = _setting(
+        1000,
+        "Number of frames after which a closed loop counts as proven. If the guard opens a proven loop, it "
+        "closes it again after `guard_frames`, with a learnt controller's integrator; 0: never.",
+        low=0,
+        high=1_000_000,
+        whole=True,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """Controller, matrices and limits with which an engine computes commands; checked on creation.
+
+    Parameters
+    ----------
+    interaction : (2 n, commands) array
+        Slopes [px] (all x, then all y) that one unit of each command adds.
+    reference : (2 n,) or (n, 2) array, optional
+        Reference slopes [px] from each sub-aperture's centre. Default: 0.
+    options : ControlOptions
+    model : path, optional
+        Learnt model of the controller, a file written by `Model.save`. The integrator ignores it.
+    positions : (n, 2) array, optional
+        x and y of the sub-apertures in any unit, if focus is removed from the slopes.
+
+    Raises
+    ------
+    InputError
+        If the model or the shapes do not fit, numbers are not finite, or the slopes cannot control the
+        mirror.
+    """
+
+    interaction: Any
+    reference: Any = None
+    options: ControlOptions = field(default_factory=ControlOptions)
+    model: Any = None
+    positions: Any = None
+
+    def __post_init__(self) -> None:
+        matrix = finite_array(INTERACTION, self.interaction).astype(np.float64)
+        if matrix.ndim != 2 or len(matrix) % 2:
+            raise InputError(f"{INTERACTION}: expected shape (2 n, commands), got {matrix.shape}")
+        if matrix.shape[1] > len(matrix):
+            raise InputError(
+                f"{INTERACTION}: expected (2 n, commands), no more commands than slopes, got {matrix.shape}"
+            )
+        reference = self.reference
+        if reference is not None:
+            reference = finite_array(REFERENCE, reference).astype(np.float64)
+            if reference.shape == (len(matrix) // 2, 2):
+                reference = reference.T.reshape(-1)
+            if reference.shape != (len(matrix),):
+                raise InputError(f"{REFERENCE}: expected shape ({len(matrix)},), got {reference.shape}")
+            if np.abs(reference).max() > _LARGEST_SLOPE_PX:
+                raise InputError(f"{REFERENCE}: expected positions up to {_LARGEST_SLOPE_PX:g} px")
+        object.__setattr__(self, "interaction", matrix)
+        object.__setattr__(self, "reference", reference)
+        assert self.reconstructor  # refuses a matrix that cannot be inverted
+        object.__setattr__(self, "model", self._checked_model())
+
+    def _checked_model(self) -> Any:
+        kind = self.options.controller
+        if self.removed_modes and kind not in (INTEGRATOR, MODAL):
+            raise InputError(
+                f"removed_modes = {self.removed_modes.name!r}: expected an integrator, as the model of "
+                f"{kind!r} has all modes"
+            )
+        if kind == KALMAN and self.options.prediction == STREAM:
+            raise InputError(
+                'prediction = "stream": expected "controller", as a Kalman filter predicts itself'
+            )
+        if kind == INTEGRATOR:
+            return self.model  # kept for `with_controller`
+        if self.model is None:
+            raise InputError(f"{MODEL}: expected a file with the learnt model of {CONTROLS[kind]}, got none")
+        model = self.model if isinstance(self.model, Model) else Model.load(self.model, self.plant)
+        if model.kind != kind:
+            raise InputError(f"{MODEL}: expected a model of controller {kind!r}, got one of {model.kind!r}")
+        model.check(self.plant)
+        return model
+
+    @cached_property
+    def removed_modes(self) -> RemovedModes:
+        """Modes that are removed from the slopes before reconstruction."""
+        return RemovedModes(self.options.removed_modes, self.positions)
+
+    @cached_property
+    def controlled(self) -> Floats:
+        """Interaction matrix without the removed modes, whose reconstructor does not drive them."""
+        return self.removed_modes.removed(self.interaction)
+
+    @cached_property
+    def reconstructor(self) -> Reconstructor:
+        """Reconstructor from slopes to the commands that cause them."""
+        return make_reconstructor(self.controlled, self.options.largest_condition)
+
+    @property
+    def plant(self) -> Plant:
+        """Loop properties that controllers use."""
+        options = self.options
+        return Plant(self.controlled, self.reconstructor, options.delay_frames, options.leak)
+
+    @property
+    def prediction(self) -> str:
+        """Source of predictions: NONE, CONTROLLER or STREAM."""
+        usual = CONTROLLER if self.options.controller == KALMAN else NONE
+        return self.options.prediction or usual
+
+    def with_controller(self, kind: str) -> Control:
+        """Return the same configuration with another controller.
+
+        Raises
+        ------
+        InputError
+            If the model belongs to another controller.
+        """
+        if kind == self.options.controller:
+            return self
+        return replace(self, options=self.options.replaced({"controller": kind}))
+
+    def with_model(self, model: Model) -> Control:
+        """Return the same configuration with a learnt controller.
+
+        Raises
+        ------
+        InputError
+            If the model belongs to another loop.
+        """
+        return replace(self, options=self.options.replaced({"controller": model.kind}), model=model)
+
+    @property
+    def commands(self) -> int:
+        """Number of commands."""
+        return int(self.interaction.shape[1])
+
+    def check_fits(self, n: int) -> None:
+        """Check the number of sub-apertures against the interaction matrix.
+
+        Raises
+        ------
+        InputError
+            If it differs.
+        """
+        slopes = len(self.interaction)
+        if slopes != 2 * n:
+            raise InputError(
+                f"{TABLE}.{INTERACTION}: expected {2 * n} rows for {n} sub-apertures (all x, then all y), "
+                f"got {slopes}"
+            )
+
+    def check_errors(self, calibration: Calibration, kind: str | None = None) -> None:
+        """Refuse a camera without read noise if the controller needs standard errors of the slopes.
+
+        Parameters
+        ----------
+        calibration : Calibration
+        kind : str, optional
+            Of the controller. Default: the one that is set.
+
+        Raises
+        ------
+        InputError
+            It says what is missing.
+        """
+        kind = kind or self.options.controller
+        if kind in (POLC, KALMAN) and calibration.read_noise_photoelectrons is None:
+            raise InputError(
+                f"{TABLE}.controller = {kind!r}: expected standard errors of the slopes, which need the "
+                "camera's read noise: calibration.read_noise_e"
+            )
+
+    def line(self) -> CommandDelayLine:
+        """Return the delay line of commands to a flat mirror."""
+        options = self.options
+        return CommandDelayLine(self.commands, options.delay_frames, options.largest_command or _BEYOND_ALL)
+
+    def controller(self, line: CommandDelayLine) -> Controller:
+        """Return the controller, which sends its commands along `line`."""
+        options, matrix = self.options, self.reconstructor.matrix
+        if options.controller == INTEGRATOR:
+            return CompiledIntegrator(line, self.controlled, matrix, options.gain, options.leak)
+        if options.controller == MODAL:
+            modes = self.reconstructor.modes
+            matrix = (modes * self.model.arrays["gains"]) @ modes.T @ matrix
+            return CompiledIntegrator(line, self.controlled, matrix, 1.0, options.leak)
+        return Learnt(self.plant, self.model).controller(line)
+
+    def rehearse(self) -> None:
+        """Compile the controller and run it on test frames, the last without a valid slope.
+
+        Raises
+        ------
+        InputError
+            When its commands, or the slopes that it expects, are not finite numbers.
+        """
+        slopes_px = np.resize([1.0, -1.0], len(self.interaction))
+        line = self.line()
+        try:
+            with np.errstate(all="ignore"):
+                controller = self.controller(line)
+                for error_px in (0.1, 1.0, np.inf):
+                    controller.update(slopes_px * np.isfinite(error_px), np.full_like(slopes_px, error_px))
+                    expected = controller.expected()
+                finite_array("expected slopes", expected.mean_px)
+                if expected.std_px is not None:
+                    finite_array("their errors", expected.std_px)
+        except (ArithmeticError, ValueError) as error:  # also of NumPy's linear algebra, and InputError
+            reason = str(error).split("\n")[0]
+            raise InputError(
+                f"{TABLE}.controller = {self.options.controller!r}: cannot compute commands with these "
+                f"{INTERACTION} and {MODEL} ({reason}); measure the matrix, or learn the model, again"
+            ) from None
+
+
+def prior_std_px(settings: Settings, layout: Layout) -> Floats | None:
+    """Return the standard deviations of an estimator's prior, (2 n,); None without a prior."""
+    if not settings.estimator.takes_prior or PRIOR not in settings.declared():
+        return None
+    each = settings.values(PRIOR, len(layout), layout.pixels).astype(np.float64)
+    return np.tile(each, 2) if np.isfinite(each).all() else None
+
+
+def load_control(path: str | Path) -> Control | None:
+    """Read [control] of a configuration file and the files that it names; None without such a table.
+
+    Raises
+    ------
+    InputError
+        When something cannot be read, is unknown or does not fit.
+    """
+    path = Path(path)
+    document = read_tables(path)
+    if TABLE not in document:
+        return None
+    with errors_of_table(path, TABLE):
+        return _of_table(path, document[TABLE])
+
+
+def _of_table(path: Path, values: Mapping[str, Any]) -> Control:
+    declared = ControlOptions.declared()
+    check_keys(f"{TABLE}.", values, [*FILES, *declared], required=[INTERACTION])
+    arrays = {name: _read(path, name, values[name]) for name in FILES[:2] if name in values}
+    model = values.get(MODEL)
+    if model is not None and not isinstance(model, str):
+        raise InputError(f"{MODEL}: expected the name of a file, found {model!r:.80}")
+    options = ControlOptions(**{name: value for name, value in values.items() if name in declared})
+    places = Layout.load(path).centres if options.removed_modes == TIP_TILT_FOCUS else None
+    file = None if model is None else path.parent / model
+    return Control(arrays[INTERACTION], arrays.get(REFERENCE), options, file, places)
+
+
+def _read(path: Path, name: str, location: Any) -> NDArray[Any]:
+    """Read an array from the file that the table names, relative to the configuration."""
+    if not isinstance(location, str):
+        raise InputError(f"{name}: expected the name of a file, found {location!r:.80}")
+    try:
+        return read_array(f"{path.parent / location}")
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
+def save_control(path: str | Path, **values: Any) -> None:
+    """Write values into [control] of a configuration file; the rest of the file stays.
+
+    Raises
+    ------
+    InputError
+        When the file exists and cannot be understood, or cannot be written.
+    """
+    path = Path(path)
+    before = read_tables(path).get(TABLE, {}) if path.exists() else {}
+    save_tables(path, {TABLE: {**before, **values}})

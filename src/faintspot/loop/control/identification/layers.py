@@ -1,0 +1,198 @@
+"""Estimate wind layers, turbulence, noise and vibrations from open-loop slopes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.loop.control.identification.layer_likelihood import LayerLikelihood, Layers
+from faintspot.loop.control.identification.oscillators import fitted_oscillators
+from faintspot.loop.control.identification.slope_records import SlopeRecords
+from faintspot.loop.control.identification.vibrations import Vibration, find_vibrations, with_vibrations
+from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.control.telemetry import OpenLoopTelemetry
+from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+
+Floats = NDArray[np.float64]
+
+_SPEEDS_M_PER_S = (5.0, 10.0, 20.0)  # of winds from anywhere
+AVERAGED = 1.0, 0.85, 0.7, 0.55
+"""Values of `SlopeTurbulence.averaged` that describe slopes; a filter for them is best with the first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """Turbulence, noise and vibrations estimated from telemetry."""
+
+    turbulence: SlopeTurbulence
+    noise_factor: float
+    """Variance of the noise relative to the squared standard errors."""
+    vibrations: tuple[Vibration, ...]
+    rate_hz: float
+    is_layered: bool
+    """Whether each layer has its own state; else winds only describe how fast turbulence changes."""
+    wind_error_m_per_s: Floats
+    """(layers, 2): standard errors; NaN for winds that were not fitted."""
+    fraction_error: Floats
+    """(layers,): standard errors; NaN if not fitted."""
+    criterion: float
+    """Half the Bayesian information criterion, up to a constant."""
+    oscillators: tuple[Vibration, ...] = ()
+    """Oscillators that stand for turbulence and vibrations of a single sub-aperture; then r0 is infinite."""
+
+    @property
+    def layers(self) -> list[SlopeTurbulence]:
+        """Turbulence of each part of the slopes that has a state of its own."""
+        return self.turbulence.layers() if self.is_layered else [self.turbulence]
+
+    def covariances_px2(self) -> Floats:
+        """Return (layers, 3, m, m): covariances of each layer's slopes for lags of 0, 1 and 2 frames."""
+        return np.array([layer.lagged_px2(1 / self.rate_hz) for layer in self.layers])
+
+    def parameters(self) -> Layers:
+        """Return the parameters of the layers' likelihood."""
+        air = self.turbulence
+        strength = air.fraction * air.r0_m ** (-5 / 3)
+        return Layers(air.wind_m_per_s, strength, self.noise_factor, air.outer_scale_m)
+
+    def slope_model(self) -> SlopeModel:
+        """Return the temporal model of the slopes, vibrations included."""
+        slopes = 2 * len(self.turbulence.positions_m)
+        model = SlopeModel(*np.zeros((3, 0, slopes, slopes)))
+        if not self.oscillators:
+            model = SlopeModel.of_covariances(self.covariances_px2())
+        return with_vibrations(model, self.moving, self.turbulence.positions_m, self.rate_hz)
+
+    @property
+    def moving(self) -> tuple[Vibration, ...]:
+        """Oscillators of the model: vibrations, or all that a single sub-aperture sees."""
+        return self.oscillators or self.vibrations
+
+    def summary(self) -> str:
+        """Return a summary of one line."""
+        if self.oscillators:
+            return ", ".join(f"{each.mode} at {each.frequency_hz:.1f} Hz" for each in self.oscillators)
+        winds, shares = self.turbulence.wind_m_per_s, self.turbulence.fraction
+        layers = [
+            f"{math.hypot(x, y):.1f} m/s to {math.degrees(math.atan2(y, x)) % 360:.0f} degrees ({part:.0%})"
+            for (x, y), part in sorted(zip(winds, shares, strict=True), key=lambda each: -each[1])
+        ]
+        shaking = [f"{each.mode} shakes at {each.frequency_hz:.1f} Hz" for each in self.vibrations]
+        air = ", ".join(layers) if self.is_layered else "winds from anywhere"
+        return ", ".join([air, *shaking])
+
+
+class Identification:
+    """Models of one piece of telemetry.
+
+    Parameters
+    ----------
+    telemetry : OpenLoopTelemetry
+    site : SlopeTurbulence
+        Positions, sub-aperture and pixel scale; its outer scale is assumed within a factor of two.
+    rate_hz : float
+        Frames per second.
+    averaged : sequence of float
+        Values of `SlopeTurbulence.averaged` of which the likeliest is used.
+
+    Raises
+    ------
+    InputError
+        When too few sub-apertures were measured, or too few frames without a gap.
+    """
+
+    def __init__(
+        self,
+        telemetry: OpenLoopTelemetry,
+        site: SlopeTurbulence,
+        rate_hz: float,
+        averaged: Sequence[float] = AVERAGED,
+    ) -> None:
+        self._site, self._rate_hz, self._averaged = site, rate_hz, tuple(averaged)
+        records = SlopeRecords.of(telemetry, site)
+        self._vibrations = find_vibrations(records.modes(), rate_hz, records.slopes.shape[1])
+        self._given = LayerLikelihood(records, rate_hz, self._vibrations)
+        self._records = records
+
+    def layers(self, start: Identified | None = None) -> Identified:
+        """Return layers with winds fitted to the telemetry, from earlier ones on, if any.
+
+        A single sub-aperture shows no winds: of it, oscillators are fitted.
+        """
+        if len(self._site.positions_m) == 1:
+            return self._oscillating()
+        if start is not None:
+            likelihood = self._given.averaging(start.turbulence.averaged)
+            return self._identified(likelihood, *likelihood.selected(start.parameters()))
+        likelihood, _ = self._best
+        found, errors = likelihood.selected(likelihood.peaks())
+        # Winds from anywhere are not quite the turbulence, so neighbouring values are tried with layers, too.
+        place = self._averaged.index(likelihood.averaged)
+        for averaged in (*self._averaged[max(place - 1, 0) : place], *self._averaged[place + 1 : place + 2]):
+            other = self._given.averaging(averaged)
+            refined = other.refined(found)
+            if refined.criterion < found.criterion:
+                likelihood, found, errors = other, refined, other.errors(refined)
+        return self._identified(likelihood, found, errors)
+
+    def of_winds(self, winds_m_per_s: Floats) -> Identified:
+        """Return layers with given winds, (layers, 2), and fitted strengths."""
+        likelihood, _ = self._best
+        winds = np.asarray(winds_m_per_s, np.float64)[:, None]
+        return self._identified(likelihood, likelihood.of_winds(winds))
+
+    def anywhere(self) -> Identified:
+        """Return isotropic turbulence: winds of several speeds, equally from all directions."""
+        return self._identified(*self._best, is_layered=False)
+
+    @cached_property
+    def _best(self) -> tuple[LayerLikelihood, Layers]:
+        """The likelihood with the best of `averaged` for winds from anywhere, and these."""
+        speeds = np.array(_SPEEDS_M_PER_S)
+        still = replace(self._site, fraction=np.ones(len(speeds)), wind_m_per_s=np.outer(speeds, [1.0, 0.0]))
+        winds = still.from_anywhere().wind_m_per_s
+        tried = [self._given.averaging(each) for each in self._averaged]
+        found = [(each, each.of_winds(winds[None])) for each in tried]
+        return min(found, key=lambda each: each[1].criterion)
+
+    def _oscillating(self) -> Identified:
+        records, none = self._records, np.full((1, 2), np.nan)
+        found, noise_px2 = fitted_oscillators(records.modes()[:, :2], self._rate_hz, records.slopes.shape[1])
+        still = replace(self._site, r0_m=math.inf, fraction=np.ones(1), wind_m_per_s=np.zeros((1, 2)))
+        factor = float((noise_px2 / records.noise_px2).mean())
+        known = factor, self._vibrations, self._rate_hz, False, none, none[0, :1], math.nan
+        return Identified(still, *known, found)
+
+    def _identified(
+        self,
+        likelihood: LayerLikelihood,
+        layers: Layers,
+        errors: Floats | None = None,
+        *,
+        is_layered: bool = True,
+    ) -> Identified:
+        fraction = layers.strength / layers.strength.sum()
+        errors = np.full((len(fraction), 3), np.nan) if errors is None else errors
+        turbulence = replace(
+            self._site,
+            r0_m=float(layers.strength.sum() ** (-3 / 5)),
+            outer_scale_m=layers.outer_scale_m,
+            fraction=fraction,
+            wind_m_per_s=layers.wind_m_per_s,
+            averaged=likelihood.averaged,
+        )
+        return Identified(
+            turbulence,
+            layers.noise,
+            self._vibrations,
+            self._rate_hz,
+            is_layered,
+            errors[:, :2],
+            fraction * errors[:, 2],
+            layers.criterion,
+        )

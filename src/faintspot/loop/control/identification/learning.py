@@ -1,0 +1,150 @@
+"""Controllers that learn what they need to know from telemetry, with an integrator to fall back to."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.loop.control.base import ASSUMED, LEARNT
+from faintspot.loop.control.identification.layers import AVERAGED, Identification, Identified
+from faintspot.loop.control.identification.model import (
+    CONTROLS,
+    INTEGRATOR,
+    KALMAN,
+    MODAL,
+    POLC,
+    Learnt,
+    Model,
+    Plant,
+)
+from faintspot.loop.control.kalman.local_covariance import STEPS
+from faintspot.loop.control.kalman.local_predictor import local_filter
+from faintspot.loop.control.modal_gains import largest_stable_gain, modal_gains
+from faintspot.loop.control.phase import phase_of_commands
+from faintspot.loop.control.telemetry import OpenLoopTelemetry, usual_noise
+from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+
+__all__ = ["CONTROLS", "INTEGRATOR", "KALMAN", "MODAL", "POLC", "Learnt", "Plant", "learn"]
+
+Floats = NDArray[np.float64]
+
+
+GAINS = (0.03, 0.05, 0.07, 0.1, 0.13, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5, 0.6, 0.7, 0.8)
+"""Gains of an integrator that are tried."""
+_POLC_GAINS = (0.05, 0.1, 0.2, 0.3, 0.45, 0.65)
+_MOST_SLOPES = 300  # whose filter lets each correct all others
+_MOST_REPLAYED, _FEWEST_REPLAYED = 1_200_000, 500  # slopes, and frames, by which controllers are compared
+_LARGEST_PART = 0.85  # of the gain at which a mode would be unstable where slopes are fully trusted
+
+
+def learn(
+    kind: str,
+    plant: Plant,
+    telemetry: OpenLoopTelemetry,
+    site: SlopeTurbulence,
+    rate_hz: float,
+    winds: str = LEARNT,
+    noise_scale: float = 1.0,
+    start: Identified | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Learnt:
+    """Return a controller of the given kind, learnt from telemetry.
+
+    Parameters
+    ----------
+    kind : str
+        One of `CONTROLS` but the plain integrator.
+    plant : Plant
+    telemetry : OpenLoopTelemetry
+    site : SlopeTurbulence
+        Geometry of the sensor, outer scale and, for winds that are assumed, these.
+    rate_hz : float
+        Frames per second.
+    winds : str
+        One of `WINDS`.
+    noise_scale : float
+        Factor on the noise variance that telemetry shows.
+    start : Identified, optional
+        Earlier turbulence of the same site, from which winds are learnt faster.
+    progress : callable, optional
+        Called with the steps done and their number while filters of many slopes are computed.
+    """
+    cells = np.rint(site.positions_m[:, ::-1] / site.subaperture_m).astype(np.int64)
+    of_commands = phase_of_commands(plant.interaction, cells)
+    frames = max(_FEWEST_REPLAYED, _MOST_REPLAYED // len(site.positions_m) // 2)
+    whole, telemetry = telemetry, telemetry.part(-frames, None)
+    gain, plain_left = plant.best_gain(GAINS, telemetry, of_commands @ plant.reconstructor.matrix)
+    plain = Model(kind, {}, gain, 1.0, (math.inf, plain_left), of_commands)
+    if kind == MODAL:
+        return Learnt(plant, _modal(plain, plant, telemetry))
+    identification = Identification(whole, site, rate_hz, AVERAGED[:1])
+    tried = []
+    known = start if start is not None and start.is_layered and winds == LEARNT else None
+    if known is None:  # else the comparison was made before
+        tried.append(identification.anywhere())
+    if winds == LEARNT:
+        tried.append(identification.layers(known))
+    elif winds == ASSUMED:
+        tried.append(identification.of_winds(site.wind_m_per_s))
+    made = []
+    total = len(tried) * sum(steps for _, steps in STEPS)
+    done = itertools.count(1)
+
+    def advance() -> None:
+        if progress is not None:
+            progress(next(done), total)
+
+    make = _pseudo_open_loop if kind == POLC else partial(_kalman, advance)
+    for found in tried:
+        text = f"{found.summary()}, noise variance x {found.noise_factor:.2f}"
+        model = replace(plain, noise_factor=found.noise_factor, description=text)
+        made.append((make(model, plant, telemetry, found), found))
+    model, found = min(made, key=lambda each: each[0].left[0])
+    return Learnt(plant, model.with_noise(noise_scale) if kind == KALMAN else model, found)
+
+
+def _kalman(
+    advance: Callable[[], None], model: Model, plant: Plant, telemetry: OpenLoopTelemetry, found: Identified
+) -> Model:
+    """Return the model with its Kalman filter and residual."""
+    variance, covariance = usual_noise(telemetry.scaled(found.noise_factor))
+    if len(variance) > _MOST_SLOPES:
+        arrays = local_filter(found.layers, 1 / found.rate_hz, variance, advance, covariance)
+    else:
+        slopes = found.slope_model()
+        arrays = {
+            "first": slopes.first,
+            "second": slopes.second,
+            "driving_px2": slopes.driving,
+            "variance_px2": variance,
+            "covariance_xy_px2": covariance,
+        }
+    return replace(model, arrays=arrays).scored(plant, telemetry)
+
+
+def _modal(model: Model, plant: Plant, telemetry: OpenLoopTelemetry) -> Model:
+    """Return the model with one gain per mode."""
+    trust = max(float(telemetry.trust.mean()), 1e-6)  # by which slopes are smaller than they should be
+    weighted = telemetry.trust * telemetry.open_loop_px / trust
+    modes = weighted @ plant.reconstructor.matrix.T @ plant.reconstructor.modes
+    gains = modal_gains(modes, plant.delay_frames, plant.leak) / trust
+    gains = np.minimum(gains, _LARGEST_PART * largest_stable_gain(plant.delay_frames))
+    text = f"gains {gains.min():g} to {gains.max():g}"
+    return replace(model, arrays={"gains": gains}, description=text).scored(plant, telemetry)
+
+
+def _pseudo_open_loop(model: Model, plant: Plant, telemetry: OpenLoopTelemetry, found: Identified) -> Model:
+    """Return the model with pseudo-open-loop control for the time at which the command acts."""
+    covariances = found.covariances_px2().sum(axis=0)
+    arrays = {"now_px2": covariances[0], "ahead_px2": covariances[min(plant.delay_frames, 2)]}
+    made = [
+        replace(model, arrays={**arrays, "gain": np.array(gain)}).scored(plant, telemetry)
+        for gain in _POLC_GAINS
+    ]
+    return min(made, key=lambda each: each.left[0])

@@ -1,0 +1,333 @@
+"""Models of controllers, which can be saved to a file, and the controllers made from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.checks import numbers_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.base.npz import read_arrays, save_arrays
+from faintspot.loop.control.base import Controller
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification.layers import Identified
+from faintspot.loop.control.identification.replay import mean_left, replayed_frames, replayed_integrators
+from faintspot.loop.control.integrator import Integrator
+from faintspot.loop.control.kalman.compiled import CompiledKalman
+from faintspot.loop.control.kalman.guarded import Guarded
+from faintspot.loop.control.kalman.large_guarded import LargeGuarded
+from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_shapes
+from faintspot.loop.control.kalman.predictive import Predictive, PseudoOpenLoop
+from faintspot.loop.control.kalman.predictor import SlopePredictor, steady_covariance
+from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.control.reconstructor import Reconstructor
+from faintspot.loop.control.telemetry import OpenLoopTelemetry
+
+Floats = NDArray[np.float64]
+Make = Callable[[CommandDelayLine], Controller]
+
+INTEGRATOR, MODAL, POLC, KALMAN = "integrator", "modal", "polc", "kalman"
+CONTROLS = {
+    INTEGRATOR: "integrator with one gain",
+    MODAL: "integrator with a gain for each mode",
+    POLC: "pseudo-open-loop control",
+    KALMAN: "predictive Kalman filter",
+}
+"""Kinds of control and their names in reports."""
+
+SETTLE_FRAMES = 200
+"""Frames after which a replayed controller has settled; predictive filters take longer than integrators."""
+_LOCAL = "local kalman"  # in files: KALMAN for a large sensor
+_OF_KIND = {
+    MODAL: ("gains",),
+    POLC: ("now_px2", "ahead_px2", "gain"),
+    KALMAN: ("first", "second", "driving_px2", "variance_px2", "covariance_xy_px2"),
+    _LOCAL: ("near", "around", "weights", "corrections", "variance_px2", "predicted_px2", "share"),
+}
+_NOISE = "variance_px2", "covariance_xy_px2"
+_SQUARE = {"now_px2", "ahead_px2"}
+_OF_LAYERS = {"first", "second", "driving_px2"}
+_OF_ALL = ("plain_gain", "noise_factor", "left", "phase_of_commands")
+_COVARIANCE = -1e8, 1e8  # px^2: of slopes of 1e4 px
+_RANGES = {
+    "gains": (0.0, 2.0),
+    "gain": (0.0, 1.0),
+    "plain_gain": (0.0, 2.0),
+    "noise_factor": (1e-6, 1e6),
+    "variance_px2": (1e-12, 1e8),
+    "now_px2": _COVARIANCE,
+    "ahead_px2": _COVARIANCE,
+    "driving_px2": _COVARIANCE,
+    "covariance_xy_px2": _COVARIANCE,
+    "predicted_px2": (0.0, 1e8),
+    "share": (0.0, 1.0),
+    "weights": (-1e6, 1e6),
+    "corrections": (-1e6, 1e6),
+    "first": (-1e6, 1e6),
+    "second": (-1e6, 1e6),
+}
+"""Accepted range; other values are damaged or in another unit, and products may overflow."""
+
+
+def settled(telemetry: OpenLoopTelemetry) -> int:
+    """Return the number of frames at the start of a replay that are not scored."""
+    return min(SETTLE_FRAMES, len(telemetry) // 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """Loop properties that a controller needs."""
+
+    interaction: Floats
+    """(m, commands): slopes [px] per unit of each command."""
+    reconstructor: Reconstructor
+    delay_frames: int
+    leak: float
+
+    def integrator(self, gain: float | Floats, line: CommandDelayLine) -> Controller:
+        """Return an integrator of this loop."""
+        return Integrator(line, self.interaction, self.reconstructor, gain, self.leak)
+
+    def replayed(self, make: Make, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
+        """Return the squared residual that a controller would have left; see `replayed_frames`."""
+        return replayed_frames(make, telemetry, self.interaction, phase, self.delay_frames)
+
+    def replayed_integrators(
+        self, gains: Sequence[float], telemetry: OpenLoopTelemetry, phase: Floats
+    ) -> Floats:
+        """Return the squared residuals of integrators, (gains, frames)."""
+        of_loop = self.interaction, self.reconstructor, phase, self.delay_frames, self.leak
+        return replayed_integrators(gains, telemetry, *of_loop)
+
+    def best_gain(
+        self, gains: Sequence[float], telemetry: OpenLoopTelemetry, phase: Floats
+    ) -> tuple[float, float]:
+        """Return the gain of the integrator that leaves the least phase variance, and that variance."""
+        found = self.replayed_integrators(gains, telemetry, phase)
+        left = [mean_left(each, telemetry, settled(telemetry)) for each in found]
+        best = int(np.argmin(left))
+        return gains[best], left[best]
+
+    def left(self, make: Make, telemetry: OpenLoopTelemetry, phase: Floats) -> float:
+        """Return the phase variance that a controller would have left; see `mean_left`."""
+        return mean_left(self.replayed(make, telemetry, phase), telemetry, settled(telemetry))
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Learnt model of a controller."""
+
+    kind: str
+    arrays: Mapping[str, Floats]
+    """modal: gains (modes,). polc: now_px2 and ahead_px2 (m, m), gain. kalman: first, second and driving_px2
+    (layers, m, m), variance_px2 (m,) and covariance_xy_px2 (m / 2,) of the slopes' noise; for large sensors
+    those of `local_filter`."""
+    plain_gain: float
+    """Gain of the fallback integrator."""
+    noise_factor: float
+    """Factor on the variances of standard errors."""
+    left: tuple[float, float]
+    """Residual phase variance of the learnt and the plain controller on the telemetry, noise included."""
+    phase_of_commands: Floats
+    """(commands, commands): matrix of the measure that compares both; see `phase_of_commands`."""
+    description: str = ""
+    covariance: Floats | None = None
+    """(states, states) px^2: as from `steady_covariance`, where it is known already."""
+
+    def controller(self, plant: Plant, line: CommandDelayLine) -> Controller:
+        """Return the learnt controller."""
+        arrays = self.arrays
+        if self.kind == MODAL:
+            return plant.integrator(arrays["gains"], line)
+        clean = plant.reconstructor.clean
+        if self.kind == POLC:
+            covariances = arrays["now_px2"], arrays["ahead_px2"]
+            return PseudoOpenLoop(line, plant.interaction, *covariances, clean, float(arrays["gain"]))
+        return Predictive(line, plant.interaction, self.predictor(), clean, from_latest=self.is_local)
+
+    def compiled(self, plant: Plant, line: CommandDelayLine, phase: Floats, **options: Any) -> CompiledKalman:
+        """Return the Kalman filter of a small sensor with its fallback, see `CompiledKalman`."""
+        predictor, reconstructor = self.predictor(), plant.reconstructor
+        assert isinstance(predictor, SlopePredictor)
+        return CompiledKalman(
+            line,
+            plant.interaction,
+            reconstructor.matrix,
+            phase,
+            predictor,
+            reconstructor.clean,
+            self.plain_gain,
+            plant.leak,
+            noise_factor=self.noise_factor,
+            prefers_plain=self.left[1] < self.left[0],
+            **options,
+        )
+
+    def replayed(self, plant: Plant, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
+        """Return the squared residual that the learnt controller would have left; see `replayed_frames`."""
+        if self.kind != KALMAN or self.is_local:
+            scaled = telemetry.scaled(self.noise_factor)
+            return plant.replayed(partial(self.controller, plant), scaled, phase)
+        line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames)
+        return self.compiled(plant, line, phase).replayed(telemetry)
+
+    def phase(self, plant: Plant) -> Floats:
+        """Return the matrix (commands, m) from slopes to what is compared."""
+        return np.asarray(self.phase_of_commands @ plant.reconstructor.matrix)
+
+    def scored(self, plant: Plant, telemetry: OpenLoopTelemetry) -> Model:
+        """Return the model with its residual on telemetry."""
+        left = mean_left(self.replayed(plant, telemetry, self.phase(plant)), telemetry, settled(telemetry))
+        is_dense = self.kind == KALMAN and not self.is_local
+        return replace(self, left=(left, self.left[1]), covariance=self._covariance if is_dense else None)
+
+    @property
+    def is_local(self) -> bool:
+        """Whether the Kalman filter is one for large sensors, in which only near sub-apertures interact."""
+        return "around" in self.arrays
+
+    @property
+    def expected_std_px(self) -> Floats | None:
+        """(m,): standard deviations of the predicted slopes; None if unknown."""
+        return self.predictor().std_px if self.kind == KALMAN else None
+
+    def predictor(self) -> SlopePredictor | LocalPredictor:
+        """Return the Kalman filter of the model."""
+        if self.is_local:
+            return LocalPredictor(self.arrays)
+        return SlopePredictor(self._slopes, *self._noise, covariance=self._covariance)
+
+    def with_noise(self, scale: float) -> Model:
+        """Return the model of "kalman" with the noise variances scaled by a factor."""
+        if scale == 1.0:
+            return self
+        arrays = self.arrays
+        if not self.is_local:  # which has gains for several variances
+            arrays = {**arrays, **{name: scale * arrays[name] for name in _NOISE}}
+        text, factor = f"{self.description}, and {scale:g} of that", scale * self.noise_factor
+        return replace(self, arrays=arrays, noise_factor=factor, description=text, covariance=None)
+
+    @cached_property
+    def _slopes(self) -> SlopeModel:
+        return SlopeModel(*(self.arrays[name] for name in ("first", "second", "driving_px2")))
+
+    @cached_property
+    def _covariance(self) -> Floats:
+        if self.covariance is not None:
+            return self.covariance
+        return steady_covariance(self._slopes, *self._noise)
+
+    @property
+    def _noise(self) -> tuple[Floats, Floats]:
+        """Variances and covariances of the slopes' noise."""
+        variance, covariance = (self.arrays[name] for name in _NOISE)
+        return variance, covariance
+
+    def save(self, path: str | Path) -> None:
+        """Write the model to a NumPy file (.npz).
+
+        Raises
+        ------
+        InputError
+            When it cannot be written.
+        """
+        numbers = {name: np.asarray(getattr(self, name), np.float64) for name in _OF_ALL}
+        kind = _LOCAL if self.is_local else self.kind
+        save_arrays(path, {"kind": np.array(kind), **numbers, **self.arrays})
+
+    @classmethod
+    def load(cls, path: str | Path, plant: Plant) -> Model:
+        """Read a model for a loop.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read, is for another loop, or has numbers out of range.
+        """
+        what = "what control has learnt"
+        kind = one_of("kind", str(read_arrays(path, what, ("kind",))["kind"]), list(_OF_KIND))
+        numbers = _checked(read_arrays(path, what, (*_OF_ALL, *_OF_KIND[kind])), plant)
+        learnt, plain = numbers["left"]
+        return cls(
+            KALMAN if kind == _LOCAL else kind,
+            {name: numbers[name] for name in _OF_KIND[kind]},
+            float(numbers["plain_gain"]),
+            float(numbers["noise_factor"]),
+            (float(learnt), float(plain)),
+            numbers["phase_of_commands"],
+        )
+
+    def check(self, plant: Plant) -> None:
+        """Refuse a model of another loop, or with numbers out of range.
+
+        Raises
+        ------
+        InputError
+            One line.
+        """
+        numbers = {name: getattr(self, name) for name in _OF_ALL}
+        _checked({**self.arrays, **numbers}, plant)
+
+
+def _checked(found: Mapping[str, Any], plant: Plant) -> dict[str, Floats]:
+    """Return a model's arrays as float64, with checked shapes and ranges."""
+    (slopes, commands), modes = plant.interaction.shape, plant.reconstructor.modes.shape[1]
+    ranges = {**_RANGES, "near": (0, slopes // 2), "around": (0, slopes // 2)}
+    numbers = {name: numbers_between(name, value, *ranges.get(name, ())) for name, value in found.items()}
+    shapes: dict[str, tuple[int, ...]] = {"gains": (modes,), "variance_px2": (slopes,), "left": (2,)}
+    shapes["phase_of_commands"] = commands, commands
+    shapes["covariance_xy_px2"] = (slopes // 2,)
+    shapes |= dict.fromkeys(_SQUARE, (slopes, slopes))
+    layers = len(numbers["first"]) if "first" in numbers and numbers["first"].ndim == 3 else 1
+    shapes |= dict.fromkeys(_OF_LAYERS, (layers, slopes, slopes))
+    if "around" in numbers:
+        shapes |= local_shapes(numbers, slopes)
+    for name, array in numbers.items():
+        if array.shape != shapes.get(name, ()):
+            raise InputError(f"{name}: expected shape {shapes.get(name, ())}, got {array.shape}")
+    return numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """Learnt controller of a loop, from which controllers are made."""
+
+    plant: Plant
+    model: Model
+    found: Identified | None = None
+    """Turbulence that the model follows from; None for modal gains and models read from a file."""
+
+    @property
+    def noise_factor(self) -> float:
+        """Factor on the variances of standard errors."""
+        return self.model.noise_factor
+
+    @property
+    def expected_std_px(self) -> Floats | None:
+        """(m,): standard deviations of the predicted slopes; None if unknown."""
+        return self.model.expected_std_px
+
+    def controller(
+        self, line: CommandDelayLine, prior_std_px: Floats | None = None
+    ) -> Guarded | CompiledKalman:
+        """Return the controller, with the estimator's prior if it has one."""
+        plant, model = self.plant, self.model
+        if model.kind == KALMAN and not model.is_local:
+            return model.compiled(plant, line, model.phase(plant), prior_std_px=prior_std_px)
+        options: dict[str, Any] = {
+            "prior_std_px": prior_std_px,
+            "noise_factor": model.noise_factor,
+            "prefers_plain": model.left[1] < model.left[0],
+        }
+        interaction, gain = plant.interaction, model.plain_gain
+        if model.is_local:
+            of_loop = interaction, plant.reconstructor, model.phase_of_commands
+            return LargeGuarded(line, *of_loop, model.arrays, gain, plant.leak, **options)
+        learnt, plain = partial(model.controller, plant), partial(plant.integrator, gain)
+        return Guarded(line, interaction, model.phase(plant), learnt, plain, **options)

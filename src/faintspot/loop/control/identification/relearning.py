@@ -1,0 +1,109 @@
+"""Learn a Kalman filter again from a stretch of a running loop, and judge it on frames not learnt from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.layers import Identified
+from faintspot.loop.control.identification.learning import learn
+from faintspot.loop.control.identification.model import KALMAN, SETTLE_FRAMES, Learnt, Model, Plant
+from faintspot.loop.control.telemetry import OpenLoopTelemetry
+from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+
+Floats = NDArray[np.float64]
+
+JUDGED_PART = 0.35
+"""Part of a stretch, its end, on which models are judged; they are learnt from the rest."""
+STANDARD_ERRORS = 2.0
+_BLOCK_FRAMES = 25
+_FEWEST_BLOCKS = 10
+FEWEST_FRAMES = math.ceil(_FEWEST_BLOCKS * _BLOCK_FRAMES / JUDGED_PART) + 1
+"""Frames of a stretch that can be learnt from and judged on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Relearnt:
+    """New filter, and the residual phase variance that it and others would have left on the same frames."""
+
+    learnt: Learnt
+    left: float
+    left_by_running: float
+    left_by_integrator: float
+    error: float
+    """Standard error of `left_by_running` minus `left`."""
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the new filter leaves less than the running one, beyond the error, and the integrator."""
+        gain = self.left_by_running - self.left
+        return gain > STANDARD_ERRORS * self.error and self.left < self.left_by_integrator
+
+    def summary(self) -> str:
+        """Return a summary of one line."""
+        part, error = self.left / self.left_by_running, self.error / self.left_by_running
+        of_integrator = self.left / self.left_by_integrator
+        return (
+            f"{self.learnt.model.description}; phase variance {part:.3f} +- {error:.3f} of the running "
+            f"filter's, {of_integrator:.2f} of the integrator's"
+        )
+
+
+def relearn(
+    plant: Plant,
+    running: Model,
+    telemetry: OpenLoopTelemetry,
+    site: SlopeTurbulence,
+    rate_hz: float,
+    start: Identified | None = None,
+) -> Relearnt:
+    """Learn from the first part of telemetry, and judge on the rest by replay; nothing else is changed.
+
+    All filters are replayed on the same open-loop slopes, each with its own commands, so that nothing is
+    risked on the mirror. The running filter must not have learnt from this telemetry.
+
+    Parameters
+    ----------
+    plant : Plant
+    running : Model
+        Model of the Kalman filter in use.
+    telemetry : OpenLoopTelemetry
+        Consecutive frames.
+    site : SlopeTurbulence
+    rate_hz : float
+        Frames per second.
+    start : Identified, optional
+        Turbulence that was found before, from which the search starts: faster, but finds no new layer.
+
+    Raises
+    ------
+    InputError
+        When there are too few frames.
+    """
+    frames = len(telemetry)
+    if frames < FEWEST_FRAMES:
+        raise InputError(f"telemetry: expected {FEWEST_FRAMES} frames to judge a filter, got {frames}")
+    first = frames - round(JUDGED_PART * frames)
+    learnt = learn(KALMAN, plant, telemetry.part(0, first), site, rate_hz, start=start)
+    new, begin = learnt.model, max(0, first - SETTLE_FRAMES)
+    replayed = telemetry.part(begin, None)  # all have settled when the part begins that they are judged on
+    phase = new.phase(plant)
+    by_integrator = plant.replayed_integrators([new.plain_gain], replayed, phase)[0]
+    found = *(model.replayed(plant, replayed, phase) for model in (new, running)), by_integrator
+    left, by_running, by_integrator = (each[first - begin :] for each in found)
+    means = float(left.mean()), float(by_running.mean()), float(by_integrator.mean())
+    scored = replace(new, left=(means[0], means[2]))  # by which the engine chooses what begins
+    return Relearnt(replace(learnt, model=scored), *means, _error_of_mean(by_running - left))
+
+
+def _error_of_mean(values: Floats) -> float:
+    """Return the standard error of the mean of correlated values, from the scatter of blocks."""
+    blocks = len(values) // _BLOCK_FRAMES
+    means = values[: blocks * _BLOCK_FRAMES].reshape(blocks, _BLOCK_FRAMES).mean(axis=1)
+    with np.errstate(invalid="ignore"):
+        error = float(means.std(ddof=1)) / math.sqrt(blocks)
+    return error if math.isfinite(error) else math.inf

@@ -1,0 +1,79 @@
+"""Integrator with one gain, or one gain per mode."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.loop.control.base import Expected
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.reconstructor import Reconstructor
+
+Floats = NDArray[np.float64]
+
+
+class Integrator:
+    """Integrator with leak: subtracts a fraction of each frame's wavefront from the command.
+
+    Parameters
+    ----------
+    line : CommandDelayLine
+    interaction : (2 n, commands) array
+        Slopes in px that a unit of each command adds.
+    reconstructor : Reconstructor
+    gain : float or (modes,) array
+        Loop gain, of everything or of each of the reconstructor's modes.
+    leak : float
+        Part of the command that is forgotten in every frame, so that a loop that has lost the star returns.
+    weighted : bool
+        Whether slopes count by their standard errors and covariances.
+    sees_mirror : bool
+        Whether the sensor is behind the mirror. If not (open loop), the command follows the running mean of
+        the wavefront.
+    """
+
+    undoes_prior = False
+
+    def __init__(
+        self,
+        line: CommandDelayLine,
+        interaction: Floats,
+        reconstructor: Reconstructor,
+        gain: float | Floats,
+        leak: float,
+        *,
+        weighted: bool = False,
+        sees_mirror: bool = True,
+    ) -> None:
+        self._line, self._interaction, self._reconstructor = line, interaction, reconstructor
+        self._gain, self._leak = gain, leak
+        self._weighted, self._sees_mirror = weighted, sees_mirror
+
+    def expected(self) -> Expected:
+        """See `Controller`; assumes that the latest command is right for this frame."""
+        line = self._line
+        commands = line.acting - line.latest if self._sees_mirror else -line.latest
+        return Expected(self._interaction @ commands, None)
+
+    def begin(self) -> None:
+        """See `Controller`; the delay line is the only state."""
+
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
+        """See `Controller`."""
+        if self._weighted:
+            wavefront = self._reconstructor.weighted(slopes_px, standard_error_px, covariance_xy_px2)
+        else:
+            wavefront = self._reconstructor(slopes_px)
+        self.follow(wavefront)
+
+    def follow(self, wavefront: Floats) -> None:
+        """Update with this frame's wavefront, given as the commands that cause it."""
+        if np.ndim(self._gain):
+            modes = self._reconstructor.modes
+            step = modes @ (self._gain * (modes.T @ wavefront))
+        else:
+            step = self._gain * wavefront
+        forgotten = self._leak if self._sees_mirror else self._gain
+        self._line.put((1 - forgotten) * self._line.latest - step)

@@ -1,0 +1,1 @@
+"""Prediction: Kalman filters of all slopes or of neighbours, and their guards."""

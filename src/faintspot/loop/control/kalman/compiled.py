@@ -1,0 +1,213 @@
+"""Controller with the compiled Kalman filter and its fallback."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.loop.control.base import Expected
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.kalman.kernels import (
+    CHOSEN,
+    COMMAND_ROWS,
+    FOLLOW,
+    FRAMES,
+    GO_ON,
+    GUARD_NUMBERS,
+    HELD,
+    HOLD,
+    LATEST_PLAIN,
+    PREDICTED,
+    SENT,
+    SLOPE_ROWS,
+    Lines,
+    Matrices,
+    Memory,
+    replay,
+)
+from faintspot.loop.control.kalman.predictor import SlopePredictor, shares
+from faintspot.loop.control.telemetry import LEAST_VARIANCE_PX2, OpenLoopTelemetry
+
+Floats = NDArray[np.float64]
+
+STEPS = 4
+"""Conjugate-gradient iterations used to compute the Kalman gain."""
+_NO_PRIOR = np.zeros(0)
+
+
+class CompiledKalman:
+    """`guarded.Guarded` with `predictive.Predictive` and the integrator beside it, in compiled code.
+
+    How much each slope corrects follows the noise of each frame, as in `SlopePredictor`; in place of solving
+    its equations to the end it takes `STEPS` steps of conjugate gradients, which is products with matrices.
+
+    Before a command goes out, only that is done which needs the frame's slopes: the rest when somebody asks
+    what is expected next, or with the next `update`.
+
+    Parameters
+    ----------
+    line : CommandDelayLine
+        To the mirror.
+    interaction : (m, commands) array
+    reconstruct : (commands, m) array
+        From slopes to what the integrator integrates.
+    phase : (commands, m) array
+        From slopes to what is compared, see `residual_phase`.
+    predictor : SlopePredictor
+    clean : (commands, m) array
+        The wavefront, as commands that cause it, from open-loop slopes without noise.
+    plain_gain, leak : float
+        Of the integrator.
+    prior_std_px : (m,) array, optional
+        Prior of the estimator, whose mean is `expected`. Default: it has none.
+    noise_factor : float
+        What to multiply the variances of standard errors by.
+    prefers_plain : bool
+        Whether the integrator begins.
+    steps : int
+        Of conjugate gradients.
+    """
+
+    undoes_prior = False
+
+    def __init__(
+        self,
+        line: CommandDelayLine,
+        interaction: Floats,
+        reconstruct: Floats,
+        phase: Floats,
+        predictor: SlopePredictor,
+        clean: Floats,
+        plain_gain: float,
+        leak: float,
+        *,
+        prior_std_px: Floats | None = None,
+        noise_factor: float = 1.0,
+        prefers_plain: bool = False,
+        steps: int = STEPS,
+    ) -> None:
+        self._line, self._interaction = line, interaction
+        slopes, commands = interaction.shape
+        self._learnt, self._plain = (
+            CommandDelayLine(commands, line.delay_frames, line.largest) for _ in range(2)
+        )
+        self.prior_std_px = prior_std_px
+        ahead = -clean @ predictor.model.ahead(line.delay_frames)
+        usual = predictor.usual_px2
+        self._matrices = Matrices(
+            np.ascontiguousarray(interaction.T),
+            np.ascontiguousarray(reconstruct.T),
+            np.ascontiguousarray(phase.T),
+            np.ascontiguousarray(predictor.with_slopes.T),
+            predictor.predicted_px2,
+            np.linalg.inv(usual),
+            np.diag(usual).copy(),
+            np.ascontiguousarray(predictor.model.both.swapaxes(1, 2)),
+            np.ascontiguousarray(ahead.T),
+        )
+        self._lines = Lines(line.rows, self._learnt.rows, self._plain.rows)
+        self._memory = Memory(
+            np.zeros((predictor.model.layers, 2, slopes)),
+            np.zeros(GUARD_NUMBERS),
+            np.zeros((SLOPE_ROWS, slopes)),
+            np.zeros((COMMAND_ROWS, commands)),
+        )
+        self._memory.guard[[CHOSEN, SENT]] = prefers_plain
+        self._noise_factor = float(noise_factor)
+        self._numbers = float(plain_gain), 1.0 - leak, float(line.largest), steps
+        self._std_px, self._shares = predictor.std_px, shares(predictor.model)
+        self._independent = np.zeros(slopes // 2)
+        self._is_behind = False
+        self._held_at = -1
+        """Position of the delay line at which the acting command was turned into slopes."""
+
+    @property
+    def chosen(self) -> int:
+        """0: the filter's commands are sent; 1: the integrator's."""
+        self._catch_up()
+        return int(self._memory.guard[CHOSEN])
+
+    def expected(self) -> Expected:
+        """See `Controller`."""
+        self._catch_up()
+        rows = self._memory.slopes
+        if self._memory.guard[CHOSEN]:
+            return Expected(rows[HELD] - rows[LATEST_PLAIN], None)
+        return Expected(rows[HELD] + rows[PREDICTED], self._std_px)
+
+    def fall_back(self) -> None:
+        """See `Guarded`."""
+        self._catch_up()
+        self._memory.guard[CHOSEN] = 1.0
+
+    def begin(self) -> None:
+        """See `Controller`; open-loop slopes are assumed to equal the mirror's correction."""
+        latest = self._line.latest
+        for own in (self._learnt, self._plain):
+            own.hold(latest)
+        open_loop = -(self._interaction @ latest)
+        self._memory.state[:] = self._shares[:, None, None] * open_loop
+        self._memory.slopes[PREDICTED] = open_loop
+        self._memory.guard[FRAMES:] = 0.0
+        self._memory.guard[SENT] = self._memory.guard[CHOSEN]
+        self._is_behind, self._held_at = False, -1
+
+    def hand_over(self) -> None:
+        """See `Guarded`."""
+        self._memory.guard[SENT] = -1.0
+
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
+        """See `Controller`; of an estimator with a prior, x and y are taken to be independent.
+
+        Raises
+        ------
+        ArithmeticError
+            When a controller's commands are not finite.
+        """
+        self._catch_up()
+        prior = self.prior_std_px
+        total = FOLLOW(
+            slopes_px,
+            standard_error_px,
+            self._independent if covariance_xy_px2 is None else covariance_xy_px2,
+            _NO_PRIOR if prior is None else prior,
+            self._noise_factor,
+            self._numbers,
+            self._matrices,
+            self._lines,
+            self._places(),
+            self._memory,
+        )
+        self._line.sent(total)
+        self._is_behind = True
+
+    def replayed(self, telemetry: OpenLoopTelemetry) -> Floats:
+        """Return the squared residual that the filter alone would have left, (frames,).
+
+        See `replayed_frames`. Turbulence and mirror, of unlimited stroke, begin flat. The state is lost.
+        """
+        squares = np.zeros(len(telemetry))
+        variance = np.maximum(self._noise_factor * telemetry.variance_px2, LEAST_VARIANCE_PX2)
+        slopes, trust = telemetry.open_loop_px, telemetry.trust
+        covariance = self._noise_factor * telemetry.covariances_px2
+        self._memory.state[:], self._memory.slopes[PREDICTED] = 0.0, 0.0
+        line = np.zeros_like(self._lines.learnt)
+        what = slopes, variance, covariance, trust
+        replay(*what, self._numbers[-1], self._matrices, line, self._memory, squares)
+        return squares
+
+    def _catch_up(self) -> None:
+        """Complete the previous frame."""
+        if self._is_behind:
+            self._is_behind, self._held_at = False, -1
+            total = GO_ON(self._numbers, self._matrices, self._lines, self._places(), self._memory)
+            self._learnt.sent(total)
+            self._plain.sent(total)
+        if self._held_at != self._line.place:
+            HOLD(self._matrices, self._lines, self._places(), self._memory)
+            self._held_at = self._line.place
+
+    def _places(self) -> tuple[int, int, int]:
+        return self._line.place, self._learnt.place, self._plain.place

@@ -1,0 +1,389 @@
+"""Kernels of the guarded Kalman filter: command from a frame's slopes, then the rest of the update.
+
+What they do is written in NumPy in `guarded`, `predictive`, `kalman` and `telemetry`; `compiled_kalman` calls
+them in their order.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from faintspot.loop.control.kalman.guarded import (
+    CORRELATED_FRAMES,
+    FEWEST_FRAMES,
+    HANDOVER_FRAMES,
+    MEMORY_FRAMES,
+    STANDARD_ERRORS,
+)
+from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
+from faintspot.loop.control.telemetry import LEAST_SHARE, LEAST_VARIANCE_PX2
+from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
+from faintspot.slopes.kernels.driver.products import add_products
+
+_compiled = partial(compiled_with, source=__file__)
+
+# Rows of memory: of slopes, and of commands; the first four are commands and what they add to slopes.
+HELD, HELD_LEARNT, HELD_PLAIN, LATEST_PLAIN, _LEFT_LEARNT, _LEFT_PLAIN, _FOR_PLAIN = range(7)
+_VARIANCE, _COVARIANCE, _SCALE, _SURPRISE, _SOLUTION, _DIRECTION, _IMAGE, _SPARE, PREDICTED = range(7, 16)
+SLOPE_ROWS = 16
+_MADE, _LEFT, _OFFSET = 4, 5, 7
+COMMAND_ROWS = 8
+# Of the guard: 1 where the plain one's commands go out; the same of the frame before, or another number;
+# frames, mean difference of late, and its mean square; frames of the handover that are left.
+CHOSEN, SENT, FRAMES, _MEAN, _SQUARE, _BLENDED = range(6)
+GUARD_NUMBERS = 6
+
+
+class Matrices(NamedTuple):
+    """Constant matrices, transposed so that the terms of a sum are adjacent in memory."""
+
+    interaction: Any
+    """(commands, m)"""
+    reconstruct: Any
+    """(m, commands)"""
+    phase: Any
+    """(m, commands)"""
+    covariance: Any
+    """(m, states): covariance of the errors of slopes and state before a measurement."""
+    uncertainty: Any
+    """(m, m): covariance of the slopes' error."""
+    usual_inverse: Any
+    """(m, m): inverse of the slopes' covariance with their usual noise."""
+    usual_variance: Any
+    """(m,): diagonal of that covariance."""
+    onward: Any
+    """(layers, 2 m, m)"""
+    command: Any
+    """(states, commands): matrix from the state to commands."""
+
+
+class Lines(NamedTuple):
+    """Delayed commands: of the mirror, and of both controllers."""
+
+    true: Any
+    """(delay + 1, commands)"""
+    learnt: Any
+    plain: Any
+
+
+class Memory(NamedTuple):
+    """State that persists between frames, and work arrays."""
+
+    state: Any
+    """(layers, 2, m): predicted state of the next frame."""
+    guard: Any
+    """(GUARD_NUMBERS,)"""
+    slopes: Any
+    """(SLOPE_ROWS, m)"""
+    commands: Any
+    """(COMMAND_ROWS, commands)"""
+
+
+@_compiled
+def _take(
+    slopes: Any, errors: Any, covariance: Any, prior_std: Any, noise_factor: Any, rows: Any, chosen: Any
+) -> None:
+    """Write the inputs of both controllers; see `Guarded.update` and `telemetry.without_prior`."""
+    for s in range(slopes.shape[0]):
+        held, of_learnt, of_plain = rows[HELD, s], rows[HELD_LEARNT, s], rows[HELD_PLAIN, s]
+        latest = rows[LATEST_PLAIN, s]
+        measured = errors[s] < math.inf
+        variance = max(errors[s] * errors[s], LEAST_VARIANCE_PX2)
+        alone, trust = slopes[s], 1.0 if measured else 0.0
+        if prior_std.shape[0] > 0:
+            expected = held - latest if chosen else held + rows[PREDICTED, s]
+            prior = prior_std[s] * prior_std[s]
+            share = max(prior / variance - 1.0, LEAST_SHARE)
+            alone = expected + (slopes[s] - expected) * (1.0 + share) / share
+            variance = prior / share
+            trust = trust * share / (1.0 + share)
+        open_loop = alone - held
+        rows[_LEFT_LEARNT, s] = trust * (open_loop + of_learnt)
+        residual, expects = open_loop + of_plain, of_plain - latest
+        rows[_LEFT_PLAIN, s] = trust * residual
+        rows[_FOR_PLAIN, s] = expects + trust * (residual - expects)
+        noise = noise_factor * variance
+        measured = measured and noise < LARGEST_VARIANCE_PX2
+        rows[_VARIANCE, s] = noise if measured else math.inf
+        rows[_SURPRISE, s] = open_loop - rows[PREDICTED, s] if measured else 0.0
+    # Of an estimator with a prior, the covariance of the frame alone is not known.
+    _correlate(covariance, noise_factor if prior_std.shape[0] == 0 else 0.0, rows)
+
+
+@_compiled
+def _correlate(covariance: Any, factor: Any, rows: Any) -> None:
+    """Write the covariances of x and y, 0 where one was not measured."""
+    n = covariance.shape[0]
+    for s in range(n):
+        both = rows[_VARIANCE, s] < math.inf and rows[_VARIANCE, n + s] < math.inf
+        rows[_COVARIANCE, s] = factor * covariance[s] if both else 0.0
+
+
+@_compiled
+def _solve(matrices: Any, rows: Any, steps: Any) -> None:
+    """Write x with (S + V) x = surprise: S of the predicted slopes' error, V of this frame's noise.
+
+    Conjugate gradients among the slopes that were measured. What they are preconditioned by is the inverse
+    for the usual noise, scaled to this frame's variances: nearly the solution, where noise is not much other
+    than usual.
+    """
+    m, n = rows.shape[1], rows.shape[1] // 2
+    variance, covariance, scale, left = rows[_VARIANCE], rows[_COVARIANCE], rows[_SCALE], rows[_SURPRISE]
+    solution, direction = rows[_SOLUTION], rows[_DIRECTION]
+    for s in range(m):
+        own = matrices.uncertainty[s, s]
+        scale[s] = math.sqrt(matrices.usual_variance[s] / (own + variance[s]))  # 0: not measured
+        solution[s] = direction[s] = 0.0
+    before = 0.0
+    for _ in range(steps):
+        for s in range(m):
+            rows[_SPARE, s] = scale[s] * left[s]
+            rows[_IMAGE, s] = 0.0
+        add_products(matrices.usual_inverse, rows[_SPARE : _SPARE + 1], rows[_IMAGE : _IMAGE + 1])
+        descent = 0.0
+        for s in range(m):
+            rows[_IMAGE, s] *= scale[s]
+            descent += rows[_IMAGE, s] * left[s]
+        if not descent > 0.0:
+            return
+        more = descent / before if before > 0.0 else 0.0
+        before = descent
+        for s in range(m):
+            direction[s] = rows[_IMAGE, s] + more * direction[s]
+        for s in range(n):
+            rows[_IMAGE, s] = covariance[s] * direction[n + s]
+            rows[_IMAGE, n + s] = covariance[s] * direction[s]
+        add_products(matrices.uncertainty, rows[_DIRECTION : _DIRECTION + 1], rows[_IMAGE : _IMAGE + 1])
+        curvature = 0.0
+        for s in range(m):
+            if scale[s] > 0.0:
+                rows[_IMAGE, s] += variance[s] * direction[s]
+                curvature += direction[s] * rows[_IMAGE, s]
+        step = descent / curvature
+        for s in range(m):
+            if scale[s] > 0.0:
+                solution[s] += step * direction[s]
+                left[s] -= step * rows[_IMAGE, s]
+
+
+@_compiled
+def _filter(matrices: Any, memory: Any, steps: Any, largest: Any, command: Any) -> float:
+    """Correct the state and write the filter's command; return its sum before clipping."""
+    rows = memory.slopes
+    whole = memory.state.reshape(1, memory.state.size)
+    _solve(matrices, rows, steps)
+    add_products(matrices.covariance, rows[_SOLUTION : _SOLUTION + 1], whole)
+    made, total = memory.commands[_MADE : _MADE + 1], 0.0
+    made[:] = 0.0
+    add_products(matrices.command, whole, made)
+    for c in range(command.shape[0]):
+        total += made[0, c]
+        command[c] = min(max(made[0, c], -largest), largest)
+    return total
+
+
+@_compiled
+def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, command: Any) -> float:
+    """Write the integrator's command; return its sum before clipping."""
+    made = memory.commands[_MADE : _MADE + 1]
+    made[:] = 0.0
+    add_products(matrices.reconstruct, memory.slopes[_FOR_PLAIN : _FOR_PLAIN + 1], made)
+    total = 0.0
+    for c in range(command.shape[0]):
+        wanted = keep * memory.commands[LATEST_PLAIN, c] - gain * made[0, c]
+        total += wanted
+        command[c] = min(max(wanted, -largest), largest)
+    return total
+
+
+@_compiled
+def _send(own: Any, true: Any, here: Any, memory: Any, largest: Any) -> None:
+    """Write the mirror's command; see `Guarded`."""
+    guard, offset = memory.guard, memory.commands[_OFFSET]
+    if guard[SENT] != guard[CHOSEN]:
+        guard[SENT], guard[_BLENDED] = guard[CHOSEN], HANDOVER_FRAMES
+        for c in range(own.shape[0]):
+            offset[c] = true[here - 1, c] - own[c]
+    guard[_BLENDED] = max(0.0, guard[_BLENDED] - 1.0)
+    share = guard[_BLENDED] / HANDOVER_FRAMES
+    for c in range(own.shape[0]):
+        true[here, c] = min(max(own[c] + share * offset[c], -largest), largest)
+
+
+@_compiled
+def _advance(matrices: Any, memory: Any) -> None:
+    """Predict the filter's state of the next frame."""
+    state, rows = memory.state, memory.slopes
+    now, m = rows[_SPARE : _SPARE + 1], rows.shape[1]
+    rows[PREDICTED] = 0.0
+    for layer in range(state.shape[0]):
+        now[:] = 0.0
+        add_products(matrices.onward[layer], state[layer].reshape(1, 2 * m), now)
+        for s in range(m):
+            state[layer, 1, s] = state[layer, 0, s]
+            state[layer, 0, s] = now[0, s]
+            rows[PREDICTED, s] += now[0, s]
+
+
+@_compiled
+def _choose(guard: Any, learnt: Any, plain: Any) -> None:
+    """Select the controller with the smaller residual; see `Guarded`."""
+    difference = (learnt - plain) / max(learnt + plain, 1e-30)
+    guard[FRAMES] += 1.0
+    share = 1.0 / min(guard[FRAMES], MEMORY_FRAMES)
+    guard[_MEAN] += share * (difference - guard[_MEAN])
+    guard[_SQUARE] += share * (difference * difference - guard[_SQUARE])
+    if guard[FRAMES] < FEWEST_FRAMES:
+        return
+    values = min(guard[FRAMES], 2 * MEMORY_FRAMES) / CORRELATED_FRAMES
+    variance = max(0.0, guard[_SQUARE] - guard[_MEAN] * guard[_MEAN]) / values
+    if abs(guard[_MEAN]) > STANDARD_ERRORS * math.sqrt(variance):
+        guard[CHOSEN] = 1.0 if guard[_MEAN] > 0.0 else 0.0
+
+
+@_compiled
+def hold(matrices: Any, lines: Any, places: Any, memory: Any) -> None:
+    """Write the slopes caused by the commands that act in the next frame.
+
+    Parameters
+    ----------
+    matrices : Matrices
+    lines : Lines
+    places : (int, int, int)
+        Where the lines' next commands go.
+    memory : Memory
+    """
+    rows, commands, length = memory.slopes, memory.commands, lines.true.shape[0]
+    here, of_learnt, of_plain = places
+    for c in range(commands.shape[1]):
+        commands[HELD, c] = lines.true[(here + 1) % length, c]
+        commands[HELD_LEARNT, c] = lines.learnt[(of_learnt + 1) % length, c]
+        commands[HELD_PLAIN, c] = lines.plain[(of_plain + 1) % length, c]
+        commands[LATEST_PLAIN, c] = lines.plain[(of_plain + length - 1) % length, c]
+    rows[: LATEST_PLAIN + 1] = 0.0
+    add_products(matrices.interaction, commands[: LATEST_PLAIN + 1], rows[: LATEST_PLAIN + 1])
+
+
+@_compiled
+def follow(
+    slopes: Any,
+    errors: Any,
+    covariance: Any,
+    prior_std: Any,
+    noise_factor: Any,
+    numbers: Any,
+    matrices: Any,
+    lines: Any,
+    places: Any,
+    memory: Any,
+) -> float:
+    """Write the selected controller's command for the mirror; return its sum before clipping.
+
+    Parameters
+    ----------
+    slopes, errors : (m,) float64 arrays
+        Finite; infinite error: not measured.
+    covariance : (m / 2,) float64 array
+        Covariances of the noise of x and y.
+    prior_std : (m,) or (0,) float64 array
+        Prior of the estimator; none.
+    noise_factor : float
+        Of the errors' variances.
+    numbers : (float, float, float, int)
+        The integrator's gain, what it keeps of its command, stroke, steps of conjugate gradients.
+    matrices, lines, places, memory
+        As for `hold`, which was called before.
+    """
+    here, of_learnt, of_plain = places
+    gain, keep, largest, steps = numbers
+    plainly = memory.guard[CHOSEN] > 0.0
+    _take(slopes, errors, covariance, prior_std, noise_factor, memory.slopes, plainly)
+    if plainly:
+        total: float = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
+    else:
+        total = _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
+    _send(lines.plain[of_plain] if plainly else lines.learnt[of_learnt], lines.true, here, memory, largest)
+    return total
+
+
+@_compiled
+def go_on(numbers: Any, matrices: Any, lines: Any, places: Any, memory: Any) -> float:
+    """Complete a frame after its command was sent: the other controller, the guard, the state.
+
+    Return the sum of the other controller's command before it is cut.
+    """
+    _, of_learnt, of_plain = places
+    gain, keep, largest, steps = numbers
+    if memory.guard[CHOSEN] > 0.0:
+        total: float = _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
+    else:
+        total = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
+    left = memory.commands[_LEFT : _LEFT + 2]
+    left[:] = 0.0
+    add_products(matrices.phase, memory.slopes[_LEFT_LEARNT : _LEFT_PLAIN + 1], left)
+    learnt, plain = 0.0, 0.0
+    for c in range(left.shape[1]):
+        learnt += left[0, c] * left[0, c]
+        plain += left[1, c] * left[1, c]
+    _choose(memory.guard, learnt, plain)
+    _advance(matrices, memory)
+    return total
+
+
+@_compiled
+def replay(
+    open_loop: Any,
+    variance: Any,
+    covariance: Any,
+    trust: Any,
+    steps: Any,
+    matrices: Any,
+    line: Any,
+    memory: Any,
+    squares: Any,
+) -> None:
+    """Write the squared residual that the filter alone would have left in each recorded frame.
+
+    Parameters
+    ----------
+    open_loop, variance, trust : (frames, m) float64 arrays
+        See `OpenLoopTelemetry`.
+    covariance : (frames, m / 2) float64 array
+    steps : int
+        Of conjugate gradients.
+    matrices : Matrices
+    line : (delay + 1, commands) float64 array
+        Zeros.
+    memory : Memory
+    squares : (frames,) float64 array
+        Infinite from the first command on that is not finite.
+    """
+    rows, delay = memory.slopes, line.shape[0] - 1
+    squares[:] = math.inf
+    for frame in range(open_loop.shape[0]):
+        place = frame % (delay + 1)
+        acting = (place + 1) % (delay + 1)
+        rows[HELD] = 0.0
+        add_products(matrices.interaction, line[acting : acting + 1], rows[HELD : HELD + 1])
+        for s in range(rows.shape[1]):
+            measured = variance[frame, s] < LARGEST_VARIANCE_PX2
+            rows[_LEFT_LEARNT, s] = trust[frame, s] * (open_loop[frame, s] + rows[HELD, s])
+            rows[_VARIANCE, s] = variance[frame, s] if measured else math.inf
+            rows[_SURPRISE, s] = open_loop[frame, s] - rows[PREDICTED, s] if measured else 0.0
+        _correlate(covariance[frame], 1.0, rows)
+        left, square = memory.commands[_LEFT : _LEFT + 1], 0.0
+        left[:] = 0.0
+        add_products(matrices.phase, rows[_LEFT_LEARNT : _LEFT_LEARNT + 1], left)
+        for c in range(left.shape[1]):
+            square += left[0, c] * left[0, c]
+        if not np.isfinite(_filter(matrices, memory, steps, math.inf, line[place])):
+            return
+        squares[frame] = square
+        _advance(matrices, memory)
+
+
+HOLD, FOLLOW, GO_ON = Direct(hold), Direct(follow), Direct(go_on)

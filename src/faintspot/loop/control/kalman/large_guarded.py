@@ -1,0 +1,216 @@
+"""Guarded predictive control of large sensors: little is left to do when a frame's slopes arrive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.loop.control.base import Expected
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.integrator import Integrator
+from faintspot.loop.control.kalman.guarded import Guarded
+from faintspot.loop.control.kalman.local_covariance import replies
+from faintspot.loop.control.kalman.local_predictor import LocalPredictor
+from faintspot.loop.control.kalman.predictive import Predictive
+from faintspot.loop.control.reconstructor import Reconstructor
+from faintspot.loop.control.slope_product import SlopeProduct
+from faintspot.loop.control.telemetry import without_prior
+from faintspot.slopes.kernels.driver.products import ProductPart
+
+Floats = NDArray[np.float64]
+
+_LEARNT, _PLAIN = range(2)
+
+
+class _Frame(NamedTuple):
+    """A frame's slopes, and those that commands of both lines cause."""
+
+    open_loop: Floats
+    surprise: Floats
+    """Open-loop slopes minus their prediction."""
+    variance: Floats
+    trust: Floats
+    by_learnt: Floats
+    by_plain: Floats
+    by_latest_plain: Floats
+
+    @property
+    def left(self) -> tuple[Floats, Floats]:
+        """Residual slopes that both controllers leave."""
+        return self.trust * (self.open_loop + self.by_learnt), self.trust * (self.open_loop + self.by_plain)
+
+    @property
+    def missing(self) -> Floats:
+        """Addition by the integrator's estimator to what it leaves, where it trusts its prior."""
+        return (1 - self.trust) * (self.by_plain - self.by_latest_plain)
+
+
+class LargeGuarded(Guarded):
+    """`Guarded` with `Predictive` and the integrator, for large sensors.
+
+    Reading matrices takes most of the time of a frame. They are kept in float32. The predictive command is
+    linear in what the slopes differ from their prediction; the matrix of that is computed beforehand, and so
+    is the command for slopes as predicted. When slopes arrive, one product is left, which can be begun while
+    they are measured. Four more follow with the next frame, or when somebody asks what is expected.
+
+    Parameters
+    ----------
+    line : CommandDelayLine
+        To the mirror.
+    interaction : (m, commands) array
+    reconstructor : Reconstructor
+    phase_of_commands : (commands, commands) array
+        From commands to the compared amplitudes, see `phase.phase_of_commands`.
+    arrays : mapping
+        Of the filter, as from `local_filter`.
+    plain_gain, leak : float
+        Of the integrator.
+    options
+        As for `Guarded`.
+    """
+
+    def __init__(
+        self,
+        line: CommandDelayLine,
+        interaction: Floats,
+        reconstructor: Reconstructor,
+        phase_of_commands: Floats,
+        arrays: Mapping[str, Any],
+        plain_gain: float,
+        leak: float,
+        **options: Any,
+    ) -> None:
+        predictor = LocalPredictor(arrays)
+
+        def learnt(line: CommandDelayLine) -> Predictive:
+            return Predictive(line, interaction, predictor, reconstructor.clean, from_latest=True)
+
+        def plain(line: CommandDelayLine) -> Integrator:
+            return Integrator(line, interaction, reconstructor, plain_gain, leak)
+
+        super().__init__(line, interaction, phase_of_commands, learnt, plain, **options)
+        self._predictor, self._gain, self._keep = predictor, plain_gain, 1.0 - leak
+        self._product, self._reconstruct = SlopeProduct(interaction), SlopeProduct(reconstructor.matrix)
+        self._clean, self._compare = SlopeProduct(reconstructor.clean), SlopeProduct(phase_of_commands)
+        found = replies(arrays, line.delay_frames)
+        self._replies = [SlopeProduct((each.T @ reconstructor.clean.T).T) for each in found]
+        self._caused = np.zeros((2, len(line.rows), len(interaction)))
+        """Slopes that the commands of both lines cause, row by row."""
+        self._held, self._held_at = np.zeros(len(interaction)), -1
+        """Slopes that the mirror adds."""
+        self._mean, self._predicted = np.zeros((2, len(interaction)))
+        """Predicted slopes of the open loop, and with what the mirror adds."""
+        self._level = len(self._replies) // 2
+        """Gains of the latest frame."""
+        self._if_as_predicted = np.zeros(interaction.shape[1])
+        """The predictive command for slopes as predicted."""
+        self._frame: _Frame | None = None
+        """The previous frame, while it is not complete."""
+        self._restarted = True
+
+    def expected(self) -> Expected:
+        """See `Controller`."""
+        self._complete()
+        if self.chosen == _PLAIN:
+            return Expected(self._held - self._of_line(_PLAIN, 0), None)
+        return Expected(self._predicted, self._predictor.std_px)
+
+    def fall_back(self) -> None:
+        """See `Guarded`."""
+        self._complete()
+        super().fall_back()
+
+    def begin(self) -> None:
+        """See `Controller`; both restart from there."""
+        super().begin()
+        self._frame, self._restarted = None, True
+
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
+        """See `Controller`; the gains have the usual covariances of x and y."""
+        expected = self.expected().mean_px
+        alone, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
+        caused = self._of_line(_LEARNT, 1), self._of_line(_PLAIN, 1), self._of_line(_PLAIN, 0)
+        open_loop, surprise = alone - self._held, alone - self._predicted
+        self._frame = frame = _Frame(open_loop, surprise, self._noise_factor * variance, trust, *caused)
+        if self.chosen == _LEARNT:
+            self._predict(frame)
+        else:
+            left = trust * (alone - (self._held - frame.by_plain))
+            self._integrate(self._reconstruct(left + frame.missing))
+        self._send()
+
+    def begin_product(self, threads: int, scale: float) -> Sequence[ProductPart]:
+        """Return the parts of the next frame's product with its slopes; see `SlopeProduct.parts`.
+
+        There are none before everything is known of the frame before, and of estimators with a prior.
+        """
+        if self._frame is not None or self._held_at != self._line.place or self.prior_std_px is not None:
+            return ()
+        if self.chosen == _PLAIN:
+            return self._reconstruct.parts(threads, scale, self._held - self._of_line(_PLAIN, 1))
+        return self._replies[self._level].parts(threads, scale, self._predicted)
+
+    def _predict(self, frame: _Frame) -> None:
+        """Compute the predictive command."""
+        surprise, self._level = self._predictor.surprise(frame.surprise, frame.variance)
+        self._lines[_LEARNT].put(self._if_as_predicted - self._replies[self._level](surprise))
+
+    def _integrate(self, wavefront: Floats) -> None:
+        """Compute the integrator's command."""
+        line = self._lines[_PLAIN]
+        line.put(self._keep * line.latest - self._gain * wavefront)
+
+    def _complete(self) -> None:
+        """Complete the previous frame, and compute what does not need the slopes of this one."""
+        frame, self._frame = self._frame, None
+        if frame is not None:
+            learnt, plain = self._compare.several(*self._follow_up(frame))
+            self._predictor.correct(frame.open_loop, frame.variance)
+            self._predictor.advance()
+            left, by_plain = float(learnt @ learnt), float(plain @ plain)
+            self._choose((left - by_plain) / max(left + by_plain, 1e-30))
+        if frame is not None or self._restarted or self._held_at != self._line.place:
+            self._follow_mirror(is_new=frame is not None or self._restarted)
+
+    def _follow_up(self, frame: _Frame) -> Floats:
+        """Compute the command that was not sent; return the wavefronts that both leave, as commands."""
+        left, missing = frame.left, frame.missing
+        if self.chosen == _PLAIN:
+            self._predict(frame)
+            return self._reconstruct.several(*left)
+        if not missing.any():
+            found = self._reconstruct.several(*left)
+            self._integrate(found[_PLAIN])
+            return found
+        found = self._reconstruct.several(*left, missing)
+        self._integrate(found[_PLAIN] + found[-1])
+        return found[:-1]
+
+    def _follow_mirror(self, *, is_new: bool) -> None:
+        """Compute the slopes that commands cause and, if the latest are new, the prediction."""
+        lines, mirror = self._lines, self._line
+        commands = [line.latest for line in lines] if is_new else []
+        same = [np.array_equal(line.acting, mirror.acting) for line in lines]
+        if not any(same):
+            commands.append(mirror.acting)
+        found = self._product.several(*commands) if commands else np.zeros((0, 0))
+        if is_new:
+            for caused, line, slopes in zip(self._caused, lines, found, strict=False):
+                caused[slice(None) if self._restarted else line.place - 1] = slopes
+            self._restarted = False
+            self._mean = self._predictor.mean_px
+            left = self._predictor.ahead(lines[_LEARNT].delay_frames) + self._of_line(_LEARNT, 0)
+            self._if_as_predicted = lines[_LEARNT].latest - self._clean(left)
+        self._held = self._of_line(same.index(True), 1) if any(same) else found[-1]
+        self._held_at, self._predicted = mirror.place, self._held + self._mean
+
+    def _of_line(self, which: int, acting: int) -> Floats:
+        """Return the slopes that the latest command of a line causes, or the one that acts in this frame."""
+        rows = self._caused[which]
+        slopes: Floats = rows[(self._lines[which].place + (2 * acting - 1)) % len(rows)]
+        return slopes

@@ -1,0 +1,113 @@
+"""Reconstruction of commands from slopes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import finite_array, number_between
+from faintspot.base.errors import InputError
+from faintspot.loop.control.noise import weighted_slopes
+
+Floats = NDArray[np.float64]
+
+_LARGEST_ANSWER_PX = 1e-12, 1e12
+"""Range of the largest element of an interaction matrix; its square is far from the limits of float64."""
+_RIDGE = 3e-2  # of the mean square of the driven combinations' slopes: weak ones move less, noise does too
+_RIDGE_CLEAN = 3e-3  # of slopes that a filter has freed of most of their noise
+_RIDGE_OF_MANY = 11.0  # at most, divided by the number of combinations: low orders of many move slopes less
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstructor:
+    """Reconstructor from slopes to commands, for the modes that slopes can see."""
+
+    matrix: Floats
+    """(commands, 2 n): regularised least squares with equal weights."""
+    modes: Floats
+    """(commands, modes): controlled modes, orthonormal."""
+    slopes_of_modes: Floats
+    """(2 n, modes)"""
+    clean: Floats
+    """(commands, 2 n): as `matrix`, hardly regularised, for slopes with little noise."""
+
+    def __call__(self, slopes: Floats) -> Floats:
+        """Return the commands in the unit of the interaction matrix."""
+        return self.matrix @ slopes
+
+    def weighted(self, slopes: Floats, standard_error: Floats, covariance_xy: Floats | None = None) -> Floats:
+        """Return the commands by weighted least squares, weighted with the inverse covariance of the noise.
+
+        Regularised like `matrix`, which it is where all errors are the same.
+
+        Parameters
+        ----------
+        slopes, standard_error : (2 n,) array
+            All x, then all y; a slope whose error is not finite or 0 does not count.
+        covariance_xy : (n,) array, optional
+            Covariance of x and y of each sub-aperture. Default: 0.
+        """
+        variance = np.square(standard_error)
+        usable = np.isfinite(variance) & (variance > 0)
+        if not usable.any():
+            return np.zeros(len(self.modes))
+        weighted = weighted_slopes(self.slopes_of_modes, variance, covariance_xy)
+        weighted *= usable.size / np.sum(1 / variance[usable])  # as many slopes as without weights
+        return self.modes @ (_estimator(self.slopes_of_modes, weighted) @ slopes)
+
+
+def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) -> Reconstructor:
+    """Return the reconstructor of an interaction matrix, by truncated and damped singular values.
+
+    Parameters
+    ----------
+    interaction : (2 n, commands) array
+        Slopes for a unit of each command.
+    largest_condition : float
+        Combinations whose slopes are smaller than the largest's by more than this are not driven: piston,
+        what looks like waffle, and what tip-tilt mirror and actuators could do against each other.
+
+    Raises
+    ------
+    InputError
+        When there are more commands than slopes, no command moves a slope, or the elements are too small or
+        too large to compute with.
+    """
+    matrix: Floats = finite_array("interaction", interaction).astype(np.float64)
+    if matrix.ndim != 2:
+        raise InputError(f"interaction: expected shape (2 n, commands), got {matrix.shape}")
+    slopes, commands = matrix.shape
+    check_controllable(commands, slopes)
+    limit = number_between("largest_condition", largest_condition, 1)
+    largest, (smallest_px, largest_px) = np.abs(matrix).max(initial=0.0), _LARGEST_ANSWER_PX
+    if largest == 0:
+        raise InputError("interaction: expected slopes that follow the commands, got zeros only")
+    if not smallest_px <= largest <= largest_px:
+        raise InputError(
+            f"interaction: expected a largest element of {smallest_px:g} to {largest_px:g} px for a unit of "
+            f"the command, got {largest:.3g}; express the commands in another unit"
+        )
+    left, size, right = np.linalg.svd(matrix, full_matrices=False)
+    driven = size * limit >= size[0]
+    modes, seen = right[driven].T, left[:, driven] * size[driven]
+    plain, clean = (modes @ _estimator(seen, seen, ridge) for ridge in (_RIDGE, _RIDGE_CLEAN))
+    return Reconstructor(plain, modes, seen, clean)
+
+
+def _estimator(slopes_of_modes: Floats, weighted: Floats, largest_ridge: float = _RIDGE) -> Floats:
+    """Return (modes, 2 n): modes from slopes, by least squares with a ridge; `weighted_slopes` or equal."""
+    normal = weighted.T @ slopes_of_modes
+    ridge = min(largest_ridge, _RIDGE_OF_MANY / len(normal))
+    normal[np.diag_indices_from(normal)] += ridge * np.trace(normal) / len(normal)
+    return np.asarray(np.linalg.solve(normal, weighted.T))
+
+
+def check_controllable(commands: int, slopes: int) -> None:
+    """Raise InputError when there are more commands than slopes."""
+    if commands > slopes:
+        raise InputError(
+            f"mirror.actuators: {commands} commands (actuators, tip and tilt) are more than {slopes} slopes "
+            "of the lit sub-apertures can control"
+        )

@@ -1,0 +1,1 @@
+"""The configuration of a simulated telescope, and those that are built in."""

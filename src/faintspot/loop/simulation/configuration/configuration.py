@@ -1,0 +1,392 @@
+"""Configuration of a simulated closed loop: telescope, sensor, mirror, atmosphere, camera, control (TOML)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field, fields
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+
+from faintspot.base.checks import one_of
+from faintspot.base.errors import InputError
+from faintspot.base.sizes import check_size
+from faintspot.base.toml_files import check_keys, check_known, checked_table, parse_file, parse_text
+from faintspot.loop.control.base import WINDS
+from faintspot.loop.simulation.configuration.checked_fields import checked_section
+from faintspot.loop.simulation.configuration.laser_section import Laser, NaturalStar
+from faintspot.loop.simulation.configuration.sections import (
+    CLOSED,
+    OPEN,
+    Atmosphere,
+    Camera,
+    ControlParameters,
+    Mirror,
+    RunLength,
+    Science,
+    SensorParameters,
+    Telescope,
+)
+from faintspot.slopes.estimators.scene import Scene
+from faintspot.slopes.simulate.photometry import ZERO_POINTS, Photometry
+from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
+
+ARCSEC = math.pi / 180 / 3600
+"""Radians in one arcsecond."""
+
+SPOT_FWHM = 0.886  # full width at half maximum of sinc^2, in lambda / d
+_MOST_POINTS = 4096**2  # of a wavefront
+_ROLLING_DELAY = 2
+_POINT_FIELD = 0.9  # of a window that holds a laser guide star
+_POSITION_RANGE_PX = {CLOSED: 2.0, OPEN: 5.0}
+
+
+@dataclass(frozen=True)
+class LoopConfiguration:
+    """Configuration of a closed-loop experiment.
+
+    Raises
+    ------
+    InputError
+        For a value out of its range, and for parts that do not fit together: an aperture smaller than a
+        sub-aperture or than all of them cover, a window that the phase's points cannot fill, layers with
+        lists of different lengths, no flux or two amounts of it.
+
+    Examples
+    --------
+    >>> from faintspot.loop.simulation import LoopConfiguration
+    >>> loop = LoopConfiguration().replace("camera", photons_per_subaperture=50.0)
+    >>> loop.name, loop.sensor.subapertures, round(loop.subaperture_m, 2)
+    ('canary', 7, 0.6)
+    """
+
+    name: str = "canary"
+    telescope: Telescope = field(default_factory=Telescope)
+    sensor: SensorParameters = field(default_factory=SensorParameters)
+    mirror: Mirror = field(default_factory=Mirror)
+    atmosphere: Atmosphere = field(default_factory=Atmosphere)
+    camera: Camera = field(default_factory=lambda: Camera(photons_per_subaperture=100.0))
+    control: ControlParameters = field(default_factory=ControlParameters)
+    science: Science = field(default_factory=Science)
+    run: RunLength = field(default_factory=RunLength)
+    laser: Laser | None = None
+    natural_star: NaturalStar | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise InputError(f"name: expected a text, got {self.name!r}")
+        for name in SECTIONS:
+            if name not in _OPTIONAL or getattr(self, name) is not None:
+                object.__setattr__(self, name, checked_section(name, getattr(self, name), SECTIONS[name]))
+        if self.laser is not None:
+            object.__setattr__(self, "laser", self.laser.checked())
+        _check_layers(self.atmosphere)
+        _check_flux(self.camera)
+        _check_sampling(self)
+
+    def replace(self, section: str, **values: Any) -> LoopConfiguration:
+        """Return the configuration with some values of one section changed.
+
+        Raises
+        ------
+        InputError
+            For an unknown section or key, or a bad value.
+        """
+        check_known("", section, SECTIONS, "section")
+        check_keys(f"{section}.", values, _keys(section))
+        changed = dataclasses.replace(getattr(self, section) or SECTIONS[section](), **values)
+        return dataclasses.replace(self, **{section: changed})
+
+    def slowed_to(self, rate_hz: float) -> LoopConfiguration:
+        """Return the same loop at another frame rate, with winds that move the turbulence as far in a frame.
+
+        Raises
+        ------
+        InputError
+            For a rate or winds out of range.
+        """
+        part = rate_hz / self.control.frame_rate_hz
+        winds = tuple(part * each for each in self.atmosphere.wind_speed_m_per_s)
+        slower = self.replace("control", frame_rate_hz=rate_hz)
+        return slower.replace("atmosphere", wind_speed_m_per_s=winds)
+
+    @property
+    def subaperture_m(self) -> float:
+        """Side of a sub-aperture."""
+        given = self.sensor.subaperture_m
+        return self.telescope.diameter_m / self.sensor.subapertures if given is None else given
+
+    @property
+    def width_m(self) -> float:
+        """Width of all sub-apertures together, which the pupil lies in."""
+        return self.subaperture_m * self.sensor.subapertures
+
+    @property
+    def pixel_scale_rad(self) -> float:
+        """Angle on the sky that a pixel sees."""
+        if self.sensor.pixel_scale_arcsec is None:
+            return self.sensor.wavelength_m / self.subaperture_m / 2
+        return self.sensor.pixel_scale_arcsec * ARCSEC
+
+    @property
+    def spot_width_px(self) -> float:
+        """Width of a spot, lambda / d, in pixels."""
+        return self.sensor.wavelength_m / self.subaperture_m / self.pixel_scale_rad
+
+    @property
+    def d_over_r0(self) -> float:
+        """Side of a sub-aperture in Fried parameters at the sensor's wavelength, in the worst seeing."""
+        r0_sensing = np.min(self.atmosphere.r0_m) * (self.sensor.wavelength_m / R0_WAVELENGTH_M) ** (6 / 5)
+        return self.subaperture_m / float(r0_sensing)
+
+    def position_range_px(self, *, predicted: bool = False) -> float:
+        """Return the largest distance of spots from the reference, or from the predicted position."""
+        return _POSITION_RANGE_PX[CLOSED if predicted else self.control.mode]
+
+    @property
+    def scene(self) -> Scene:
+        """Knowledge that estimators have when their options are chosen."""
+        camera = self.camera
+        width, elongation = self._spot_fwhm_and_elongation
+        return Scene(
+            flux_e=self.photons,
+            read_noise_e=camera.read_noise_e / camera.em_gain,
+            window=(self.sensor.pixels,) * 2,
+            spot_fwhm_px=width * math.sqrt(elongation),
+            position_range_px=self.position_range_px(),
+            elongation=elongation,
+            excess_noise=2.0 if camera.em_gain > 1 else 1.0,
+            background_e=camera.background_e + camera.dark_e,
+            d_over_r0=self.d_over_r0,
+            diffraction_px=self.spot_width_px,
+        )
+
+    @property
+    def _spot_fwhm_and_elongation(self) -> tuple[float, float]:
+        """Width of a spot's short axis [px], and its elongation, which a laser adds itself."""
+        width = SPOT_FWHM * self.spot_width_px
+        if self.laser is None:
+            return width, self.sensor.spot_elongation
+        pixel_arcsec = self.pixel_scale_rad / ARCSEC
+        return math.hypot(width, self.laser.spot_fwhm_arcsec / pixel_arcsec), 1.0
+
+    @property
+    def photons(self) -> float:
+        """Photo-electrons of a fully illuminated sub-aperture in a frame."""
+        camera = self.camera
+        if camera.photons_per_subaperture is not None:
+            return camera.photons_per_subaperture
+        return float(self.photometry.electrons(camera.magnitude or 0.0))
+
+    @property
+    def photometry(self) -> Photometry:
+        """Conversion between magnitudes and photo-electrons."""
+        return Photometry(
+            self.subaperture_m**2,
+            1 / self.control.frame_rate_hz,
+            self.camera.band,
+            self.camera.zero_point,
+            self.camera.throughput,
+            self.camera.quantum_efficiency,
+        )
+
+    def to_text(self) -> str:
+        """Return the configuration as TOML with every value written out."""
+        document = tomlkit.document()
+        document["name"] = self.name
+        for name in SECTIONS:
+            if getattr(self, name) is None:
+                continue
+            table = tomlkit.table()
+            for item in fields(SECTIONS[name]):
+                value = getattr(getattr(self, name), item.name)
+                if value is not None:  # TOML has no word for nothing
+                    table[item.name] = np.array(value).tolist() if isinstance(value, tuple) else value
+            document[name] = table
+        return tomlkit.dumps(document)
+
+    @classmethod
+    def from_text(cls, text: str, where: str = "configuration") -> LoopConfiguration:
+        """Read a configuration from TOML text; `where` names it in messages.
+
+        Raises
+        ------
+        InputError
+            When it is not TOML, has an unknown table or key, or a bad value.
+        """
+        return cls.from_document(parse_text(text, where), where)
+
+    @classmethod
+    def from_document(cls, document: dict[str, Any], where: str) -> LoopConfiguration:
+        """Make a configuration of the tables of a TOML file.
+
+        Raises
+        ------
+        InputError
+            For an unknown table or key, or a bad value.
+        """
+        try:
+            return _build(document)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+
+
+SECTIONS: dict[str, type[Any]] = {
+    "telescope": Telescope,
+    "sensor": SensorParameters,
+    "mirror": Mirror,
+    "atmosphere": Atmosphere,
+    "camera": Camera,
+    "control": ControlParameters,
+    "science": Science,
+    "run": RunLength,
+    "laser": Laser,
+    "natural_star": NaturalStar,
+}
+_OPTIONAL = ("laser", "natural_star")
+
+
+def load_loop(path: str | Path) -> LoopConfiguration:
+    """Read the configuration of a loop: a TOML file, or one of `shipped_loops` by its name.
+
+    Raises
+    ------
+    InputError
+        When there is neither, or as for `LoopConfiguration.from_text`.
+
+    Examples
+    --------
+    >>> from faintspot.loop.simulation import load_loop
+    >>> canary = load_loop("canary")
+    >>> canary.telescope.diameter_m, canary.control.frame_rate_hz
+    (4.2, 250.0)
+    """
+    path = Path(path)
+    name = path.name.removesuffix(".toml")
+    # A folder of that name holds results of an earlier run.
+    if not path.is_file() and path.parent == Path() and name in shipped_loops():
+        document, where = parse_file(_shipped() / f"{name}.toml"), f"{name}.toml"
+    else:
+        shipped = ", ".join(shipped_loops())
+        document = parse_file(path, if_missing=f"none of the shipped configurations either: {shipped}")
+        where = str(path)
+    return LoopConfiguration.from_document(document, where)
+
+
+def shipped_loops() -> list[str]:
+    """Return the names of the configurations that come with the package.
+
+    Examples
+    --------
+    >>> from faintspot.loop.simulation import shipped_loops
+    >>> shipped_loops()[:4]
+    ['camera_3e', 'canary', 'canary_faint', 'diffraction_limit']
+    """
+    names = (item.name for item in _shipped().iterdir())
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+
+
+def _shipped() -> Any:
+    return resources.files("faintspot.loop.simulation.configuration") / "presets"
+
+
+def _build(document: dict[str, Any]) -> LoopConfiguration:
+    check_keys("", document, ["name", *SECTIONS], what="table")
+    values: dict[str, Any] = {}
+    for name, table in document.items():
+        if name != "name":
+            check_keys(f"{name}.", checked_table(name, table), _keys(name))
+            table = SECTIONS[name](**table)
+        values[name] = table
+    return LoopConfiguration(**values)
+
+
+def _keys(section: str) -> list[str]:
+    return [item.name for item in fields(SECTIONS[section])]
+
+
+def _check_layers(atmosphere: Atmosphere) -> None:
+    names = ("altitude_m", "fraction", "wind_speed_m_per_s", "wind_direction_deg")
+    lengths = {name: len(getattr(atmosphere, name)) for name in names}
+    if len(set(lengths.values())) > 1 or not atmosphere.fraction:
+        found = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise InputError(f"atmosphere: expected lists with one value for each layer, got {found}")
+    if sum(atmosphere.fraction) <= 0:
+        raise InputError("atmosphere.fraction: expected at least one layer with a strength above 0")
+    if isinstance(atmosphere.r0_m, tuple) and (
+        len(atmosphere.r0_m) != 2 or atmosphere.r0_m[0] > atmosphere.r0_m[1]
+    ):
+        raise InputError(
+            f"atmosphere.r0_m = {list(atmosphere.r0_m)}: expected one number or [lowest, highest]"
+        )
+
+
+def _check_flux(camera: Camera) -> None:
+    if (camera.photons_per_subaperture is None) == (camera.magnitude is None):
+        raise InputError("camera: expected either photons_per_subaperture or magnitude")
+    one_of("camera.band", camera.band, list(ZERO_POINTS))
+
+
+def _check_sampling(whole: LoopConfiguration) -> None:
+    """Refuse a sensor that is sampled too coarsely, and inconsistent control."""
+    if whole.natural_star is not None and whole.laser is None:
+        raise InputError("natural_star: expected a table laser beside it, got none")
+    if whole.laser is not None and whole.sensor.spot_elongation > 1:
+        raise InputError("sensor.spot_elongation: expected 1 with a laser, which elongates the spots itself")
+    one_of("control.mode", whole.control.mode, (CLOSED, OPEN))
+    one_of("control.winds", whole.control.winds, WINDS)
+    if not isinstance(whole.mirror.tip_tilt, bool):
+        raise InputError(f"mirror.tip_tilt = {whole.mirror.tip_tilt!r}: expected true or false")
+    if whole.camera.rolling_shutter and whole.control.delay_frames < _ROLLING_DELAY:
+        raise InputError(
+            f"camera.rolling_shutter = {whole.camera.rolling_shutter:g}: expected control.delay_frames >= "
+            f"{_ROLLING_DELAY}, as the last rows see the mirror's next commands"
+        )
+    sensor = whole.sensor
+    check_size(
+        "sensor: (subapertures x samples)^2", [(sensor.subapertures * sensor.samples) ** 2], _MOST_POINTS
+    )
+    check_size(
+        "sensor: (subapertures x pixels)^2", [(sensor.subapertures * sensor.pixels) ** 2], what="pixels"
+    )
+    actuators = whole.mirror.actuators or sensor.subapertures + 1
+    check_size("interaction matrix (slopes, actuators)", (2 * sensor.subapertures**2, actuators**2))
+    diameter, side = whole.telescope.diameter_m, whole.subaperture_m
+    if side > diameter:
+        raise InputError(
+            f"telescope.diameter_m = {diameter:g}: expected at least one sub-aperture, "
+            f"sensor.subaperture_m = {side:g}"
+        )
+    if whole.width_m < diameter * (1 - 1e-9):
+        raise InputError(
+            f"sensor.subapertures = {sensor.subapertures} of {side:g} m: expected enough to cover the "
+            f"{diameter:g} m of the telescope"
+        )
+    needed = math.ceil(field_of_view(whole) / whole.spot_width_px)
+    if sensor.samples < needed:
+        raise InputError(
+            f"sensor.samples = {sensor.samples}: expected at least {needed} for a field of "
+            f"{field_of_view(whole):.3g} px with lambda / d = {whole.spot_width_px:.3g} px"
+        )
+    if whole.run.settle_frames >= whole.run.frames:
+        raise InputError(
+            f"run.settle_frames = {whole.run.settle_frames}: expected fewer than the {whole.run.frames} "
+            "frames"
+        )
+
+
+def field_of_view(whole: LoopConfiguration) -> float:
+    """Return the width of the lenslet images that must not alias [px]."""
+    if whole.laser is not None:  # images of a point; the sodium layer is added afterwards
+        return whole.sensor.pixels * _POINT_FIELD
+    return whole.sensor.pixels * 1.125 + 2 * 3 * blur_px(whole)
+
+
+def blur_px(whole: LoopConfiguration) -> float:
+    """Return the standard deviation along x of the source that elongates the spots, px."""
+    width = SPOT_FWHM * whole.spot_width_px
+    return width * math.sqrt(whole.sensor.spot_elongation**2 - 1) / 2.3548

@@ -1,0 +1,137 @@
+"""Sections of the configuration of a loop: telescope, sensor, mirror, atmosphere, camera, control, run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from faintspot.loop.control.base import LEARNT
+from faintspot.loop.simulation.configuration.checked_fields import LIST, NUMBER_OR_LIST, number
+from faintspot.slopes.simulate.photometry import DEFAULT_BAND
+
+CLOSED, OPEN = "closed", "open"
+
+
+@dataclass(frozen=True)
+class Telescope:
+    """Pupil of the telescope."""
+
+    diameter_m: float = number(4.2, 0.05, 100.0)
+    obstruction: float = number(0.29, 0.0, 0.9)
+    """Diameter of the central obstruction as a fraction of the pupil's."""
+
+
+@dataclass(frozen=True)
+class SensorParameters:
+    """Shack-Hartmann sensor."""
+
+    subapertures: int = number(7, 1, 200, whole=True)
+    """Sub-apertures across the pupil."""
+    subaperture_m: float | None = number(None, 0.0, 100.0, low_open=True)
+    """Side of a sub-aperture in the pupil. Default: the sub-apertures just cover the pupil."""
+    pixels: int = number(16, 4, 64, whole=True)
+    """Pixels across a sub-aperture's window."""
+    wavelength_m: float = number(650e-9, 1e-7, 1e-4)
+    pixel_scale_arcsec: float | None = number(None, 0.0, 100.0, low_open=True)
+    """Default: two pixels for lambda / d."""
+    least_illumination: float = number(0.5, 0.0, 1.0, low_open=True)
+    """Smallest illuminated fraction of a sub-aperture that is used."""
+    samples: int = number(12, 4, 128, whole=True)
+    """Number of phase points across a sub-aperture."""
+    spot_elongation: float = number(1.0, 1.0, 30.0)
+    """Full width at half maximum of a spot along x as a multiple of that along y, before the pixels."""
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """Deformable mirror."""
+
+    actuators: int | None = number(None, 2, 201, whole=True)
+    """Actuators across the pupil, its edges included. Default: one at each corner of the sub-apertures."""
+    crosstalk: float = number(0.15, 0.0, 0.9, low_open=True)
+    """Value of an actuator's Gaussian influence function at its neighbour."""
+    tip_tilt: bool = True
+    """Whether there is a separate tip-tilt mirror."""
+
+
+@dataclass(frozen=True)
+class Atmosphere:
+    """Layers of frozen turbulence moved by the wind; the star is on axis, so altitudes do not matter."""
+
+    r0_m: float | tuple[float, float] = number(0.15, 0.01, 1e3, several=NUMBER_OR_LIST)
+    """Fried parameter at 500 nm, or the two values between which it drifts."""
+    drift_time_s: float = number(60.0, 0.0, 1e6, low_open=True)
+    """Period of the drift."""
+    outer_scale_m: float = number(25.0, 0.5, 200.0)
+    altitude_m: tuple[float, ...] = number((0.0, 2500.0, 4000.0, 13500.0), 0.0, 1e5, several=LIST)
+    fraction: tuple[float, ...] = number((0.45, 0.25, 0.15, 0.15), 0.0, 1e6, several=LIST)
+    """Relative strength of each layer."""
+    wind_speed_m_per_s: tuple[float, ...] = number((6.0, 9.0, 14.0, 22.0), 0.0, 200.0, several=LIST)
+    wind_direction_deg: tuple[float, ...] = number((20.0, 80.0, 150.0, 250.0), -360.0, 360.0, several=LIST)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """The sensor's camera and the star's flux on it; as `faintspot.slopes.simulate.Detector`."""
+
+    photons_per_subaperture: float | None = number(None, 0.0, 1e9, low_open=True)
+    """Photo-electrons of a fully illuminated sub-aperture in a frame; or give the magnitude."""
+    magnitude: float | None = number(None, -30.0, 60.0)
+    band: str = DEFAULT_BAND
+    zero_point: float | None = number(None, 0.0, 1e20, low_open=True)
+    """Photons per second and m^2 of magnitude 0. Default: that of the band."""
+    throughput: float = number(0.4, 0.0, 1.0, low_open=True)
+    quantum_efficiency: float = number(0.9, 0.0, 1.0, low_open=True)
+    read_noise_e: float = number(0.1, 0.0, 1e6)
+    """At the camera's output, after multiplication."""
+    em_gain: float = number(1.0, 1.0, 1e5)
+    gain_e_per_adu: float = number(1.0, 0.0, 1e6, low_open=True)
+    offset_adu: float = number(0.0, -1e6, 1e6)
+    bits: int | None = number(None, 1, 32, whole=True)
+    background_e: float = number(0.0, 0.0, 1e6)
+    dark_e: float = number(0.0, 0.0, 1e6)
+    rolling_shutter: float = number(0.0, 0.0, 1.0)
+    """Part of a frame by which the exposure of the last row is later than that of the first."""
+
+
+@dataclass(frozen=True)
+class ControlParameters:
+    """Control loop."""
+
+    frame_rate_hz: float = number(250.0, 0.0, 1e5, low_open=True)
+    delay_frames: int = number(2, 1, 100, whole=True)
+    """The command computed from frame k acts first during the exposure of frame k + delay_frames."""
+    gain: float = number(0.5, 0.0, 2.0)
+    leak: float = number(0.01, 0.0, 1.0)
+    """Fraction by which commands decay in each frame, so that a loop recovers after it lost the star."""
+    mode: str = CLOSED
+    """"closed", or "open": the sensor does not see the mirror."""
+    largest_condition: float = number(30.0, 1.0, 1e6)
+    """Largest condition number of the reconstructor; weaker modes are not controlled."""
+    telemetry_frames: int = number(2000, 200, 1_000_000, whole=True)
+    """Length of the closed loop with an integrator from which other controllers learn; never scored."""
+    winds: str = LEARNT
+    """Winds of a predictive model: "learnt" from telemetry, "assumed" (those of the atmosphere) or "none"."""
+    assumed_wind_factor: float = number(1.0, 0.0, 100.0)
+    """Assumed winds as a multiple of the true ones."""
+    assumed_wind_turn_deg: float = number(0.0, -360.0, 360.0)
+    """Angle by which assumed winds are turned."""
+
+
+@dataclass(frozen=True)
+class Science:
+    """Wavelength and field of the Strehl ratio, on axis."""
+
+    wavelength_m: float = number(1.65e-6, 1e-7, 1e-4)
+
+
+@dataclass(frozen=True)
+class RunLength:
+    """Length and number of runs."""
+
+    frames: int = number(1500, 1, 10_000_000, whole=True)
+    settle_frames: int = number(100, 0, 10_000_000, whole=True)
+    """Number of frames at the beginning that are not scored."""
+    seed: int = number(1, 0, 2**63 - 1, whole=True)
+    realisations: int = number(5, 1, 100_000, whole=True)
+    photons_per_subaperture: tuple[float, ...] = number((), 0.0, 1e9, low_open=True, several=LIST)
+    """Fluxes at which estimators are compared."""

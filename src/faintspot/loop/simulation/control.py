@@ -1,0 +1,218 @@
+"""Controller of a method: the integrator, or one learnt from telemetry of the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.base import Controller
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification.learning import INTEGRATOR, KALMAN, Learnt, Plant, learn
+from faintspot.loop.control.integrator import Integrator
+from faintspot.loop.control.telemetry import OpenLoopTelemetry, make_telemetry
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.configuration.sections import CLOSED, ControlParameters, RunLength
+from faintspot.loop.simulation.methods import PRIOR, Method
+from faintspot.loop.simulation.record import LoopRecord
+from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+
+if TYPE_CHECKING:
+    from faintspot.loop.simulation.telescope.model import LoopOptics
+
+Floats = NDArray[np.float64]
+Simulate = Callable[..., LoopRecord]
+
+FIRST_TELEMETRY_REALISATION = 2000
+"""Realisation of the turbulence from which controllers learn; never scored or tuned on."""
+
+_TELEMETRY_PRIOR_PX = 0.6  # while telemetry is taken, as nothing is known yet
+_SETTLE_FRAMES = 50
+
+
+def make_controller(
+    configuration: LoopConfiguration,
+    optics: LoopOptics,
+    method: Method,
+    learnt: Learnt | None,
+    line: CommandDelayLine,
+) -> Controller:
+    """Return the controller of a method, which sends its commands to `line`."""
+    if learnt is not None:
+        return learnt.controller(line, prior_std_px(method, len(optics.interaction)))
+    control = configuration.control
+    return Integrator(
+        line,
+        optics.interaction,
+        optics.reconstructor,
+        control.gain if method.gain is None else method.gain,
+        control.leak,
+        weighted=method.weighted_reconstructor and not method.true_slopes,
+        sees_mirror=control.mode == CLOSED,
+    )
+
+
+def learnt_control(
+    configuration: LoopConfiguration,
+    method: Method,
+    seed: int,
+    simulate: Simulate,
+    learns_on: LoopConfiguration | None = None,
+) -> tuple[Method, Learnt | None]:
+    """Return the learnt controller of a method (None for the integrator), and the adapted method.
+
+    The prior of an estimator that has one becomes as wide as the control is sure.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+    method : Method
+    seed : int
+    simulate : function
+        `simulate_loop`, which makes the telemetry.
+    learns_on : LoopConfiguration, optional
+        Of the loop that telemetry is taken from. Default: the same.
+
+    Raises
+    ------
+    InputError
+        For control that learns, in open loop.
+    """
+    if method.control == INTEGRATOR:
+        return method, None
+    if configuration.control.mode != CLOSED:
+        raise InputError(f"method.control = {method.control!r}: expected {INTEGRATOR!r} in open loop")
+    on = configuration if learns_on is None else learns_on
+    learnt = _learnt(
+        replace(on, name="-", run=RunLength()),
+        _Known.of(method),
+        method.control,
+        method.noise_scale,
+        seed,
+        simulate,
+    )
+    if learnt.expected_std_px is not None and _has_prior(method):
+        std = np.sqrt(np.square(learnt.expected_std_px).reshape(2, -1).mean(axis=0))
+        method = _with_prior(method, std)
+    return method, learnt
+
+
+def prior_std_px(method: Method, slopes: int) -> Floats | None:
+    """Return the standard deviations of the estimator's prior around the prediction, (2 n,), or None."""
+    if not _has_prior(method):
+        return None
+    each = np.broadcast_to(getattr(method.settings, PRIOR), (slopes // 2,))
+    return np.tile(each, 2).astype(np.float64)
+
+
+def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64]) -> SlopeTurbulence:
+    """Return the theory of slopes in turbulence with the assumed winds."""
+    atmosphere, control = configuration.atmosphere, configuration.control
+    angle = np.deg2rad(atmosphere.wind_direction_deg)
+    around = np.column_stack([np.cos(angle), np.sin(angle)])
+    return SlopeTurbulence(
+        cells[:, ::-1].astype(np.float64) * configuration.subaperture_m,
+        configuration.subaperture_m,
+        configuration.pixel_scale_rad,
+        float(np.mean(atmosphere.r0_m)),
+        atmosphere.outer_scale_m,
+        np.array(atmosphere.fraction),
+        np.array(atmosphere.wind_speed_m_per_s, np.float64)[:, None] * around,
+    ).turned(control.assumed_wind_factor, control.assumed_wind_turn_deg)
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Method, equal to others that would leave the same telemetry."""
+
+    method: Method = field(compare=False)
+    same: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, method: Method) -> _Known:
+        from faintspot.slopes.pipeline.configuration import to_text
+
+        plain = replace(method, label="telemetry", control=INTEGRATOR, noise_scale=1.0)
+        if _has_prior(method):
+            plain = _with_prior(plain, _TELEMETRY_PRIOR_PX)
+        values = {
+            **vars(plain),
+            "settings": to_text(plain.settings),
+            "psf": id(method.psf),
+            "score": id(method.score),
+        }
+        return cls(plain, tuple(values.items()))
+
+
+@lru_cache(maxsize=8)
+def _learnt(
+    configuration: LoopConfiguration,
+    known: _Known,
+    kind: str,
+    noise_scale: float,
+    seed: int,
+    simulate: Simulate,
+) -> Learnt:
+    from faintspot.loop.simulation.telescope.model import prepare
+
+    if kind == KALMAN and noise_scale != 1.0:  # learning takes long
+        usual = _learnt(configuration, known, kind, 1.0, seed, simulate)
+        return replace(usual, model=usual.model.with_noise(noise_scale))
+    optics, control = prepare(configuration), configuration.control
+    telemetry = _telemetry(_without_assumed(configuration), known, seed, simulate)
+    site = slope_turbulence(configuration, optics.sensor.layout.cells)
+    plant = Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
+    return learn(kind, plant, telemetry, site, control.frame_rate_hz, control.winds, noise_scale)
+
+
+@lru_cache(maxsize=8)
+def _telemetry(
+    configuration: LoopConfiguration, known: _Known, seed: int, simulate: Simulate
+) -> OpenLoopTelemetry:
+    """Run the loop with an integrator in turbulence that is never scored."""
+    frames = configuration.control.telemetry_frames
+    run = configuration.replace("run", frames=frames, settle_frames=0)
+    record = simulate(run, [known.method], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)
+    return telemetry_of(record, known.method)
+
+
+def telemetry_of(record: LoopRecord, method: Method) -> OpenLoopTelemetry:
+    """Return the telemetry of a run of one method with the integrator."""
+    divisor = float(record.centroid_gain[0]) if record.corrected[0] else 1.0
+    held = record.commands.astype(np.float64) @ record.interaction_matrix.T
+    expected = np.zeros_like(held)
+    if method.predict_prior:  # what acts less the latest command, which acts so many frames later
+        later = record.delay_frames - 1
+        expected[: len(held) - later] = held[: len(held) - later] - held[later:]
+    telemetry = make_telemetry(
+        record.slopes_px.astype(np.float64) / divisor,
+        record.standard_error_px.astype(np.float64) / divisor,
+        held,
+        expected,
+        prior_std_px(method, held.shape[1]),
+        record.covariance_xy_px2.astype(np.float64) / divisor**2,
+    )
+    return telemetry.part(_SETTLE_FRAMES, record.frames - record.delay_frames)
+
+
+def _has_prior(method: Method) -> bool:
+    """Whether the estimator uses the controller's prediction as its prior."""
+    has = method.predict_prior and PRIOR in method.settings.declared() and not method.true_slopes
+    return has and getattr(method.settings, PRIOR) is not None
+
+
+def _with_prior(method: Method, std_px: float | Floats) -> Method:
+    changes: dict[str, Any] = {PRIOR: std_px}
+    return replace(method, settings=method.settings.replace(**changes))
+
+
+def _without_assumed(configuration: LoopConfiguration) -> LoopConfiguration:
+    """Return the configuration without values that do not affect the telemetry."""
+    usual = ControlParameters()
+    names = ("winds", "assumed_wind_factor", "assumed_wind_turn_deg")
+    return configuration.replace("control", **{name: getattr(usual, name) for name in names})

@@ -1,0 +1,113 @@
+"""Methods that experiments compare: an estimator with settings, knowledge and control."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from faintspot.base.checks import number_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR
+from faintspot.slopes.estimators.base import Estimator
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import Score
+
+PRIOR = "prior_std_px"
+"""Option of estimators whose prior the loop sets: standard deviation from the predicted position."""
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """Method that experiments compare: estimator, settings, prior knowledge and control.
+
+    Parameters
+    ----------
+    label : str
+    settings : Settings
+    gain : float, optional
+        Loop gain, 0 to 2. Default: the configuration's.
+    window_pixels : int, optional
+        Side of the middle part of each sub-aperture's window that is used. Default: all.
+    weighted_reconstructor : bool
+        Whether slopes count by their standard errors.
+    predict_prior : bool
+        Whether estimators that take a prior are given the slopes that the loop predicts.
+    correct_gain : bool
+        Whether slopes are divided by the centroid gain measured at the run's flux.
+    true_slopes : bool
+        Whether slopes are the wavefront's true mean gradients instead of measured ones.
+    control : str
+        What makes commands of the slopes, see `learning.CONTROLS`. All but the integrator
+        learn from telemetry of a loop with the integrator, in other turbulence.
+    noise_scale : float
+        What control multiplies the variance of the slopes' noise by that telemetry shows.
+    matched_weights : bool
+        Whether the fixed weights of `window` are the linear matched filter of a laser guide star's spots.
+    follows_profile : bool
+        Whether spots of a laser guide star are those of a sodium profile that is followed, not of the one
+        learnt before the run.
+    psf, score : PSF, Score, optional
+        For the estimators that need them. Default PSF: that of a flat wavefront, or with a laser that of the
+        profile learnt.
+
+    Raises
+    ------
+    InputError
+        For an empty label, an unknown control, a gain, window or scale out of range.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.loop.simulation import Method
+    >>> method = Method("a window, less gain", fs.Settings("window"), gain=0.4)
+    >>> method.control, method.gain
+    ('integrator', 0.4)
+    """
+
+    label: str
+    settings: Settings
+    gain: float | None = None
+    window_pixels: int | None = None
+    weighted_reconstructor: bool = False
+    predict_prior: bool = False
+    correct_gain: bool = True
+    true_slopes: bool = False
+    control: str = INTEGRATOR
+    noise_scale: float = 1.0
+    matched_weights: bool = False
+    follows_profile: bool = False
+    psf: PSF | None = None
+    score: Score | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.label, str) or not self.label:
+            raise InputError(f"method.label: expected a text, got {self.label!r}")
+        if not isinstance(self.settings, Settings):
+            raise InputError(f"method.settings: expected Settings, got {type(self.settings).__name__}")
+        if self.gain is not None:
+            number_between("method.gain", self.gain, 0, 2)
+        if self.window_pixels is not None:
+            number_between("method.window_pixels", self.window_pixels, 2, 64, integer=True)
+        one_of("method.control", self.control, list(CONTROLS))
+        number_between("method.noise_scale", self.noise_scale, 0, 100, low_open=True)
+
+    @property
+    def estimator(self) -> Estimator:
+        """The estimator with its options."""
+        return self.settings.estimator
+
+    @property
+    def name(self) -> str:
+        """Name of the estimator."""
+        return self.estimator.name
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """Arguments of a pipeline beside settings and calibration."""
+        return {"psf": self.psf, "score": self.score}
+
+    def with_options(self, changes: Mapping[str, Any]) -> Method:
+        """Return the same with some settings changed."""
+        return replace(self, settings=self.settings.replace(**changes)) if changes else self

@@ -1,0 +1,91 @@
+"""Record of a closed-loop run: telemetry and true values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.loop.simulation.files import Stored
+
+
+@dataclass(frozen=True, eq=False)
+class LoopRecord(Stored):
+    """One run of `simulate_loop`, n sub-apertures and m commands."""
+
+    WHAT: ClassVar[str] = "a record of a loop"
+    FORMAT: ClassVar[int] = 3
+
+    slopes_px: NDArray[np.float32]
+    """(frames, 2 n): all x, then all y, from the reference, before division by the centroid gain."""
+    valid: NDArray[np.bool_]
+    """(frames, n)"""
+    standard_error_px: NDArray[np.float32]
+    """(frames, 2 n); infinite where invalid or unknown."""
+    covariance_xy_px2: NDArray[np.float32]
+    """(frames, n): covariance of the errors of x and y."""
+    commands: NDArray[np.float32]
+    """(frames, m): commands that acted during each frame [nm]."""
+    strehl: NDArray[np.float64]
+    """(frames,): Strehl ratio of each frame at the science wavelength, on axis."""
+    residual_nm: NDArray[np.float64]
+    """(frames,): rms of the residual wavefront."""
+    zernike_nm: NDArray[np.float32]
+    """(frames, 10): Zernike modes 2 to 11 (Noll) of the residual wavefront."""
+    r0_m: NDArray[np.float64]
+    """(frames,): true Fried parameter at 500 nm."""
+    method: NDArray[np.int8]
+    """(frames,): number of the method that measured the frame."""
+    interaction_matrix: NDArray[np.float64]
+    """(2 n, m): displacements of the spots, true px, for a command of 1 nm."""
+    centroid_gain: NDArray[np.float64]
+    """(methods,): centroid gain of each method at the run's flux."""
+    corrected: NDArray[np.bool_]
+    """(methods,): whether slopes were divided by the centroid gain."""
+    labels: tuple[str, ...]
+    """Labels of the methods."""
+    method_settings: tuple[str, ...]
+    """Settings of each method as TOML."""
+    cells: NDArray[np.int64]
+    """(n, 2): row and column of each sub-aperture in the lenslet array."""
+    illumination: NDArray[np.float64]
+    """(n,): illuminated fraction of each sub-aperture."""
+    frame_rate_hz: float
+    delay_frames: int
+    """The command computed from frame k acted first during frame k + delay_frames."""
+    settle_frames: int
+    closed: bool
+    """Whether the sensor saw the mirror."""
+    subaperture_m: float
+    pixel_scale_rad: float
+    wavelength_m: float
+    configuration: str
+    """Configuration as TOML."""
+    seed: int
+    realisation: int
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.strehl)
+
+    @property
+    def scored(self) -> NDArray[np.bool_]:
+        """(frames,): whether a frame comes after settling."""
+        return np.arange(self.frames) >= self.settle_frames
+
+    def mean_strehl(self, method: int = 0) -> float:
+        """Return the long-exposure Strehl ratio of a method: the mean of its frames after settling.
+
+        Raises
+        ------
+        InputError
+            When the method has no such frame.
+        """
+        chosen = self.scored & (self.method == method)
+        if not chosen.any():
+            raise InputError(f"method = {method}: no frame after the {self.settle_frames} settling ones")
+        return float(self.strehl[chosen].mean())

@@ -1,0 +1,412 @@
+"""Simulation of the closed loop, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.errors import InputError
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification.learning import INTEGRATOR, Learnt
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.configuration.sections import CLOSED, RunLength
+from faintspot.loop.simulation.control import learnt_control, make_controller
+from faintspot.loop.simulation.methods import Method
+from faintspot.loop.simulation.record import LoopRecord
+from faintspot.loop.simulation.telescope.calibration import (
+    centroid_gain,
+    make_pipeline,
+    mean_flux,
+    typical_spots,
+)
+from faintspot.loop.simulation.telescope.camera import Exposing, make_detector
+from faintspot.loop.simulation.telescope.model import (
+    TelescopeModel,
+    atmosphere_of,
+    laser_source,
+    prepare,
+    without_flux,
+)
+from faintspot.loop.simulation.telescope.natural_star import LowOrders
+from faintspot.loop.simulation.telescope.sodium import FollowedSodium, learn_sodium, with_spots
+from faintspot.slopes.pipeline import configuration as configuration_file
+from faintspot.slopes.pipeline.mean_flux import MeanFlux
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.training.known_sodium import KnownSodium
+
+_MOST_METHODS = 127
+_FLUX_FRAMES = 20
+"""Frames after which pipelines follow the mean flux, which changes over a thousand."""
+
+
+@dataclass(frozen=True)
+class DisabledErrors:
+    """Error sources that a run switches off, for error budgets; none by default."""
+
+    noiseless: bool = False
+    """Every pixel holds its mean flux."""
+    true_slopes: bool = False
+    """Whether slopes are the true mean gradients of the wavefront, for every method."""
+    correctable: bool = False
+    """Whether the turbulence is limited to what the mirror can correct."""
+    faster: float = 1.0
+    """Factor on the frame rate, with the same flux in each frame and the same duration."""
+    exact_gain: bool = False
+    """Whether slopes are divided by the centroid gain of a first run, for one method."""
+
+    stretch_frames: ClassVar[int] = 100
+    """Frames in each stretch of a faster loop."""
+    stretch_settle_frames: ClassVar[int] = 40
+
+    def configuration(self, configuration: LoopConfiguration) -> LoopConfiguration:
+        """Return the configuration with a changed frame rate and the same flux per frame."""
+        if self.faster == 1.0:
+            return configuration
+        rate = configuration.control.frame_rate_hz * self.faster
+        camera = {"photons_per_subaperture": configuration.photons, "magnitude": None}
+        return configuration.replace("camera", **camera).replace("control", frame_rate_hz=rate)
+
+    def method(self, method: Method) -> Method:
+        """Return the method as used in such a run."""
+        return replace(method, true_slopes=method.true_slopes or self.true_slopes)
+
+    def time_s(self, frame: int, frame_rate_hz: float) -> float:
+        """Return the middle of a frame."""
+        first = 0 if self.faster == 1.0 else frame - frame % self.stretch_frames
+        return first * self.faster / frame_rate_hz + (frame - first + 0.5) / frame_rate_hz
+
+    def settled(self, frames: int) -> NDArray[np.bool_]:
+        """Return which frames directly follow the frame before, (frames,)."""
+        place = np.arange(frames) % self.stretch_frames
+        return (place >= self.stretch_settle_frames) | (self.faster == 1.0)
+
+
+def simulate_loop(
+    configuration: LoopConfiguration,
+    methods: Sequence[Method],
+    schedule: ArrayLike | None = None,
+    *,
+    seed: int | None = None,
+    realisation: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    disabled_errors: DisabledErrors | None = None,
+    learns_on: LoopConfiguration | None = None,
+) -> LoopRecord:
+    """Run the loop once.
+
+    In every frame the sensor sees, for the whole exposure, the wavefront of its middle after the mirror; the
+    command computed from frame k acts first during the exposure of frame k + delay_frames. Air and noise
+    depend on seed, realisation and frame alone: runs with other methods see the same.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+    methods : sequence of Method
+    schedule : (frames,) array of int, optional
+        Which method measures each frame. Default: the configuration's number of frames with the first method.
+    seed : int, optional
+        Default: the configuration's.
+    realisation : int
+        Other realisations have other air and other noise.
+    progress : callable, optional
+        Called with the number of frames done and that of all, after every frame.
+    disabled_errors : DisabledErrors, optional
+        What is left out of what spoils the Strehl ratio.
+    learns_on : LoopConfiguration, optional
+        Of the loop that control learns from where it does. Default: the same, with other air.
+
+    Returns
+    -------
+    LoopRecord
+
+    Raises
+    ------
+    InputError
+        For a schedule that names methods that are not there, no methods, or parts that do not fit together.
+    MissingExtraError
+        When HCIPy is not installed.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.loop.simulation import Method, LoopConfiguration, simulate_loop
+    >>> loop = LoopConfiguration().replace("run", frames=40, settle_frames=20)
+    >>> record = simulate_loop(loop, [Method("brightest", fs.Settings("brightest"))])
+    >>> record.strehl.shape, record.slopes_px.shape, bool(record.strehl[-1] > record.strehl[0])
+    ((40,), (40, 72), True)
+    """
+    which = _checked_schedule(configuration, methods, schedule)
+    start = configuration.run.seed if seed is None else int(number_between("seed", seed, 0, integer=True))
+    number = int(number_between("realisation", realisation, 0, integer=True))
+    switches = DisabledErrors() if disabled_errors is None else disabled_errors
+    ready = [
+        learnt_control(switches.configuration(configuration), method, start, simulate_loop, learns_on)
+        for method in map(switches.method, methods)
+    ]
+    what = configuration, ready, which, start, number, switches
+    gains = None
+    if switches.exact_gain:
+        gains = _Loop(*what).run(None).gains_in_run()
+    return _Loop(*what, gains).run(progress).record()
+
+
+def measure_gains(
+    configuration: LoopConfiguration,
+    pipelines: Sequence[SlopePipeline],
+    *,
+    seed: int,
+    realisation: int = 0,
+    detector: Exposing | None = None,
+) -> NDArray[np.float64]:
+    """Return the centroid gain of each pipeline at the configuration's flux, by `centroid_gain`."""
+    optics, detector = prepare(configuration), detector or make_detector(configuration)
+    spots = _typical_spots(without_flux(configuration), seed, realisation)
+    return np.array(
+        [
+            centroid_gain(pipeline, optics.sensor, detector, configuration.photons, spots, seed)
+            for pipeline in pipelines
+        ]
+    )
+
+
+class _Loop:
+    """State and recorded values of one run."""
+
+    def __init__(
+        self,
+        configuration: LoopConfiguration,
+        ready: Sequence[tuple[Method, Learnt | None]],
+        which: NDArray[np.int64],
+        seed: int,
+        realisation: int,
+        disabled_errors: DisabledErrors,
+        gains: NDArray[np.float64] | None = None,
+    ) -> None:
+        self.configuration = configuration = disabled_errors.configuration(configuration)
+        self.known = _known_sodium(configuration, seed, realisation)
+        self.methods = methods = tuple(self._with_spots(method) for method, _ in ready)
+        self.which, self.disabled_errors = which, disabled_errors
+        self.seed, self.realisation = seed, realisation
+        self.telescope_model = TelescopeModel(
+            configuration,
+            seed,
+            realisation,
+            correctable=disabled_errors.correctable,
+            noiseless=disabled_errors.noiseless,
+        )
+        self.optics = optics = self.telescope_model.optics
+        self.pipelines = [make_pipeline(configuration, optics.sensor, method) for method in methods]
+        self.fluxes = [self._first_flux(pipeline) for pipeline in self.pipelines]
+        for number in range(len(methods)):
+            self._follow_flux(number)
+        self.gains, self.divisors = self._gains_and_divisors(gains)
+        self.line = CommandDelayLine(optics.mirror.commands, configuration.control.delay_frames)
+        self.controllers = [make_controller(configuration, optics, *each, self.line) for each in ready]
+        self.low_orders = None
+        self.followed: list[FollowedSodium | None] = [None] * len(methods)
+        if self.known is not None:
+            self.low_orders = LowOrders(configuration, optics.sensor, seed, realisation)
+            self.followed = [
+                FollowedSodium(configuration, optics.sensor.layout, self.known)
+                if method.follows_profile
+                else None
+                for method in methods
+            ]
+        frames, n = len(which), len(optics.sensor.layout)
+        self.slopes = np.zeros((frames, 2 * n), np.float32)
+        self.valid = np.zeros((frames, n), np.bool_)
+        self.errors = np.zeros((frames, 2 * n), np.float32)
+        self.covariances = np.zeros((frames, n), np.float32)
+        self.commands = np.zeros((frames, optics.mirror.commands), np.float32)
+        self.truth = np.zeros((3, frames))
+        self.zernike = np.zeros((frames, 10), np.float32)
+        self.regression = np.zeros((2, len(methods)))
+
+    def _first_flux(self, pipeline: SlopePipeline) -> MeanFlux | None:
+        """Return the mean flux of every sub-aperture for an estimator that uses it, as before a run."""
+        if not pipeline.settings.estimator.uses_flux or pipeline.settings.flux_e is not None:
+            return None
+        spots = _typical_spots(without_flux(self.configuration), self.seed, self.realisation)
+        photons, sensor = self.configuration.photons, self.optics.sensor
+        return mean_flux(pipeline, sensor, self.telescope_model.detector, photons, spots, self.seed)
+
+    def _follow_flux(self, number: int) -> None:
+        """Set the mean flux in a method's pipeline."""
+        flux = self.fluxes[number]
+        if flux is not None:
+            self.pipelines[number] = self.pipelines[number].with_flux(flux)
+
+    def _gains_and_divisors(
+        self, known: NDArray[np.float64] | None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return each method's centroid gain and the divisor of its slopes."""
+        if known is not None:
+            return known, known
+        gains = measure_gains(
+            self.configuration,
+            self.pipelines,
+            seed=self.seed,
+            realisation=self.realisation,
+            detector=self.telescope_model.detector,
+        )
+        gains = np.where([method.true_slopes for method in self.methods], 1.0, gains)
+        return gains, np.where([method.correct_gain for method in self.methods], gains, 1.0)
+
+    def run(self, progress: Callable[[int, int], None] | None) -> _Loop:
+        """Simulate all frames."""
+        frames = len(self.which)
+        for frame in range(frames):
+            self.step(frame)
+            if progress is not None:
+                progress(frame + 1, frames)
+        return self
+
+    def step(self, frame: int) -> None:
+        """Simulate one frame."""
+        number, commands = int(self.which[frame]), self.line.acting
+        time = self.disabled_errors.time_s(frame, self.configuration.control.frame_rate_hz)
+        after, seen = self.telescope_model.wavefronts(time, commands)
+        self._observe(frame, time, after)
+        slopes = self._measure(frame, self.telescope_model.by_rows(time, seen, self.line.around))
+        error = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
+        per_px = 1 / self.divisors[number]
+        vector, covariance = (each.astype(np.float64) for each in (slopes.vector, slopes.covariance_xy))
+        vector *= per_px
+        if self.low_orders is not None:
+            vector = self.low_orders.merged(frame, seen, vector, slopes.flags)
+        self.controllers[number].update(vector, error.astype(np.float64) * per_px, covariance * per_px**2)
+        self.slopes[frame], self.errors[frame] = slopes.vector, error
+        self.covariances[frame] = slopes.covariance_xy
+        self.valid[frame], self.commands[frame] = slopes.valid, commands
+
+    def _observe(self, frame: int, time: float, wavefront: NDArray[np.float32]) -> None:
+        """Record the true values."""
+        truth = self.telescope_model.truth(time, wavefront)
+        self.truth[:, frame] = truth.strehl, truth.rms_nm, truth.r0_m
+        self.zernike[frame] = self.optics.pupil.zernike(wavefront)
+
+    def _measure(self, frame: int, wavefront: NDArray[np.float32]) -> Slopes:
+        """Measure the slopes of the camera's frame."""
+        number, sensor = int(self.which[frame]), self.optics.sensor
+        if self.methods[number].true_slopes:
+            return _true_slopes(sensor.mean_slopes_px(wavefront))
+        prior = None
+        if self.methods[number].predict_prior:
+            prior = self.controllers[number].expected().mean_px
+        pixels = self.telescope_model.frame(frame, wavefront)
+        slopes = self.pipelines[number](pixels, prior)
+        self._follow_profile(number, pixels, slopes)
+        known = self.fluxes[number]
+        if known is not None:
+            self.fluxes[number] = known.updated(slopes.flux)
+            if frame % _FLUX_FRAMES == 0:
+                self._follow_flux(number)
+        if self.disabled_errors.exact_gain and frame >= self.configuration.run.settle_frames:
+            true = sensor.mean_slopes_px(wavefront)
+            self.regression[:, number] += slopes.vector.astype(np.float64) @ true, true @ true
+        return slopes
+
+    def _with_spots(self, method: Method) -> Method:
+        """Return a method that knows the spots of a laser guide star as they were before the run."""
+        if self.known is None or method.psf is not None:
+            return method
+        return with_spots(self.known, self.configuration, method)
+
+    def _follow_profile(self, number: int, pixels: NDArray[np.generic], slopes: Slopes) -> None:
+        """Take a frame for the sodium profile; make the method's pipeline anew when it changes."""
+        followed = self.followed[number]
+        if followed is None or not followed.take(pixels, slopes.vector.astype(np.float64)):
+            return
+        method = with_spots(followed.known, self.configuration, self.methods[number])
+        self.pipelines[number] = make_pipeline(self.configuration, self.optics.sensor, method)
+        self._follow_flux(number)
+
+    def gains_in_run(self) -> NDArray[np.float64]:
+        """Return the regression of each method's measured slopes on the true ones."""
+        return np.asarray(self.regression[0] / self.regression[1])
+
+    def record(self) -> LoopRecord:
+        """Return the record of the run."""
+        configuration, sensor = self.configuration, self.optics.sensor
+        strehl, residual, r0 = self.truth
+        return LoopRecord(
+            self.slopes,
+            self.valid,
+            self.errors,
+            self.covariances,
+            self.commands,
+            strehl,
+            residual,
+            self.zernike,
+            r0,
+            self.which.astype(np.int8),
+            self.optics.interaction,
+            self.gains,
+            np.array([method.correct_gain for method in self.methods]),
+            tuple(method.label for method in self.methods),
+            tuple(configuration_file.to_text(method.settings) for method in self.methods),
+            sensor.layout.cells,
+            sensor.illumination,
+            configuration.control.frame_rate_hz,
+            configuration.control.delay_frames,
+            configuration.run.settle_frames,
+            configuration.control.mode == CLOSED,
+            configuration.subaperture_m,
+            configuration.pixel_scale_rad,
+            configuration.sensor.wavelength_m,
+            configuration.to_text(),
+            self.seed,
+            self.realisation,
+        )
+
+
+def _true_slopes(vector: NDArray[np.float64]) -> Slopes:
+    """Return slopes without an error."""
+    x, y = vector.astype(np.float32).reshape(2, -1)
+    zeros, counts = np.zeros(len(x), np.float32), np.zeros(len(x), np.int32)
+    return Slopes(x, y, zeros, np.zeros(len(x), np.uint8), counts, counts, zeros, zeros, zeros)
+
+
+def _checked_schedule(
+    configuration: LoopConfiguration, methods: Sequence[Method], schedule: ArrayLike | None
+) -> NDArray[np.int64]:
+    if not 1 <= len(methods) <= _MOST_METHODS:
+        raise InputError(f"methods: expected 1 to {_MOST_METHODS}, got {len(methods)}")
+    if len(methods) > 1 and any(method.control != INTEGRATOR for method in methods):
+        raise InputError("methods: expected one, or several with the integrator alone")
+    if schedule is None:
+        return np.zeros(configuration.run.frames, np.int64)
+    which = numbers_between("schedule", schedule, 0, len(methods) - 1, integer=True)
+    if which.ndim != 1:
+        raise InputError(f"schedule: expected one method for each frame, got shape {which.shape}")
+    return which.astype(np.int64)
+
+
+@lru_cache(maxsize=2)
+def _typical_spots(
+    configuration: LoopConfiguration, seed: int, realisation: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    optics, atmosphere = prepare(configuration), atmosphere_of(configuration, seed, realisation)
+    laser = laser_source(configuration)
+    sensor = optics.sensor if laser is None else laser.sensor(0)
+    return typical_spots(configuration, sensor, optics.mirror, atmosphere, optics.reconstructor.matrix)
+
+
+def _known_sodium(configuration: LoopConfiguration, seed: int, realisation: int) -> KnownSodium | None:
+    """Return what is known of the sodium layer before a run; None without a laser."""
+    if configuration.laser is None:
+        return None
+    return _learnt_sodium(replace(configuration, name="-", run=RunLength()), seed, realisation)
+
+
+@lru_cache(maxsize=4)
+def _learnt_sodium(configuration: LoopConfiguration, seed: int, realisation: int) -> KnownSodium:
+    spots = np.concatenate(_typical_spots(without_flux(configuration), seed, realisation))
+    return learn_sodium(configuration, prepare(configuration).sensor.layout, spots, seed)

@@ -1,0 +1,1 @@
+"""The simulated telescope: atmosphere, guide star, mirror, sensor, camera."""

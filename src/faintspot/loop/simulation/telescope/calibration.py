@@ -1,0 +1,206 @@
+"""Calibration of the loop: interaction matrix, reference slopes and centroid gain, through the pipeline."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.configuration.sections import CLOSED
+from faintspot.loop.simulation.methods import Method
+from faintspot.loop.simulation.telescope.atmosphere import MovingLayers
+from faintspot.loop.simulation.telescope.camera import Exposing, camera_calibration
+from faintspot.loop.simulation.telescope.mirror import DeformableMirror
+from faintspot.loop.simulation.telescope.wavefront_sensor import ShackHartmann
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.pipeline.mean_flux import MeanFlux
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.psf import PSF
+
+_BRIGHT_E = 1e6
+_POKE_NM = 20.0
+_DITHER_PX = 0.25
+_DITHER_WAVEFRONTS = 60
+_DITHER_STEP_S = 0.1  # between wavefronts, so that they differ
+_SMALLEST_GAIN = 0.05  # less is noise, and dividing by it would make the loop unstable
+
+Floats = NDArray[np.float64]
+
+
+def method_layout(layout: Layout, method: Method) -> Layout:
+    """Return the windows of a method: the middle of the sensor's windows.
+
+    Raises
+    ------
+    InputError
+        When they are larger than the sensor's.
+    """
+    side = layout.window[0]
+    pixels = side if method.window_pixels is None else method.window_pixels
+    if pixels > side:
+        raise InputError(
+            f"method.window_pixels = {pixels}: expected at most the {side} of the sensor's windows"
+        )
+    corners = layout.corners + (side - pixels) // 2
+    return Layout(layout.frame_shape, (pixels, pixels), corners, layout.centres, layout.cells)
+
+
+def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, method: Method) -> SlopePipeline:
+    """Return the pipeline of a method, with the reference slopes of a flat wavefront."""
+    return SlopePipeline(
+        method_layout(sensor.layout, method),
+        method.settings,
+        camera_calibration(configuration),
+        reference_slopes(configuration, sensor, method),
+        psf=_psf(configuration, method),
+        score=method.score,
+        threads=1,
+    )
+
+
+def reference_slopes(
+    configuration: LoopConfiguration, sensor: ShackHartmann, method: Method
+) -> NDArray[np.float32]:
+    """Return the slopes that a method measures for a flat wavefront, all x, then all y, (2 n,) px.
+
+    With a laser they are those of the spots that the method knows.
+
+    References are measured with bright frames without noise, and without what is for faint flux:
+    at its strength of denoising they would be denoised to nothing.
+    """
+    bright = SlopePipeline(
+        method_layout(sensor.layout, method),
+        method.settings.replace(estimator=method.settings.estimator.for_bright_flux(), flux_e=None),
+        Calibration(dark=0.0, read_noise_e=1.0),
+        psf=_psf(configuration, method),
+        score=method.score,
+        threads=1,
+    )
+    if configuration.laser is not None and method.psf is not None:  # the true spots change with time
+        n = len(sensor.layout)
+        known = method.psf.images(np.zeros((n, 2)), sensor.layout.window, which=method.psf.index_of(n))
+        flat = known.astype(np.float32)
+    else:
+        flat = sensor.spots(np.zeros((sensor.points, sensor.points), np.float32))
+    return bright(sensor.frame(flat) * _BRIGHT_E).vector
+
+
+def _psf(configuration: LoopConfiguration, method: Method) -> PSF:
+    if method.psf is not None:
+        return method.psf
+    return flat_psf(configuration.spot_width_px, configuration.sensor.spot_elongation)
+
+
+@lru_cache(maxsize=4)
+def flat_psf(width_px: float, elongation: float) -> PSF:
+    """Return the PSF of a lenslet without turbulence."""
+    return PSF.analytic(size=width_px / 2, elongation=elongation)
+
+
+def interaction_matrix(sensor: ShackHartmann, mirror: DeformableMirror) -> Floats:
+    """Return the displacements of the spots for a command of 1 nm of each actuator, (2 n, commands) px.
+
+    Measured by poking each actuator up and down, with bright frames without noise, centres of gravity of all
+    the flux in the windows, and divided by the slopes that a known displacement gives. All methods use it,
+    each with its own reference slopes and its own centroid gain at the run's flux. A matrix through a
+    method's own estimator with such frames was no better: it changed the Strehl ratio by -0.035 to 0.000 for
+    the 20 brightest pixels, -0.007 to 0.016 for weighted centres of gravity, and -0.037 to -0.014 for
+    likelihood, which sees bright spots with other weights than faint ones (80 to 1000 photons, 700 frames).
+    """
+    pixels = sensor.layout.pixels
+    settings = Settings(BrightestPixels(keep_brightest=pixels - 1))
+    pipeline = SlopePipeline(sensor.layout, settings, threads=1)
+
+    def slopes(wavefront: NDArray[np.floating[Any]], displacement_px: float = 0.0) -> Floats:
+        frame = sensor.frame(sensor.spots(wavefront, displacement_px)) * _BRIGHT_E
+        return pipeline(frame).vector.astype(np.float64)
+
+    flat = np.zeros((sensor.points, sensor.points), np.float32)
+    gain = (slopes(flat, _DITHER_PX) - slopes(flat, -_DITHER_PX)) / (2 * _DITHER_PX)
+    columns = []
+    for command in range(mirror.commands):
+        poke = np.zeros(mirror.commands)
+        poke[command] = _POKE_NM
+        shape = mirror.wavefront_nm(poke)
+        columns.append((slopes(shape) - slopes(-shape)) / (2 * _POKE_NM))
+    return np.stack(columns, axis=1) / gain[:, None]
+
+
+def true_interaction_matrix(sensor: ShackHartmann, mirror: DeformableMirror) -> Floats:
+    """Return the mean gradients for a command of 1 nm of each actuator, (2 n, commands) px."""
+    pokes = np.eye(mirror.commands)
+    return np.stack([sensor.mean_slopes_px(mirror.wavefront_nm(poke)) for poke in pokes], axis=1)
+
+
+def typical_spots(
+    configuration: LoopConfiguration,
+    sensor: ShackHartmann,
+    mirror: DeformableMirror,
+    atmosphere: MovingLayers,
+    reconstructor: Floats,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return spots as in the loop, all displaced by +0.25 px in x and y, and by -0.25 px.
+
+    Wavefronts are those of the turbulence before the run. In closed loop the mirror corrects the wavefront of
+    `delay_frames` earlier.
+
+    Returns
+    -------
+    tuple of two arrays, (wavefronts, n, pixels, pixels)
+    """
+    pairs = []
+    control = configuration.control
+    for number in range(1, _DITHER_WAVEFRONTS + 1):
+        time = -_DITHER_STEP_S * number
+        wavefront = atmosphere.wavefront_nm(time)
+        if control.mode == CLOSED:
+            earlier = atmosphere.wavefront_nm(time - control.delay_frames / control.frame_rate_hz)
+            wavefront = wavefront - mirror.wavefront_nm(reconstructor @ sensor.mean_slopes_px(earlier))
+        pairs.append([sensor.spots(wavefront, sign * _DITHER_PX) for sign in (1.0, -1.0)])
+    up, down = (np.stack(spots) for spots in zip(*pairs, strict=True))
+    return up, down
+
+
+def mean_flux(
+    pipeline: SlopePipeline,
+    sensor: ShackHartmann,
+    detector: Exposing,
+    photons: float,
+    spots: tuple[NDArray[np.float32], NDArray[np.float32]],
+    seed: int,
+) -> MeanFlux:
+    """Return the mean flux of every sub-aperture, from frames of `typical_spots` at the run's own flux."""
+    frames = []
+    for number, each in enumerate(spots[0]):
+        rng = np.random.default_rng([seed, number, 5])
+        frames.append(detector.expose(sensor.frame(each) * photons, rng))
+    return MeanFlux(pipeline(np.stack(frames)).flux)
+
+
+def centroid_gain(
+    pipeline: SlopePipeline,
+    sensor: ShackHartmann,
+    detector: Exposing,
+    photons: float,
+    spots: tuple[NDArray[np.float32], NDArray[np.float32]],
+    seed: int,
+) -> float:
+    """Return the slope that a pipeline measures for a displacement of 1 px, at the run's own flux.
+
+    From `typical_spots` with the camera's noise; sub-apertures that could not be measured count as they do
+    in the loop, as 0. At least 0.05: less could not be told from none.
+    """
+    total = 0.0
+    for displaced, sign in zip(spots, (1.0, -1.0), strict=True):
+        for number, each in enumerate(displaced):
+            rng = np.random.default_rng([seed, number, 3])
+            frame = detector.expose(sensor.frame(each) * photons, rng)
+            total += sign * float(pipeline(frame).vector.mean(dtype=np.float64))
+    return max(_SMALLEST_GAIN, total / (2 * _DITHER_PX * len(spots[0])))

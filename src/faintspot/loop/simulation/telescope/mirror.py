@@ -1,0 +1,111 @@
+"""Deformable mirror and tip-tilt mirror: wavefront from commands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.telescope.pupil import PupilAmplitude, pupil_grid, require_hcipy
+
+_LEAST_POWER = 0.1  # of an influence function, that must be in the pupil for the actuator to be used
+_CUTOFF = 2.5  # actuators, at which an influence function ends: below 1e-5 of its height
+
+
+@dataclass(frozen=True, eq=False)
+class DeformableMirror:
+    """Influence functions of the used actuators, then tip and tilt where there is a mirror for them."""
+
+    influence: Any
+    """Sparse (points^2, actuators): wavefront in nm for a command of 1 nm."""
+    tilts: NDArray[np.float32]
+    """(0 or 2, points, points): wavefront of tip and tilt, 1 nm rms over the pupil for a command of 1 nm."""
+    points: int
+
+    @property
+    def commands(self) -> int:
+        """Number of commands."""
+        return int(self.influence.shape[1]) + len(self.tilts)
+
+    def wavefront_nm(self, commands: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return the wavefront that the mirror adds, (points, points)."""
+        actuators = self.influence.shape[1]
+        command = np.asarray(commands, np.float32)
+        surface: NDArray[np.float32] = (self.influence @ command[:actuators]).reshape(
+            self.points, self.points
+        )
+        for tilt, amount in zip(self.tilts, command[actuators:], strict=True):
+            surface = surface + amount * tilt
+        return surface
+
+    def matrix(self) -> NDArray[np.float32]:
+        """Return the wavefronts of all commands, (points^2, commands)."""
+        columns: NDArray[np.float32] = np.hstack(
+            [self.influence.toarray(), self.tilts.reshape(len(self.tilts), self.points**2).T]
+        )
+        return columns
+
+
+@dataclass(frozen=True, eq=False)
+class BestFit:
+    """Best fit of a mirror to a known wavefront; its residual is the fitting error."""
+
+    basis: NDArray[np.float32]
+    """Orthonormal wavefronts of the mirror (and piston), weighted by the pupil, (points^2, n)."""
+    weight: NDArray[np.float32]
+    """Square root of the pupil's amplitude, (points^2,)."""
+
+    @classmethod
+    def of(cls, mirror: DeformableMirror, pupil: PupilAmplitude, *, piston: bool = True) -> BestFit:
+        """Make the fit of a mirror, and of piston; it needs the full matrix, (points^2, commands)."""
+        weight = np.sqrt(pupil.amplitude.ravel())
+        flat = np.ones((len(weight), int(piston)), np.float32)
+        columns = np.hstack([mirror.matrix(), flat]) * weight[:, None]
+        left, size, _ = np.linalg.svd(columns, full_matrices=False)
+        return cls(left[:, : np.count_nonzero(size > 1e-6 * size[0])], weight)
+
+    def fitted(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return the mirror's best fit to a wavefront (points, points); 0 outside the pupil."""
+        inside = self.weight > 0
+        inverse = np.where(inside, 1 / np.where(inside, self.weight, 1), 0)
+        seen = self.basis.T @ (self.weight * wavefront.ravel())
+        fitted: NDArray[np.float32] = (inverse * (self.basis @ seen)).reshape(wavefront.shape)
+        return fitted.astype(np.float32)
+
+    def residual(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return a wavefront (points, points) minus the mirror's best fit; 0 outside the pupil."""
+        left: NDArray[np.float32] = np.where(
+            self.weight.reshape(wavefront.shape) > 0, wavefront - self.fitted(wavefront), 0
+        )
+        return left.astype(np.float32)
+
+
+def make_mirror(configuration: LoopConfiguration, pupil: PupilAmplitude) -> DeformableMirror:
+    """Return the mirror of a configuration: Gaussian influence functions of HCIPy, one for each actuator.
+
+    Actuators with less than a tenth of their influence function's power in the pupil are left out.
+    """
+    hcipy = require_hcipy("the closed loop")
+    across = configuration.mirror.actuators or configuration.sensor.subapertures + 1
+    pitch = configuration.width_m / (across - 1)
+    basis = hcipy.make_gaussian_influence_functions(
+        pupil_grid(configuration), across, pitch, configuration.mirror.crosstalk, _CUTOFF
+    )
+    influence = basis.transformation_matrix.tocsc()
+    # Power relative to a whole influence function's: half of that of an actuator at the edge is off the grid.
+    power = influence.multiply(influence)
+    inside = pupil.amplitude.ravel() @ power
+    used = inside >= _LEAST_POWER * np.asarray(power.sum(axis=0)).max()
+    line = (np.arange(pupil.points) + 0.5) / pupil.points - 0.5
+    tilts = np.array(
+        [np.broadcast_to(line, (pupil.points,) * 2), np.broadcast_to(line[:, None], (pupil.points,) * 2)]
+    )
+    tilts = np.stack([tilt / pupil.rms(tilt) for tilt in tilts]).astype(np.float32)
+    return DeformableMirror(
+        influence[:, np.flatnonzero(used)].astype(np.float32).tocsr(),
+        tilts if configuration.mirror.tip_tilt else tilts[:0],
+        pupil.points,
+    )

@@ -1,0 +1,179 @@
+"""Shack-Hartmann sensor: flux on the camera from the wavefront in the pupil."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, blur_px
+from faintspot.loop.simulation.telescope.pupil import PupilAmplitude
+from faintspot.slopes.sensor.layout import Layout
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class ShackHartmann:
+    """Lenslets behind the pupil.
+
+    Each lenslet images the field of its own square of points (Fraunhofer), so that turbulence inside it
+    speckles its spot; light does not stray into neighbours' windows. All frames hold the flux of the whole
+    exposure, with the wavefront of its middle.
+    """
+
+    layout: Layout
+    illumination: NDArray[np.float64]
+    """Illuminated fraction of each sub-aperture, (n,)."""
+    amplitude: Floats
+    """(n, samples, samples)"""
+    wavelength_m: float
+    px_per_nm: float
+    """Displacement of a spot [px] for a tilt of 1 nm across the sub-aperture."""
+    rows: NDArray[np.complex64]
+    columns: NDArray[np.complex64]
+    """Fourier transforms along y and x, (image samples, samples)."""
+    row_pixels: Floats
+    column_pixels: Floats
+    """From image samples to pixels, (pixels, image samples)."""
+
+    points: int
+    """Number of points across the pupil."""
+
+    def lenslets(self, wavefront: NDArray[np.floating]) -> Floats:
+        """Return the parts of a wavefront (n, n) in illuminated sub-apertures, (n, samples, samples)."""
+        samples = self.amplitude.shape[-1]
+        across = len(wavefront) // samples
+        squares = wavefront.reshape(across, samples, across, samples).swapaxes(1, 2)
+        cells = self.layout.cells
+        part: Floats = np.ascontiguousarray(squares[cells[:, 0], cells[:, 1]], np.float32)
+        return part
+
+    def spots(self, wavefront_nm: NDArray[np.floating], displacement_px: float = 0.0) -> Floats:
+        """Return the flux of every spot, (n, pixels, pixels); 1 for a fully illuminated lenslet.
+
+        Parameters
+        ----------
+        wavefront_nm : (n, n) array
+        displacement_px : float
+            How far all spots are moved, in x and in y, by tilting the wavefront.
+        """
+        phase = self.lenslets(wavefront_nm) * np.float32(2e-9 * np.pi / self.wavelength_m)
+        if displacement_px:
+            phase += self._tilt(displacement_px)
+        phase, lit = (np.ascontiguousarray(part.transpose(1, 2, 0)) for part in (phase, self.amplitude))
+        amplitude = _both_axes(self.rows, _field(phase, lit), self.columns)
+        intensity = amplitude.real**2 + amplitude.imag**2
+        images = _both_axes(self.row_pixels, intensity, self.column_pixels)
+        return np.ascontiguousarray(images.transpose(2, 0, 1))
+
+    def frame(self, spots: Floats) -> NDArray[np.float64]:
+        """Return a camera frame with the spots in their windows."""
+        frame = np.zeros(self.layout.frame_shape)
+        frame[self.layout.window_pixels] = spots
+        return frame
+
+    def mean_slopes_px(self, wavefront_nm: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return the spot displacements by the mean gradient, all x, then all y, (2 n,) px.
+
+        The mean over the lit part of each sub-aperture, of differences between neighbouring points.
+        """
+        part, amplitude = self.lenslets(wavefront_nm).astype(np.float64), self.amplitude
+        slopes = []
+        for axis in (2, 1):
+            low, high = (
+                np.take(amplitude, range(start, amplitude.shape[axis] - 1 + start), axis) for start in (0, 1)
+            )
+            weight = low * high
+            rise = np.diff(part, axis=axis) * amplitude.shape[axis]
+            slopes.append((weight * rise).sum(axis=(1, 2)) / weight.sum(axis=(1, 2)))
+        vector: NDArray[np.float64] = np.concatenate(slopes) * self.px_per_nm
+        return vector
+
+    def _tilt(self, displacement_px: float) -> Floats:
+        samples = self.amplitude.shape[-1]
+        line = (np.arange(samples) + 0.5) / samples - 0.5
+        rise = displacement_px / self.px_per_nm * 2e-9 * np.pi / self.wavelength_m
+        return np.asarray(rise * (line + line[:, None]), np.float32)
+
+
+def make_sensor(configuration: LoopConfiguration, pupil: PupilAmplitude) -> ShackHartmann:
+    """Return the sensor of a configuration.
+
+    Raises
+    ------
+    InputError
+        When no sub-aperture is lit.
+    """
+    sensor = configuration.sensor
+    samples, across, pixels = sensor.samples, sensor.subapertures, sensor.pixels
+    squares = pupil.amplitude.reshape(across, samples, across, samples).swapaxes(1, 2)
+    illumination = squares.mean(axis=(2, 3), dtype=np.float64)
+    cells = np.argwhere(illumination >= sensor.least_illumination)
+    if not len(cells):
+        raise InputError(
+            f"telescope.diameter_m = {configuration.telescope.diameter_m:g}, sensor.subapertures = {across}: "
+            f"no sub-aperture has {sensor.least_illumination:g} of its area in the pupil"
+        )
+    layout = Layout((across * pixels,) * 2, (pixels, pixels), cells * pixels, cells=cells, pitch_px=pixels)
+    width = configuration.spot_width_px
+    along_y = _image_axis(pixels, width, samples, 0.0)
+    along_x = _image_axis(pixels, width, samples, blur_px(configuration))
+    return ShackHartmann(
+        layout,
+        illumination[cells[:, 0], cells[:, 1]],
+        np.ascontiguousarray(squares[cells[:, 0], cells[:, 1]], np.float32),
+        sensor.wavelength_m,
+        1e-9 / configuration.subaperture_m / configuration.pixel_scale_rad,
+        along_y[0],
+        along_x[0],
+        along_y[1],
+        along_x[1],
+        across * samples,
+    )
+
+
+def _image_axis(
+    pixels: int, width_px: float, samples: int, blur_px: float
+) -> tuple[NDArray[np.complex64], Floats]:
+    """Return one axis's Fourier transform to samples of the image, and from these to pixels.
+
+    Gauss-Legendre samples in each pixel; with a blur, pixels beside the window shine into it.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(1 + math.ceil(2 / width_px))
+    margin = math.ceil(3 * blur_px)
+    place = np.arange(-margin, pixels + margin) - (pixels - 1) / 2
+    where = (place[:, None] + nodes / 2).ravel()
+    angle = where / width_px  # in lambda / d
+    line = (np.arange(samples) + 0.5) / samples - 0.5
+    square = np.sinc(angle / samples) / samples  # each point is a square of constant phase
+    transform = np.exp(-2j * np.pi * np.outer(angle, line)) * square[:, None]
+    weight = np.tile(weights / 2, len(place)) / width_px
+    inner = np.arange(pixels) - (pixels - 1) / 2
+    if blur_px:
+        from scipy.special import ndtr
+
+        edges = (np.concatenate([inner - 0.5, inner[-1:] + 0.5])[:, None] - where) / blur_px
+        to_pixels = np.diff(ndtr(edges), axis=0) * weight
+    else:
+        to_pixels = np.where(np.abs(where - inner[:, None]) < 0.5, weight, 0.0)
+    return transform.astype(np.complex64), to_pixels.astype(np.float32)
+
+
+def _field(phase: Floats, amplitude: Floats) -> NDArray[np.complex64]:
+    """Return the complex amplitude."""
+    field = np.empty(phase.shape, np.complex64)
+    np.multiply(np.cos(phase), amplitude, out=field.real)
+    np.multiply(np.sin(phase), amplitude, out=field.imag)
+    return field
+
+
+def _both_axes(left: Any, images: Any, right: Any) -> Any:
+    """Return left @ image @ right.T for each of the images (ny, nx, n), as a few large products."""
+    ny, nx, n = images.shape
+    half = (left @ images.reshape(ny, nx * n)).reshape(len(left), nx, n)
+    return np.matmul(right, half)

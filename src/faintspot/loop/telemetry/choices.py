@@ -1,0 +1,265 @@
+"""Residual wavefront of other controllers, by replay of the slopes of a recorded loop.
+
+Recorded slopes hold more than turbulence and white noise: unequal centroid gains, speckles. These grow with
+the residual wavefront, so a filter that leaves less has less of them. Its residual is that in the identified
+turbulence, with the noise of small displacements.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.base.statistics import mean_by_blocks
+from faintspot.loop.control.identification.layers import Identified
+from faintspot.loop.control.identification.learning import GAINS, KALMAN, MODAL, learn
+from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.model import SETTLE_FRAMES, Model, Plant
+from faintspot.loop.control.kalman.predictor import steady_covariance
+from faintspot.loop.control.phase import residual_phase
+from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.control.telemetry import OpenLoopTelemetry
+from faintspot.loop.simulation.configuration.configuration import ARCSEC
+from faintspot.loop.telemetry.measured import Measured
+from faintspot.loop.telemetry.open_loop import OpenLoop
+from faintspot.loop.telemetry.recorded_loop import RecordedLoop
+from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+
+Floats = NDArray[np.float64]
+
+BEST, AS_RUN = "integrator, best gain", "as it ran"
+MODES, FILTER = "integrator, a gain for each mode", "predictive Kalman filter"
+FEWEST_FRAMES = 600
+_MOST_SLOPES = 500  # beyond, the filter takes too long to learn
+_LEAK = 0.01
+_BLOCKS = 12
+_SPREAD_AS_RUN, _SPREAD_OF_OTHERS = 0.5, 1.0
+"""Standard errors, in differences between the views: other control changes noise and gain of the slopes."""
+_LEAST_COMPARED = 0.25  # of the frames: those with the largest shares of measured slopes
+_FITTING, _FITTING_ERROR = 0.28, 0.04  # rad^2 at (sub-aperture / r0)^(5/3): continuous mirrors
+_ALIASING = 0.08  # rad^2, likewise: what the sensor mistakes for larger scales (Rigaut et al. 1998)
+_R0_WAVELENGTH_NM = 500.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Controller and its replayed residual in the second half of the recording."""
+
+    name: str
+    residual: Measured
+    """Rms of the residual wavefront within the mirror's reach."""
+    less: Measured
+    """Root of the variance saved relative to the loop as it ran; negative if it is larger."""
+    total: Measured
+    """Strehl ratio, including the fitting error."""
+    strehl: Measured
+    gain: float = math.nan
+    """Gain of an integrator."""
+
+    def as_values(self) -> dict[str, Any]:
+        """Return plain values."""
+        names = ("residual", "less", "total", "strehl")
+        gain = self.gain if math.isfinite(self.gain) else None
+        return {"name": self.name, "gain": gain, **{name: getattr(self, name).as_values() for name in names}}
+
+
+def compared_choices(
+    loop: RecordedLoop,
+    seen: OpenLoop,
+    delay: LoopDelay,
+    site: SlopeTurbulence,
+    r0: Measured,
+    identified: Identified | None,
+) -> list[Choice]:
+    """Replay integrators of several gains and a predictive filter that learns from the first half.
+
+    Where the turbulence is identified, the filter's residual is that in this turbulence, and the difference
+    from the replay is an error.
+
+    Raises
+    ------
+    InputError
+        When there are too few frames, or the mirror cannot be controlled by the slopes.
+    """
+    frames = len(seen.telemetry)
+    assert loop.interaction is not None
+    if frames < FEWEST_FRAMES:
+        raise InputError(f"{frames} frames, expected {FEWEST_FRAMES} for a replay")
+    reconstructor = make_reconstructor(loop.interaction)
+    plant = Plant(loop.interaction, reconstructor, max(1, round(delay.delay_frames)), _LEAK)
+    phase = residual_phase(reconstructor.clean, loop.interaction, loop.cells)
+    views = [_View.of(each, phase) for each in (seen, seen.scaled(delay.gain))]
+    relative = float(seen.variance_error.mean()) / math.sqrt(len(reconstructor.modes.T))
+    scale = _Scale.of(loop, r0, delay, relative)
+
+    def learnt_left(model: Model) -> list[Floats]:
+        return [view.compared(model.replayed(plant, view.replayed, phase)) for view in views]
+
+    def integrators(gains: Sequence[float]) -> list[list[Floats]]:
+        of_views = [view.compared(plant.replayed_integrators(gains, view.replayed, phase)) for view in views]
+        return [list(each) for each in zip(*of_views, strict=True)]
+
+    ran = None
+    if loop.is_closed and loop.commands is not None:
+        ran = [view.ran for view in views]
+    noise = [view.noise for view in views]
+    compare = partial(_choice, ran=ran, noise=noise, scale=scale)
+    found = [] if ran is None else [compare(AS_RUN, ran)]
+    first = seen.telemetry.part(0, frames // 2)
+    if len(seen.variance) <= _MOST_SLOPES:
+        modal, learnt = (
+            learn(kind, plant, first, site, loop.frame_rate_hz).model for kind in (MODAL, KALMAN)
+        )
+        found.append(compare(BEST, *integrators([learnt.plain_gain]), gain=learnt.plain_gain))
+        found.append(compare(MODES, learnt_left(modal)))
+        expected = math.nan
+        if identified is not None:
+            expected = _expected_left(identified, plant, delay.gain**2 * seen.variance, phase)
+        found.append(compare(FILTER, learnt_left(learnt), expected=expected))
+    else:
+        best, _ = plant.best_gain(GAINS, first, phase)
+        found.append(compare(BEST, *integrators([best]), gain=best))
+    uncorrected = float(np.square(views[0].replayed.open_loop_px @ phase.T).sum(axis=1).mean())
+    for gain, values in zip(GAINS[1::2], integrators(GAINS[1::2]), strict=True):
+        if values[0].max() < np.inf and values[0].mean() < uncorrected:  # else it is not stable
+            found.append(compare("integrator", values, gain=gain))
+    return [_at_gain(each, delay.gain) for each in found]
+
+
+def _expected_left(identified: Identified, plant: Plant, variance: Floats, phase: Floats) -> float:
+    """Return the phase variance that the predictive filter leaves in the turbulence that was identified."""
+    model = identified.slope_model()
+    after = model.spread(steady_covariance(model, variance), plant.delay_frames - 1)
+    return float(np.einsum("pi,ij,pj->", phase, model.seen @ after @ model.seen.T, phase))
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """Second half of the recording with one centroid gain.
+
+    That of the loop holds for displacements as large as in the recording, that of the interaction matrix for
+    small ones. Another controller's are between them.
+    """
+
+    replayed: OpenLoopTelemetry
+    """Second half, and the frames before it in which controllers settle."""
+    scored: NDArray[np.int64]
+    """Frames of these that are compared."""
+    share: Floats
+    """Share of the slopes that were measured in them."""
+    ran: Floats
+    """Squared phase of the loop as it ran in the frames that are compared."""
+    noise: float
+    """Phase variance of the noise."""
+
+    @classmethod
+    def of(cls, seen: OpenLoop, phase: Floats) -> _View:
+        half = len(seen.telemetry) // 2
+        replayed = seen.telemetry.part(half - SETTLE_FRAMES, None)
+        share = replayed.trust.mean(axis=1)
+        least = np.quantile(share[SETTLE_FRAMES:], 1 - _LEAST_COMPARED)
+        scored = SETTLE_FRAMES + np.flatnonzero(share[SETTLE_FRAMES:] >= max(float(least), 1e-9))
+        noise = float(seen.variance @ np.square(phase).sum(axis=0))
+        view = cls(replayed, scored, share[scored], np.zeros(0), noise)
+        ran = np.square(seen.residual[half - SETTLE_FRAMES :] @ phase.T).sum(axis=1)
+        return replace(view, ran=view.compared(ran))
+
+    def compared(self, frames: Floats) -> Floats:
+        """Return the squared phase in the frames that are compared, for slopes that are all measured."""
+        return np.asarray(frames[..., self.scored] / self.share)
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """Conversion of phase variances to wavefronts and Strehl ratios."""
+
+    unit: str
+    factor: float
+    fitting_nm2: float
+    fitting_error_nm2: float
+    wavelength_nm: float
+    gain_error: float
+    """Relative error of variances due to that of the centroid gain."""
+    noise_error: float
+    """Relative error of the noise's phase variance."""
+
+    @classmethod
+    def of(cls, loop: RecordedLoop, r0: Measured, delay: LoopDelay, noise_error: float) -> _Scale:
+        gain_error = 2 * float(np.nan_to_num(delay.gain_error))
+        if loop.subaperture_m is None or loop.pixel_scale_arcsec is None:
+            unit = f"{loop.slope_unit} x sub-aperture"
+            return cls(unit, 1.0, math.nan, math.nan, math.nan, gain_error, noise_error)
+        factor = loop.pixel_scale_arcsec * ARCSEC * loop.subaperture_m * 1e9
+        square = (loop.subaperture_m / r0.value) ** (5 / 3) * (_R0_WAVELENGTH_NM / (2 * math.pi)) ** 2
+        unseen = _FITTING + _ALIASING
+        error = square * math.hypot(_FITTING_ERROR, unseen * 5 / 3 * r0.error / r0.value)
+        wavelength_nm = loop.science_wavelength_m * 1e9
+        return cls("nm", factor, unseen * square, error, wavelength_nm, gain_error, noise_error)
+
+
+def _choice(
+    name: str,
+    left: list[Floats],
+    ran: list[Floats] | None,
+    noise: list[float],
+    scale: _Scale,
+    gain: float = math.nan,
+    expected: float = math.nan,
+) -> Choice:
+    """Return a choice from its squared phase in each view, or from the expected one."""
+    unit = scale.factor**2
+    spread = _SPREAD_AS_RUN if name == AS_RUN else _SPREAD_OF_OTHERS
+    without = [values - each for values, each in zip(left, noise, strict=True)]
+    square, error = _mean_of_views(without, unit, spread)
+    error = math.hypot(error, unit * noise[0] * scale.noise_error, scale.gain_error * square)
+    less = Measured("less than as it ran", scale.unit, remark="the loop was open")
+    corrected = 0.0 if math.isnan(expected) else square - unit * expected
+    square, error = square - corrected, math.hypot(error, corrected)
+    if ran is not None:
+        saved = [before - after for before, after in zip(ran, left, strict=True)]
+        mean, spread_of_mean = _mean_of_views(saved, unit, spread)
+        less = _root(less.name, scale.unit, mean + corrected, math.hypot(spread_of_mean, corrected))
+    total = square + scale.fitting_nm2
+    total_error = math.hypot(error, scale.fitting_error_nm2)
+    wave = (2 * math.pi / scale.wavelength_nm) ** 2
+    strehl = math.exp(-wave * total) if math.isfinite(total) else math.nan
+    remark = "" if math.isfinite(total) else "r0, pixel_scale_arcsec or subaperture_m is unknown"
+    return Choice(
+        name,
+        _root("residual", scale.unit, square, error),
+        less,
+        _root("with fitting and aliasing", scale.unit, total, total_error, remark),
+        Measured("Strehl ratio", "", min(strehl, 1.0), strehl * wave * total_error, remark),
+        gain,
+    )
+
+
+def _mean_of_views(values: list[Floats], unit: float, spread: float) -> tuple[float, float]:
+    """Return the mean of all views and its standard error."""
+    block = max(1, len(values[0]) // _BLOCKS)
+    means = [mean_by_blocks(each, block) for each in values]
+    found = [each.value for each in means]
+    error = math.hypot(means[0].standard_error, spread * (max(found) - min(found)))
+    return unit * float(np.mean(found)), unit * error
+
+
+def _root(name: str, unit: str, square: float, error: float, remark: str = "") -> Measured:
+    """Return the root of a variance, with its sign."""
+    if not math.isfinite(square):
+        return Measured(name, unit, remark=remark)
+    root = math.copysign(math.sqrt(abs(square)), square)
+    if name == "residual" and square < error:
+        return Measured(name, unit, remark=f"less than {math.sqrt(max(square, 0.0) + 2 * error):.3g}")
+    return Measured(name, unit, root, error / max(2 * abs(root), math.sqrt(error), 1e-12), remark)
+
+
+def _at_gain(choice: Choice, gain: float) -> Choice:
+    """Return a choice whose integrator's gain is that of slopes as measured."""
+    return replace(choice, gain=choice.gain / gain)

@@ -1,0 +1,136 @@
+"""Open-loop slopes of a recorded loop and their noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
+from faintspot.loop.control.telemetry import LEAST_VARIANCE_PX2, OpenLoopTelemetry
+from faintspot.loop.simulation.configuration.configuration import ARCSEC
+from faintspot.loop.telemetry.recorded_loop import RecordedLoop
+from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.turbulence.strength import OUTER_SCALE_M
+
+Floats = NDArray[np.float64]
+
+FEWEST_FRAMES = 200
+_MOST_LOST = 0.3  # of the frames; with more, the longest run without a gap is used
+_LEAST_SIGNAL = 1e-6  # of the slopes' variance, that their noise is taken to have
+
+
+@dataclass(frozen=True, eq=False)
+class OpenLoop:
+    """Slopes of a recording on a regular grid of frames, in the interaction matrix's slopes."""
+
+    telemetry: OpenLoopTelemetry
+    residual: Floats
+    """(frames, 2 n)"""
+    run: NDArray[np.int64]
+    """(frames,): numbers of runs without a gap."""
+    variance_error: Floats
+    """(2 n,): relative standard error of the noise's variance."""
+
+    @property
+    def variance(self) -> Floats:
+        """(2 n,): variance of the noise."""
+        return np.asarray(np.min(self.telemetry.variance_px2, axis=0))
+
+    def scaled(self, gain: float) -> OpenLoop:
+        """Return the same with residual slopes multiplied by a gain."""
+        telemetry, residual = self.telemetry, gain * self.residual
+        slopes = telemetry.open_loop_px + residual - self.residual
+        scaled = OpenLoopTelemetry(slopes, gain**2 * telemetry.variance_px2, telemetry.trust)
+        return replace(self, telemetry=scaled, residual=residual)
+
+
+def site_of_loop(loop: RecordedLoop) -> SlopeTurbulence:
+    """Return the geometry; unknown scales are 1 m and 1 arcsec, which only r0 and winds depend on."""
+    side, scale = loop.subaperture_m or 1.0, (loop.pixel_scale_arcsec or 1.0) * ARCSEC
+    outer = loop.outer_scale_m or OUTER_SCALE_M
+    positions = np.asarray(loop.cells[:, ::-1] * side, np.float64)
+    return SlopeTurbulence(positions, side, scale, 0.15, outer, np.ones(1), np.zeros((1, 2)))
+
+
+def runs_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return a number for each frame, the same for consecutive ones, (frames,)."""
+    return np.cumsum(np.diff(frame, prepend=frame[0] - 1) > 1).astype(np.int64)
+
+
+def open_loop_of(loop: RecordedLoop, delay: LoopDelay) -> OpenLoop:
+    """Return open-loop slopes, with the noise from deviations from a parabola in time.
+
+    Raises
+    ------
+    InputError
+        When fewer than 200 frames have known commands, or are without a gap where many are lost.
+    """
+    held, usable = _held(loop, delay)
+    usable &= np.isfinite(loop.slopes).any(axis=1)
+    rows = np.flatnonzero(usable)
+    if len(rows) and np.ptp(loop.frame[rows]) + 1 > (1 + _MOST_LOST) * len(rows):
+        runs = runs_of(loop.frame[rows])
+        rows = rows[runs == np.bincount(runs).argmax()]
+    if len(rows) < FEWEST_FRAMES:
+        raise InputError(f"{len(rows)} frames with known commands, expected {FEWEST_FRAMES}")
+    place = loop.frame[rows] - loop.frame[rows[0]]
+    grid = np.full((2, int(place[-1]) + 1, loop.slopes.shape[1]), np.nan)
+    grid[:, place] = loop.slopes[rows] / delay.gain
+    grid[1, place] -= held[rows]
+    with np.errstate(invalid="ignore"):
+        grid -= np.nansum(grid, axis=1, keepdims=True) / np.isfinite(grid).sum(axis=1, keepdims=True)
+    residual, atmosphere = grid
+    measured = np.isfinite(atmosphere)
+    variance, count = _noise_variance(atmosphere)
+    variance = np.maximum(variance, max(LEAST_VARIANCE_PX2, _LEAST_SIGNAL * float(np.nanvar(atmosphere))))
+    telemetry = OpenLoopTelemetry(
+        np.where(measured, atmosphere, 0.0), np.where(measured, variance, np.inf), measured.astype(np.float64)
+    )
+    runs = np.repeat(runs_of(place), np.diff(place, append=place[-1] + 1))
+    # Products of Gaussian noise with its deviation from a parabola have this variance.
+    error = np.sqrt(2.5 / np.maximum(count, 1))
+    return OpenLoop(telemetry, np.where(measured, residual, 0.0), runs, error)
+
+
+def _held(loop: RecordedLoop, delay: LoopDelay) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the slopes of the mirror in each frame, and whether they are known."""
+    held, known = np.zeros_like(loop.slopes), np.ones(len(loop.slopes), np.bool_)
+    if loop.commands is None or loop.interaction is None or not loop.is_closed:
+        return held, known
+    whole, part = int(delay.delay_frames), delay.delay_frames % 1
+    caused = loop.commands @ loop.interaction.T
+    for lag, share in ((whole, 1 - part), (whole + 1, part)):
+        if share > 0:
+            held[lag:] += share * caused[: len(caused) - lag]
+            known[:lag] = False
+            known[lag:] &= loop.frame[lag:] - loop.frame[: len(caused) - lag] == lag
+    return held, known
+
+
+def _noise_variance(slopes: Floats) -> tuple[Floats, Floats]:
+    """Return the variance of each slope's noise, and the number of frames that it is from.
+
+    From the slopes without each frame's mean along x and y, which fast vibrations change.
+    """
+    n = slopes.shape[1] // 2
+    if n < FEWEST_SUBAPERTURES:
+        return _deviation(slopes)
+    axes = slopes.reshape(-1, 2, n)
+    known = np.isfinite(axes)
+    mean = np.nansum(axes, axis=2, keepdims=True) / np.maximum(known.sum(axis=2, keepdims=True), 1)
+    left, count = _deviation((axes - mean).reshape(slopes.shape))
+    left = left.reshape(2, n)
+    # The mean takes some of each slope's noise away, and adds some of the others'.
+    total = left.sum(axis=1, keepdims=True) * n / (n - 1)
+    return ((left - total / n**2) / (1 - 2 / n)).ravel(), count
+
+
+def _deviation(slopes: Floats) -> tuple[Floats, Floats]:
+    """Return the variance of slopes about parabolas through their neighbours in time, and the frames."""
+    near, far = slopes[3:-1] + slopes[1:-3], slopes[4:] + slopes[:-4]
+    products = slopes[2:-2] * (slopes[2:-2] - (4 * near - far) / 6)
+    count = np.isfinite(products).sum(axis=0)
+    return np.nansum(products, axis=0) / np.maximum(count, 1), count

@@ -1,0 +1,179 @@
+"""Page of a recorded loop: pictures and tables with errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
+from faintspot.base.report.figure_data import FigureWithData
+from faintspot.base.report.page import Page, Section, Table, html_of
+from faintspot.base.report.texts import Texts
+from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER
+from faintspot.loop.telemetry.measured import Measured
+from faintspot.loop.telemetry.report import LoopReport, Part, wind_errors
+
+_TEXT = Texts("faintspot.loop.telemetry")
+_STREHL = "Strehl ratio"
+_MOST_DECIMALS = 6
+
+
+def page_of_loop(report: LoopReport) -> str:
+    """Return the page (HTML) of a report.
+
+    Raises
+    ------
+    MissingExtraError
+        When matplotlib or jinja2 is not installed.
+    """
+    figures: dict[str, Callable[[LoopReport], FigureWithData | None]] = {
+        "noise": _noise_figure,
+        "turbulence": _wind_figure,
+        "spectra": _spectra_figure,
+        "choices": _gain_figure,
+    }
+    sections = []
+    for name, part in report.parts.items():
+        drawn = figures[name](report) if name in figures else None
+        tables = [_table(part)] if part.known else []
+        if name == "choices" and report.choices:
+            tables.append(_choices_table(report))
+        text = [_TEXT[f"{name}.about"]] if not part.missing or tables else []
+        sections.append(
+            Section(name, part.title, text, tables, [] if drawn is None else [drawn], missing=part.missing)
+        )
+    loop = report.loop
+    facts = {"Sub-apertures": str(len(loop.cells)), "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"}
+    return html_of(Page(f"Loop of {loop.name}", facts, sections, remark=_TEXT["remark"]))
+
+
+def _table(part: Part) -> Table:
+    rows = [[each.name, _with_interval(each, each.unit), each.remark] for each in part.known]
+    return Table(["", "value (95 %)", "remark"], rows, words=True)
+
+
+def _with_interval(measured: Measured, unit: str = "") -> str:
+    """Return a value with its 95 % interval; counts have none."""
+    if not np.isfinite(measured.value):
+        return "not known"
+    if measured.error == 0:
+        return f"{measured.value:.6g} {unit}".rstrip()
+    if not np.isfinite(measured.error):
+        return "not known"
+    decimals = max(0, 1 - int(np.floor(np.log10(measured.error))))
+    style = f".{decimals}f" if decimals <= _MOST_DECIMALS else ".1e"
+    value, low_text, high_text = (f"{each:{style}}" for each in (measured.value, *measured.interval))
+    text = f"{value} {unit}".rstrip() + f" ({low_text} to {high_text})"
+    return text.replace("-", "−")
+
+
+def _choices_table(report: LoopReport) -> Table:
+    unit = report.choices[0].residual.unit
+    columns = {
+        f"residual ({unit})": [each.residual for each in report.choices],
+        f"less than as run ({unit})": [each.less for each in report.choices],
+        f"with fitting and aliasing ({unit})": [each.total for each in report.choices],
+        _STREHL: [each.strehl for each in report.choices],
+    }
+    known = {
+        name: values for name, values in columns.items() if any(np.isfinite(each.value) for each in values)
+    }
+    rows = []
+    for each, *values in zip(report.choices, *known.values(), strict=True):
+        gain = f"{each.gain:.2f}" if np.isfinite(each.gain) else "–"
+        rows.append([each.name, gain, *map(_with_interval, values)])
+    texts = ["choices.table", *(["choices.strehl"] if _STREHL in known else [])]
+    return Table(["control", "gain", *known], rows, " ".join(_TEXT[name] for name in texts))
+
+
+@styled
+def _noise_figure(report: LoopReport) -> FigureWithData | None:
+    """Draw the noise of each sub-aperture along x and y."""
+    if report.noise_px is None or len(report.loop.cells) == 1:
+        return None
+    figure, cells = new_figure(WIDTH * 0.7, 4.0), report.loop.cells - report.loop.cells.min(axis=0)
+    axes = list(figure.subplots(1, 2))
+    halves = report.noise_px.reshape(2, -1)
+    for panel, values, name in zip(axes, halves, "xy", strict=True):
+        grid = np.full(cells.max(axis=0) + 1, np.nan)
+        grid[tuple(cells.T)] = values
+        shown = panel.imshow(grid, vmin=halves.min(), vmax=halves.max())
+        panel.set(title=f"noise of {name}", xlabel="column", ylabel="row")
+    colour_bar(axes, shown, report.loop.slope_unit)
+    rows = [(*cell, *pair) for cell, pair in zip(report.loop.cells, halves.T, strict=True)]
+    return _TEXT.figure("noise", figure, rows, ("row", "column", "noise x", "noise y"))
+
+
+@styled
+def _wind_figure(report: LoopReport) -> FigureWithData | None:
+    """Draw the wind of each layer, with errors."""
+    found = report.turbulence
+    if found is None or report.loop.subaperture_m is None or not found.is_layered:
+        return None
+    figure = new_figure(WIDTH * 0.5, 5.4)
+    axes = figure.subplots()
+    winds, errors = found.turbulence.wind_m_per_s, wind_errors(found)
+    share = found.turbulence.fraction
+    reach = 1.25 * float(np.hypot(*winds.T).max())
+    for radius in np.arange(5, reach, 5):
+        angle = np.linspace(0, 2 * np.pi, 181)
+        axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=GREY, lw=0.6, ls=":")
+    x, y = winds.T
+    axes.errorbar(x, y, 1.96 * errors[:, 1], 1.96 * errors[:, 0], fmt="none", color=GREY, capsize=2)
+    axes.scatter(x, y, 900 * share, color=METHOD_COLOURS[1], alpha=0.7)
+    for place, part in zip(winds, share, strict=True):
+        axes.annotate(f"{part:.0%}", place, textcoords="offset points", xytext=(12, 8))
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+    axes.set(xlabel="wind along x (m/s)", ylabel="wind along y (m/s)")
+    rows = [(*wind, *error, part) for wind, error, part in zip(winds, errors, share, strict=True)]
+    return _TEXT.figure("winds", figure, rows, ("x", "y", "error of x", "error of y", "share"))
+
+
+@styled
+def _spectra_figure(report: LoopReport) -> FigureWithData | None:
+    """Draw spectra of open-loop slopes and of the fitted model."""
+    spectra = report.spectra
+    if spectra is None:
+        return None
+    lines = (len(spectra.measured) + 1) // 2
+    figure = new_figure(WIDTH, 3.6 * lines)
+    rows = []
+    panels = figure.subplots(lines, 2).ravel()
+    for panel in panels[len(spectra.measured) :]:
+        panel.set_visible(False)
+    for panel, name in zip(panels, spectra.measured, strict=False):
+        measured, model = spectra.measured[name], spectra.model[name]
+        panel.loglog(spectra.frequency_hz, measured, color=GREY, lw=1, label="measured")
+        panel.loglog(spectra.frequency_hz, model, color=METHOD_COLOURS[0], lw=1.6, label="found")
+        spread = np.exp(1.96 / np.sqrt(0.55 * spectra.pieces))
+        panel.fill_between(
+            spectra.frequency_hz, model / spread, model * spread, color=METHOD_COLOURS[0], alpha=0.15, lw=0
+        )
+        panel.set(title=name, xlabel="frequency (Hz)", ylabel=f"slope² ({report.loop.slope_unit}²/Hz)")
+        rows += [(name, *each) for each in zip(spectra.frequency_hz, measured, model, strict=True)]
+        panel.legend(frameon=False)
+    return _TEXT.figure("spectra", figure, rows, ("slopes", "frequency", "measured", "found"))
+
+
+@styled
+def _gain_figure(report: LoopReport) -> FigureWithData | None:
+    """Draw the residual of integrators against gain, and those of the loop and the filter."""
+    curve = [each for each in report.choices if np.isfinite(each.gain) and each.name != BEST]
+    curve = [each for each in curve if np.isfinite(each.residual.value)]
+    if not curve:
+        return None
+    figure = new_figure(WIDTH * 0.7, 4.4)
+    axes = figure.subplots()
+    values = [(each.gain, each.residual.value, each.residual.error) for each in curve]
+    gain, residual, error = np.array(values).T
+    axes.errorbar(
+        gain, residual, 1.96 * error, fmt="o-", color=METHOD_COLOURS[1], capsize=3, label="integrator"
+    )
+    for name, colour in ((AS_RUN, "black"), (FILTER, METHOD_COLOURS[0])):
+        for each in (one for one in report.choices if one.name == name):
+            axes.axhline(each.residual.value, color=colour, label=name)
+            axes.axhspan(*each.residual.interval, color=colour, alpha=0.12, lw=0)
+    axes.set(xlabel="gain of an integrator", ylabel=f"residual ({curve[0].residual.unit})", ylim=(0, None))
+    axes.legend(frameon=False)
+    return _TEXT.figure("gains", figure, values, ("gain", "residual", "standard error"))

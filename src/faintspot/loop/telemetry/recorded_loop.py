@@ -1,0 +1,304 @@
+"""Recorded loop of any system: slopes, commands and geometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.checks import finite_array, number_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.base.npz import read_arrays
+from faintspot.base.toml_files import check_keys, parse_file
+from faintspot.io.arrays.zarr_store import holds_telemetry
+from faintspot.io.frames import read_array
+from faintspot.io.telemetry.recording import read_telemetry
+from faintspot.loop.control.configuration import load_control
+from faintspot.loop.simulation.configuration.configuration import ARCSEC
+from faintspot.loop.telemetry.recording import CLOSED
+from faintspot.slopes.sensor.pupil import side_m
+
+Floats = NDArray[np.float64]
+
+SCIENCE_WAVELENGTH_M = 1.65e-6
+UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
+"""Units of slopes, in arcsec."""
+_OF_AOT = {"pix": "px", "pixel": "px", "px": "px", "arcsec": "arcsec", "rad": "rad"}
+_ARRAYS = ("slopes", "commands", "interaction_matrix", "control_matrix", "cells", "time_s", "frame")
+_NUMBERS = (
+    "frame_rate_hz",
+    "pixel_scale_arcsec",
+    "subaperture_m",
+    "diameter_m",
+    "delay_frames",
+    "largest_command",
+    "outer_scale_m",
+    "science_wavelength_m",
+)
+_WORDS = ("slope_unit", "slope_order", "loop")
+_PAIRS, _AXES = "pairs", "axes"
+_TABLES = (".npz", ".npy", ".csv", ".txt")
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedLoop:
+    """Slopes and commands of a loop with n sub-apertures; None if unknown."""
+
+    name: str
+    slopes: Floats
+    """(frames, 2 n): residual slopes in `slope_unit`, all x, then all y; NaN where not measured."""
+    frame: NDArray[np.int64]
+    """(frames,): number of each frame; missing ones were lost."""
+    frame_rate_hz: float
+    slope_unit: str
+    cells: NDArray[np.int64]
+    """(n, 2): row and column of each sub-aperture."""
+    commands: Floats | None = None
+    """(frames, commands): computed from each frame."""
+    interaction: Floats | None = None
+    """(2 n, commands): slopes in `slope_unit` for a unit of each command."""
+    subaperture_m: float | None = None
+    pixel_scale_arcsec: float | None = None
+    """Angle of one `slope_unit`."""
+    delay_frames: float | None = None
+    largest_command: float | None = None
+    outer_scale_m: float | None = None
+    science_wavelength_m: float = SCIENCE_WAVELENGTH_M
+    is_closed: bool = True
+    remarks: tuple[str, ...] = ()
+    """Assumptions made."""
+
+    def __post_init__(self) -> None:
+        n, slopes = len(self.cells), self.slopes.shape
+        if slopes[1] != 2 * n:
+            raise InputError(f"slopes: expected {2 * n} columns for {n} sub-apertures, got {slopes[1]}")
+        if self.commands is None or self.interaction is None:
+            return
+        if len(self.commands) != slopes[0]:
+            raise InputError(
+                f"commands: expected {slopes[0]} frames, as of the slopes, got {len(self.commands)}"
+            )
+        if self.interaction.shape != (2 * n, self.commands.shape[1]):
+            expected = 2 * n, self.commands.shape[1]
+            raise InputError(f"interaction_matrix: expected shape {expected}, got {self.interaction.shape}")
+
+
+def read_recorded_loop(
+    path: str | Path, system: str | Path | None = None, configuration: str | Path | None = None
+) -> RecordedLoop:
+    """Read a recording of a loop.
+
+    Parameters
+    ----------
+    path : path
+        A store of `faintspot realtime record`, an AOT file, a TOML file that names arrays, or a NumPy or CSV
+        file with slopes.
+    system : path, optional
+        TOML with values that the recording lacks, or that replace its own.
+    configuration : path, optional
+        faintspot.toml with [control], for a store of `faintspot realtime record`.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be read, shapes do not fit together, or rate, unit or geometry are missing.
+    """
+    path, values = Path(path), {}
+    if not path.exists():
+        raise InputError(f"{path}: no such file or directory")
+    if path.suffix == ".toml":
+        values = _of_toml(path)
+    elif path.suffix in _TABLES:
+        values = _of_table(path)
+    elif path.is_dir() and holds_telemetry(path):
+        values = _of_store(path, configuration)
+    else:
+        values = _of_aot(path)
+    if system is not None:
+        values |= _of_toml(Path(system))
+    try:
+        return _loop(path.name, values)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _of_toml(path: Path) -> dict[str, Any]:
+    """Return the values of a TOML file, with the arrays that it names."""
+    values = parse_file(path)
+    check_keys(f"{path}: ", values, [*_ARRAYS, *_NUMBERS, *_WORDS])
+    for name in _ARRAYS:
+        if name in values and isinstance(values[name], str):
+            values[name] = _array(str(path.parent / values[name]))
+    return values
+
+
+def _array(location: str) -> NDArray[Any]:
+    if not location.endswith((".csv", ".txt")):
+        return read_array(location)
+    try:
+        table = np.genfromtxt(location, delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{location}: expected rows of numbers with commas ({error})") from None
+    return table[1:] if np.isnan(table[0]).all() else table  # a line of names
+
+
+def _of_table(path: Path) -> dict[str, Any]:
+    if path.suffix != ".npz":
+        return {"slopes": _array(str(path))}
+    stored = read_arrays(path, "slopes of a loop")
+    check_keys(f"{path}: ", stored, [*_ARRAYS, *_NUMBERS, *_WORDS])
+    return {name: each.item() if each.ndim == 0 else each for name, each in stored.items()}
+
+
+def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
+    """Return the values of a recording of our own engine."""
+    recording = read_telemetry(path, images=False)
+    layout = recording.attributes["layout"]
+    closed = np.asarray(recording.loop) == CLOSED
+    rows = closed if closed.any() else np.ones(len(recording.frame), np.bool_)
+    slopes = recording.slopes[rows].astype(np.float64)
+    slopes[~np.tile(recording.valid[rows], 2)] = np.nan
+    values: dict[str, Any] = {
+        "slopes": slopes,
+        "slope_unit": "px",
+        "frame": recording.frame[rows],
+        "time_s": recording.last_row_time_ns[rows] / 1e9,
+        "cells": np.asarray(layout["cells"]),
+        "loop": "closed" if closed.any() else "open",
+    }
+    for name in ("pixel_scale_arcsec", "subaperture_m", "diameter_m"):
+        if layout.get(name) is not None:
+            values[name] = layout[name]
+    control = None if configuration is None else load_control(configuration)
+    if recording.commands.shape[1]:
+        values["commands"] = recording.commands[rows]
+    if control is not None:
+        values["interaction_matrix"] = control.interaction
+        values["delay_frames"] = control.options.delay_frames
+        if control.options.largest_command is not None:
+            values["largest_command"] = control.options.largest_command
+    return values
+
+
+def _of_aot(path: Path) -> dict[str, Any]:
+    from faintspot.io.telemetry.aot_reading import read_aot
+
+    sensor = read_aot(path)
+    loop = sensor.loop
+    if sensor.slopes is None:
+        raise InputError(f"{path}: expected slopes (measurements of the sensor), found none")
+    values: dict[str, Any] = {
+        "slopes": sensor.slopes.reshape(len(sensor.slopes), -1),
+        "loop": "closed" if loop is None or loop.is_closed else "open",
+    }
+    if sensor.unit.lower() in _OF_AOT:
+        values["slope_unit"] = _OF_AOT[sensor.unit.lower()]
+    optional: dict[str, Any] = {
+        "frame": sensor.frame,
+        "time_s": sensor.unix_time_s,
+        "cells": sensor.cells,
+        "interaction_matrix": sensor.interaction,
+        "diameter_m": sensor.diameter_m,
+        "pixel_scale_arcsec": sensor.pixel_scale_arcsec,
+    }
+    if loop is not None:
+        names = ("commands", "control_matrix", "frame_rate_hz", "delay_frames")
+        optional |= {name: getattr(loop, name) for name in names}
+    return values | {name: value for name, value in optional.items() if value is not None and np.size(value)}
+
+
+def _loop(name: str, values: dict[str, Any]) -> RecordedLoop:
+    """Return the loop of values from files, checked."""
+    if "slopes" not in values:
+        raise InputError("slopes: expected an array, found none")
+    slopes, remarks = np.asarray(values["slopes"], np.float64), []
+    if slopes.ndim == 3:  # (frames, n, 2) or (frames, 2, n)
+        slopes = (slopes if slopes.shape[1] == 2 else slopes.swapaxes(1, 2)).reshape(len(slopes), -1)
+    if slopes.ndim != 2 or slopes.shape[1] % 2:
+        raise InputError(f"slopes: expected shape (frames, 2 n), got {slopes.shape}")
+    if one_of("slope_order", values.get("slope_order", _AXES), (_AXES, _PAIRS)) == _PAIRS:
+        slopes = np.hstack([slopes[:, ::2], slopes[:, 1::2]])
+    numbers = {key: number_between(key, values[key], 0, low_open=True) for key in _NUMBERS if key in values}
+    if "slope_unit" not in values:
+        raise InputError(f"slope_unit: unknown; give it in a TOML file with --system ({', '.join(UNITS)})")
+    unit = one_of("slope_unit", values["slope_unit"], list(UNITS))
+    scale = UNITS[unit] or numbers.get("pixel_scale_arcsec")
+    cells = _cells(values.get("cells"), slopes.shape[1] // 2)
+    frame, rate = _timing(values, len(slopes), numbers.get("frame_rate_hz"))
+    commands, interaction = values.get("commands"), values.get("interaction_matrix")
+    if commands is not None:
+        commands = finite_array("commands", commands).astype(np.float64).reshape(len(commands), -1)
+    if interaction is None and values.get("control_matrix") is not None:
+        control = finite_array("control_matrix", values["control_matrix"]).astype(np.float64)
+        interaction = np.linalg.pinv(control.reshape(len(control), -1), rcond=0.03)
+        remarks.append("interaction matrix: pseudo-inverse of the control matrix")
+    if interaction is not None:
+        interaction = finite_array("interaction_matrix", interaction).astype(np.float64)
+    loop = RecordedLoop(
+        name,
+        slopes,
+        frame,
+        rate,
+        unit,
+        cells,
+        commands,
+        interaction,
+        side_m(cells, numbers.get("subaperture_m"), numbers.get("diameter_m")),
+        scale,
+        numbers.get("delay_frames"),
+        numbers.get("largest_command"),
+        numbers.get("outer_scale_m"),
+        numbers.get("science_wavelength_m", SCIENCE_WAVELENGTH_M),
+        one_of("loop", values.get("loop", "closed"), ("closed", "open")) == "closed",
+    )
+    return _with_sign(replace(loop, remarks=tuple(remarks)))
+
+
+def _cells(given: Any, n: int) -> NDArray[np.int64]:
+    """Return row and column of n sub-apertures, from a list, a mask, or a full square."""
+    if given is None:
+        side = round(n**0.5)
+        if side * side != n:
+            raise InputError(
+                f"cells: expected row and column of the {n} sub-apertures; give them with --system"
+            )
+        return np.argwhere(np.ones((side, side)))
+    cells = finite_array("cells", given)
+    if cells.shape == (n, 2):
+        return cells.astype(np.int64)
+    if cells.ndim == 2 and np.count_nonzero(cells > 0) == n:  # a mask
+        return np.argwhere(cells > 0)
+    raise InputError(f"cells: expected shape ({n}, 2), or a mask with {n} sub-apertures, got {cells.shape}")
+
+
+def _timing(values: dict[str, Any], frames: int, rate: float | None) -> tuple[NDArray[np.int64], float]:
+    """Return frame numbers and the frame rate."""
+    time = values.get("time_s")
+    if time is not None:
+        time = finite_array("time_s", time).astype(np.float64)
+        if len(time) != frames or (np.diff(time) <= 0).any():
+            raise InputError(f"time_s: expected {frames} increasing times, got {len(time)}")
+        rate = rate or float(1 / np.median(np.diff(time))) if frames > 1 else rate
+    if rate is None:
+        raise InputError("frame_rate_hz: unknown; give it in a TOML file with --system")
+    frame = values.get("frame")
+    if frame is None:
+        frame = np.arange(frames) if time is None else np.rint((time - time[0]) * rate)
+    frame = np.asarray(frame).astype(np.int64)
+    if len(frame) != frames or (np.diff(frame) <= 0).any():
+        raise InputError(f"frame: expected {frames} increasing numbers, got {len(frame)}")
+    return frame, rate
+
+
+def _with_sign(loop: RecordedLoop) -> RecordedLoop:
+    """Return a loop with the sign of commands such that they add to the slopes."""
+    if loop.commands is None or loop.interaction is None or not loop.is_closed:
+        return loop
+    change = np.diff(loop.commands, axis=0) @ loop.interaction.T
+    if np.nansum(change * loop.slopes[1:]) <= 0:
+        return loop
+    remark = "commands: sign reversed, as they are subtracted from the turbulence"
+    return replace(loop, commands=-loop.commands, remarks=(*loop.remarks, remark))

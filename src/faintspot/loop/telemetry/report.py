@@ -1,0 +1,324 @@
+"""Report of a recorded loop: noise, turbulence, vibrations and control, each with its error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.layers import Identification, Identified
+from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay, loop_delay
+from faintspot.loop.simulation.configuration.configuration import ARCSEC
+from faintspot.loop.telemetry.choices import Choice, compared_choices
+from faintspot.loop.telemetry.measured import Measured, outer_scale_and_r0
+from faintspot.loop.telemetry.open_loop import OpenLoop, open_loop_of, runs_of, site_of_loop
+from faintspot.loop.telemetry.recorded_loop import RecordedLoop
+from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
+from faintspot.loop.telemetry.spectra import ModalSpectra, modal_spectra
+from faintspot.loop.turbulence.strength import turbulence_strength
+from faintspot.slopes.sensor.pupil import subapertures_across
+
+Floats = NDArray[np.float64]
+
+_WHOLE_FRAMES = 0.1  # closer to a whole number of frames than this, a delay is taken for that
+_TIMES_AT_LIMIT = 3  # that a largest value occurs, to be taken for a limit
+_DRAWS = 1000
+_GAIN_SPREAD = 0.5  # of the deviation of the centroid gain from 1: it differs between spatial scales
+_MOST_UNMEASURED = 0.2  # of the slopes; large ones are missed most, so that the others vary too little
+_WIND_ERROR = 0.35  # sub-apertures per second: measured slopes are not quite mean gradients in squares
+_PARABOLA_ERROR = 0.03  # of the noise: turbulence and speckles within two frames are no parabola
+
+
+@dataclass
+class Part:
+    """A part of a report."""
+
+    title: str
+    known: list[Measured] = field(default_factory=list)
+    missing: str = ""
+    """Reason for missing values."""
+
+
+@dataclass
+class LoopReport:
+    """Report of a recorded loop."""
+
+    loop: RecordedLoop
+    parts: dict[str, Part]
+    noise_px: Floats | None = None
+    """(2 n,): standard deviation of each slope's noise, in the unit of the slopes."""
+    noise_error_px: Floats | None = None
+    turbulence: Identified | None = None
+    spectra: ModalSpectra | None = None
+    choices: list[Choice] = field(default_factory=list)
+
+    def as_values(self) -> dict[str, Any]:
+        """Return the report as plain values, for JSON; null is not known."""
+        values: dict[str, Any] = {
+            name: {
+                "title": part.title,
+                "known": [each.as_values() for each in part.known],
+                "missing": part.missing,
+            }
+            for name, part in self.parts.items()
+        }
+        if self.noise_px is not None and self.noise_error_px is not None:
+            values["noise"]["of_slopes"] = _plain(self.noise_px)
+            values["noise"]["of_slopes_error"] = _plain(self.noise_error_px)
+        values["choices"]["compared"] = [each.as_values() for each in self.choices]
+        return {"recording": self.loop.name, "slope_unit": self.loop.slope_unit, **values}
+
+
+def report_of_loop(loop: RecordedLoop, progress: Callable[[str], None] = lambda _: None) -> LoopReport:
+    """Analyse a recorded loop.
+
+    Parameters
+    ----------
+    loop : RecordedLoop
+    progress : callable
+        Called with the name of each step.
+
+    Raises
+    ------
+    InputError
+        When the slopes do not vary.
+    """
+    slopes = loop.slopes[np.isfinite(loop.slopes)]
+    if not slopes.size or slopes.std() <= 1e-12 * max(1.0, float(np.abs(slopes).max())):
+        raise InputError(f"{loop.name}: expected slopes that vary, got constant ones")
+    titles = {
+        "frames": "Frames",
+        "loop": "Loop",
+        "noise": "Noise",
+        "turbulence": "Turbulence",
+        "vibrations": "Vibrations",
+        "spectra": "Spectra",
+        "choices": "Other choices of control",
+    }
+    report = LoopReport(loop, {name: Part(title) for name, title in titles.items()})
+    _frames(report)
+    progress("delay")
+    delay = _loop(report)
+    progress("noise")
+    seen = _noise(report, delay)
+    if seen is not None:
+        progress("turbulence")
+        _turbulence(report, seen, delay)
+        progress("other choices")
+        _choices(report, seen, delay)
+    return report
+
+
+def _frames(report: LoopReport) -> None:
+    loop, part = report.loop, report.parts["frames"]
+    lost = np.diff(loop.frame) - 1
+    span = (loop.frame[-1] - loop.frame[0] + 1) / loop.frame_rate_hz
+    part.known = [
+        Measured("frames", "", len(loop.frame), 0.0),
+        Measured("duration", "s", float(span), 0.0),
+        Measured("lost frames", "", float(lost.sum()), 0.0, f"in {np.count_nonzero(lost)} gaps"),
+        Measured("longest gap", "frames", float(lost.max(initial=0)), 0.0),
+        Measured("slopes not measured", "", float(np.isnan(loop.slopes).mean()), 0.0, "share"),
+    ]
+    part.missing = "; ".join(loop.remarks)
+
+
+def _loop(report: LoopReport) -> LoopDelay:
+    """Return delay and gain; without commands those of an open loop."""
+    loop, part = report.loop, report.parts["loop"]
+    part.known.append(_saturated(loop))
+    is_still = loop.commands is None or not np.ptp(loop.commands, axis=0).any()
+    if not loop.is_closed or (is_still and loop.commands is not None):
+        part.missing = "The loop was open: it has no delay and no gain to measure."
+        return LoopDelay(1.0, 0.0, 1.0, 0.0)
+    if loop.commands is None or loop.interaction is None:
+        absent = "commands" if loop.commands is None else "an interaction or control matrix"
+        why = f"The recording has no {absent}: its open-loop slopes are unknown."
+        for name in ("loop", "turbulence", "vibrations", "spectra", "choices"):
+            report.parts[name].missing = why
+        return LoopDelay(1.0, 0.0, 1.0, 0.0)
+    known, found = _delay(loop)
+    part.known = [*known, *part.known]
+    return found
+
+
+def _delay(loop: RecordedLoop) -> tuple[list[Measured], LoopDelay]:
+    """Return delay and gain as reported and as used, the latter rounded to whole frames if consistent."""
+    assert loop.commands is not None
+    assert loop.interaction is not None
+    names, given = (("delay", "frames"), ("centroid gain", "")), loop.delay_frames
+    slopes, held = np.nan_to_num(loop.slopes), loop.commands @ loop.interaction.T
+    known = runs_of(loop.frame), site_of_loop(loop), loop.frame_rate_hz
+    try:
+        found = loop_delay(slopes, held, *known, given)
+        nearest = float(round(found.delay_frames))
+        remark, used = "given" if given is not None else "", found
+        if given is None and abs(found.delay_frames - nearest) < max(_WHOLE_FRAMES, 2 * found.delay_error):
+            remark, used = f"{nearest:g} is used", loop_delay(slopes, held, *known, nearest)
+    except InputError as error:
+        used = LoopDelay(given or 2.0, math.nan, 1.0, math.nan)
+        remarks = f"{error}; {used.delay_frames:g} is used", f"{error}; 1 is used"
+        return [Measured(*name, remark=text) for name, text in zip(names, remarks, strict=True)], used
+    gain = Measured(*names[1], used.gain, used.gain_error, f"for a delay of {used.delay_frames:.3g} frames")
+    return [Measured(*names[0], found.delay_frames, found.delay_error, remark), gain], used
+
+
+def _saturated(loop: RecordedLoop) -> Measured:
+    """Return how many actuators reached a limit, given or seen as a largest value that occurs repeatedly."""
+    name, unit = "actuators that reached a limit", ""
+    if loop.commands is None:
+        return Measured(name, unit, remark="no commands")
+    commands = loop.commands
+    if loop.largest_command is not None:
+        at_limit = np.abs(commands) >= loop.largest_command * (1 - 1e-6)
+        remark = f"largest command {loop.largest_command:g}"
+    else:
+        low, high = commands.min(axis=0), commands.max(axis=0)
+        at_limit = ((commands == high) | (commands == low)) & (high > low)
+        at_limit &= at_limit.sum(axis=0) >= 2 * _TIMES_AT_LIMIT
+        remark = "largest values that occur repeatedly count as limits"
+    number = int(at_limit.any(axis=0).sum())
+    most = f"; the worst in {at_limit.mean(axis=0).max():.1%} of the frames" if number else ""
+    return Measured(name, unit, float(number), 0.0, f"of {commands.shape[1]}; {remark}{most}")
+
+
+def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
+    """Return the open-loop slopes; None if they are unknown."""
+    loop, part = report.loop, report.parts["noise"]
+    try:
+        found = open_loop_of(loop, delay)
+    except InputError as error:
+        for name in ("noise", "turbulence", "vibrations", "spectra", "choices"):
+            report.parts[name].missing = report.parts[name].missing or f"{error}."
+        return None
+    report.noise_px = delay.gain * np.sqrt(found.variance)
+    report.noise_error_px = 0.5 * report.noise_px * found.variance_error
+    rms = float(np.sqrt(np.square(report.noise_px).mean()))
+    spread = 0.5 * rms * float(found.variance_error.mean()) / math.sqrt(len(found.variance))
+    spread = math.hypot(spread, _PARABOLA_ERROR * rms)
+    over = "rms over the sub-apertures"
+    part.known.append(Measured("noise of a slope", loop.slope_unit, rms, spread, over))
+    scale = loop.pixel_scale_arcsec
+    if scale is None or loop.subaperture_m is None:
+        part.missing = "Not in nm: pixel_scale_arcsec and subaperture_m are not known."
+    else:
+        to_nm = scale * ARCSEC * loop.subaperture_m * 1e9
+        part.known.append(Measured("tilt over a sub-aperture", "nm", rms * to_nm, spread * to_nm, over))
+    unmeasured = 1 - float(found.telemetry.trust[found.telemetry.trust.any(axis=1)].mean())
+    if unmeasured > _MOST_UNMEASURED:
+        why = f"{unmeasured:.0%} of the slopes were not measured, more than {_MOST_UNMEASURED:.0%}."
+        for name in ("turbulence", "vibrations", "spectra", "choices"):
+            report.parts[name].missing = report.parts[name].missing or why
+    return None if report.parts["turbulence"].missing else found
+
+
+def _turbulence(report: LoopReport, seen: OpenLoop, delay: LoopDelay) -> None:
+    loop = report.loop
+    part, site = report.parts["turbulence"], site_of_loop(loop)
+    try:
+        identified = Identification(seen.telemetry, site, loop.frame_rate_hz).layers()
+    except InputError as error:
+        part.missing = report.parts["vibrations"].missing = report.parts["spectra"].missing = str(error)
+        return
+    report.turbulence = identified
+    report.spectra = modal_spectra(seen.telemetry, identified)
+    _vibrations(report, identified)
+    if len(loop.cells) < FEWEST_SUBAPERTURES:
+        part.missing = f"Fewer than {FEWEST_SUBAPERTURES} sub-apertures show neither winds nor r0."
+        return
+    report.parts["noise"].known += recorded_discrepancy(loop, seen, identified)
+    if loop.subaperture_m is None:
+        part.missing = "Without subaperture_m (or diameter_m) neither r0 nor winds are known."
+        return
+    r0 = Measured("r0 at 500 nm", "m", remark="pixel_scale_arcsec is unknown")
+    if loop.pixel_scale_arcsec is not None:
+        rows = seen.telemetry.trust.any(axis=1)
+        slopes = seen.telemetry.open_loop_px[rows], seen.residual[rows], seen.run[rows]
+        # A matrix of mean gradients makes of what the mirror corrects mean gradients, too.
+        averaged = 0.5 * (1 + identified.turbulence.averaged)
+        found = turbulence_strength(
+            *slopes,
+            replace(site, averaged=averaged),
+            gain_error=delay.gain_error / delay.gain,
+            gain_spread=_GAIN_SPREAD * abs(1 - delay.gain),
+            outer_scale_m=loop.outer_scale_m,
+        )
+        part.known += outer_scale_and_r0(found, loop.outer_scale_m)
+        r0 = part.known[-1]
+    else:
+        part.known.append(r0)
+    part.known += _winds(identified, r0)
+
+
+def _winds(identified: Identified, r0: Measured) -> list[Measured]:
+    """Return coherence time, mean wind speed, and each layer's speed, direction and share."""
+    turbulence = identified.turbulence
+    winds, share = turbulence.wind_m_per_s, turbulence.fraction
+    errors = wind_errors(identified)
+    rng = np.random.default_rng(1)
+    drawn = winds + errors * rng.standard_normal((_DRAWS, *winds.shape))
+    weight = np.maximum(share + identified.fraction_error * rng.standard_normal((_DRAWS, len(share))), 1e-6)
+    speeds = np.hypot(drawn[..., 0], drawn[..., 1])
+    mean = ((weight * speeds ** (5 / 3)).sum(axis=1) / weight.sum(axis=1)) ** 0.6
+    speed = float((share @ np.hypot(*winds.T) ** (5 / 3)) ** 0.6)
+    known = [Measured("wind speed, mean for the coherence time", "m/s", speed, float(mean.std()))]
+    if math.isfinite(r0.value):
+        time_ms = 314 * r0.value / speed
+        error = time_ms * math.hypot(r0.error / r0.value, float(mean.std()) / speed)
+        known.append(Measured("coherence time at 500 nm", "ms", time_ms, error))
+    for rank, number in enumerate(np.argsort(-share), 1):
+        x, y = winds[number]
+        speed = math.hypot(x, y)
+        along = float(np.hypot(*(errors[number] * winds[number]))) / max(speed, 1e-9)
+        across = float(np.hypot(*(errors[number] * winds[number][::-1]))) / max(speed, 1e-9)
+        degrees = math.degrees(across / max(speed, 1e-9))
+        name = f"layer {rank}"
+        direction = math.degrees(math.atan2(y, x)) % 360
+        known += [
+            Measured(f"{name}: speed", "m/s", speed, along),
+            Measured(f"{name}: direction", "degrees", direction, degrees, "towards, from +x to +y"),
+            Measured(f"{name}: share", "", float(share[number]), float(identified.fraction_error[number])),
+        ]
+    return known
+
+
+def wind_errors(identified: Identified) -> Floats:
+    """Return standard errors (layers, 2) of winds, m/s, with those of the model."""
+    return np.hypot(identified.wind_error_m_per_s, _WIND_ERROR * identified.turbulence.subaperture_m)
+
+
+def _vibrations(report: LoopReport, identified: Identified) -> None:
+    loop, part = report.loop, report.parts["vibrations"]
+    diameter_m = subapertures_across(loop.cells) * (loop.subaperture_m or math.nan)
+    to_nm = math.sqrt(2) * (loop.pixel_scale_arcsec or math.nan) * ARCSEC * diameter_m / 4 * 1e9
+    for each in identified.vibrations:
+        rms = each.rms_px, each.rms_error_px
+        shown = Measured(f"rms of {each.mode}", loop.slope_unit, *rms, "over all slopes")
+        if each.mode != "focus" and math.isfinite(to_nm):
+            shown = Measured(shown.name, "nm", to_nm * rms[0], to_nm * rms[1])
+        frequency = each.frequency_hz, each.frequency_error_hz
+        part.known += [Measured(f"frequency of {each.mode}", "Hz", *frequency), shown]
+    if not part.known:
+        part.missing = "No narrow line stands out of the spectra of tip, tilt and focus."
+
+
+def _choices(report: LoopReport, seen: OpenLoop, delay: LoopDelay) -> None:
+    loop, part = report.loop, report.parts["choices"]
+    if loop.interaction is None:
+        part.missing = "The recording has no interaction or control matrix: no mirror can be replayed."
+        return
+    turbulence = report.parts["turbulence"].known
+    r0 = next((each for each in turbulence if each.name.startswith("r0")), Measured("r0", "m"))
+    try:
+        report.choices = compared_choices(loop, seen, delay, site_of_loop(loop), r0, report.turbulence)
+    except InputError as error:
+        part.missing = str(error)
+
+
+def _plain(values: Floats) -> list[float]:
+    return [float(f"{value:.4g}") for value in values]

@@ -1,0 +1,216 @@
+"""Covariances of slopes in von Karman turbulence carried over the telescope by the wind.
+
+The mean gradient over a square is a difference of the phase along two of its edges, so that all covariances
+are sums of the phase structure function D over pairs of edges: cov = 1/2 sum of signs times D. No spectrum
+is sampled, and nothing is periodic. Layers are frozen and independent: after a time t, a layer is shifted
+by the wind and otherwise unchanged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M, structure_function
+
+Floats = NDArray[np.float64]
+
+_SMALLEST, _LARGEST, _NODES = 1e-6, 1e3, 2000  # separations of the table in outer scales
+_DIRECTIONS = 8
+_POINTS = 6  # of the quadrature along half an edge
+
+
+@dataclass(frozen=True, eq=False)
+class SlopeTurbulence:
+    """Turbulence and geometry that determine the slopes of a Shack-Hartmann sensor.
+
+    Parameters
+    ----------
+    positions_m : (n, 2) array
+        x (along columns) and y (along rows) of the sub-aperture centres.
+    subaperture_m : float
+        Side of a sub-aperture.
+    pixel_scale_rad : float
+        Angle on the sky per pixel.
+    r0_m : float
+        Fried parameter at 500 nm.
+    outer_scale_m : float
+        Outer scale L0; infinite for the Kolmogorov spectrum.
+    fraction : (layers,) array
+        Strength of each layer; only ratios matter.
+    wind_m_per_s : (layers, 2) array
+        Velocity of each layer along x and y.
+    averaged : float
+        Side of the square in which a slope is the mean gradient, in sub-apertures. 1: centres of gravity of
+        all flux. Near the diffraction limit windows see the least-squares tilt, which varies as the mean
+        gradient in a smaller square does.
+    """
+
+    positions_m: Floats
+    subaperture_m: float
+    pixel_scale_rad: float
+    r0_m: float
+    outer_scale_m: float
+    fraction: Floats
+    wind_m_per_s: Floats
+    averaged: float = 1.0
+
+    def covariance_px2(self, later_s: float = 0.0) -> Floats:
+        """Return E[slopes at t + later_s, slopes at t], (2 n, 2 n) px^2: all x, then all y."""
+        return np.asarray(self._covariances_px2((later_s,))[0])
+
+    def lagged_px2(self, frame_s: float) -> Floats:
+        """Return `covariance_px2` for delays of 0, 1 and 2 frames, (3, 2 n, 2 n)."""
+        return self._covariances_px2((0.0, frame_s, 2 * frame_s))
+
+    def _covariances_px2(self, later_s: Sequence[float]) -> Floats:
+        """Return `covariance_px2` for each delay, (delays, 2 n, 2 n); equal shifts of layers count once."""
+        part = np.asarray(self.fraction, np.float64) / np.sum(self.fraction)
+        (apart_m, which), wind = self._separations, np.asarray(self.wind_m_per_s, np.float64)
+        shifts_m = np.asarray(later_s)[:, None, None] * wind
+        distinct_m, of_layer = np.unique(shifts_m.reshape(-1, 2), axis=0, return_inverse=True)
+        along, across = (apart_m - distinct_m[:, None]).transpose(2, 0, 1)
+        side_m = self.averaged * self.subaperture_m
+        found = gradient_covariances(along, across, side_m, self.outer_scale_m)
+        found *= self.r0_m ** (-5 / 3) * self.px2_per_rad2_per_m2
+        blocks = [
+            np.tensordot(part, found[:, each], axes=([0], [1]))[:, which]
+            for each in of_layer.reshape(shifts_m.shape[:2])
+        ]
+        return np.array([np.block([[xx, xy], [xy, yy]]) for xx, xy, yy in blocks])
+
+    @cached_property
+    def _separations(self) -> tuple[Floats, NDArray[np.int64]]:
+        """Distinct separations of sub-apertures (distinct, 2) m, and which of them each pair has, (n, n)."""
+        apart = (self.positions_m[:, None] - self.positions_m).reshape(-1, 2)
+        distinct, which = np.unique(np.round(apart, 9), axis=0, return_inverse=True)
+        return distinct, which.reshape(len(self.positions_m), -1)
+
+    @property
+    def px2_per_rad2_per_m2(self) -> float:
+        """Squared slope [px] for a gradient of 1 rad/m at 500 nm."""
+        return (R0_WAVELENGTH_M / (2 * math.pi) / self.pixel_scale_rad) ** 2
+
+    def turned(self, factor: float, degrees: float) -> Self:
+        """Return the same turbulence with all winds multiplied by a factor and rotated by an angle."""
+        angle = math.radians(degrees)
+        turn = factor * np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        return replace(self, wind_m_per_s=np.asarray(self.wind_m_per_s) @ turn.T)
+
+    def layers(self) -> list[Self]:
+        """Return each layer separately, with its own strength."""
+        part = np.asarray(self.fraction, np.float64) / np.sum(self.fraction)
+        return [
+            replace(
+                self,
+                r0_m=self.r0_m * strength ** (-3 / 5),
+                fraction=np.ones(1),
+                wind_m_per_s=np.asarray(self.wind_m_per_s)[[number]],
+            )
+            for number, strength in enumerate(part)
+            if strength > 0
+        ]
+
+    def from_anywhere(self) -> Self:
+        """Return the same turbulence with winds of the same speeds, averaged over all directions."""
+        angles = 2 * math.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+        around = np.column_stack([np.cos(angles), np.sin(angles)])
+        speeds = np.hypot(*np.asarray(self.wind_m_per_s).T)
+        winds = (speeds[:, None, None] * around).reshape(-1, 2)
+        return replace(self, fraction=np.repeat(self.fraction, _DIRECTIONS), wind_m_per_s=winds)
+
+
+def gradient_covariances(along: Floats, across: Floats, side_m: float, outer_scale_m: float) -> Floats:
+    """Return covariances of mean gradients over squares, (3, ...) rad^2 m^-2 for r0 = 1 m: xx, xy, yy.
+
+    Parameters
+    ----------
+    along, across : array
+        Separations along x and y, m.
+    side_m : float
+        Side of the squares.
+    outer_scale_m : float
+    """
+    structure = _structure(outer_scale_m)
+    return np.array(
+        [
+            _same_axis(along, across, side_m, structure),
+            _both_axes(along, across, side_m, structure),
+            _same_axis(across, along, side_m, structure),
+        ]
+    )
+
+
+def phase_covariance_rad2(positions_m: Floats, r0_m: float, outer_scale_m: float) -> Floats:
+    """Return the covariance of the phase at 500 nm between points, (n, n) rad^2, without an infinite piston.
+
+    Parameters
+    ----------
+    positions_m : (n, 2) array
+        x and y of points in the pupil.
+    r0_m : float
+        Fried parameter at 500 nm.
+    outer_scale_m : float
+        Outer scale of the von Karman spectrum; finite.
+    """
+    structure = _structure(outer_scale_m)
+    x, y = (line[:, None] - line for line in positions_m.T)
+    far = structure(np.array([(1e3 * outer_scale_m) ** 2]))
+    return np.asarray(0.5 * r0_m ** (-5 / 3) * (far - structure(x * x + y * y)))
+
+
+class _Structure:
+    """Phase structure function [rad^2] of the squared separation, for r0 = 1 m."""
+
+    def __init__(self, outer_scale_m: float) -> None:
+        self._scale = outer_scale_m
+        if math.isfinite(outer_scale_m):
+            line = np.geomspace(_SMALLEST, _LARGEST, _NODES)
+            self._table = CubicSpline(np.log(line), np.log(structure_function(line, 1.0)))
+
+    def __call__(self, square_m2: Floats) -> Floats:
+        square = np.maximum(square_m2, 1e-20)
+        if not math.isfinite(self._scale):
+            return structure_function(np.sqrt(square), math.inf)
+        separation = np.clip(0.5 * np.log(square / self._scale**2), math.log(_SMALLEST), math.log(_LARGEST))
+        return np.asarray(np.exp(self._table(separation)) * self._scale ** (5 / 3))
+
+
+@lru_cache(maxsize=4)
+def _structure(outer_scale_m: float) -> _Structure:
+    return _Structure(float(outer_scale_m))
+
+
+def _same_axis(along: Floats, across: Floats, side: float, structure: _Structure) -> Floats:
+    """Return the covariance of gradients along the same axis, from parallel edges."""
+    nodes, weights = np.polynomial.legendre.leggauss(2 * _POINTS)
+    total = np.zeros(along.shape)
+    for half in (-0.5, 0.5):  # the density of differences between points of two edges is a triangle
+        place = half * side * (1 + nodes * np.sign(half))
+        weight = 0.5 * weights * (1 - np.abs(place) / side)
+        for node, part in zip(place, weight, strict=True):
+            square = (across + node) ** 2
+            apart = structure((along + side) ** 2 + square) + structure((along - side) ** 2 + square)
+            total += part * (0.5 * apart - structure(along**2 + square))
+    return total / side**2
+
+
+def _both_axes(along: Floats, across: Floats, side: float, structure: _Structure) -> Floats:
+    """Return the covariance of gradients along x and y at the separation `along`, `across`."""
+    nodes, weights = np.polynomial.legendre.leggauss(_POINTS)
+    total = np.zeros(along.shape)
+    for on_x, weight_x in zip(0.5 * side * nodes, 0.5 * weights, strict=True):
+        for on_y, weight_y in zip(0.5 * side * nodes, 0.5 * weights, strict=True):
+            for edge_x in (-1, 1):
+                for edge_y in (-1, 1):
+                    square = (along + on_x - edge_x * side / 2) ** 2
+                    square = square + (across + edge_y * side / 2 - on_y) ** 2
+                    total -= 0.5 * edge_x * edge_y * weight_x * weight_y * structure(square)
+    return total / side**2

@@ -1,0 +1,172 @@
+"""Strength and outer scale of the turbulence from open-loop slopes, with their errors.
+
+The variance of the slopes is split by the degree of polynomials over the pupil. Low degrees depend on the
+outer scale, high ones on the centroid gain and on the averaging within a sub-aperture. The estimate weighs
+each degree by its errors. Tip and tilt, which vibrations change, are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+
+Floats = NDArray[np.float64]
+
+OUTER_SCALE_M, OUTER_SCALE_SPREAD = 25.0, 0.7
+"""Outer scale expected before telemetry, and the standard deviation of its logarithm."""
+
+_SCALES_M = np.geomspace(4.0, 250.0, 13)
+_FINE_SCALES_M = np.geomspace(4.0, 250.0, 61)
+_MOST_SUBAPERTURES = 150
+_LONGEST_LAG = 4000  # frames
+_GAIN_STEP = 0.05
+_COMMON_ERROR = 0.03  # of r0: centroids of speckled, partly illuminated spots are not quite mean gradients
+_ERROR_OF_DEGREE = 0.01  # of r0, for each degree: averaging within a sub-aperture
+_TO_R0 = 3 / 5
+
+
+@dataclass(frozen=True)
+class Strength:
+    """Fried parameter and outer scale with standard errors."""
+
+    r0_m: float
+    """At 500 nm; NaN if the slopes vary no more than their noise."""
+    r0_error_m: float
+    outer_scale_m: float
+    outer_scale_error_m: float
+
+
+def turbulence_strength(
+    atmosphere_px: Floats,
+    residual_px: Floats,
+    run: NDArray[np.int64],
+    site: SlopeTurbulence,
+    *,
+    gain_error: float = 0.0,
+    gain_spread: float = 0.0,
+    outer_scale_m: float | None = None,
+) -> Strength:
+    """Return r0 and the outer scale.
+
+    Parameters
+    ----------
+    atmosphere_px, residual_px : (frames, 2 n) array
+        Open-loop slopes, and residual slopes divided by the centroid gain. White noise is removed by
+        extrapolating covariances of one and two frames to zero.
+    run : (frames,) array of int
+        Frames with the same number are consecutive.
+    site : SlopeTurbulence
+        Geometry; its strength, outer scale and winds are not used.
+    gain_error : float
+        Relative standard error of the centroid gain.
+    gain_spread : float
+        Relative standard deviation between centroid gains of different spatial scales.
+    outer_scale_m : float, optional
+        Outer scale, where it is known; else 25 m within a factor of two are expected.
+    """
+    n = len(site.positions_m)
+    kept = np.arange(n)[:: math.ceil(n / _MOST_SUBAPERTURES)]
+    both = np.concatenate([kept, kept + n])
+    site = replace(site, positions_m=site.positions_m[kept], r0_m=1.0)
+    atmosphere, residual = (
+        each[:, both] - each[:, both].mean(axis=0) for each in (atmosphere_px, residual_px)
+    )
+    degrees = [degree for degree in _degrees(site) if degree.shape[1]]
+    measured = [(each, _signal(atmosphere @ each, run)) for each in degrees]
+    usable = [(number, each, signal) for number, (each, signal) in enumerate(measured, 1) if signal > 0]
+    if not usable:
+        return Strength(math.nan, math.nan, outer_scale_m or OUTER_SCALE_M, math.nan)
+    number, modes, signal = zip(*usable, strict=True)
+    change = [_of_gain(atmosphere @ each, residual @ each, run) for each in modes]
+    sampling = [_sampling(atmosphere @ each, run, value) for each, value in zip(modes, signal, strict=True)]
+    of_degree = _ERROR_OF_DEGREE / _TO_R0 * np.array(number)
+    covariance = np.diag(sampling + np.square(gain_spread * np.array(change)) + np.square(of_degree))
+    covariance += gain_error**2 * np.outer(change, change)
+    theory = np.array([_theory(site, each, list(modes)) for each in _SCALES_M])
+    return _fitted(np.log(signal), theory, covariance, outer_scale_m)
+
+
+def _fitted(signal: Floats, theory: Floats, covariance: Floats, known_m: float | None) -> Strength:
+    """Return mean and standard deviation over outer scales of the strength that fits best.
+
+    `signal` and `theory` (scales, degrees) are logarithms of variances, the latter for r0 = 1 m.
+    """
+    scales = _FINE_SCALES_M if known_m is None else np.array([known_m])
+    expected = np.array([np.interp(np.log(scales), np.log(_SCALES_M), each) for each in theory.T]).T
+    inverse = np.linalg.inv(covariance)
+    weight = inverse.sum(axis=0) / inverse.sum()
+    strength = (signal - expected) @ weight
+    left = signal - expected - strength[:, None]
+    likelihood = -0.5 * np.einsum("si,ij,sj->s", left, inverse, left)
+    likelihood -= 0.5 * (np.log(scales / OUTER_SCALE_M) / OUTER_SCALE_SPREAD) ** 2
+    part = np.exp(likelihood - likelihood.max())
+    part /= part.sum()
+    mean, scale = float(part @ strength), float(part @ np.log(scales))
+    error = _TO_R0 * math.sqrt(float(part @ (strength - mean) ** 2) + 1 / inverse.sum())
+    r0, outer = math.exp(-_TO_R0 * mean), math.exp(scale)
+    spread = math.sqrt(float(part @ (np.log(scales) - scale) ** 2))
+    return Strength(r0, r0 * math.hypot(error, _COMMON_ERROR), outer, outer * spread)
+
+
+def _degrees(site: SlopeTurbulence) -> list[Floats]:
+    """Return orthonormal slopes (2 n, modes) for each degree, as far as degrees are well sampled.
+
+    With one or two sub-apertures: all slopes.
+    """
+    n = len(site.positions_m)
+    if n <= 2:
+        return [np.eye(2 * n)]
+    centred = site.positions_m - site.positions_m.mean(axis=0)
+    x, y = (centred / np.abs(centred).max()).T
+    across = round(float(np.ptp(centred, axis=0).max()) / site.subaperture_m) + 1
+    found, known = [], np.zeros((2 * n, 0))
+    for degree in range((across + 1) // 2 + 1):
+        terms = np.array([x**power * y ** (degree - power) for power in range(degree + 1)]).T
+        new = np.kron(np.eye(2), terms)
+        for _ in range(2):
+            new = new - known @ (known.T @ new)
+        left, size, _ = np.linalg.svd(new, full_matrices=False)
+        found.append(left[:, size > 1e-6])
+        known = np.hstack([known, found[-1]])
+    return found[1:]
+
+
+def _theory(site: SlopeTurbulence, outer_scale_m: float, degrees: list[Floats]) -> list[float]:
+    covariance = replace(site, outer_scale_m=outer_scale_m).covariance_px2()
+    return [math.log(float(np.einsum("ik,ij,jk->", each, covariance, each))) for each in degrees]
+
+
+def _lagged(modes: Floats, run: NDArray[np.int64], lag: int) -> float:
+    together = run[lag:] == run[: len(run) - lag]
+    products = (modes[lag:] * modes[: len(run) - lag])[together]
+    return float(products.sum(axis=1).mean()) if len(products) else math.nan
+
+
+def _signal(modes: Floats, run: NDArray[np.int64]) -> float:
+    """Return the variance without white noise."""
+    return (4 * _lagged(modes, run, 1) - _lagged(modes, run, 2)) / 3
+
+
+def _of_gain(atmosphere: Floats, residual: Floats, run: NDArray[np.int64]) -> float:
+    """Return the relative change of the variance with that of the centroid gain."""
+    low, high = (_signal(atmosphere + step * residual, run) for step in (-_GAIN_STEP, _GAIN_STEP))
+    return math.log(max(low, 1e-3 * abs(high)) / high) / (2 * _GAIN_STEP) if high > 0 else 1.0
+
+
+def _sampling(modes: Floats, run: NDArray[np.int64], signal: float) -> float:
+    """Return the relative variance of `_signal` of Gaussian modes with the measured autocorrelation."""
+    frames, count = len(modes), modes.shape[1]
+    transformed = np.fft.rfft(modes, 2 * frames, axis=0)
+    products = np.fft.irfft((transformed * transformed.conj()).real, 2 * frames, axis=0)
+    lags = np.arange(min(frames // 2, _LONGEST_LAG))
+    correlation = products[lags].sum(axis=1) / (frames - lags) / signal
+    noise = max(float(correlation[0]) - 1, 0.0)
+    last = int(np.argmax(correlation < 0)) or len(correlation)
+    of_signal = 2 * (1 + 2 * float(np.square(correlation[1:last]).sum()))
+    total: float = of_signal + 4 * noise + 17 / 9 * noise**2
+    return float(total / (frames * count))

@@ -1,0 +1,341 @@
+"""Calibration: from raw frames in ADU to photo-electrons."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.checks import number_between, numbers_between, real_array
+from faintspot.base.config.tables import (
+    check_fields,
+    chosen_fields,
+    errors_of_table,
+    is_map,
+    read_tables,
+    save_tables,
+)
+from faintspot.base.errors import InputError
+from faintspot.base.files import derived
+from faintspot.base.npz import save_arrays
+from faintspot.io.frames import open_frames, read_array
+
+_BLOCK_PIXELS = 1 << 22  # processed at a time
+_MAPS = ("dark", "flat", "bad_pixels", "read_noise_e")
+# Limit of values that the kernels square in float32, with a wide margin; no camera reaches it.
+_GAINS = 1e-9, 1e9
+_LARGEST_READ_NOISE_E, _LARGEST_BACKGROUND_E, _LARGEST_ADU = 1e6, 1e9, 1e30
+
+
+@cache  # asked in every frame
+def _largest(dtype: np.dtype[Any]) -> float:
+    return float(np.iinfo(dtype).max)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Conversion of raw frames to electrons: (raw - dark) * gain_e_per_adu / (em_gain * flat); immutable.
+
+    Parameters
+    ----------
+    dark : float or (h, w) array, optional, ADU
+        Frame without flux: bias and dark current. NaN marks a bad pixel. Default: unknown, and treated as
+        0. A value of 0 states that there is none.
+    rough_dark : bool
+        Whether `dark` is only approximate, such as the background of frames with light in them.
+    flat : (h, w) array, optional
+        Relative response of each pixel, 1 on average. NaN, zero or negative marks a bad pixel.
+    gain_e_per_adu : float
+        Electrons per ADU at the camera's output.
+    em_gain : float
+        Multiplication gain of an EMCCD; 1 for other cameras.
+    bad_pixels : (h, w) array of bool, or (n, 2) array of row and column, optional
+        Pixels to ignore; they are filled in from their neighbours within the sub-aperture.
+    saturation_adu : float, optional
+        Raw value at which a pixel is saturated. Default: the largest value of the integer dtype of the
+        frames; none for floating-point frames.
+    read_noise_e : float or (h, w) array, optional
+        Standard deviation of the read noise in electrons at the camera's output, after multiplication; in
+        photo-electrons it is read_noise_e / em_gain. A map gives that of each pixel; NaN marks a bad pixel.
+        Required for standard errors and for the estimators "ml" and "map".
+    background_e : float
+        Mean background of sky and dark current per pixel and frame [photo-electrons], whose mean is
+        subtracted with `dark` and whose noise remains.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range, or arrays have different shapes.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> emccd = fs.Calibration(dark=200.0, gain_e_per_adu=10.0, em_gain=500.0, read_noise_e=50.0)
+    >>> emccd.read_noise_photoelectrons, emccd.excess_noise
+    (0.1, 2.0)
+    """
+
+    dark: Any = None
+    flat: Any = None
+    gain_e_per_adu: float = 1.0
+    em_gain: float = 1.0
+    bad_pixels: Any = None
+    saturation_adu: float | None = None
+    read_noise_e: Any = None
+    background_e: float = 0.0
+    rough_dark: bool = False
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        if self.dark is not None:
+            put(self, "dark", _scalar_or_map("calibration.dark", self.dark))
+        if not isinstance(self.rough_dark, bool):
+            raise InputError(f"calibration.rough_dark = {self.rough_dark!r}: expected true or false")
+        if self.flat is not None:
+            put(self, "flat", _map("calibration.flat", self.flat))
+        for name in ("gain_e_per_adu", "em_gain"):
+            put(self, name, number_between(f"calibration.{name}", getattr(self, name), *_GAINS))
+        if self.read_noise_e is not None:
+            put(self, "read_noise_e", _read_noise(self.read_noise_e))
+        background = number_between("calibration.background_e", self.background_e, 0.0, _LARGEST_BACKGROUND_E)
+        put(self, "background_e", background)
+        if self.saturation_adu is not None:
+            level = number_between(
+                "calibration.saturation_adu", self.saturation_adu, 0.0, _LARGEST_ADU, low_open=True
+            )
+            put(self, "saturation_adu", level)
+        if self.bad_pixels is not None:
+            put(self, "bad_pixels", _mask_or_list(self.bad_pixels))
+        shapes = {name: array.shape for name, array in self._arrays().items()}
+        if len(set(shapes.values())) > 1:
+            text = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+            raise InputError(f"calibration: expected maps of one shape, got {text}")
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Calibration):
+            return NotImplemented
+        mine, theirs = vars(self), vars(other)
+        return all(
+            (mine[name] is None) == (theirs[name] is None)
+            and (mine[name] is None or np.array_equal(mine[name], theirs[name], equal_nan=True))
+            for name in mine
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def excess_noise(self) -> float:
+        """Factor of the multiplication register on the variance of the electrons: 2, or 1 without one."""
+        return 2.0 if self.em_gain > 1 else 1.0
+
+    @property
+    def vouches_for_dark(self) -> bool:
+        """Whether the dark level is known accurately; otherwise estimators may fit it."""
+        return self.dark is not None and not self.rough_dark
+
+    @property
+    def typical_read_noise_e(self) -> float | None:
+        """Read noise as one number: the root mean square of a map; None if unknown."""
+        noise = self.read_noise_e
+        if isinstance(noise, np.ndarray):
+            return math.sqrt(float(np.nanmean(np.square(noise))))
+        return noise  # type: ignore[no-any-return]
+
+    @property
+    def read_noise_photoelectrons(self) -> float | None:
+        """`typical_read_noise_e` divided by the multiplication gain; None if unknown."""
+        noise = self.typical_read_noise_e
+        return None if noise is None else noise / self.em_gain
+
+    def read_noise_map(self, frame_shape: tuple[int, int]) -> NDArray[np.float64] | None:
+        """Return the read noise of each pixel [photo-electrons], NaN in bad ones; None if it is one number.
+
+        Raises
+        ------
+        InputError
+            If the map does not fit the frame.
+        """
+        if not isinstance(self.read_noise_e, np.ndarray):
+            return None
+        good = np.isfinite(self.maps(frame_shape)).all(axis=0)
+        return np.where(good, self.read_noise_e / self.em_gain, np.nan)
+
+    def with_bad_pixels(self, rows_and_columns: NDArray[np.int64]) -> Calibration:
+        """Return the same calibration with further bad pixels, (n, 2)."""
+        known = self.bad_pixels
+        if known is None:
+            known = np.empty((0, 2), np.int64)
+        elif known.dtype == np.bool_:
+            known = np.argwhere(known)
+        return replace(self, bad_pixels=np.unique(np.concatenate([known, rows_and_columns]), axis=0))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Calibration:
+        """Read the table [calibration] of a configuration file (TOML)."""
+        return cls.from_tables(path, read_tables(path))
+
+    @classmethod
+    def from_tables(cls, path: str | Path, document: Mapping[str, dict[str, Any]]) -> Calibration:
+        """Return the calibration in the tables of a configuration file, or the default if there is none."""
+        values = document.get("calibration", {})
+        with errors_of_table(path, "calibration"):
+            check_fields("calibration", cls, values)
+            return cls(**{key: _map_or_value(Path(path), key, value) for key, value in values.items()})
+
+    def save(self, path: str | Path) -> None:
+        """Write the table [calibration] of a configuration file (TOML); other tables stay as they are."""
+        path = Path(path)
+        values = chosen_fields(self)
+        maps = {key: value for key, value in values.items() if is_map(value)}
+        store = derived(path, ".calibration.npz")
+        if maps:
+            save_arrays(store, maps)
+        save_tables(path, {"calibration": {**values, **{key: f"{store.name}:{key}" for key in maps}}})
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the table of a configuration file, in which maps are represented by their shapes."""
+        values = chosen_fields(self)
+        return {key: f"map of {value.shape}" if is_map(value) else value for key, value in values.items()}
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """Maps with the size of a frame."""
+        arrays = {name: getattr(self, name) for name in _MAPS}
+        return {
+            name: value
+            for name, value in arrays.items()
+            if isinstance(value, np.ndarray) and not (name == "bad_pixels" and value.dtype != np.bool_)
+        }
+
+    def maps(self, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
+        """Return dark [ADU] and electrons per ADU of each pixel, NaN in bad ones: (2, h, w) float32.
+
+        Raises
+        ------
+        InputError
+            If a map or a bad pixel does not fit into the frame.
+        """
+        self._check_shapes(frame_shape)
+        maps = np.empty((2, *frame_shape), np.float32)
+        with np.errstate(over="ignore"):  # values that overflow float32 become infinite: bad pixels
+            maps[0] = 0.0 if self.dark is None else self.dark
+            gain = np.full(frame_shape, self.gain_e_per_adu / self.em_gain)
+            if self.flat is not None:
+                usable = np.isfinite(self.flat) & (self.flat > 0)
+                gain = np.divide(gain, self.flat, where=usable, out=np.full(frame_shape, np.nan))
+            if self.bad_pixels is not None:
+                gain[self._bad_mask(frame_shape)] = np.nan
+            if isinstance(self.read_noise_e, np.ndarray):
+                gain[np.isnan(self.read_noise_e)] = np.nan
+            maps[1] = gain
+        return maps
+
+    def saturation(self, dtype: np.dtype[Any]) -> float:
+        """Return the raw value at which pixels of this dtype are saturated (NaN: none)."""
+        if self.saturation_adu is not None:
+            return self.saturation_adu
+        # Not infinity, which an infinite pixel would reach.
+        return _largest(dtype) if dtype.kind in "iu" else math.nan
+
+    def _check_shapes(self, frame_shape: tuple[int, int]) -> None:
+        """Raise an error if a map does not have the frame's shape."""
+        for name, array in self._arrays().items():
+            if array.shape != frame_shape:
+                raise InputError(
+                    f"calibration.{name}: expected the frame's shape {frame_shape}, got {array.shape}"
+                )
+
+    def _bad_mask(self, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
+        if self.bad_pixels.dtype == np.bool_:
+            return self.bad_pixels  # type: ignore[no-any-return]
+        outside = np.any(self.bad_pixels >= np.array(frame_shape), axis=1)
+        if outside.any():
+            place = tuple(int(i) for i in self.bad_pixels[np.argmax(outside)])
+            raise InputError(f"calibration.bad_pixels: (row, column) {place} is outside {frame_shape}")
+        mask = np.zeros(frame_shape, bool)
+        mask[self.bad_pixels[:, 0], self.bad_pixels[:, 1]] = True
+        return mask
+
+
+def _map(name: str, value: Any) -> NDArray[np.float64]:
+    """Return a private, read-only copy of a map, which may contain NaN."""
+    array = real_array(name, value).astype(np.float64)
+    if array.ndim != 2:
+        raise InputError(f"{name}: expected shape (h, w), got {array.shape}")
+    array.flags.writeable = False
+    return array
+
+
+def _scalar_or_map(name: str, value: Any) -> Any:
+    if real_array(name, value).ndim == 0:
+        return number_between(name, value, -_LARGEST_ADU, _LARGEST_ADU)
+    return _map(name, value)
+
+
+def _read_noise(value: Any) -> Any:
+    """Return a number, or a map whose values are in range or NaN, not all of them NaN."""
+    name = "calibration.read_noise_e"
+    if real_array(name, value).ndim == 0:
+        return number_between(name, value, 0.0, _LARGEST_READ_NOISE_E)
+    noise = _map(name, value)
+    known = noise[~np.isnan(noise)]
+    if known.size == 0:
+        raise InputError(f"{name}: expected the noise of at least one pixel, every value is NaN")
+    numbers_between(name, known, 0.0, _LARGEST_READ_NOISE_E)
+    return noise
+
+
+def _mask_or_list(value: Any) -> NDArray[Any]:
+    """Return a boolean mask, or rows and columns as (n, 2) int64."""
+    try:
+        array = np.array(value)
+    except ValueError:
+        raise InputError("calibration.bad_pixels: expected [row, column] in every row of the list") from None
+    if array.dtype != np.bool_:
+        if array.size == 0:
+            array = np.empty((0, 2), np.int64)
+        if array.size:
+            array = numbers_between("calibration.bad_pixels", array, 0, 2**31, integer=True)
+        if array.ndim != 2 or array.shape[1] != 2:
+            raise InputError(
+                "calibration.bad_pixels: expected a boolean map (h, w) or a list of [row, column], "
+                f"got {array.dtype} of shape {array.shape}"
+            )
+    elif array.ndim != 2:
+        raise InputError(f"calibration.bad_pixels: expected shape (h, w), got {array.shape}")
+    array.flags.writeable = False
+    return array
+
+
+def read_map(key: str, location: str | Path) -> NDArray[Any]:
+    """Read `dark` or `flat` (the mean of several frames), `read_noise_e` (one map), or `bad_pixels`.
+
+    Bad pixels are a map of nonzero values, or rows of (row, column).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    if key != "bad_pixels":
+        with open_frames([location]) as frames:
+            if key == "read_noise_e" and frames.n_frames > 1:
+                raise InputError(f"{location}: expected one map of the read noise, got {frames.n_frames}")
+            total = np.zeros(frames.shape)
+            for _, block in frames.blocks(0, frames.n_frames, max(1, _BLOCK_PIXELS // total.size)):
+                total += block.sum(axis=0, dtype=np.float64)
+            return total / frames.n_frames
+    array = read_array(location)
+    if array.ndim == 2 and array.shape[1] == 2:
+        return array
+    return np.asarray((array != 0) | ~np.isfinite(array))
+
+
+def _map_or_value(path: Path, key: str, value: Any) -> Any:
+    """Read the map named in a configuration file, relative to that file."""
+    return read_map(key, str(path.parent / value)) if key in _MAPS and isinstance(value, str) else value

@@ -1,0 +1,127 @@
+"""Dark level and noise of each pixel, from dark frames, and the pixels that blink or are hot."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.slopes.camera.hot_pixels import find_hot_pixels
+
+Floats = NDArray[np.float64]
+
+FEWEST_FRAMES = 10
+"""Number of dark frames from which on blinking pixels are looked for."""
+
+_OUTLYING = 3.0  # scaled median absolute deviations: variances beyond are left out of the distribution's fit
+_MAD_TO_STD = 1.4826
+_TRIALS = 20_000  # pixels without blinking that are simulated
+_SURELY = 5.0  # standard deviations below the simulated mean: one false alarm among millions of pixels
+_LEAST_EXCESS = 2.0  # times the typical variance, below which blinking does not matter
+_FEWEST_IN_STATE = 0.05  # fraction of the frames; a cosmic ray is no state
+_BLOCK_NUMBERS = 1 << 22
+
+
+class DarkPixels(NamedTuple):
+    """Properties of each pixel in the dark."""
+
+    level_adu: Floats
+    """(h, w): mean."""
+    noise_adu: Floats
+    """(h, w): standard deviation, its square shrunk towards the typical variance."""
+    blinking: NDArray[np.int64]
+    """(n, 2): row and column of pixels that switch between two levels."""
+    hot: NDArray[np.int64]
+    """(n, 2): those that are brighter than all their neighbours."""
+
+
+def dark_pixels(level: Floats, residuals: Floats) -> DarkPixels:
+    """Measure each pixel.
+
+    Parameters
+    ----------
+    level : (h, w) array, ADU
+        Mean dark frame.
+    residuals : (n, h, w) array, ADU
+        Dark frames less this mean and less the drift of each frame.
+    """
+    variance = np.var(residuals, axis=0, ddof=1)
+    shrunk, typical = shrunk_variance(variance, len(residuals) - 1)
+    blinking = np.empty((0, 2), np.int64)
+    if len(residuals) >= FEWEST_FRAMES:
+        limit = _one_level_limit(len(residuals))
+        blinking = np.argwhere((variance > _LEAST_EXCESS * typical) & (two_level_fraction(residuals) < limit))
+    return DarkPixels(level, np.sqrt(shrunk), blinking, find_hot_pixels(level))
+
+
+def shrunk_variance(variance: Floats, degrees: int) -> tuple[Floats, float]:
+    """Shrink variances towards the typical one according to their uncertainty; return both.
+
+    A variance of n frames is known to sqrt(2 / (n - 1)). If the true variances follow a scaled inverse
+    chi-squared distribution, whose degrees of freedom and scale follow from mean and variance of the
+    logarithms, the expected variance of a pixel is the mean of its own and the typical one, weighted by their
+    degrees of freedom (Smyth 2004, Stat. Appl. Genet. Mol. Biol. 3, 3).
+
+    Parameters
+    ----------
+    variance : array
+    degrees : int
+        Degrees of freedom of each.
+    """
+    from scipy.optimize import brentq
+    from scipy.special import digamma, polygamma
+
+    positive = variance[variance > 0]
+    if positive.size == 0:
+        return variance, 0.0
+    logarithm = np.log(positive)
+    middle = np.median(logarithm)
+    spread = _MAD_TO_STD * np.median(np.abs(logarithm - middle))
+    logarithm = logarithm[np.abs(logarithm - middle) <= _OUTLYING * spread]
+    own = 0.5 * degrees
+    centre = float(logarithm.mean()) - float(digamma(own)) + math.log(own)
+    excess = float(logarithm.var()) - float(polygamma(1, own))
+    limits = 0.05, 1e4  # half degrees of freedom
+    if excess <= polygamma(1, limits[1]):
+        typical = math.exp(centre)
+        return np.full_like(variance, typical), typical
+    half = brentq(lambda d: float(polygamma(1, d)) - min(excess, float(polygamma(1, limits[0]))), *limits)
+    typical = math.exp(centre + float(digamma(half)) - math.log(half))
+    shrunk: Floats = (half * typical + own * variance) / (half + own)
+    return shrunk, typical
+
+
+def two_level_fraction(residuals: Floats) -> Floats:
+    """Return the smallest fraction of each pixel's variance that is left when its frames have two levels.
+
+    Frames are sorted and split where the variance within both parts is least. Random telegraph noise leaves
+    little; normal noise leaves about 1 - 2 / pi.
+
+    Parameters
+    ----------
+    residuals : (n, ...) array
+    """
+    n, pixels = len(residuals), residuals[0].size
+    flat = residuals.reshape(n, pixels)
+    fewest = max(2, math.ceil(_FEWEST_IN_STATE * n))
+    count = np.arange(fewest, n - fewest + 1)[:, None]
+    left = np.empty(pixels)
+    for start in range(0, pixels, max(1, _BLOCK_NUMBERS // n)):
+        part = slice(start, start + max(1, _BLOCK_NUMBERS // n))
+        ordered = np.sort(flat[:, part] - flat[:, part].mean(axis=0), axis=0)
+        below = np.cumsum(ordered, axis=0)[count[:, 0] - 1]  # the sum above is its negative
+        between = (np.square(below) * (n / (count * (n - count)))).max(axis=0)
+        whole = np.square(ordered).sum(axis=0)
+        left[part] = 1.0 - between / np.maximum(whole, 1e-300)
+    return left.reshape(residuals.shape[1:])
+
+
+@cache
+def _one_level_limit(n: int) -> float:
+    """Return the fraction below which n frames surely have two levels."""
+    normal: Any = np.random.default_rng(0).standard_normal((n, _TRIALS))
+    fraction = two_level_fraction(normal)
+    return float(fraction.mean() - _SURELY * fraction.std())

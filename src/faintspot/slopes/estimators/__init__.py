@@ -1,0 +1,40 @@
+"""Estimators of a spot's position: one module each, with a class that describes itself completely.
+
+A new estimator is a module like these: a frozen dataclass with its options, and either `locate` in NumPy or a
+compiled kernel. `docs/estimators.md` describes them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from faintspot.base.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from faintspot.base.config.options import option as option
+    from faintspot.slopes.estimators.base import Estimator as Estimator
+    from faintspot.slopes.estimators.base import Need as Need
+    from faintspot.slopes.estimators.base import Positions as Positions
+    from faintspot.slopes.estimators.base import Style as Style
+    from faintspot.slopes.estimators.registry import estimator_named as estimator_named
+    from faintspot.slopes.estimators.registry import estimators as estimators
+    from faintspot.slopes.estimators.registry import register as register
+    from faintspot.slopes.estimators.scene import Scene as Scene
+    from faintspot.slopes.estimators.sensor import Sensor as Sensor
+
+_HOMES = {
+    "Estimator": "faintspot.slopes.estimators.base",
+    "Need": "faintspot.slopes.estimators.base",
+    "Positions": "faintspot.slopes.estimators.base",
+    "Scene": "faintspot.slopes.estimators.scene",
+    "Sensor": "faintspot.slopes.estimators.sensor",
+    "Style": "faintspot.slopes.estimators.base",
+    "estimator_named": "faintspot.slopes.estimators.registry",
+    "estimators": "faintspot.slopes.estimators.registry",
+    "option": "faintspot.base.config.options",
+    "register": "faintspot.slopes.estimators.registry",
+}
+
+__all__ = [*sorted(_HOMES)]
+
+__getattr__ = lazy_attributes(__name__, _HOMES)

@@ -1,0 +1,205 @@
+"""Background subtraction and compiled kernel shared by the centre-of-gravity estimators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.checks import LARGEST_FLOAT32
+from faintspot.base.config.options import is_auto, option
+from faintspot.base.errors import InputError
+from faintspot.slopes.estimators.algorithms.automatic import automatic_kept_pixels
+from faintspot.slopes.estimators.algorithms.brightest import RULES, most_kept, threshold_rank
+from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, EstimatorPlan, Need, Step
+from faintspot.slopes.estimators.scene import PIXEL_BLUR_PX2, Scene
+from faintspot.slopes.estimators.sensor import Sensor
+from faintspot.slopes.kernels.gravity import gravity
+
+Floats = NDArray[np.float64]
+
+KEPT_FRACTION = 0.08  # of a window's pixels, if keep_brightest is not given: 20 of 16 x 16
+FEWEST_KEPT = 5
+FLUX_FLOOR = 1e-4
+_KEPT = (1.0, 0.35, 0.5, 0.7, 1.4, 2.0, 3.0, 4.5)  # multiples of the automatic number
+_USUAL_RANGE_PX = 1.0  # of positions, if no search range is set
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Centroid(Estimator):
+    """Centre of gravity."""
+
+    flux_floor: Any = option(
+        FLUX_FLOOR,
+        "A sub-aperture is flagged NO_FLUX when the flux after background subtraction does not exceed this "
+        "fraction of the largest pixel of its image.",
+        low=0.0,
+        high=1.0,
+    )
+
+    runs_on_gpu = True
+    steps_shown: ClassVar[tuple[Step, ...]] = (RAW, CALIBRATED, BACKGROUND)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class KeepingBrightest(Centroid):
+    """Centre of gravity of the brightest pixels."""
+
+    keep_brightest: Any = option(
+        None,
+        "Number of pixels kept by the background subtraction. Default: 8 % of the window's pixels, at "
+        'least 5. "auto": chosen by `estimators.algorithms.automatic.automatic_kept_pixels`.',
+        low=1,
+        high=2**24,
+        whole=True,
+        automatic=True,
+    )
+    rule: Any = option(
+        "subtract_next",
+        "Rule that sets the level subtracted from the kept pixels; see `faintspot.brightest_pixels`.",
+        choices=RULES,
+    )
+
+    automatic_method: ClassVar[str]
+    """Value of `method` for `automatic_kept_pixels`."""
+
+    @property
+    def uses_flux(self) -> bool:
+        """See `Estimator`."""
+        return self.is_automatic
+
+    @property
+    def is_automatic(self) -> bool:
+        """Whether an option is chosen from the flux."""
+        return is_auto(self.keep_brightest)
+
+    @property
+    def required(self) -> frozenset[Need]:
+        """Knowledge required by the automatic options, if there are any."""
+        return frozenset({Need.READ_NOISE, Need.WIDTH}) if self.is_automatic else frozenset()
+
+    def default_of(self, name: str, pixels: int) -> Any:
+        """Return the default of `keep_brightest`."""
+        if name == "keep_brightest":
+            return min(max(FEWEST_KEPT, round(KEPT_FRACTION * pixels)), pixels - 1)
+        return super().default_of(name, pixels)
+
+    def denoised(self, images: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        """Return the images (n, ny, nx) from which the brightest pixels are selected.
+
+        None if only the kernel can compute them. Studies evaluate all numbers of kept pixels on these
+        images at once.
+        """
+        return None
+
+    def for_bright_flux(self) -> Estimator:
+        """Keep the default number of pixels if the number is automatic."""
+        return self.replaced({"keep_brightest": None}) if is_auto(self.keep_brightest) else self
+
+    def kept_in_words(self, n_subapertures: int, pixels: int) -> str:
+        """Describe the steps after denoising."""
+        kept, rule = (self._span(name, n_subapertures, pixels) for name in ("keep_brightest", "rule"))
+        number = "an automatic number of" if is_auto(self.keep_brightest) else kept
+        return f"{number} brightest of {pixels} pixels kept (rule {rule}), centre of gravity"
+
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+        """Return numbers of kept pixels around the automatic one, larger for speckled spots."""
+        kept = float(automatic_kept_pixels(**scene.rule_arguments, method=self.automatic_method))
+        kept *= max(1.0, scene.d_over_r0)
+        numbers = (int(np.clip(round(kept * factor), 1, scene.pixels - 1)) for factor in _KEPT)
+        return {"keep_brightest": list(dict.fromkeys(numbers))}
+
+
+class GravityPlan(EstimatorPlan):
+    """Settings and tables of a centre of gravity."""
+
+    kernel = staticmethod(gravity.gravity_of_groups)
+    setting_rows = gravity.SETTING_ROWS
+    fewer_lanes_are_faster = True
+
+    estimator: Centroid
+
+    def __init__(self, estimator: Centroid, sensor: Sensor) -> None:
+        super().__init__(estimator, sensor)
+        self._keeping = estimator if isinstance(estimator, KeepingBrightest) else None
+        automatic = self._keeping is not None and self._keeping.is_automatic
+        self.needs_flux = automatic and bool(np.isnan(sensor.flux_e).all())
+
+    # Tables of the kernels ------------------------------------------------------------------------------
+
+    @cached_property
+    def first_step(self) -> gravity.GravityTables:
+        """Tables of the step before the background subtraction."""
+        return gravity.GravityTables()
+
+    @property
+    def before(self) -> int:
+        """First step: NOTHING, SMOOTH or DENOISE of `faintspot.slopes.kernels.gravity.gravity`."""
+        if self.first_step.flat_start is not None:
+            return gravity.DENOISE
+        return gravity.NOTHING if self.first_step.taps is None else gravity.SMOOTH
+
+    @property
+    def tables(self) -> Any:
+        """See `EstimatorPlan`."""
+        return self.first_step
+
+    @property
+    def own_scratch(self) -> Any:
+        """See `EstimatorPlan`."""
+        return gravity.gravity_scratch
+
+    # Settings ---------------------------------------------------------------------------------------
+
+    def fill(self, table: NDArray[np.float32]) -> None:
+        """See `EstimatorPlan`."""
+        table[gravity.FLOOR] = self.each("flux_floor")
+
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
+        if self._keeping is None:
+            keep_all(table)
+            return
+        keep = self.each("keep_brightest")
+        if is_auto(self._keeping.keep_brightest):
+            method = self._keeping.automatic_method
+            keep = automatic_kept_pixels(**self.rule_arguments(flux_e), method=method)
+        pixels, rules = self.sensor.pixels, self.each("rule")
+        for rule in np.unique(rules):
+            selected = rules == rule
+            limit = most_kept(pixels, rule)
+            if keep[selected].max() > limit:
+                ny, nx = self.sensor.window
+                raise InputError(
+                    f"estimator.keep_brightest = {keep[selected].max()}: expected at most {limit} "
+                    f"with rule {str(rule)!r} in windows of {ny} x {nx} pixels"
+                )
+            table[gravity.RANK, selected] = threshold_rank(keep[selected], rule)
+            table[gravity.SUBTRACT, selected] = rule != "threshold"
+
+    def rule_arguments(self, flux_e: Floats) -> dict[str, Any]:
+        """Return the arguments of the automatic rules: flux, camera and optical spot size."""
+        sensor, fwhm = self.sensor, self.sensor.spot_fwhm_px
+        optical = np.sqrt(np.maximum(fwhm**2 - PIXEL_BLUR_PX2, 0.25 * fwhm**2))
+        # Rounded as in the kernel's table.
+        reach = sensor.search_range_px.astype(np.float32)
+        return {
+            "flux_e": flux_e,
+            "read_noise_e": sensor.read_noise_e,
+            "pixels": sensor.pixels,
+            "excess_noise": sensor.excess_noise,
+            "background_e": sensor.calibration.background_e,
+            "spot_fwhm_px": np.sqrt(optical.prod(axis=1)),
+            "elongation": optical.max(axis=1) / optical.min(axis=1),
+            "position_range_px": np.where(np.isfinite(reach), reach, _USUAL_RANGE_PX),
+        }
+
+
+def keep_all(table: NDArray[np.float32]) -> None:
+    """Skip the background subtraction."""
+    table[gravity.RANK] = table[gravity.SUBTRACT] = 0.0
+    table[gravity.LEVEL] = -LARGEST_FLOAT32  # below every pixel

@@ -1,0 +1,99 @@
+"""Centre of gravity of the flux above a threshold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.config.options import option
+from faintspot.base.errors import InputError
+from faintspot.slopes.estimators.base import Style
+from faintspot.slopes.estimators.built_in.gravity import Centroid, Floats, GravityPlan
+from faintspot.slopes.estimators.registry import register
+from faintspot.slopes.estimators.scene import Scene
+from faintspot.slopes.estimators.sensor import Sensor
+from faintspot.slopes.kernels.compilation.host import WIDTHS, lanes_for
+from faintspot.slopes.kernels.gravity import gravity
+from faintspot.slopes.kernels.gravity.thresholded import RowTables, thresholded_in_rows
+
+_OF_NOISE = (3.0, 1.5, 2.0, 2.5, 4.0, 5.0)  # multiples of the noise of a dark pixel
+_OF_PEAK = (0.05, 0.1, 0.2, 0.3)  # for bright spots
+_SMALLEST_E = 0.01
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Thresholded(Centroid):
+    """Centre of gravity after subtracting a threshold from every pixel; negative pixels are set to 0."""
+
+    threshold_e: Any = option(None, "Level subtracted from every pixel.", unit="e-", low=0.0, high=1e12)
+
+    name = "thresholded"
+    label = "thresholded centre of gravity"
+    method = "centre of gravity of the flux above a threshold"
+    cost = 0.15
+    style = Style("#9a9a9a", ":", "X")
+
+    def in_words(self, n_subapertures: int, pixels: int) -> str:
+        """See `Estimator`."""
+        return f"centre of gravity of the flux above {self._span('threshold_e', n_subapertures, pixels)} e-"
+
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+        """Return multiples of the noise of a dark pixel, and fractions of a typical spot's peak."""
+        peak = scene.flux_e / (2.5 * scene.seen_fwhm_px**2)
+        levels = [factor * scene.dark_noise_e for factor in _OF_NOISE] + [
+            factor * peak for factor in _OF_PEAK
+        ]
+        return {"threshold_e": list(dict.fromkeys(max(float(f"{e:.3g}"), _SMALLEST_E) for e in levels))}
+
+    def for_bright_flux(self) -> Thresholded:
+        """Subtract nothing: a threshold for low flux does not suit high flux."""
+        return self.replaced({"threshold_e": 0.0})
+
+    def check(self, sensor: Sensor) -> None:
+        """See `Estimator`."""
+        if np.isnan(self.values("threshold_e", sensor.n, sensor.pixels).astype(float)).any():
+            raise InputError(
+                f"estimator.threshold_e: expected a level (electrons) for estimator {self.name!r}, got none"
+            )
+
+    def prepared(self, sensor: Sensor) -> GravityPlan:
+        """See `Estimator`."""
+        return _Plan(self, sensor)
+
+
+class _Plan(GravityPlan):
+    """Thresholds, and the tables of the kernel that reads pixels in rows, if it can be used."""
+
+    def __init__(self, estimator: Thresholded, sensor: Sensor) -> None:
+        super().__init__(estimator, sensor)
+        columns = sensor.window[1]
+        # Width of the machine, not of the pipeline: the order of a sum depends on it.
+        widest = lanes_for(np.float32).width
+        self._widths = [width for width in WIDTHS if columns % width == 0 and width <= widest]
+        if self._widths:
+            self.kernel = thresholded_in_rows
+
+    @cached_property
+    def tables(self) -> Any:
+        """See `EstimatorPlan`."""
+        tables = super().tables
+        if not self._widths:
+            return tables
+        maps = np.ascontiguousarray(self.sensor.calibration.maps(self.sensor.layout.frame_shape), np.float32)
+        columns = self.sensor.window[1]
+        ramp = np.arange(columns, dtype=np.float32) - np.float32(0.5 * (columns - 1))
+        variances = None
+        noise = self.sensor.calibration.read_noise_map(self.sensor.layout.frame_shape)
+        if noise is not None:
+            variances = (np.square(noise) + self.sensor.background_variance).astype(np.float32)
+        return RowTables(lanes_for(np.float32, max(self._widths)), maps, ramp, tables, variances)
+
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
+        table[gravity.LEVEL], table[gravity.SUBTRACT] = self.each("threshold_e"), 1.0

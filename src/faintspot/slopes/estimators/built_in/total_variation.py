@@ -1,0 +1,177 @@
+"""Total-variation denoising, brightest pixels, centre of gravity: the method of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.config.options import PerSubaperture, is_auto, option
+from faintspot.base.config.presets import PRESETS, of_denoising
+from faintspot.base.errors import InputError
+from faintspot.slopes.estimators.algorithms.automatic import automatic_strength
+from faintspot.slopes.estimators.algorithms.noise import suggested_strength
+from faintspot.slopes.estimators.algorithms.total_variation import ALGORITHMS, tv_denoise
+from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Step, Style
+from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.estimators.built_in.gravity import Floats, GravityPlan, KeepingBrightest
+from faintspot.slopes.estimators.registry import register
+from faintspot.slopes.estimators.scene import Scene
+from faintspot.slopes.estimators.sensor import Sensor
+from faintspot.slopes.kernels.gravity import gravity
+from faintspot.slopes.kernels.total_variation.flat_start import flat_start_table
+
+_STRENGTHS = (1.0, 0.4, 0.6, 0.8, 1.25)  # multiples of the automatic strength
+_LEAST_STRENGTH_E = 1e-3
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TotalVariation(KeepingBrightest):
+    """Centre of gravity of the brightest pixels of the denoised image (Basden et al. 2015, MNRAS)."""
+
+    noise_std: Any = option(
+        None,
+        'Denoising strength: standard deviation of the noise to remove from a pixel. "auto": chosen from '
+        "read noise, flux and spot by `estimators.algorithms.automatic.automatic_strength`. 0: no "
+        "denoising. A strength above 0.9 of an image's own rms is lowered to 0.6 of it.",
+        unit="e-",
+        low=0.0,
+        automatic=True,
+    )
+    tolerance: Any = option(
+        None,
+        "Relative change at which the denoising of a sub-aperture stops; see `faintspot.tv_denoise`. "
+        'Default: that of the preset, 0.02; with "fast" 0 (only the iteration limit applies).',
+        low=0.0,
+        high=1.0,
+    )
+    max_iterations: Any = option(
+        None, "Iteration limit. Default: that of the preset, 200 or 8.", low=1, high=2**24, whole=True
+    )
+    algorithm: str = option(
+        "fgp", "Algorithm of the denoising.", choices=tuple(ALGORITHMS), per_subaperture=False
+    )
+    preset: str = option(
+        "accurate",
+        '"fast": 8 denoising iterations for every image, so that the run time is constant. Its accuracy is '
+        "given in docs/results/iterations.md.",
+        choices=PRESETS,
+        per_subaperture=False,
+    )
+
+    name = "tv"
+    label = "TV denoising"
+    method = "total-variation denoising, brightest pixels, centre of gravity"
+    cost = 0.71
+    style = Style("#D55E00", "-", "s")
+    steps_shown = (RAW, CALIBRATED, Step("denoised", "denoised"), BACKGROUND)
+    automatic_method = "tv"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        strength = self.noise_std
+        if strength is None or (isinstance(strength, PerSubaperture) and strength.default is None):
+            raise InputError(
+                'noise_std: expected a number (electrons) or "auto", got none; '
+                'or set estimator = "brightest", which does not denoise'
+            )
+
+    @property
+    def denoises(self) -> bool:
+        """See `Estimator`."""
+        return True
+
+    @property
+    def is_automatic(self) -> bool:
+        """See `KeepingBrightest`."""
+        return is_auto(self.noise_std) or is_auto(self.keep_brightest)
+
+    def without_denoising(self) -> BrightestPixels:
+        """See `Estimator`."""
+        return BrightestPixels.like(self)
+
+    def for_bright_flux(self) -> Estimator:
+        """Do not denoise: a noise-free image has nothing to remove."""
+        return self.without_denoising().for_bright_flux()
+
+    def default_of(self, name: str, pixels: int) -> Any:
+        """See `Options`."""
+        usual = of_denoising(self.preset)
+        return usual[name] if name in usual else super().default_of(name, pixels)
+
+    def in_words(self, n_subapertures: int, pixels: int) -> str:
+        """See `Estimator`."""
+        where, unit, strength = "", "", self._span("noise_std", n_subapertures, pixels)
+        if not is_auto(self.noise_std):
+            unit = " e-"
+            denoised = int(np.count_nonzero(self.values("noise_std", n_subapertures, pixels)))
+            if denoised < n_subapertures:
+                where = f" in {denoised} of {n_subapertures} sub-apertures"
+        tolerance, limit = (
+            self._span(name, n_subapertures, pixels) for name in ("tolerance", "max_iterations")
+        )
+        return (
+            f"total-variation denoising{where} of strength {strength}{unit} ({self.algorithm}, tolerance "
+            f"{tolerance}, at most {limit} iterations); {self.kept_in_words(n_subapertures, pixels)}"
+        )
+
+    def for_scene(self, scene: Scene) -> Self:
+        """Use the preset "fast"."""
+        return self.replaced({"preset": "fast"})
+
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+        """Return numbers of kept pixels and strengths around the automatic ones."""
+        ordinary = float(
+            suggested_strength(scene.dark_noise_e, scene.excess_noise * scene.flux_e, scene.pixels)
+        )
+        strength = max(float(automatic_strength(**scene.rule_arguments)) or ordinary, _LEAST_STRENGTH_E)
+        return {**super().tuned(scene), "noise_std": [strength * factor for factor in _STRENGTHS]}
+
+    def denoised(self, images: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        """See `KeepingBrightest`."""
+        if is_auto(self.noise_std):
+            return None  # the strength depends on the flux
+        limits = {name: getattr(self, name) for name in ("tolerance", "max_iterations")}
+        result: NDArray[np.float32] = tv_denoise(
+            images,
+            self.noise_std,
+            algorithm=self.algorithm,
+            preset=self.preset,
+            lower_strength=True,
+            **limits,
+        )
+        return result
+
+    def prepared(self, sensor: Sensor) -> GravityPlan:
+        """See `Estimator`."""
+        return _Plan(self, sensor)
+
+
+class _Plan(GravityPlan):
+    """Strengths, and the starting point of the denoising."""
+
+    estimator: TotalVariation
+
+    @cached_property
+    def first_step(self) -> gravity.GravityTables:
+        """See `GravityPlan`."""
+        return gravity.GravityTables(
+            flat_start_table(*self.sensor.window), ALGORITHMS[self.estimator.algorithm]
+        )
+
+    def fill(self, table: NDArray[np.float32]) -> None:
+        """See `EstimatorPlan`."""
+        super().fill(table)
+        table[gravity.TOLERANCE], table[gravity.LIMIT] = self.each("tolerance"), self.each("max_iterations")
+
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
+        super().fill_flux(table, flux_e)
+        automatic = is_auto(self.estimator.noise_std)
+        strength = automatic_strength(**self.rule_arguments(flux_e)) if automatic else self.each("noise_std")
+        table[gravity.STRENGTH] = strength

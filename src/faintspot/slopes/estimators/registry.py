@@ -1,0 +1,130 @@
+"""Registry of estimators by name: built-in, installed and user-defined."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, TypeVar
+from unittest import mock
+
+from faintspot.base.errors import InputError
+from faintspot.slopes.estimators.faults import faults_of
+
+if TYPE_CHECKING:
+    from faintspot.slopes.estimators.base import Estimator
+
+ENTRY_POINTS = "faintspot.estimators"
+_PACKAGE = "faintspot.slopes.estimators.built_in"
+_BUILT_IN = (
+    "brightest",
+    "total_variation",
+    "smoothed",
+    "centroid",
+    "thresholded",
+    "window",
+    "weighted",
+    "matched",
+    "maximum_likelihood",
+    "maximum_a_posteriori",
+    "trained",
+)
+"""Modules of `built_in`, in the order in which estimators are listed."""
+
+Kind = TypeVar("Kind", bound="type[Estimator]")
+_kinds: dict[str, type[Estimator]] = {}
+
+
+def register(kind: Kind) -> Kind:
+    """Register an estimator by its name; use as a class decorator.
+
+    Raises
+    ------
+    InputError
+        If another estimator has that name.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> import faintspot as fs
+    >>> from faintspot.slopes.estimators import Estimator, register
+    >>> @register
+    ... @dataclass(frozen=True, eq=False, kw_only=True)
+    ... class Middle(Estimator):
+    ...     name = "middle"
+    ...     label = "the middle of the window"
+    ...     def locate(self, images, sensor, prior):
+    ...         return sensor.zero
+    >>> fs.Settings("middle").estimator.label
+    'the middle of the window'
+    """
+    name = getattr(kind, "name", None)
+    if not isinstance(name, str) or not name.isidentifier():
+        raise InputError(f"estimator {kind.__name__}: name = {name!r}: expected a word")
+    other = _kinds.get(name)
+    if other is not None and (other.__module__, other.__qualname__) != (kind.__module__, kind.__qualname__):
+        raise InputError(f"estimator {name!r}: {other.__module__} has one of that name already")
+    _kinds[name] = kind
+    return kind
+
+
+def estimators() -> dict[str, type[Estimator]]:
+    """Return the classes of all estimators by name, built-in ones first.
+
+    Examples
+    --------
+    >>> from faintspot.slopes.estimators import estimators
+    >>> list(estimators())[:4]
+    ['brightest', 'tv', 'smoothed', 'centroid']
+    """
+    _load()
+    places = {f"{_PACKAGE}.{module}": place for place, module in enumerate(_BUILT_IN)}
+    # Independent of the order in which modules happened to be imported.
+    return dict(sorted(_kinds.items(), key=lambda item: places.get(item[1].__module__, len(places))))
+
+
+def restore(kinds: Mapping[str, type[Estimator]]) -> None:
+    """Restore the registry to a mapping that `estimators` returned before."""
+    global _kinds
+    _kinds = dict(kinds)
+
+
+def estimator_named(name: str) -> type[Estimator]:
+    """Return the class of the estimator with the given name.
+
+    Raises
+    ------
+    InputError
+        If the name is unknown.
+
+    Examples
+    --------
+    >>> from faintspot.slopes.estimators import estimator_named
+    >>> estimator_named("map").label
+    'maximum a posteriori'
+    """
+    _load()
+    if not isinstance(name, str) or name not in _kinds:
+        raise InputError(f"estimator = {name!r}: expected one of {', '.join(map(repr, _kinds))}")
+    return _kinds[name]
+
+
+@cache
+def _load() -> None:
+    """Import the built-in estimators and those of installed packages."""
+    modules = [f"{_PACKAGE}.{module}" for module in _BUILT_IN]
+    for module in modules:
+        import_module(module)
+    # User code that imported one of them directly has changed the order.
+    places = {module: place for place, module in enumerate(modules)}
+    kinds = sorted(_kinds.values(), key=lambda kind: places.get(kind.__module__, len(places)))
+    _kinds.clear()
+    _kinds.update({kind.name: kind for kind in kinds})
+    for point in entry_points(group=ENTRY_POINTS):
+        package = point.dist.name if point.dist else "?"
+        title = f"estimator {point.name!r} of the package {package} (mend or uninstall it)"
+        # A plugin that exits on import would end the process without a message.
+        with faults_of(title), mock.patch("os._exit", sys.exit):
+            point.load()

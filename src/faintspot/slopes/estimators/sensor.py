@@ -1,0 +1,116 @@
+"""Sensor for which an estimator is prepared: geometry, camera and knowledge of the spots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import Score
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """Layout, camera and spots of a sensor, as seen by an estimator.
+
+    Parameters
+    ----------
+    layout : Layout
+    calibration : Calibration
+    psf, score : PSF, Score, or None
+    zero : (n, 2) array
+        Reference positions, px from the window centres.
+    search_range_px : (n,) array
+        Largest distance of a position from the reference; infinite if there is no limit.
+    flux_e : (n,) array
+        Expected flux [electrons]; NaN where unknown.
+    given_fwhm_px : (n, 2) array
+        Full width at half maximum of the spots along x and y; NaN where not given.
+    width : int
+        Number of SIMD lanes.
+    """
+
+    layout: Layout
+    calibration: Calibration
+    psf: PSF | None
+    score: Score | None
+    zero: Floats
+    search_range_px: Floats
+    flux_e: Floats
+    given_fwhm_px: Floats
+    width: int
+
+    @property
+    def n(self) -> int:
+        """Number of sub-apertures."""
+        return len(self.layout)
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """ny, nx of a sub-aperture, px."""
+        return self.layout.window
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of a sub-aperture."""
+        return self.layout.pixels
+
+    @property
+    def excess_noise(self) -> float:
+        """Factor on the variance of the photon noise."""
+        return self.calibration.excess_noise
+
+    @property
+    def has_noise_map(self) -> bool:
+        """Whether the read noise differs from pixel to pixel."""
+        return isinstance(self.calibration.read_noise_e, np.ndarray)
+
+    @cached_property
+    def pixel_noise_e(self) -> Floats:
+        """Read noise [photo-electrons] of each pixel, (n, ny, nx), or of all, (n, 1, 1); 0 if it is unknown.
+
+        Bad pixels, which are filled in, count with the mean variance of their window.
+        """
+        usual = self.calibration.read_noise_photoelectrons or 0.0
+        noise = self.calibration.read_noise_map(self.layout.frame_shape)
+        if noise is None:
+            return np.full((self.n, 1, 1), usual)
+        squares = np.square(self.layout.images(noise))
+        known = ~np.isnan(squares)
+        count = known.sum(axis=(1, 2))
+        total = np.where(known, squares, 0.0).sum(axis=(1, 2))
+        mean = np.where(count > 0, total / np.maximum(count, 1), usual**2)
+        return np.sqrt(np.where(known, squares, mean[:, None, None]))
+
+    @property
+    def read_noise_e(self) -> Floats:
+        """Read noise of each sub-aperture [photo-electrons], (n,): the root mean square of its pixels."""
+        return np.asarray(np.sqrt(np.square(self.pixel_noise_e).mean(axis=(1, 2))))
+
+    @property
+    def pixel_variance(self) -> Floats:
+        """Variance [photo-electrons^2] of each dark pixel, shaped as `pixel_noise_e`; 0 if it is unknown."""
+        if self.calibration.read_noise_e is None:
+            return np.zeros((self.n, 1, 1))
+        return np.asarray(np.square(self.pixel_noise_e) + self.background_variance)
+
+    @property
+    def background_variance(self) -> float:
+        """Variance of the background in each pixel [photo-electrons^2]."""
+        return self.calibration.excess_noise * self.calibration.background_e
+
+    @cached_property
+    def spot_fwhm_px(self) -> Floats:
+        """Full width at half maximum of each spot along x and y, (n, 2); NaN where unknown."""
+        given = self.given_fwhm_px
+        if self.psf is None:
+            return given
+        learnt = self.psf.fwhm_px[self.psf.index_of(self.n)]
+        return np.where(np.isnan(given), learnt, given)

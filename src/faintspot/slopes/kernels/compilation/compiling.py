@@ -1,0 +1,175 @@
+"""Compilation of kernels: once per machine, cached on disk, and repeated when a kernel source changes.
+
+Numba makes machine code of every function, and optimises it anew with every function that calls it, which
+took half of the time of compiling a pipeline. Here a kernel is optimised and becomes machine code once, where
+Python calls it, together with all that it calls; what other kernels call is only a part of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+from numba import config, njit
+from numba.core import types as numba_types
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
+from numba.core.registry import CPUDispatcher
+
+from faintspot.base import checks
+from faintspot.slopes.kernels.compilation.cached import kernel_cache
+
+_KERNELS = Path(__file__).parents[1]
+
+
+@cache
+def _kernels_stamp() -> tuple[tuple[float, int], ...]:
+    """Return modification time and size of every source file that a kernel may inline."""
+    base = Path(checks.__file__).parent
+    sources = sorted([*_KERNELS.rglob("*.py"), base / "checks.py", base / "flags.py"])
+    return tuple(_stamp(source) for source in sources)
+
+
+def _stamp(source: Path) -> tuple[float, int]:
+    return source.stat().st_mtime, source.stat().st_size
+
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """Make a function part of the machine code of every compiled function that calls it.
+
+    Constant arguments become constants in the machine code, but not to Numba's typing: inlining by Numba
+    would type the function's body anew at every call, which takes several times longer to compile.
+    """
+    return _kernel(function, forceinline=True, _nrt=False)
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """Compile with Numba: cached on disk, without the GIL, division by zero as in NumPy.
+
+    Nor does it count references to arrays: who calls a kernel keeps its arrays alive, and counting them, with
+    atomic instructions at every call of one kernel by another, took half of the time of a plain centre of
+    gravity. So it cannot make arrays: see `allocating`.
+    """
+    return _kernel(function, _nrt=False)
+
+
+def compiled_with(function: Callable[..., Any], source: str) -> Any:
+    """Compile like `compiled` a function that calls one of another package, whose source file is given."""
+    inside = Path(source).is_relative_to(_KERNELS)
+    return _kernel(function, () if inside else (Path(source),), _nrt=False)
+
+
+def allocating(function: Callable[..., Any]) -> Any:
+    """Compile like `compiled` a function that allocates arrays."""
+    return _kernel(function)
+
+
+def at_once(function: Callable[..., Any], *kinds: Any) -> Any:
+    """Compile now for the given argument types; return a function that calls it in 0.1 us without checks.
+
+    It keeps the GIL: given up for a moment, it may come back to a real-time thread milliseconds later.
+    """
+    whole = _kernel(function, nogil=False, _nrt=False).whole
+    whole.compile(kinds)
+    return whole.overloads[kinds].entry_point
+
+
+def _kernel(function: Callable[..., Any], sources: tuple[Path, ...] = (), **options: Any) -> Any:
+    """Return the kernel of a function; `sources` are other files that its code depends on."""
+    return function if config.DISABLE_JIT else _Kernel(function, sources, options)
+
+
+class _Kernel(CPUDispatcher):
+    """Function that kernels call; for calls from Python it is compiled again as a whole, and cached."""
+
+    def __init__(
+        self, function: Callable[..., Any], sources: tuple[Path, ...], options: dict[str, Any]
+    ) -> None:
+        self._sources = sources
+        self._options = {"nogil": True, "error_model": "numpy", **options}
+        wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+        every = {"nopython": True, "boundscheck": None, **self._options, **wrappers}
+        super().__init__(function, targetoptions=every, pipeline_class=_PartCompiler)
+
+    @cached_property
+    def whole(self) -> Any:
+        """Compiled function for calls from Python, with its machine code cached on disk."""
+        dispatcher: Any = njit(**self._options)(self.py_func)
+        stamps = tuple(_stamp(path) for path in self._sources)
+        dispatcher._cache = kernel_cache(self.py_func, _kernels_stamp() + stamps)
+        return dispatcher
+
+    def get_call_template(self, arguments: Any, named: Any) -> Any:
+        """Return what a call of these types is: what is written out is of the same type as any other value.
+
+        Else the same code would be compiled for every number that it is called with somewhere.
+        """
+        return super().get_call_template(tuple(map(types.unliteral, arguments)), named)
+
+    def add_overload(self, result: Any) -> None:
+        """Keep what kernels call; there is nothing that Python's call could find."""
+        self.overloads[tuple(result.signature.args)] = result
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call from Python."""
+        return self.whole(*arguments)
+
+
+class _PartCompiler(Compiler):
+    """Stop before optimisation and machine code, which come with the kernel that this is a part of."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        context = self.state.targetctx  # a copy, made for this compilation
+        context.get_executable = lambda library, description, environment: object()  # a name for callers
+        self.state.library = _PartLibrary(context.codegen(), "part")
+
+
+class _PartLibrary(JITCodeLibrary):
+    """LLVM's code of a part, as it was generated."""
+
+    def _optimize_functions(self, module: Any) -> None:
+        module.data_layout = self._codegen._data_layout
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+
+class Direct:
+    """A kernel for arguments that always have the same types, which are found out once.
+
+    Finding them out takes longer than a small frame's measurement. Nothing is checked afterwards: other types
+    would be read as if they were those. Only whether an array may be written to makes no difference, so that
+    nothing is compiled once more for arrays that are read-only.
+    """
+
+    def __init__(self, kernel: Any) -> None:
+        self._kernel = kernel.whole
+        self._entry: Any = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the kernel."""
+        if self._entry is None:
+            signature = tuple(_writable(self._kernel.typeof_pyval(argument)) for argument in arguments)
+            self._kernel.compile(signature)
+            self._entry = self._kernel.overloads[signature].entry_point
+        return self._entry(*arguments)
+
+
+types: Any = numba_types  # as far as mypy knows, a part of it is missing
+
+
+def _writable(kind: Any) -> Any:
+    """Return the type of arrays that may be written to, also within tuples."""
+    if isinstance(kind, types.Array):
+        return kind.copy(readonly=False)
+    if isinstance(kind, types.BaseNamedTuple):
+        return types.NamedTuple([_writable(each) for each in kind], kind.instance_class)
+    if isinstance(kind, types.BaseTuple):
+        return types.BaseTuple.from_types([_writable(each) for each in kind])
+    return kind

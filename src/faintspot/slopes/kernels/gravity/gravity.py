@@ -1,0 +1,205 @@
+"""Centres of gravity of the brightest pixels, after denoising, smoothing or nothing."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from faintspot.base.flags import SubapertureFlag
+from faintspot.slopes.kernels.compilation.compiling import compiled
+from faintspot.slopes.kernels.compilation.host import aligned_zeros
+from faintspot.slopes.kernels.compilation.simd import Lanes, load, store, width_of
+from faintspot.slopes.kernels.driver.groups import (
+    BACKGROUND,
+    COMMON_ROWS,
+    COVARIANCE,
+    DENOISED,
+    ERROR_X,
+    ERROR_Y,
+    EXCESS,
+    FLUX,
+    NO_FLUX,
+    TOO_MANY_BAD_PIXELS,
+    VARIANCE,
+    X,
+    Y,
+    driver_of,
+    store_stage,
+)
+from faintspot.slopes.kernels.gravity import brightest
+from faintspot.slopes.kernels.gravity.smoothing import gather_taps, smooth_group
+from faintspot.slopes.kernels.total_variation import denoise as total_variation
+from faintspot.slopes.kernels.total_variation.denoise import denoise_group
+from faintspot.slopes.kernels.total_variation.sweeps import STATE_VECTORS
+
+_find_threshold = brightest.find_threshold
+_subtract_background = brightest.subtract_background
+_centre_of_gravity = brightest.centre_of_gravity
+_centre_and_error = brightest.centre_and_error
+_find_largest = brightest.find_largest
+
+INFEASIBLE_STRENGTH = int(SubapertureFlag.INFEASIBLE_STRENGTH)
+NOT_CONVERGED = int(SubapertureFlag.NOT_CONVERGED)
+
+# Rows of the settings' table that follow the common ones.
+STRENGTH, TOLERANCE, LIMIT, RANK, SUBTRACT, FLOOR, LEVEL = range(COMMON_ROWS, COMMON_ROWS + 7)
+SETTING_ROWS = COMMON_ROWS + 7
+
+NOTHING, SMOOTH, DENOISE = range(3)
+"""Steps before the background subtraction."""
+
+
+class GravityTables(NamedTuple):
+    """Tables of the kernel; None, a separate type, for a step that is not compiled."""
+
+    flat_start: Any = None
+    """From `flat_start_table`: images are denoised."""
+    algorithm: Any = None
+    """Algorithm of the denoising, see `denoise_group`."""
+    taps: Any = None
+    """Taps of the smoothing along x and y, central tap first: (n_subapertures, 2, 1 + reach) float32."""
+
+
+class GravityScratch(NamedTuple):
+    """Memory of one thread: of the denoiser, and the lanes' values of denoiser and centroid."""
+
+    state: Any
+    rows: Any
+    denoiser: Any
+    counts: Any
+    centroid: Any
+
+
+def gravity_scratch(lanes: Lanes, ny: int, nx: int) -> GravityScratch:
+    """Return the kernel's own memory."""
+    width, pixels = lanes.width, ny * nx
+    return GravityScratch(
+        aligned_zeros(STATE_VECTORS * pixels * width, lanes.dtype),
+        aligned_zeros((pixels + 2 * nx + 3) * width, lanes.dtype),
+        aligned_zeros(total_variation.LANE_ROWS * width, lanes.dtype),
+        np.zeros(total_variation.COUNT_ROWS * width, np.int64),
+        aligned_zeros(brightest.LANE_ROWS * width, lanes.dtype),
+    )
+
+
+@compiled
+def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+    """Find the centres of gravity of a group; an estimator's own kernel of `groups.measure_groups`."""
+    lanes, ny, nx, first, settings = group.lanes, group.ny, group.nx, group.first, group.settings
+    width, own = width_of(lanes), scratch.own
+    _read_settings(width, first, settings, own.denoiser, own.counts, own.centroid)
+    flat_start, algorithm, taps = tables
+    denoised = _first_step(flat_start, algorithm, taps, group, scratch.image, scratch.spare, own)
+    if stages.shape[0] > 0:
+        store_stage(width, denoised, stages[DENOISED, group.frame], first)
+    _set_threshold(lanes, denoised, ny * nx, own.centroid)
+    if settings[VARIANCE, first] >= 0.0:
+        place = first * ny * nx
+        _centre_and_error(lanes, scratch.image, group.variances, place, denoised, ny, nx, own.centroid)
+    else:
+        _centre_of_gravity(lanes, denoised, ny, nx, own.centroid)
+    if stages.shape[0] > 0:
+        _subtract_background(lanes, denoised, ny * nx, own.centroid, scratch.spare)
+        store_stage(width, scratch.spare, stages[BACKGROUND, group.frame], first)
+    for row, found in (
+        (FLUX, brightest.SUM),
+        (X, brightest.X),
+        (Y, brightest.Y),
+        (ERROR_X, brightest.ERROR_X),
+        (ERROR_Y, brightest.ERROR_Y),
+        (COVARIANCE, brightest.COVARIANCE),
+    ):
+        store(scratch.results, row * width, load(lanes, own.centroid, found * width))
+    for lane in range(width):
+        _flag_lane(width, lane, ny, nx, first, settings, own, scratch)
+
+
+@compiled
+def _first_step(
+    flat_start: Any, algorithm: Any, taps: Any, group: Any, image: Any, output: Any, own: Any
+) -> Any:
+    """Denoise or smooth the images where there are tables for it; return where the result is."""
+    lanes, ny, nx = group.lanes, group.ny, group.nx
+    if flat_start is not None:
+        denoise_group(
+            lanes,
+            algorithm,
+            True,  # strengths are lowered
+            flat_start,
+            ny,
+            nx,
+            image,
+            output,
+            own.state,
+            own.rows,
+            own.denoiser,
+            own.counts,
+        )
+        return output
+    if taps is not None:
+        gather_taps(width_of(lanes), group.first, taps, own.rows)
+        smooth_group(lanes, image, ny, nx, taps.shape[2] - 1, own.rows, own.state, output)
+        return output
+    return image
+
+
+@compiled
+def _read_settings(width: Any, first: Any, settings: Any, denoiser: Any, counts: Any, centroid: Any) -> None:
+    """Copy the settings of the lanes' sub-apertures."""
+    for lane in range(width):
+        s = min(first + lane, settings.shape[1] - 1)
+        denoiser[total_variation.STRENGTH * width + lane] = settings[STRENGTH, s]
+        denoiser[total_variation.TOLERANCE * width + lane] = settings[TOLERANCE, s]
+        counts[total_variation.LIMIT * width + lane] = int(settings[LIMIT, s])
+        counts[total_variation.ITERATIONS * width + lane] = 0
+        counts[total_variation.CONVERGED * width + lane] = 1
+        counts[total_variation.INFEASIBLE * width + lane] = 0
+        centroid[brightest.RANK * width + lane] = settings[RANK, s]
+        centroid[brightest.SUBTRACT * width + lane] = settings[SUBTRACT, s]
+        centroid[brightest.THRESHOLD * width + lane] = settings[LEVEL, s]
+        centroid[brightest.VARIANCE * width + lane] = settings[VARIANCE, s]
+        centroid[brightest.EXCESS * width + lane] = settings[EXCESS, s]
+
+
+@compiled
+def _set_threshold(lanes: Any, image: Any, pixels: Any, centroid: Any) -> None:
+    """Find THRESHOLD and LARGEST; without a RANK, THRESHOLD is given."""
+    if centroid[brightest.RANK * width_of(lanes)] > 0.0:
+        _find_threshold(lanes, image, pixels, centroid)
+    else:
+        _find_largest(lanes, image, pixels, centroid)
+
+
+@compiled
+def _flag_lane(
+    width: Any, lane: Any, ny: Any, nx: Any, first: Any, settings: Any, own: Any, scratch: Any
+) -> None:
+    """Write the bits of one lane's flags, and its iterations."""
+    s = min(first + lane, settings.shape[1] - 1)
+    counts, centroid = own.counts, own.centroid
+    bits = scratch.flags[lane]
+    if not bits & TOO_MANY_BAD_PIXELS:  # else no further flags are added
+        if counts[total_variation.INFEASIBLE * width + lane]:
+            bits |= INFEASIBLE_STRENGTH
+        if not counts[total_variation.CONVERGED * width + lane] and settings[TOLERANCE, s] > 0.0:
+            bits |= NOT_CONVERGED
+    flux, largest = centroid[brightest.SUM * width + lane], centroid[brightest.LARGEST * width + lane]
+    x, y = centroid[brightest.X * width + lane], centroid[brightest.Y * width + lane]
+    scratch.flags[lane] = bits | lightless(ny, nx, bits, flux, settings[FLOOR, s] * largest, x, y)
+    scratch.iterations[lane] = counts[total_variation.ITERATIONS * width + lane]
+
+
+@compiled
+def lightless(ny: Any, nx: Any, bits: Any, flux: Any, floor: Any, x: Any, y: Any) -> Any:
+    """Return NO_FLUX if an otherwise valid image has no usable flux, else 0.
+
+    A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
+    """
+    inside = abs(x) <= 0.5 * nx and abs(y) <= 0.5 * ny
+    if bits & TOO_MANY_BAD_PIXELS or (flux > floor and inside):
+        return 0
+    return NO_FLUX
+
+
+gravity_of_groups = driver_of(locate_gravity)

@@ -1,0 +1,1 @@
+"""Total-variation denoising of groups of sub-apertures."""

@@ -1,0 +1,215 @@
+"""Settings and tables that a pipeline computes before the first frame, in the form that kernels read."""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.config.options import is_auto
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.estimators.base import Estimator, EstimatorPlan
+from faintspot.slopes.estimators.python import PythonPlan
+from faintspot.slopes.estimators.sensor import Sensor
+from faintspot.slopes.kernels.compilation.compiling import Direct
+from faintspot.slopes.kernels.driver import groups
+from faintspot.slopes.kernels.driver.doubtful import Expected
+from faintspot.slopes.kernels.driver.groups import Task
+from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, neighbours_of
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import Score
+
+_FWHM_OF_KEPT = 0.58  # px, times the square root of a good number of kept pixels: 12 for a FWHM of 2 px
+_MOST_FLUX_E = 9e8  # mean flux per sub-aperture above which settings stay constant
+
+Floats = NDArray[np.float64]
+
+
+def packed_calibration(layout: Layout, calibration: Calibration, width: int) -> NDArray[np.float32]:
+    """Return dark and scale of all sub-aperture pixels in the order in which the kernel reads them.
+
+    The shape is (n_groups, pixels, 2, W); the last group is padded with its last sub-aperture.
+    """
+    return _packed(layout.images(calibration.maps(layout.frame_shape)), width)
+
+
+def _packed(windows: NDArray[Any], width: int) -> NDArray[np.float32]:
+    """Return windows of several maps (k, n, ny, nx) as (n_groups, pixels, k, W)."""
+    count, n = windows.shape[:2]
+    n_groups = -(-n // width)
+    lanes = windows.reshape(count, n, -1)[:, np.minimum(np.arange(n_groups * width), n - 1)]
+    groups = lanes.reshape(count, n_groups, width, -1).transpose(1, 3, 0, 2)
+    return np.ascontiguousarray(groups, np.float32)
+
+
+class Plan:
+    """Settings of each sub-aperture and tables of the estimator, for each level of flux that occurs.
+
+    Parameters
+    ----------
+    layout, settings, calibration, psf, score
+        As for `SlopePipeline`.
+    zero : (n, 2) array
+        Reference positions, px from the window centres.
+    width : int
+        Number of SIMD lanes.
+
+    Raises
+    ------
+    InputError
+        If the parts are inconsistent.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        settings: Settings,
+        calibration: Calibration,
+        psf: PSF | None,
+        score: Score | None,
+        zero: Floats,
+        width: int,
+    ) -> None:
+        n, pixels = len(layout), layout.pixels
+
+        def each(name: str) -> NDArray[Any]:
+            return settings.values(name, n, pixels)
+
+        search = each("search_range_px").astype(np.float64)
+        self.sensor = Sensor(
+            layout,
+            calibration,
+            psf,
+            score,
+            zero,
+            np.where(np.isnan(search), np.inf, search),
+            each("flux_e").astype(np.float64),
+            spot_fwhm_px(settings, n, pixels),
+            width,
+        )
+        self.estimator: Estimator = settings.estimator
+        self.estimator.check(self.sensor)
+        own = self.estimator.prepared(self.sensor)
+        self.prepared: EstimatorPlan = PythonPlan(self.estimator, self.sensor) if own is None else own
+        self.variances: NDArray[np.float32] | None = None
+        """Variance of each dark pixel for the kernel, if it differs: see `kernels.driver.groups.Task`."""
+        if self.sensor.has_noise_map:
+            self.variances = _packed(self.prepared.pixel_variance[None], width)[:, :, 0]
+        self.expected = self._expected(settings)
+        """Expected range of the spot positions; spots outside are flagged."""
+        self.no_prior = np.zeros((1, 2, n), np.float32)
+        """Prior used without predicted slopes: 0."""
+        self._fixed = self._fixed_table(each)
+        self._levels: list[NDArray[np.float32]] = []
+        self._variants: dict[int, int] = {}
+        self._kernels: dict[tuple[Any, str], Direct] = {}
+        self._lock = threading.RLock()
+        self._made: tuple[NDArray[np.float32], Any, Any] | None = None
+        if not self.needs_flux:
+            self._add(self.sensor.flux_e)
+
+    @property
+    def needs_flux(self) -> bool:
+        """Whether the flux is measured in every frame."""
+        return self.prepared.needs_flux
+
+    @property
+    def settings(self) -> NDArray[np.float32]:
+        """Settings tables (n_variants, rows, n)."""
+        return self._arguments()[0]
+
+    @property
+    def own_scratch(self) -> Any:
+        """Function that allocates the scratch memory of the estimator's kernel."""
+        return self._arguments()[2]
+
+    def kernel(self, frames: NDArray[Any]) -> Direct:
+        """Return the compiled function that measures groups of frames of this dtype."""
+        return self._direct(self.prepared.kernel, frames)
+
+    def flux_kernel(self, frames: NDArray[Any]) -> Direct:
+        """Return the compiled function that sums their flux."""
+        return self._direct(self.prepared.flux_kernel, frames)
+
+    def _direct(self, kernel: Any, frames: NDArray[Any]) -> Direct:
+        key = kernel, frames.dtype.char
+        if key not in self._kernels:
+            self._kernels[key] = Direct(kernel)
+        return self._kernels[key]
+
+    def task(self, variants: NDArray[np.int64], prior: NDArray[np.float32] | None = None) -> Task:
+        """Return the kernel's task for frames.
+
+        Parameters
+        ----------
+        variants : (n_frames,) int64
+            Settings table of each frame.
+        prior : (1 or n_frames, 2, n) float32, optional
+            Predicted slopes. Default: 0.
+        """
+        settings, tables, _ = self._arguments()
+        predicted = self.no_prior if prior is None else prior
+        return Task(settings, variants, predicted, tables, self.variances)
+
+    def _arguments(self) -> tuple[NDArray[np.float32], Any, Any]:
+        """Return settings, tables and scratch function, rebuilt only for a new flux level."""
+        with self._lock:
+            if self._made is None or len(self._made[0]) != len(self._levels):
+                prepared = self.prepared
+                self._made = np.stack(self._levels), prepared.tables, prepared.own_scratch
+            return self._made
+
+    def variants(self, flux_e: Floats) -> NDArray[np.int64]:
+        """Return the variants for the given fluxes per sub-aperture; add those that are missing."""
+        with np.errstate(invalid="ignore"):
+            flux = np.clip(np.nan_to_num(flux_e, nan=1.0, posinf=_MOST_FLUX_E), 1.0, _MOST_FLUX_E)
+        step = self.prepared.flux_step
+        levels = np.rint(np.log(flux) / math.log(step)).astype(np.int64)
+        with self._lock:  # several threads may measure frames with the same pipeline
+            for level in np.unique(levels).tolist():
+                if level not in self._variants:
+                    self._add(np.full(self.sensor.n, step**level))
+                    self._variants[level] = len(self._levels) - 1
+        return np.array([self._variants[level] for level in levels.tolist()], np.int64)
+
+    def _add(self, flux_e: Floats) -> None:
+        """Add the settings table of a flux level."""
+        table = self._fixed.copy()
+        self.prepared.fill_flux(table, flux_e)
+        self._levels.append(table)
+
+    def _expected(self, settings: Settings) -> Expected:
+        """Return the expected positions; a spot is complete if half its width is inside the window."""
+        sensor, layout = self.sensor, self.sensor.layout
+        fwhm = np.ones((sensor.n, 2))
+        if "keep_brightest" in settings.declared() and not is_auto(settings.keep_brightest):
+            kept = settings.values("keep_brightest", sensor.n, sensor.pixels).astype(np.float64)
+            fwhm *= _FWHM_OF_KEPT * np.sqrt(kept)[:, None]
+        fwhm = np.where(np.isnan(sensor.spot_fwhm_px), fwhm, sensor.spot_fwhm_px)
+        half = 0.5 * np.array(sensor.window[::-1])
+        edge = np.where(fwhm < half, half - 0.5 * fwhm, np.inf)
+        pitch = layout.pitch_px
+        return Expected(
+            np.ascontiguousarray(sensor.zero.T, np.float32),
+            np.ascontiguousarray(edge.T, np.float32),
+            neighbours_of(layout.cells, layout.geometry, diagonal=True),
+            np.float32(np.inf if pitch is None else LEAST_DIFFERENCE * pitch),
+        )
+
+    def _fixed_table(self, each: Any) -> NDArray[np.float32]:
+        """Return the settings that do not depend on the flux."""
+        sensor = self.sensor
+        table = np.zeros((self.prepared.setting_rows, sensor.n), np.float32)
+        table[groups.ZERO_X], table[groups.ZERO_Y] = sensor.zero.T
+        table[groups.RANGE] = sensor.search_range_px
+        table[groups.MOST_BAD] = np.floor(each("max_bad_fraction") * sensor.pixels)
+        known = sensor.calibration.read_noise_e is not None
+        table[groups.VARIANCE] = self.prepared.variance if known else -1.0
+        table[groups.EXCESS], table[groups.ERROR_SCALE] = sensor.excess_noise, each("error_scale")
+        self.prepared.fill(table)
+        return table

@@ -1,0 +1,453 @@
+"""Slope pipeline: frame -> calibration -> estimator -> slopes."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import math
+import threading
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from faintspot.base.checks import number_between, numbers_between, one_of, real_array
+from faintspot.base.errors import InputError
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.estimators.base import Estimator
+from faintspot.slopes.kernels.compilation.compiling import Direct
+from faintspot.slopes.kernels.compilation.host import lanes_for
+from faintspot.slopes.kernels.driver.doubtful import flag_doubtful
+from faintspot.slopes.kernels.driver.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
+from faintspot.slopes.kernels.parallel import most_threads, run_groups, thread_scratch
+from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.pipeline.mean_flux import MeanFlux
+from faintspot.slopes.pipeline.plan import Plan, packed_calibration
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes, Stages
+from faintspot.slopes.pipeline.small_frames import NO_STAGES, SmallFrames
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import Score
+
+if TYPE_CHECKING:
+    from faintspot.slopes.pipeline.device import DevicePipeline
+
+_KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
+_SMALL_TYPES = (np.dtype(np.uint8), *_KERNEL_TYPES)
+_flag_doubtful = Direct(flag_doubtful)
+_FLUX_COST = 0.1  # of summing the pixels of a sub-aperture, in units of `Estimator.cost`
+
+
+class SlopePipeline:
+    """Computes slopes from frames.
+
+    Parameters
+    ----------
+    layout : Layout
+    settings : Settings or Estimator
+    calibration : Calibration, optional
+        Default: frames are already in electrons.
+    reference : array or Slopes, optional
+        Reference positions, px from the centre of each sub-aperture, which are subtracted from all
+        positions: (n, 2) x and y, or (2 n,) all x then all y, or the slopes of one frame. Their magnitude
+        must not exceed the longer side of the frame. Default: 0.
+    psf : PSF, optional
+        Required by estimators that use the spot shape; it provides the spot width to others.
+    score : Score, optional
+        Required by estimators that apply one: `TrainedScore`, or `FixedWeights` for a window.
+    width : int, optional
+        SIMD width in float32 numbers: 4, 8 or 16. Default: the width of the machine.
+    threads : int, optional
+        Maximum number of threads. Default: all available processors. Slopes do not depend on it.
+    device : {"cpu", "cuda"}, optional
+        Device on which frames are measured. "cuda" uses an NVIDIA GPU (see `kernels.cuda`), for the
+        estimators that support it; `explain` and real time always use the CPU.
+
+    Raises
+    ------
+    InputError
+        If the parts are inconsistent, or for "cuda" without a GPU.
+    MissingExtraError
+        For "cuda" without the extra `gpu`.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
+    >>> frames, truth = fs.slopes.simulate.sensor_frames(
+    ...     layout.corners, layout.window, layout.frame_shape, 20, flux_e=200.0, rng=np.random.default_rng(1)
+    ... )
+    >>> pipeline = fs.SlopePipeline(layout, fs.Settings(noise_std=0.5, keep_brightest=12))
+    >>> slopes = pipeline(frames)
+    >>> slopes.x.shape
+    (20, 36)
+    >>> print(f"mean error {np.abs(slopes.x - truth[..., 0]).mean():.2f} px")
+    mean error 0.05 px
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        settings: Settings | Estimator,
+        calibration: Calibration | None = None,
+        reference: ArrayLike | Slopes | None = None,
+        *,
+        psf: PSF | None = None,
+        score: Score | None = None,
+        width: int | None = None,
+        threads: int | None = None,
+        device: str = "cpu",
+    ) -> None:
+        self.layout = layout
+        self.settings = Settings(settings) if isinstance(settings, Estimator) else settings
+        self.calibration = Calibration() if calibration is None else calibration
+        self.threads = (
+            None if threads is None else int(number_between("threads", threads, 1, 4096, integer=True))
+        )
+        self._lanes = lanes_for(np.float32, width)
+        self._calibration = packed_calibration(layout, self.calibration, self._lanes.width)
+        self._parts = psf, score, layout.offsets + _reference_positions(reference, layout)
+        self.plan = self._prepared()
+        """Settings and tables computed before the first frame."""
+        self._identity = _identity(*self._parts)
+        self.device = one_of("device", device, ("cpu", "cuda"))
+        self.on_device = self._device_pipeline() if self.device == "cuda" else None
+
+    @classmethod
+    def from_file(cls, path: str | Path, **options: Any) -> SlopePipeline:
+        """Make the pipeline described by a configuration file (faintspot.toml)."""
+        layout, settings, calibration, psf, score = configuration.load_all(path)
+        return cls(layout, settings, calibration, psf=psf, score=score, **options)
+
+    def _prepared(self) -> Plan:
+        """Compute the tables for the current SIMD width; forget what was prepared for small frames."""
+        self._small = threading.local()
+        return Plan(self.layout, self.settings, self.calibration, *self._parts, self._lanes.width)
+
+    def _device_pipeline(self) -> DevicePipeline:
+        """Transfer the tables to the GPU."""
+        from faintspot.slopes.kernels.cuda.availability import check_cuda
+
+        check_cuda()
+        from faintspot.slopes.pipeline.device import DevicePipeline
+
+        return DevicePipeline(self.layout, self.calibration, self.plan)
+
+    @property
+    def width(self) -> int:
+        """Number of sub-apertures measured at once."""
+        return self._lanes.width
+
+    def with_width(self, width: int) -> SlopePipeline:
+        """Return the same pipeline with another SIMD width: 4, 8 or 16. Slopes do not depend on it.
+
+        Raises
+        ------
+        InputError
+            If the width is another one.
+        """
+        other = copy.copy(self)
+        other._lanes = lanes_for(np.float32, width)
+        other._calibration = packed_calibration(self.layout, self.calibration, width)
+        other.plan = other._prepared()
+        other.on_device = None if self.on_device is None else other._device_pipeline()
+        return other
+
+    @property
+    def spot(self) -> tuple[PSF | None, Score | None]:
+        """PSF and score of the pipeline."""
+        return self._parts[:2]
+
+    def with_settings(self, settings: Settings) -> SlopePipeline:
+        """Return the same pipeline with other settings.
+
+        Raises
+        ------
+        InputError
+            If they do not fit the sensor.
+        """
+        psf, score, zero = self._parts
+        return SlopePipeline(
+            self.layout,
+            settings,
+            self.calibration,
+            zero - self.layout.offsets,
+            psf=psf,
+            score=score,
+            width=self.width,
+            threads=self.threads,
+            device=self.device,
+        )
+
+    def with_flux(self, mean_flux: MeanFlux | ArrayLike) -> SlopePipeline:
+        """Return the same pipeline with the given mean flux of its sub-apertures.
+
+        If `flux_e` is not set, estimators that use the flux measure it in every frame, which is less
+        precise for faint frames. Flux is quantised in steps of a few per cent. If it has not changed by a
+        step, this pipeline itself is returned, so that the method may be called in every frame.
+
+        Parameters
+        ----------
+        mean_flux : MeanFlux, or float or (n,) array
+            Flux of a frame [electrons].
+
+        Raises
+        ------
+        InputError
+            If flux is not positive, or the number of sub-apertures differs.
+        """
+        flux_e = mean_flux.positive_flux_e if isinstance(mean_flux, MeanFlux) else mean_flux
+        flux_e = numbers_between("mean_flux", flux_e, 0.0, 1e12, low_open=True)
+        if flux_e.shape not in ((), (len(self.layout),)):
+            raise InputError(
+                f"mean_flux: expected one number or {len(self.layout)}, got shape {flux_e.shape}"
+            )
+        step = math.log(self.plan.prepared.flux_step)
+        known = self.plan.sensor.flux_e
+        with np.errstate(divide="ignore", invalid="ignore"):
+            steady = np.abs(np.log(flux_e / known)) <= step
+        if steady.all():
+            return self
+        rounded = np.exp(step * np.rint(np.log(flux_e) / step))
+        return self.with_settings(self.settings.replace(flux_e=np.broadcast_to(rounded, known.shape)))
+
+    def for_images(self) -> SlopePipeline:
+        """Return the same pipeline for calibrated images (n, ny, nx) [electrons], read as one tall frame."""
+        layout, camera = self.layout, self.calibration
+        other = copy.copy(self)
+        other.layout = Layout.stacked(len(layout), layout.window, layout.offsets)
+        other.calibration = Calibration(
+            dark=None if camera.dark is None else 0.0,
+            rough_dark=camera.rough_dark,
+            gain_e_per_adu=camera.em_gain,
+            em_gain=camera.em_gain,
+            read_noise_e=self._noise_of_images(),
+            background_e=camera.background_e,
+        )
+        other._calibration = packed_calibration(other.layout, other.calibration, self.width)
+        other.plan = other._prepared()
+        other.device, other.on_device = "cpu", None
+        return other
+
+    def _noise_of_images(self) -> Any:
+        """Return the read noise of `for_images`."""
+        if not self.plan.sensor.has_noise_map:
+            return self.calibration.read_noise_e
+        noise = self.plan.sensor.pixel_noise_e * self.calibration.em_gain
+        return noise.reshape(-1, self.layout.window[1])
+
+    @property
+    def needs_flux(self) -> bool:
+        """Whether settings follow the flux of each frame, which is measured first."""
+        return self.plan.needs_flux
+
+    def fingerprint(self) -> bytes:
+        """Return bytes that identify the pipeline: they differ if slopes of the same frame may differ."""
+        parts = [self.layout.corners, self.calibration.maps(self.layout.frame_shape)]
+        if self.plan.sensor.has_noise_map:
+            parts.append(self.plan.sensor.pixel_noise_e)
+        calibration = self.calibration
+        text = (
+            f"{self.layout.window} {calibration.saturation_adu} {calibration.read_noise_photoelectrons} "
+            f"{calibration.background_e} {calibration.em_gain} {calibration.vouches_for_dark} "
+            f"{configuration.to_text(self.settings)}"
+        )
+        return (
+            b"".join(np.ascontiguousarray(part).tobytes() for part in parts) + self._identity + text.encode()
+        )
+
+    def __call__(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Slopes:
+        """Measure the slopes of a frame (h, w) or of frames (n, h, w), in ADU.
+
+        NaN and infinite pixels are treated as bad pixels; a sub-aperture that cannot be measured is flagged.
+
+        Parameters
+        ----------
+        frame : array
+        prior : array or Slopes, optional
+            Predicted slopes [px], used by "map" (mean of the prior) and "trained" (starting point): an
+            array as for `reference`, or one such array per frame. Default: 0, which also replaces values
+            that are not finite or exceed the longer side of the frame.
+
+        Raises
+        ------
+        InputError
+            If a frame is not real or does not have the layout's shape, or the prior has the wrong shape.
+        """
+        if prior is None and type(frame) is np.ndarray and frame.shape == self.layout.frame_shape:
+            small = vars(self._small)
+            if frame.dtype not in small:
+                small[frame.dtype] = self._small_frames(frame.dtype)
+            measure: SmallFrames | None = small[frame.dtype]
+            if measure is not None:
+                return measure(frame)
+        return self._run(self._checked(frame), _camera_type(frame), prior, explain=False)[0]
+
+    def _small_frames(self, dtype: np.dtype[Any]) -> SmallFrames | None:
+        """Return the calling thread's own way to measure frames of a small sensor; None if it is not one."""
+        plan, lanes, window = self.plan, self._lanes, self.layout.window
+        groups = -(-len(self.layout) // lanes.width)
+        simple = dtype in _SMALL_TYPES and self.on_device is None
+        simple = simple and not (plan.needs_flux or plan.prepared.in_python)
+        if not simple or most_threads(groups, lanes, window, plan.estimator.cost) > 1:
+            return None
+        frames = np.empty((1, *self.layout.frame_shape), np.float32 if dtype.kind == "f" else np.uint16)
+        scratch = thread_scratch(lanes, window, plan.own_scratch)
+        return SmallFrames(plan, self.source(frames, dtype), scratch, self.flag_doubtful)
+
+    def explain(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Stages:
+        """Return the sub-aperture images after every step, for figures and for debugging.
+
+        For estimators that use the calibrated image directly, the later images are equal to it.
+        """
+        array = self._checked(frame)
+        slopes, stages = self._run(array, _camera_type(frame), prior, explain=True)
+        calibrated, denoised, background = stages.reshape(3, *slopes.x.shape, *self.layout.window)
+        return Stages(self.layout.images(array), calibrated, denoised, background, slopes)
+
+    def _checked(self, frame: ArrayLike) -> NDArray[Any]:
+        array = real_array("frame", frame, minimum_dimensions=2)
+        if array.ndim > 3 or array.shape[-2:] != self.layout.frame_shape:
+            height, width = self.layout.frame_shape
+            raise InputError(
+                f"frame: expected shape ({height}, {width}) or (n, {height}, {width}), got {array.shape}"
+            )
+        return array
+
+    def _run(
+        self,
+        array: NDArray[Any],
+        dtype: np.dtype[Any],
+        prior: ArrayLike | Slopes | None,
+        explain: bool,
+    ) -> tuple[Slopes, NDArray[np.float32]]:
+        """Compute the slopes, and the stages if requested."""
+        frames = kernel_frames(array)
+        n_frames, n = len(frames), len(self.layout)
+        results = SlopeArrays(*[np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES])
+        prepared = self.plan.prepared
+        stages = NO_STAGES
+        if explain or prepared.in_python:
+            stages = np.empty((STAGE_ROWS, n_frames, n, self.layout.pixels), np.float32)
+        source = self.source(frames, dtype)
+        variants = self._variants(source)
+        if self.on_device is not None and not explain:
+            measured = self.on_device.measure_from_host(frames, dtype, variants)
+            self.flag_doubtful(SlopeArrays(*measured))
+            return Slopes(*(result.reshape(*array.shape[:-2], n) for result in measured)), stages
+        predicted = None if prior is None else _prior_slopes(prior, n_frames, self.layout)
+        task = self.plan.task(variants, predicted)
+        kernel = self.plan.kernel(frames)
+
+        def job(start: int, stop: int, scratch: Scratch) -> None:
+            kernel(source, task, start, stop, scratch, results, stages)
+
+        n_groups = n_frames * -(-n // self._lanes.width)
+        own_scratch = self.plan.own_scratch
+        cost = self.plan.estimator.cost
+        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, own_scratch, cost)
+        if prepared.in_python:
+            images = stages[CALIBRATED].reshape(n_frames, n, *self.layout.window)
+            for f in range(n_frames):
+                predicted_f = task.prior[min(f, len(task.prior) - 1)]
+                prepared.locate_frame(images[f], predicted_f, task.settings[0], f, results)
+        self.flag_doubtful(results)
+        return Slopes(*(results if array.ndim == 3 else [result[0] for result in results])), stages
+
+    def flag_doubtful(self, results: SlopeArrays) -> None:
+        """Set the flags of spots that are cut by the edge of their window or differ from all neighbours.
+
+        The flags need the slopes of whole frames; slopes can be used before they are set.
+        """
+        scratch = np.empty(len(self.layout), np.float32)
+        _flag_doubtful(results.x, results.y, results.flags, self.plan.expected, scratch)
+
+    def source(self, frames: NDArray[Any], dtype: DTypeLike) -> Source:
+        """Return the frames in the form that kernels read.
+
+        Parameters
+        ----------
+        frames : (n, h, w) array, uint16 or float32, contiguous
+        dtype : dtype
+            Type of the camera's pixels, which sets their saturation level.
+        """
+        saturation = self.calibration.saturation(np.dtype(dtype))
+        corners, window = self.layout.corners, self.layout.window
+        return Source(self._lanes, frames, corners, *window, self._calibration, saturation)
+
+    def _variants(self, source: Source) -> NDArray[np.int64]:
+        """Return the index of the settings table of each frame, by its flux if settings depend on it."""
+        n_frames, n = len(source.frames), len(self.layout)
+        if not self.needs_flux:
+            return np.zeros(n_frames, np.int64)
+        flux = np.empty((n_frames, n), np.float32)
+
+        flux_kernel = self.plan.flux_kernel(source.frames)
+
+        def job(start: int, stop: int, scratch: Scratch) -> None:
+            flux_kernel(source, start, stop, scratch, flux)
+
+        n_groups = n_frames * -(-n // self._lanes.width)
+        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, cost=_FLUX_COST)
+        return self.plan.variants(flux.mean(axis=1, dtype=np.float64))
+
+
+def kernel_frames(array: NDArray[Any]) -> NDArray[Any]:
+    """Return frames in the form that kernels read: (n, h, w), contiguous, uint16 or float32."""
+    if array.dtype in _KERNEL_TYPES and array.flags.c_contiguous and array.dtype.isnative:
+        return array if array.ndim == 3 else array[None]
+    dtype = np.uint16 if array.dtype == np.uint8 else np.float32
+    with np.errstate(over="ignore"):  # values that overflow float32 become infinite: bad pixels
+        frames = np.ascontiguousarray(array, dtype=dtype)
+    return frames.reshape(-1, *array.shape[-2:])
+
+
+def _reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -> NDArray[np.float64]:
+    """Return the reference positions as (n, 2)."""
+    n, side = len(layout), max(layout.frame_shape)
+    if reference is None:
+        return np.zeros((n, 2))
+    given = reference.vector if isinstance(reference, Slopes) else reference
+    array = numbers_between("reference", given, -side, side)
+    if array.shape == (2 * n,):
+        return np.stack([array[:n], array[n:]], axis=1)
+    if array.shape != (n, 2):
+        raise InputError(f"reference: expected shape ({n}, 2) or ({2 * n},), got {array.shape}")
+    return array
+
+
+def _camera_type(frame: ArrayLike) -> np.dtype[Any]:
+    """Return the type of the frame's pixels as given: masked integers become floats later."""
+    return frame.dtype if isinstance(frame, np.ndarray) else np.asarray(frame).dtype
+
+
+def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, layout: Layout) -> NDArray[np.float32]:
+    """Return the predicted slopes as the kernel reads them: (1 or n_frames, 2, n).
+
+    Values larger than the frame, as of a diverged loop, are treated as not predicted.
+    """
+    n = len(layout)
+    array = real_array("prior", prior.vector if isinstance(prior, Slopes) else prior)
+    if array.shape in ((n, 2), (n_frames, n, 2)):
+        array = np.moveaxis(array, -1, -2)
+    elif array.shape not in ((2 * n,), (n_frames, 2 * n)):
+        raise InputError(
+            f"prior: expected shape ({n}, 2) or ({2 * n},), or as many for each of the {n_frames} frames, "
+            f"got {array.shape}"
+        )
+    possible = np.abs(array) <= max(layout.frame_shape)
+    return np.ascontiguousarray(np.where(possible, array, 0.0).reshape(-1, 2, n), np.float32)
+
+
+def _identity(psf: PSF | None, score: Score | None, zero: NDArray[np.float64]) -> bytes:
+    """Return a digest of the inputs of slopes other than layout, settings and calibration."""
+    digest = hashlib.sha256(zero.tobytes())
+    for part in (psf, score):
+        for field in fields(part) if part is not None else ():
+            value = getattr(part, field.name)
+            whole = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+            digest.update(f"{type(part).__name__}.{field.name}".encode() + whole)
+    return digest.digest()

@@ -1,0 +1,156 @@
+"""Results of a pipeline: slopes, and the images after every step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.flags import INVALID
+from faintspot.base.notebook import table
+from faintspot.io.stored.slopes_format import VARIABLES
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+    from faintspot.slopes.sensor.layout import Layout
+
+RESULT_TYPES = tuple(map(np.dtype, ("f4", "f4", "f4", "u1", "i4", "i4", "f4", "f4", "f4")))
+
+
+@dataclass(frozen=True, repr=False)
+class Slopes:
+    """Slopes of one frame, arrays of shape (n_subapertures,), or of several, (n_frames, n_subapertures).
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> layout = fs.Layout.grid((2, 2), pixels=8)
+    >>> frame = np.zeros(layout.frame_shape)
+    >>> frame[2:4, 4:6] = 50.0
+    >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=4))(frame)
+    >>> slopes.valid
+    array([ True, False, False, False])
+    >>> float(slopes.x[0]), float(slopes.y[0]), float(slopes.flux[0])
+    (1.0, -1.0, 200.0)
+    >>> fs.SubapertureFlag(int(slopes.flags[1])).name
+    'NO_FLUX'
+    """
+
+    x: NDArray[np.float32]
+    """Position of the spot along columns, px from the reference position; 0 where invalid."""
+    y: NDArray[np.float32]
+    """Position of the spot along rows, likewise."""
+    flux: NDArray[np.float32]
+    """Flux after the background subtraction [electrons]."""
+    flags: NDArray[np.uint8]
+    """Bits of `SubapertureFlag`."""
+    iterations: NDArray[np.int32]
+    """Number of denoising iterations."""
+    bad_pixels: NDArray[np.int32]
+    """Number of pixels that were masked, NaN or infinite."""
+    standard_error_x: NDArray[np.float32]
+    """Standard error of x [px]; infinite where invalid, and where the read noise is unknown."""
+    standard_error_y: NDArray[np.float32]
+    covariance_xy: NDArray[np.float32]
+    """Covariance of the errors of x and y [px^2]; 0 where a standard error is infinite, and for an estimator
+    that does not know it (`trained`)."""
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Whether the slope was measured."""
+        return (self.flags & INVALID) == 0  # type: ignore[no-any-return]
+
+    @property
+    def vector(self) -> NDArray[np.float32]:
+        """All x, then all y, along the last axis: the input vector of a reconstructor."""
+        return np.concatenate([self.x, self.y], axis=-1)
+
+    @classmethod
+    def from_variables(cls, variables: Mapping[str, NDArray[Any]], n_frames: int | None = None) -> Slopes:
+        """Return the slopes from a file's variables, all frames or the first `n_frames`."""
+        return cls(**{item.name: variables[item.name][:n_frames] for item in fields(cls)})
+
+    @property
+    def variables(self) -> dict[str, NDArray[Any]]:
+        """Variables stored in files of slopes, by name."""
+        return {name: getattr(self, name) for name in VARIABLES}
+
+    def _in_words(self) -> dict[str, str]:
+        """Return numbers of frames and sub-apertures, valid fraction, rms and flux as text, by name."""
+        valid = self.valid
+        found = {
+            "frames": f"{1 if self.x.ndim == 1 else len(self.x)}",
+            "sub-apertures": f"{self.x.shape[-1]}",
+            "valid": f"{100 * float(np.mean(valid)):.4g} %" if valid.size else "none",
+        }
+        if valid.any():
+            x, y, flux = (values[valid].astype(np.float64) for values in (self.x, self.y, self.flux))
+            found["rms of x, y"] = f"{np.sqrt(np.mean(x**2)):.3g}, {np.sqrt(np.mean(y**2)):.3g} px"
+            found["median flux"] = f"{np.median(flux):.4g} e-"
+        return found
+
+    def __repr__(self) -> str:
+        return f"Slopes({', '.join(f'{name} {value}' for name, value in self._in_words().items())})"
+
+    def _repr_html_(self) -> str:
+        return table("Slopes", self._in_words())
+
+    def to_xarray(self, layout: Layout | None = None, *, unit: str = "px") -> xarray.Dataset:
+        """Return an xarray.Dataset with dimensions frame and subaperture, and units as attributes.
+
+        Parameters
+        ----------
+        layout : Layout, optional
+            Layout of the sub-apertures, which adds centre_x, centre_y (px), row and column as coordinates.
+        unit : {"px", "arcsec"}
+            Unit of positions and standard errors; arcsec needs a layout with `pixel_scale_arcsec`.
+
+        Raises
+        ------
+        InputError
+            If the layout has another number of sub-apertures, or lacks the required pixel scale.
+        MissingExtraError
+            If xarray is not installed.
+        """
+        from faintspot.slopes.pipeline.labelled import dataset_of
+
+        return dataset_of(self.variables, layout, unit)
+
+    def to_pandas(self, layout: Layout | None = None, *, unit: str = "px") -> pandas.DataFrame:
+        """Return a pandas.DataFrame with one row for each frame and sub-aperture, which form the index.
+
+        Columns are named as in .csv files, such as x_px. Parameters and errors are those of `to_xarray`.
+        """
+        from faintspot.slopes.pipeline.labelled import table_of_slopes
+
+        return table_of_slopes(self.variables, layout, unit)
+
+
+@dataclass(frozen=True)
+class Stages:
+    """Sub-aperture images after every step, (..., n_subapertures, ny, nx), and the slopes.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> layout = fs.Layout.grid((7, 7), pixels=16)
+    >>> frames, _ = fs.slopes.simulate.sensor_frames(layout.corners, layout.window, layout.frame_shape, 1)
+    >>> stages = fs.SlopePipeline(layout, fs.Settings(noise_std=0.5, keep_brightest=12)).explain(frames[0])
+    >>> stages.denoised.shape
+    (49, 16, 16)
+    >>> bool(stages.denoised.std() < stages.calibrated.std())
+    True
+    """
+
+    raw: NDArray[Any]
+    """Raw pixels [ADU]."""
+    calibrated: NDArray[np.float32]
+    """Calibrated images [electrons], bad pixels filled in."""
+    denoised: NDArray[np.float32]
+    background_subtracted: NDArray[np.float32]
+    slopes: Slopes

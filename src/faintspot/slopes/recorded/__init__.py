@@ -1,0 +1,21 @@
+"""Recorded frames: slopes from files to a file (`measuring`), and the page that shows them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from faintspot.base.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from faintspot.slopes.recorded.measuring import Summary as Summary
+    from faintspot.slopes.recorded.measuring import measure_recorded as measure_recorded
+
+_HOMES = {
+    "Summary": "faintspot.slopes.recorded.measuring",
+    "measure_recorded": "faintspot.slopes.recorded.measuring",
+}
+
+__all__ = sorted(_HOMES)
+
+
+__getattr__ = lazy_attributes(__name__, _HOMES)

@@ -1,0 +1,191 @@
+"""Settings to begin with, from the flux, noise, spot width and displacements that a few frames show."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.estimators.algorithms.noise import pixel_noise
+from faintspot.slopes.estimators.algorithms.spot_width import SeenSpots, seen_spots
+from faintspot.slopes.estimators.spot_tables import gaussian_psf
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.shapes import FWHM_TO_STD
+
+Floats = NDArray[np.float64]
+
+_FEWEST_PX = 4  # of a window's side; below, as in quad cells, every pixel counts
+_WIDTH_OF_WINDOW = 0.25  # of the window's side, where no spot is seen
+_LEAST_NOISE, _LARGEST_GAIN = 1e-6, 100.0  # noise over flux; of `Window.centroid_gain`
+ASSUMED_NOISE_E = 3.0  # of a dark pixel, which gives the gain of a single frame
+_WEIGHTS = (1.25, 1.6)  # width of the weight over the spot's: best where read noise, photon noise dominates
+_LEAST_DISPLACEMENT = 0.15  # rms over the spot's width: frames to come may move more than static ones
+_TIGHT, _WIDE, _WIDE_FWHM = 3.0, 4.0, 1.0  # search range over the rms displacement; what is added, in widths
+_LEAST_RANGE_PX = 1.0
+_BETTER = 0.95  # predicted error over that in a wide search range, to take a tight one
+_FAINT, _AS_GOOD = 0.8, 1.1  # response below which a fixed window is tried, and its error over the best one
+_SPOTS = 512
+
+
+@dataclass(frozen=True)
+class FirstSettings:
+    """Settings to begin with, and the noise and flux from which they follow, in the frames' unit.
+
+    Parameters
+    ----------
+    settings : Settings
+    noise : float
+        Standard deviation of a pixel far from the spots.
+    flux : float
+        Of a spot in a frame; 0 where no spots are seen.
+    response : float
+        Slope shown for a displacement of 1 px; below 1 where slopes would else be worse than none.
+    """
+
+    settings: Settings
+    noise: float
+    flux: float
+    response: float = 1.0
+
+
+def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[Any]) -> FirstSettings:
+    """Choose settings from a few frames of typical flux; they follow the unit of the frames.
+
+    Spots of the width, flux, noise and displacements that the frames show are simulated. The settings of the
+    smallest slope error are taken: a centre of gravity under a weight that follows the spot or, where the
+    flux is too low for that, under a fixed window, with slopes reduced to those of least squares. In windows
+    narrower than 4 px it is the plain centre of gravity.
+
+    Parameters
+    ----------
+    layout : Layout
+    calibration : Calibration
+    frames : (n, h, w) array, ADU
+        Two or more show the photon noise; of a single one it is assumed.
+
+    Returns
+    -------
+    FirstSettings
+    """
+    calibrated = SlopePipeline(layout, Settings("brightest"), calibration).explain(frames).calibrated
+    images: Floats = calibrated.astype(np.float64)
+    noise = pixel_noise(images)
+    if min(layout.window) < _FEWEST_PX:
+        sums = images.sum(axis=(-2, -1))
+        return FirstSettings(Settings("centroid"), noise, max(float(np.median(sums)), 0.0))
+    spots = _seen(images)
+    if spots is None:
+        side = _rounded(_WIDTH_OF_WINDOW * min(layout.window))
+        unseen = Settings(
+            "window", spot_fwhm_px=side, centroid_gain=_LARGEST_GAIN, search_range_px=_LEAST_RANGE_PX
+        )
+        return FirstSettings(unseen, noise, 0.0, 0.0)
+    noise = max(noise, _LEAST_NOISE * spots.flux)
+    settings, response = _Trial(images, layout, noise, spots).best()
+    return FirstSettings(settings, noise, spots.flux, response)
+
+
+def _seen(images: Floats) -> SeenSpots | None:
+    """Return width and flux of the spots; of the mean frame where those of single frames are lost."""
+    for shown in (images, images.mean(axis=0)):
+        try:
+            return seen_spots(shown)
+        except InputError:
+            pass
+    return None
+
+
+def _displacement(images: Floats, layout: Layout, spots: SeenSpots) -> float:
+    """Return how far spots are from their references, rms of both axes, however faint they are.
+
+    Displacements widen the mean of all images, and not their autocorrelation.
+    """
+    mean = images.mean(axis=(0, 1))
+    mean = mean - np.median(mean[[0, -1]])
+    try:
+        seen = seen_spots(mean)
+    except InputError:
+        return _WIDTH_OF_WINDOW * min(layout.window)
+    squares = np.square([seen.fwhm_x_px, seen.fwhm_y_px]) - np.square([spots.fwhm_x_px, spots.fwhm_y_px])
+    v, u = (np.arange(side) - 0.5 * (side - 1) for side in layout.window)
+    spot = np.maximum(mean - 0.5 * mean.max(), 0.0)
+    middle = np.array([u @ spot.sum(axis=0), v @ spot.sum(axis=1)]) / spot.sum()
+    away = np.square(middle - layout.offsets.mean(axis=0)) - layout.offsets.var(axis=0)
+    return math.sqrt(max(float((squares * FWHM_TO_STD**2 + away).mean()), 0.0))
+
+
+def _photon_noise(images: Floats, noise: float, flux: float) -> float:
+    """Return the variance that flux adds, over the flux: at most what successive frames differ by."""
+    if len(images) == 1:
+        return noise / ASSUMED_NOISE_E
+    squares = 0.5 * np.square(np.diff(images, axis=0)).sum(axis=(-2, -1))
+    pixels = images.shape[-2] * images.shape[-1]
+    return float(max(np.median(squares) - pixels * noise**2, 0.0) / flux)
+
+
+class _Trial:
+    """Settings tried on simulated spots like those of the frames."""
+
+    def __init__(self, images: Floats, layout: Layout, noise: float, spots: SeenSpots) -> None:
+        rng = np.random.default_rng(1)
+        self._spots, self._window = spots, layout.window
+        self._fwhm = math.sqrt(spots.fwhm_x_px * spots.fwhm_y_px)
+        self._displacement = max(_displacement(images, layout, spots), _LEAST_DISPLACEMENT * self._fwhm)
+        self._truth = self._displacement * rng.standard_normal((_SPOTS, 2))
+        psf = gaussian_psf(np.array([[spots.fwhm_x_px, spots.fwhm_y_px]]))
+        mean = np.maximum(psf.images(self._truth, self._window, spots.flux), 0.0)
+        variance = noise**2 + _photon_noise(images, noise, spots.flux) * mean
+        self._images = mean + np.sqrt(variance) * rng.standard_normal(mean.shape)
+
+    def best(self) -> tuple[Settings, float]:
+        """Return the settings of the smallest error, and the slope that they show for 1 px."""
+        width = {
+            "spot_fwhm_px": _rounded(self._spots.fwhm_x_px),
+            "spot_fwhm_y_px": _rounded(self._spots.fwhm_y_px),
+        }
+        tight = _reach(_TIGHT * self._displacement)
+        wide = _reach(_WIDE * self._displacement + _WIDE_FWHM * self._fwhm)
+        following = [
+            Settings("weighted", weight_fwhm_px=_rounded(factor * self._fwhm), search_range_px=reach, **width)
+            for reach in (wide, tight)
+            for factor in _WEIGHTS
+        ]
+        window = Settings("window", search_range_px=tight, flux_e=_rounded(self._spots.flux), **width)
+        shown = self._measured(window.replace(centroid_gain=1.0))
+        product = max(float((shown * self._truth).sum()), 1e-30)
+        response = product**2 / float((shown**2).sum() * (self._truth**2).sum())
+        gain = min(float((shown**2).sum()) / product, _LARGEST_GAIN)  # of least squares
+        window = window.replace(centroid_gain=_rounded(gain))
+        best, least = following[0], math.inf
+        for settings in following:
+            if (error := self._error(self._measured(settings))) < _BETTER * least:
+                best, least = settings, error
+        if response < _FAINT and self._error(self._measured(window)) < _AS_GOOD * least:
+            return window, response
+        return best, 1.0
+
+    def _error(self, positions: Floats) -> float:
+        return float(np.abs(positions - self._truth).mean())
+
+    def _measured(self, settings: Settings) -> Floats:
+        """Return the positions (n, 2) of the simulated spots."""
+        images, (ny, nx) = self._images, self._window
+        layout = Layout.stacked(len(images), (ny, nx))
+        frame = images.reshape(len(images) * ny, nx).astype(np.float32)
+        slopes = SlopePipeline(layout, settings, Calibration(dark=0.0))(frame)
+        return np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64)
+
+
+def _reach(value: float) -> float:
+    return _rounded(max(value, _LEAST_RANGE_PX))
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.3g}")

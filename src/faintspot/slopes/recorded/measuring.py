@@ -1,0 +1,314 @@
+"""Slopes of recorded frames: from files to a file, block by block, resumable."""
+
+from __future__ import annotations
+
+import hashlib
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.checks import one_of
+from faintspot.base.config.tables import read_tables
+from faintspot.base.errors import InputError
+from faintspot.base.flags import SubapertureFlag
+from faintspot.base.version import __version__
+from faintspot.io.frames import FrameSource, open_frames
+from faintspot.io.locations import split_location
+from faintspot.io.references import read_reference
+from faintspot.io.slopes import create_writer
+from faintspot.io.stored.slopes_format import UNITS, pixels_in, scaled_positions
+from faintspot.io.telemetry.aot_reading import is_aot, read_aot
+from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.pipeline.labelled import layout_coordinates
+from faintspot.slopes.pipeline.mean_flux import MeanFlux
+from faintspot.slopes.pipeline.settings import Settings, with_preset, without_denoising
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.sensor.layout import Layout
+
+_BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
+
+_LOOKS_FOR_FLUX, _FRAMES_FOR_FLUX = 20, 50  # stretches of frames over the whole recording
+
+Progress = Callable[[int, int], None]
+"""Called with the number of finished frames and of all frames."""
+
+
+@dataclass
+class Summary:
+    """Summary of a run over recorded frames."""
+
+    n_frames: int
+    n_subapertures: int
+    resumed_at: int = 0
+    flag_counts: dict[SubapertureFlag, int] = field(default_factory=dict)
+    """Number of slopes of this call with each flag."""
+    bad_frames: int = 0
+    """Frames of this call without a single valid slope."""
+    measured: int = 0
+    """Slopes made by this call."""
+    failed_frames: int = 0
+    """Frames of this call in which an estimator in NumPy failed."""
+    failure: str = ""
+    """Error of the last of them."""
+    origin: str = ""
+    """Description of the values taken from a file of telemetry."""
+
+    def add(self, slopes: Slopes) -> None:
+        """Count the flags of a block."""
+        self.measured += slopes.flags.size
+        self.bad_frames += int(np.count_nonzero(~slopes.valid.any(axis=-1)))
+        for flag in SubapertureFlag:
+            count = int(np.count_nonzero(slopes.flags & flag))
+            self.flag_counts[flag] = self.flag_counts.get(flag, 0) + count
+
+
+def measure_recorded(
+    frames: Sequence[str | Path],
+    configuration_file: str | Path,
+    output: str | Path,
+    *,
+    denoise: bool = True,
+    preset: str | None = None,
+    changes: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+    unit: str = "px",
+    mean_flux: bool = False,
+    reference: NDArray[Any] | str | Path | None = None,
+    key: str | None = None,
+    threads: int | None = None,
+    block_frames: int | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Summary:
+    """Measure the slopes of all frames in some files and write them to a file.
+
+    Interrupted and called again with the same arguments, it goes on where it stopped.
+
+    Parameters
+    ----------
+    frames : sequence of path
+        FITS, TIFF, .npy, .npz or Zarr; see `faintspot.io.open_frames`.
+    configuration_file : path
+        The TOML file with layout, settings and calibration. Where it has no layout, sub-apertures and
+        reference slopes are those of the first file of frames, if that is an AOT file, and where there is no
+        such file, the settings, too.
+    output : path
+        .zarr, .fits, .npz or .csv.
+    denoise : bool
+        False switches the denoising off for all sub-apertures.
+    changes : mapping, optional
+        New values of settings by name, instead of those in the configuration; "estimator" is one.
+    preset : str, optional
+        "accurate" or "fast", instead of that in the configuration.
+    device : str
+        "cpu" or "cuda", see `SlopePipeline`.
+    unit : {"px", "arcsec"}
+        Of positions and standard errors in the output; arcsec needs the layout's `pixel_scale_arcsec`.
+    mean_flux : bool
+        Tell the estimator the mean flux of every sub-aperture over the recording, instead of letting it take
+        that of each frame: better where the star is faint and steady; see `faintspot.MeanFlux`.
+    reference : array or path, optional
+        Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key", or
+        slopes of which they are the mean; see `faintspot.io.references.read_reference`.
+    key : str, optional
+        Which array of the files to read, where they hold several.
+    threads : int, optional
+        Most threads to use; default all processors.
+    block_frames : int, optional
+        Frames to work on at a time; default so many that a block takes 32 MB.
+    overwrite : bool
+        Replace an existing output of another run.
+    progress : callable, optional
+        Called with finished and all frames after every block.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be read or written, or frames and configuration do not fit together.
+    """
+    given, origin, in_file = _given(configuration_file, frames, key)
+    layout, settings, calibration, psf, score = given
+    if changes:
+        settings = settings.replace(**changes)
+    if not denoise:
+        settings = without_denoising(settings, "denoise = False (--no-denoise)")
+    if preset is not None:
+        settings = with_preset(settings, preset)
+    positions = read_reference(reference) if isinstance(reference, str | Path) else reference
+    if positions is None:
+        positions = in_file
+    try:
+        pipeline = SlopePipeline(
+            layout, settings, calibration, positions, psf=psf, score=score, threads=threads, device=device
+        )
+    except InputError as error:
+        if str(error).startswith("device"):
+            raise
+        about_reference = positions is not None and str(error).startswith("reference")
+        where = reference if about_reference and isinstance(reference, str | Path) else configuration_file
+        raise InputError(f"{where}: {error}") from None
+    with open_frames(frames, key=key) as source:
+        _check_output(output, frames)
+        if source.shape != layout.frame_shape:
+            raise InputError(
+                f"{source.description}: frames of {source.shape[0]} x {source.shape[1]} pixels, expected "
+                f"{layout.frame_shape[0]} x {layout.frame_shape[1]} as in {configuration_file}"
+            )
+        if mean_flux:
+            pipeline = _told_mean_flux(pipeline, source)
+        attributes = _attributes(pipeline, source, frames, configuration_file, key, unit)
+        factor = pixels_in(one_of("unit", unit, UNITS), attributes)
+        if positions is not None:
+            attributes["reference"] = np.asarray(positions).tolist()
+        summary = Summary(source.n_frames, len(layout), origin=origin)
+        size = block_frames or max(1, _BLOCK_BYTES // (4 * source.shape[0] * source.shape[1]))
+        with create_writer(
+            output,
+            n_frames=source.n_frames,
+            n_subapertures=len(layout),
+            attributes=attributes,
+            coordinates=layout_coordinates(layout),
+            overwrite=overwrite,
+        ) as writer:
+            summary.resumed_at = writer.finished()
+            for start, block in source.blocks(summary.resumed_at, source.n_frames, size):
+                slopes = pipeline(block)
+                writer.append(start, scaled_positions(slopes.variables, factor))
+                summary.add(slopes)
+                if progress is not None:
+                    progress(start + len(block), source.n_frames)
+    prepared = pipeline.plan.prepared
+    summary.failed_frames, summary.failure = prepared.faults, prepared.fault
+    return summary
+
+
+def _given(
+    path: str | Path, frames: Sequence[str | Path], key: str | None
+) -> tuple[configuration.Configuration, str, NDArray[Any] | None]:
+    """Return the configuration, what of it is that of an AOT file, in words, and that file's references."""
+    if isinstance(frames, str | Path) or not frames or configuration.has(path, "layout"):
+        return configuration.load_all(path), "", None
+    try:
+        first, own = split_location(frames[0])
+    except InputError:  # whoever opens it says so, after what is wrong with the configuration
+        return configuration.load_all(path), "", None
+    if not is_aot(first):
+        return configuration.load_all(path), "", None
+    sensor = read_aot(first, own or key)
+    if sensor.layout is None:
+        raise InputError(
+            f"{first}: sensor {sensor.name!r}: expected its sub-apertures (subaperture_mask, mask_offsets, "
+            f"subaperture_size), found none; give [layout] in {path}"
+        )
+    layout = Layout(**sensor.layout)
+    words = ["sub-apertures", *(["reference slopes"] if sensor.reference is not None else [])]
+    document = dict(sensor.tables)
+    if not Path(path).exists() and not document:
+        command = _layout_command(frames[0], layout, path)
+        raise InputError(f"{path}: no such file, and {first} has no settings; `{command}` makes one")
+    if Path(path).exists():
+        document = read_tables(path)
+    else:
+        words.append("settings")
+    where = Path(path)
+    if "settings" in words and sensor.parts is not None:
+        settings = Settings.from_tables(where, document)
+        measuring = configuration.Parts(settings, *configuration.unpacked(sensor.parts))
+    else:
+        measuring = configuration.Parts.from_tables(where, document)
+    parts = configuration.Configuration(layout, *measuring)
+    listed = " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
+    return parts, f"{listed} of {first}", sensor.reference
+
+
+def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str:
+    """Return the command that writes a configuration for a layout whose cells are on a grid."""
+    rows, columns = np.ptp(layout.cells, axis=0) + 1
+    (top, left), (bottom, right) = layout.corners.min(axis=0), layout.corners.max(axis=0) + layout.window
+    whole = (top, left, bottom, right) == (0, 0, *layout.frame_shape)
+    roi = [] if whole else ["--roi", f"{left},{top},{right},{bottom}"]
+    words = ["faintspot", "layout", str(frames), "--grid", f"{rows}x{columns}", *roi, "-o", str(path)]
+    return shlex.join(words)
+
+
+def _told_mean_flux(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeline:
+    """Return the pipeline for the mean flux of frames from all over the recording."""
+    estimator = pipeline.settings.estimator
+    if not estimator.uses_flux:
+        raise InputError(f"mean flux: the estimator {estimator.name!r} does not use the flux of spots")
+    starts = np.unique(np.linspace(0, max(source.n_frames - _FRAMES_FOR_FLUX, 0), _LOOKS_FOR_FLUX, dtype=int))
+    flux = [
+        pipeline(block).flux
+        for start in starts.tolist()
+        for _, block in source.blocks(start, min(start + _FRAMES_FOR_FLUX, source.n_frames), _FRAMES_FOR_FLUX)
+    ]
+    return pipeline.with_flux(MeanFlux(np.concatenate(flux)))
+
+
+def _check_output(output: str | Path, frames: Sequence[str | Path]) -> None:
+    """Refuse to replace the frames by their slopes."""
+    if Path(output).resolve() in [split_location(path)[0].resolve() for path in frames]:
+        raise InputError(f"{output}: expected a name for the slopes, got a file of the frames")
+
+
+def _version(path: Path) -> str:
+    """Return values that change when a file of frames is written to."""
+    status = path.stat()
+    return "" if path.is_dir() else f"{status.st_size} {status.st_mtime_ns}"
+
+
+def _attributes(
+    pipeline: SlopePipeline,
+    source: FrameSource,
+    frames: Sequence[str | Path],
+    configuration_file: str | Path,
+    key: str | None,
+    unit: str,
+) -> dict[str, Any]:
+    """Return the attributes of the output; the fingerprint decides whether a run may be continued."""
+    text = configuration.to_text(pipeline.layout, pipeline.settings, pipeline.calibration)
+    paths = [str(Path(path).resolve()) for path in frames]
+    state = hashlib.sha256()
+    for part in (
+        __version__,
+        text,
+        str(key),
+        *([] if unit == "px" else [unit]),
+        *paths,
+        *(_version(split_location(path)[0]) for path in frames),
+        str((source.n_frames, source.shape, source.dtype)),
+    ):
+        state.update(part.encode() + b"\0")
+    state.update(pipeline.fingerprint())
+    scale = pipeline.layout.pixel_scale_arcsec
+    return {
+        "title": "Shack-Hartmann slopes",
+        "unit": unit,
+        **({} if scale is None else {"pixel_scale_arcsec": scale}),
+        "configuration": text,
+        "configuration_file": str(Path(configuration_file).resolve()),
+        **_files_of_the_spot(configuration_file),
+        "sources": paths,
+        "source_key": key or "",
+        "faintspot_version": __version__,
+        "fingerprint": state.hexdigest(),
+    }
+
+
+def _files_of_the_spot(configuration_file: str | Path) -> dict[str, str]:
+    """Return the files of PSF and score, for a report: their own, or the configuration."""
+    path = Path(configuration_file).resolve()
+    if not path.exists():  # everything was in a file of telemetry
+        return {}
+    tables = read_tables(path)
+    return {
+        f"{part}_file": str(path.parent / tables[part].get("file", path.name))
+        for part in ("psf", "score")
+        if part in tables
+    }

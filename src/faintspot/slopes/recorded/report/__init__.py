@@ -1,0 +1,1 @@
+"""The report of recorded slopes: sections, maps, key numbers, advice."""

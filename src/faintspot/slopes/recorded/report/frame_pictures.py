@@ -1,0 +1,254 @@
+"""Pictures of a frame: the sensor and single sub-apertures after every step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.report.drawing import (
+    FLUX_GREY,
+    TRUTH_COLOUR,
+    WIDTH,
+    colour_bar,
+    limits_of,
+    new_figure,
+    styled,
+)
+from faintspot.slopes.estimators.base import Step
+from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
+from faintspot.slopes.pipeline.slopes import Stages
+from faintspot.slopes.sensor.layout import Layout
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+MOST_MARKED = 150
+"""With more sub-apertures than this the whole sensor's picture has no marks: they would hide the spots."""
+_MOST_PIXELS = 400  # a side of the whole sensor's picture: of more, spots would be too small to be seen
+_MARKS = (("+", "white"), ("x", "#D55E00"), ("1", "#E69F00"), ("2", "#CC79A7"))  # with a black outline
+
+
+@dataclass(frozen=True)
+class Example:
+    """One frame after every step.
+
+    Attributes
+    ----------
+    layout : Layout
+    stages : mapping of Stages
+        By method; images (n_subapertures, ny, nx). The first one's images are shown, the positions of all are
+        marked. They must be measured from the sub-apertures' centres (no other reference).
+    truth : array (n_subapertures, 2), optional
+        True x, y, px.
+    steps : sequence of Step
+        What is shown of them; "raw" first.
+    """
+
+    layout: Layout
+    stages: Mapping[str, Stages]
+    truth: Floats | None = None
+    steps: Sequence[Step] = TotalVariation.steps_shown
+
+    @property
+    def first(self) -> Stages:
+        """What is shown."""
+        return next(iter(self.stages.values()))
+
+    @property
+    def raw_is_calibrated(self) -> bool:
+        """Whether the raw frame is in electrons already."""
+        return bool(np.allclose(self.first.raw, self.first.calibrated, rtol=1e-5, equal_nan=True))
+
+    @property
+    def shown_steps(self) -> dict[str, str]:
+        """Attributes of `Stages` by title; a raw frame in electrons is not shown twice and nothing else."""
+        only_twice = len(self.steps) == 2 and self.raw_is_calibrated
+        return dict(self.steps[:1] if only_twice else self.steps)
+
+    def positions(self) -> dict[str, Floats]:
+        """Return valid positions by method, and the truth, from the window's middle, px; NaN if invalid."""
+        found = {}
+        for name, stages in self.stages.items():
+            xy = np.stack([stages.slopes.x, stages.slopes.y], axis=-1).astype(np.float64)
+            found[name] = np.where(stages.slopes.valid[:, None], xy, np.nan) + self.layout.offsets
+        if self.truth is not None:
+            found["truth"] = self.truth + self.layout.offsets
+        return found
+
+
+@styled
+def whole_sensor(example: Example) -> Figure:
+    """Draw all windows at their places after every step; on the last, the positions of the spots."""
+    layout, steps = example.layout, example.shown_steps
+    factor = coarseness(layout)
+    sheets = {
+        title: coarser(assembled(layout, getattr(example.first, of)), factor) for title, of in steps.items()
+    }
+    figure, axes = _step_panels(len(steps), sheets["raw"].shape)
+    start = layout.corners.min(axis=0) - 0.5
+    n_rows, n_columns = factor * np.array(sheets["raw"].shape)
+    extent = (start[1], start[1] + n_columns, start[0], start[0] + n_rows)
+    shown = _draw_steps(axes, sheets, example.raw_is_calibrated, extent)
+    _sheet_bars(axes, shown, example.raw_is_calibrated)
+    for panel in axes:
+        panel.label_outer()
+    if len(layout) <= MOST_MARKED:
+        middles = layout.corners[:, ::-1] + 0.5 * (np.array(layout.window[::-1]) - 1)
+        _mark(axes[-1], {name: xy + middles for name, xy in example.positions().items()}, size=6)
+        _legend(figure, axes[-1])
+    return figure
+
+
+def _sheet_bars(axes: list[Axes], shown: Mapping[str, Any], one_unit: bool) -> None:
+    """Put colour bars beside the panels: electrons at the right end, ADU beside the raw frame."""
+    two_rows = len(axes) == 4
+    if not one_unit:
+        first, side = ([axes[0], axes[2]], "left") if two_rows else ([axes[0]], "right")
+        colour_bar(first, shown["raw"], "raw: ADU", location=side)
+    last = [axes[1], axes[3]] if two_rows else axes if one_unit else axes[1:]
+    colour_bar(last, list(shown.values())[-1], "e- per pixel")
+
+
+def _step_panels(number: int, shape: tuple[int, ...]) -> tuple[Figure, list[Axes]]:
+    """Return panels for the steps: four in two rows, fewer side by side."""
+    rows, columns = (2, 2) if number == 4 else (1, number)
+    wide = WIDTH if number > 1 else 0.62 * WIDTH
+    height = min(max(0.84 * wide / columns * shape[0] / shape[1], 1.2), 9.0) + 0.7
+    figure = new_figure(wide, rows * height)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for panel in grid.flat:
+        panel.set(xlabel="column (px)", ylabel="row (px)")
+    return figure, list(grid.flat)
+
+
+def coarseness(layout: Layout) -> int:
+    """Return how many frame pixels a side make one of the whole sensor's picture, so that it can be seen."""
+    height, width = np.ptp(layout.corners, axis=0) + np.array(layout.window)
+    return max(1, -(-int(max(height, width)) // _MOST_PIXELS))
+
+
+def coarser(sheet: Floats, factor: int) -> Floats:
+    """Return the largest of each `factor` x `factor` pixels, so that spots stay visible; NaN is left out."""
+    if factor == 1:
+        return sheet
+    rows, columns = (-(-length // factor) * factor for length in sheet.shape)
+    padded = np.full((rows, columns), -np.inf)
+    padded[: sheet.shape[0], : sheet.shape[1]] = np.where(np.isfinite(sheet), sheet, -np.inf)
+    largest = padded.reshape(rows // factor, factor, columns // factor, factor).max(axis=(1, 3))
+    return np.where(np.isfinite(largest), largest, np.nan)
+
+
+@styled
+def zoom(example: Example) -> Figure:
+    """Draw the faintest, a median and the brightest valid sub-aperture after every step."""
+    chosen, steps = example_subapertures(example.first), example.shown_steps
+    height, width = example.layout.window
+    panel_width = WIDTH / 5.3
+    figure = new_figure(
+        panel_width * (len(steps) + 1.3), len(chosen) * (panel_width * min(height / width, 2.0) + 0.25) + 0.9
+    )
+    grid = figure.subplots(len(chosen), len(steps), squeeze=False, sharex=True, sharey=True)
+    extent = (-width / 2, width / 2, -height / 2, height / 2)
+    positions = example.positions()
+    for row, (what, index) in enumerate(chosen.items()):
+        axes = list(grid[row])
+        images = {title: getattr(example.first, of)[index] for title, of in steps.items()}
+        shown = _draw_steps(axes, images, example.raw_is_calibrated, extent, titles=row == 0)
+        if not example.raw_is_calibrated:
+            colour_bar(axes[0], shown["raw"], "ADU")
+        electrons = axes if example.raw_is_calibrated else axes[1:]
+        colour_bar(electrons, list(shown.values())[-1], "e- per pixel")
+        axes[0].set_ylabel(f"{what}\nno. {index}, {_flux(example.first, index)} e-\ny (px)")
+        for panel in axes[1:] or axes:
+            _mark(panel, {name: xy[index : index + 1] for name, xy in positions.items()}, size=13)
+    for panel in grid[-1]:
+        panel.set_xlabel("x (px)")
+    _legend(figure, grid[0, -1])
+    return figure
+
+
+def _flux(stages: Stages, index: int) -> str:
+    flux = float(stages.slopes.flux[index])
+    return f"{flux:.0f}" if abs(flux) >= 100 else f"{flux:.3g}"
+
+
+def example_subapertures(stages: Stages) -> dict[str, int]:
+    """Return the numbers of the faintest, a median and the brightest valid sub-aperture, each once.
+
+    Without any valid one it is the sub-aperture with the most flux after calibration.
+    """
+    valid = np.flatnonzero(stages.slopes.valid)
+    if valid.size == 0:
+        flux = stages.calibrated.sum(axis=(-2, -1))
+        return {"none is valid": int(np.argmax(flux))}
+    order = valid[np.argsort(stages.slopes.flux[valid], kind="stable")]
+    chosen = {"brightest": int(order[-1])}
+    if len(order) > 1:
+        chosen = {"faintest": int(order[0]), **chosen}
+    if len(order) > 2:
+        chosen = {"faintest": int(order[0]), "median": int(order[len(order) // 2]), **chosen}
+    return chosen
+
+
+def assembled(layout: Layout, images: NDArray[Any]) -> Floats:
+    """Return the windows' images (n, ny, nx) at their places; NaN between them."""
+    start = layout.corners.min(axis=0)
+    height, width = layout.corners.max(axis=0) - start + np.array(layout.window)
+    sheet = np.full((height, width), np.nan)
+    rows, columns = layout.window_pixels
+    sheet[rows - start[0], columns - start[1]] = images
+    return sheet
+
+
+def _draw_steps(
+    axes: list[Axes], images: Mapping[str, Floats], one_unit: bool, extent: Any, titles: bool = True
+) -> dict[str, Any]:
+    """Draw the steps on one colour scale, raw on its own one when it is in ADU; return the images."""
+    adu = limits_of(images["raw"], percent=99.8)
+    electrons = adu if one_unit else limits_of(images["calibrated"], percent=99.8)
+    shown = {}
+    for panel, (step, image) in zip(axes, images.items(), strict=True):
+        low, high = adu if step == "raw" else electrons
+        shown[step] = panel.imshow(image, vmin=low, vmax=high, extent=extent, interpolation="nearest")
+        panel.set_facecolor(FLUX_GREY)
+        if titles:
+            panel.set_title(step + (" (ADU)" if step == "raw" and not one_unit else ""))
+    return shown
+
+
+def _mark(axes: Axes, positions: Mapping[str, Floats], size: float) -> None:
+    """Mark positions: each method by its own cross, the first one's on top, and the truth by a circle."""
+    from matplotlib.patheffects import withStroke
+
+    width = 0.5 + 0.08 * size
+    outline = withStroke(linewidth=2.6 * width, foreground="black")
+    crosses = dict(zip((name for name in positions if name != "truth"), _MARKS, strict=False))
+    for name, xy in positions.items():
+        if name == "truth":
+            axes.plot(*xy.T, "o", ms=1.5 * size, mfc="none", mec=TRUTH_COLOUR, mew=width, ls="", label=name)
+        elif name in crosses:
+            marker, colour = crosses[name]
+            order = 3.0 - 0.1 * list(crosses).index(name)
+            axes.plot(*xy.T, marker, ms=size, mew=width, color=colour, ls="", label=name, zorder=order)
+            axes.lines[-1].set_path_effects([outline])
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(
+            handles,
+            labels,
+            loc="outside upper center",
+            ncols=len(labels),
+            facecolor="#777777",
+            labelcolor="white",
+            edgecolor="none",
+        )

@@ -1,0 +1,75 @@
+"""Section of a report page that shows sodium profiles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from faintspot.base.errors import InputError
+from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, new_figure, styled
+from faintspot.base.report.figure_data import FigureWithData
+from faintspot.base.report.page import Section
+from faintspot.base.report.texts import Texts
+from faintspot.io.frames import FrameSource
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.recorded.sodium import sodium_of_frames
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.laser_spots import LaserSpots
+from faintspot.slopes.spots.sodium import SodiumProfile
+from faintspot.slopes.training.known_sodium import SODIUM
+
+_TEXT = Texts("faintspot.slopes.recorded")
+
+
+@styled
+def profile_figure(profiles: Mapping[str, SodiumProfile]) -> FigureWithData:
+    """Draw the density of profiles against altitude; the last one is emphasised."""
+    figure = new_figure(0.6 * WIDTH, 4.6)
+    axes = figure.subplots()
+    rows: list[tuple[Any, ...]] = []
+    *before, newest = profiles
+    for place, (name, profile) in enumerate(profiles.items()):
+        altitude, density = profile.altitudes_m / 1e3, 1e3 * profile.density
+        style: dict[str, Any] = {"color": METHOD_COLOURS[1], "lw": 2.2}
+        if name != newest:
+            dashes = ("--", ":", "-.")[place % 3] if len(before) > 1 else "--"
+            style = {"color": GREY, "lw": 1.6, "ls": dashes}
+        mean = f"mean {profile.mean_m / 1e3:.1f} km, std {profile.std_m / 1e3:.1f} km"
+        axes.plot(density, altitude, label=f"{name}\n({mean})", **style)
+        rows += [(name, f"{a:.6g}", f"{b:.6g}") for a, b in zip(altitude, density, strict=True)]
+    axes.set(xlabel="return flux per km of altitude", ylabel="altitude above sea level (km)", xlim=(0, None))
+    axes.legend(frameon=False)
+    return _TEXT.figure("sodium", figure, rows)
+
+
+def sodium_section_of_frames(
+    source: FrameSource, layout: Layout, calibration: Calibration, laser: LaserSpots, most_frames: int
+) -> Section:
+    """Return the section with the configured profile, and that of frames; or why there is none."""
+    try:
+        known, _ = sodium_of_frames(source, layout, calibration, laser, most_frames=most_frames)
+    except InputError as error:
+        return Section("sodium", "Sodium profile", missing=f"Not fitted: {error}.")
+    profiles = {"configured": known.star.focused(laser.profile), "these frames": known.fit.profile}
+    return _section(profiles, known.spot_fwhm_arcsec)
+
+
+def sodium_sections_of_changes(changes: Sequence[Mapping[str, Any]]) -> list[Section]:
+    """Return the section with the profiles that an engine has followed, from telemetry's changes; or none."""
+    followed = [change["changes"][SODIUM] for change in changes if SODIUM in change["changes"]]
+    followed = [each for each in followed if isinstance(each, Mapping)]  # else it was too long
+    if not followed:
+        return []
+    first, last = followed[0], followed[-1]
+    shown = ("at the start", first, "before_per_km"), ("at the end", last, "flux_per_km")
+    profiles = {
+        name: SodiumProfile(1e3 * np.asarray(each["altitude_km"]), each[of]) for name, each, of in shown
+    }
+    return [_section(profiles, float(last["spot_fwhm_arcsec"]))]
+
+
+def _section(profiles: Mapping[str, SodiumProfile], spot_fwhm_arcsec: float) -> Section:
+    text = [_TEXT["sodium.about"], _TEXT("sodium.spot", width=spot_fwhm_arcsec)]
+    return Section("sodium", "Sodium profile", text, figures=[profile_figure(profiles)])

@@ -1,0 +1,246 @@
+"""The report page of slopes that lie in files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.base.report.page import Section
+from faintspot.base.report.texts import Texts
+from faintspot.io import open_frames
+from faintspot.io.frames import FrameSource
+from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
+from faintspot.slopes.pipeline.slopes import Slopes, Stages
+from faintspot.slopes.recorded.report.page import slopes_report
+from faintspot.slopes.recorded.report.sodium_section import sodium_section_of_frames
+from faintspot.slopes.recorded.statistics import ARRAYS, MeasuredSlopes
+from faintspot.slopes.recorded.stored_run import StoredRun, open_run
+
+_TEXT = Texts("faintspot.slopes.recorded")
+_SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
+_SAME_POSITION_PX = 0.02
+"""Recomputed positions differ by less, whatever processor computed the stored ones."""
+_FRAMES_OF_PROFILE = 500
+_SAID_FIRST = ("calibration", "PSF", "score")
+"""Reasons for not drawing the frame that also stand at the top of the page."""
+
+
+def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path] | None = None) -> str:
+    """Return the report page (HTML) of one file of slopes, or of two of the same frames.
+
+    Layout, settings and calibration are rebuilt from what the file says about its run. The frame with the
+    median total flux is taken from the run's sources and measured again for the pictures. What is missing is
+    said on the page.
+
+    Parameters
+    ----------
+    paths : one or two paths
+        Slopes as `faintspot.io.create_writer` wrote them; two to compare, as denoised and not.
+    frames : paths, optional
+        Where the frames are now. Default: where they were.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be read, has no finished frame, or two do not have the same sub-apertures.
+    MissingExtraError
+        When matplotlib, jinja2 or the package that reads a file is not installed.
+    """
+    if not 1 <= len(paths) <= 2:
+        raise InputError(f"slopes: expected one file or two to compare, got {len(paths)}")
+    stores = [open_run(Path(path)) for path in paths]
+    first = stores[0]
+    for other in stores[1:]:
+        _check_same_sensor(first, other)
+    methods, notes = _methods(stores)
+    total = np.where(methods[0].valid, methods[0].flux, 0.0).sum(axis=1)
+    example_frame = int(np.argsort(total, kind="stable")[(len(total) - 1) // 2])
+    stages, reason = _example(stores, methods, example_frame, frames, notes)
+    if any(word in reason for word in _SAID_FIRST):
+        notes.append(reason)
+    return slopes_report(
+        methods,
+        layout=first.layout,
+        stages=stages,
+        title=f"Slopes of {' and '.join(store.path.name for store in stores)}",
+        facts=_facts(stores, methods),
+        configurations=_configurations(stores, methods),
+        example_frame=example_frame,
+        steps=(first.estimator or TotalVariation).steps_shown,
+        warnings=list(dict.fromkeys([*_labelled_notes(stores, methods), *notes])),
+        why_no_stages=reason,
+        slopes={
+            method.name: Slopes.from_variables(store.stored.variables, method.n_frames)
+            for store, method in zip(stores, methods, strict=True)
+        },
+        sections=_sodium(first, frames),
+    )
+
+
+def _sodium(store: StoredRun, frames: Sequence[str | Path] | None) -> list[Section]:
+    """Return the section of the sodium profile, for a laser guide star whose frames are there."""
+    if store.laser is None or store.layout is None or store.calibration is None:
+        return []
+    try:
+        with _source(store, frames) as source:
+            known = store.layout, store.calibration, store.laser
+            return [sodium_section_of_frames(source, *known, _FRAMES_OF_PROFILE)]
+    except InputError as error:
+        return [Section("sodium", "Sodium profile", missing=f"Not fitted: {error}.")]
+
+
+def _configurations(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
+    """Return the configurations by what they are of: one where all are the same."""
+    if len({store.text for store in stores}) == 1:
+        return {"Configuration": stores[0].text}
+    return {
+        f"Configuration of {method.name}": store.text for store, method in zip(stores, methods, strict=True)
+    }
+
+
+def _labelled_notes(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> list[str]:
+    """Return the notes of all runs, with the name of their method where there are several."""
+    labels = [f"{method.name}: " if len(methods) > 1 else "" for method in methods]
+    return [label + note for label, store in zip(labels, stores, strict=True) for note in store.notes]
+
+
+def _check_same_sensor(first: StoredRun, other: StoredRun) -> None:
+    mine, theirs = (store.stored.variables["x"].shape[1] for store in (first, other))
+    if mine != theirs:
+        raise InputError(f"{other.path}: expected {mine} sub-apertures, as in {first.path}, got {theirs}")
+    if first.layout is None or other.layout is None:
+        return
+    same = all(
+        np.shape(a) == np.shape(b) and np.allclose(a, b, atol=_SAME_PLACE_PX)
+        for name in ("frame_shape", "window", "corners", "centres")
+        for a, b in [(getattr(first.layout, name), getattr(other.layout, name))]
+    )
+    if not same:
+        raise InputError(f"{other.path}: expected the layout of {first.path}, got another")
+
+
+def _methods(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[str]]:
+    """Return the slopes of the frames that all files have, and notes about it."""
+    notes = []
+    counts = [store.stored.n_finished for store in stores]
+    if len(set(counts)) > 1:
+        lengths = {"first": counts[0], "second": counts[1], "fewest": min(counts)}
+        notes.append(_TEXT("stored.other_lengths", **lengths))
+    known = [store.sources for store in stores if store.sources]
+    if len(known) == 2 and known[0] != known[1]:
+        notes.append(_TEXT["stored.other_sources"])
+    methods = []
+    for name, store in zip(_names(stores), stores, strict=True):
+        variables = store.stored.variables
+        arrays = [variables[of][: min(counts)] for of in ARRAYS]
+        # Iterations of other estimators are their own steps.
+        denoised = None if store.estimator is None or store.estimator.denoises else False
+        stated = _median_standard_error(store)
+        methods.append(MeasuredSlopes(name, *arrays, denoised=denoised, standard_error_px=stated))
+    return methods, notes
+
+
+def _names(stores: Sequence[StoredRun]) -> list[str]:
+    """Name the methods by what they do where that tells them apart, else by their files."""
+    names = [_label(store) for store in stores]
+    if len(set(names)) == len(names):
+        return names
+    files = [store.path.name for store in stores]
+    if len(set(files)) < len(files):
+        files = [str(store.path) for store in stores]
+    if len(set(files)) < len(files):
+        raise InputError(f"{stores[0].path}: expected two different files of slopes, got the same twice")
+    return files
+
+
+def _label(store: StoredRun) -> str:
+    return store.path.name if store.estimator is None else store.estimator.label
+
+
+def _example(
+    stores: Sequence[StoredRun],
+    methods: Sequence[MeasuredSlopes],
+    number: int,
+    frames: Sequence[str | Path] | None,
+    notes: list[str],
+) -> tuple[dict[str, Stages] | None, str]:
+    """Measure the example frame again in every method; or return why that cannot be done."""
+    if stores[0].layout is None:
+        return None, "Not drawn: the layout is not known."
+    try:
+        frame = _frame(stores[0], number, frames)
+        stages: dict[str, Stages] = {}
+        for store, method in zip(stores, methods, strict=True):
+            stages[method.name] = store.pipeline().explain(frame)
+            notes += _disagreement(store, method, frame, number)
+        estimator = stores[0].estimator
+        without = None if estimator is None else estimator.without_denoising()
+        if len(stores) == 1 and without is not None:
+            stages[without.label] = stores[0].pipeline(without).explain(frame)
+    except InputError as error:
+        return None, f"Not drawn: {error}."
+    return stages, ""
+
+
+def _source(store: StoredRun, frames: Sequence[str | Path] | None) -> FrameSource:
+    """Open the frames of a run."""
+    places = list(frames) if frames is not None else store.sources
+    if not places:
+        raise InputError(f"{store.path.name} does not say where its frames came from")
+    return open_frames(places, key=store.stored.attributes.get("source_key") or None)
+
+
+def _frame(store: StoredRun, number: int, frames: Sequence[str | Path] | None) -> NDArray[Any]:
+    with _source(store, frames) as source:
+        frame: NDArray[Any] = source.block(number, number + 1)[0]
+    return frame
+
+
+def _disagreement(store: StoredRun, method: MeasuredSlopes, frame: NDArray[Any], number: int) -> list[str]:
+    """Warn if the example frame, measured again, gives other slopes than those stored."""
+    slopes = store.pipeline(reference=store.stored.attributes.get("reference"))(frame)
+    both = slopes.valid & method.valid[number]
+    again = np.stack([slopes.x, slopes.y])[:, both]
+    distance = np.abs(again - np.stack([method.x[number], method.y[number]])[:, both])
+    if distance.size == 0 or distance.max() <= _SAME_POSITION_PX:
+        return []
+    names = {"frame": number, "file": store.path.name}
+    return [_TEXT("stored.disagreement", **names, distance=distance.max())]
+
+
+def _range_in_words(store: StoredRun) -> str:
+    if store.layout is None or store.settings is None or store.settings.search_range_px is None:
+        return ""
+    each = store.settings.values("search_range_px", len(store.layout), store.layout.pixels)
+    return f"; positions within {np.max(each):g} px"
+
+
+def _median_standard_error(store: StoredRun) -> float:
+    """Median over the slopes whose standard error is known of its rms of x and y, px; NaN without any."""
+    x, y = (store.stored.variables[f"standard_error_{axis}"].astype(np.float64) for axis in "xy")
+    errors = np.sqrt((x**2 + y**2) / 2)
+    known = errors[np.isfinite(errors)]
+    return float(np.median(known)) if known.size else np.nan
+
+
+def _facts(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
+    sources = list(dict.fromkeys(source for store in stores for source in store.sources))
+    shown = ", ".join(sources[:4]) + (f" and {len(sources) - 4} more" if len(sources) > 4 else "")
+    versions = dict.fromkeys(
+        str(store.stored.attributes.get("faintspot_version", "unknown")) for store in stores
+    )
+    facts = {"Slopes": ", ".join(str(store.path) for store in stores), "Sources": shown or "not stored"}
+    for store, method in zip(stores, methods, strict=True):
+        words = "not stored"
+        if store.estimator is not None and store.layout is not None:
+            words = store.estimator.in_words(len(store.layout), store.layout.pixels) + _range_in_words(store)
+        of = f" of {method.name!r}" if len(methods) > 1 else ""
+        facts[f"Settings{of}"] = words
+    if any("reference" in store.stored.attributes for store in stores):
+        facts["Reference"] = "slopes are relative to stored reference positions; crosses in pictures are not"
+    return {**facts, "Measured with": f"faintspot {', '.join(versions)}"}

@@ -1,0 +1,177 @@
+"""Slopes in a file, and what could be rebuilt of the run that made them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, TypeVar
+
+import tomlkit
+from numpy.typing import ArrayLike
+from tomlkit.exceptions import TOMLKitError
+
+from faintspot.base.config.tables import read_tables
+from faintspot.base.errors import InputError
+from faintspot.io import StoredSlopes, read_slopes
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.estimators.base import Estimator
+from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.laser_spots import LaserSpots, laser_of, load_laser
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import Score, load_score
+
+_Part = TypeVar("_Part")
+
+
+@dataclass
+class StoredRun:
+    """One file of slopes and what could be rebuilt from its attributes; `notes` says what could not."""
+
+    path: Path
+    stored: StoredSlopes
+    notes: list[str]
+    layout: Layout | None = None
+    settings: Settings | None = None
+    calibration: Calibration | None = None
+    psf: PSF | None = None
+    score: Score | None = None
+    laser: LaserSpots | None = None
+    lost: list[str] = field(default_factory=list)
+    """Optional parts of a pipeline: a PSF or a score, whose file may be missing."""
+
+    @property
+    def estimator(self) -> Estimator | None:
+        """The estimator of the run, when its settings are known."""
+        return None if self.settings is None else self.settings.estimator
+
+    @property
+    def sources(self) -> list[str]:
+        """The files that the frames came from."""
+        found = self.stored.attributes.get("sources", [])
+        return [found] if isinstance(found, str) else [str(item) for item in found]
+
+    @property
+    def text(self) -> str:
+        """The configuration."""
+        return str(self.stored.attributes.get("configuration", ""))
+
+    def pipeline(
+        self, estimator: Estimator | None = None, reference: ArrayLike | None = None
+    ) -> SlopePipeline:
+        """Return the pipeline of the run, or the same with another estimator.
+
+        Raises
+        ------
+        InputError
+            When the layout, the settings or something that the estimator needs are not known.
+        """
+        settings = self.settings
+        if self.layout is None or settings is None or self.calibration is None:
+            raise InputError(f"layout, settings or calibration of {self.path.name} are not known")
+        if estimator is not None:
+            settings = settings.replace(estimator=estimator)
+        try:
+            return SlopePipeline(
+                self.layout, settings, self.calibration, reference, psf=self.psf, score=self.score
+            )
+        except InputError as error:
+            raise InputError("; ".join(self.lost) or str(error)) from None
+
+
+def open_run(path: Path) -> StoredRun:
+    """Read one file of slopes and rebuild what its attributes describe."""
+    stored = read_slopes(path)
+    if stored.n_finished == 0:
+        raise InputError(f"{path}: expected slopes, no frame is finished yet")
+    store = StoredRun(path, stored, [])
+    if not stored.complete:
+        store.notes.append(f"{path.name} is unfinished: {stored.n_finished} frames are there so far.")
+    if not store.text:
+        store.notes.append(f"{path.name} does not say with which configuration it was made.")
+        return store
+    try:
+        _rebuild(store)
+    except InputError as error:
+        store.notes.append(f"The configuration stored in {path.name} cannot be used: {error}.")
+    n = stored.variables["x"].shape[1]
+    if store.layout is not None and len(store.layout) != n:
+        store.notes.append(
+            f"The layout stored in {path.name} has {len(store.layout)} sub-apertures, the slopes have {n}: "
+            "not used."
+        )
+        store.layout = None
+    return store
+
+
+def _rebuild(store: StoredRun) -> None:
+    """Make layout, settings and calibration from the stored text, and maps from the original file."""
+    try:
+        tables: dict[str, Any] = tomlkit.parse(store.text).unwrap()
+    except TOMLKitError as error:
+        raise InputError(f"not TOML: {str(error).splitlines()[0]}") from None
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / "configuration"
+        copy.write_text(tomlkit.dumps(tables), encoding="utf-8")
+        try:
+            store.layout = configuration.load(copy, "layout")
+            store.settings = configuration.load(copy, "settings")
+            mapless = not any(_is_map(value) for value in tables.get("calibration", {}).values())
+            if mapless:
+                store.calibration = configuration.load(copy, "calibration")
+        except InputError as error:
+            raise InputError(str(error).replace(f"{copy}: ", "")) from None
+    if not mapless:
+        store.calibration = _original_calibration(store, tables["calibration"])
+    store.psf = _of_the_spot(store, "psf", PSF.load, configuration.psf_of)
+    store.score = _of_the_spot(store, "score", load_score, configuration.score_of)
+    store.laser = _of_the_spot(store, "laser", load_laser, laser_of)
+
+
+def _of_the_spot(
+    store: StoredRun,
+    name: str,
+    load: Callable[[str], _Part],
+    load_named: Callable[[Path, dict[str, dict[str, Any]]], _Part | None],
+) -> _Part | None:
+    """Read the PSF or the score of the run; a missing file is reported when it is needed."""
+    attributes = store.stored.attributes
+    file, original = (str(attributes.get(key, "")) for key in (f"{name}_file", "configuration_file"))
+    try:
+        if file and file != original:
+            return load(file)
+        if file or Path(original).is_file():
+            return load_named(Path(original), read_tables(original))
+    except InputError as error:
+        words = {"psf": "PSF", "score": "trained score", "laser": "laser guide star"}[name]
+        store.lost.append(f"the {words} of {store.path.name} is gone ({error})")
+    return None
+
+
+def _is_map(value: Any) -> bool:
+    """Whether the stored text has a description in place of a map."""
+    return isinstance(value, str) and value.startswith("map of")
+
+
+def _original_calibration(store: StoredRun, stored_table: dict[str, Any]) -> Calibration | None:
+    """Read a calibration with maps from the configuration file of the run, if it is still the same."""
+    original = store.stored.attributes.get("configuration_file")
+    if not original or not Path(str(original)).exists():
+        store.notes.append(
+            f"The calibration maps of {store.path.name} are not found (configuration file "
+            f"{original or 'unknown'})."
+        )
+        return None
+    try:
+        calibration: Calibration = configuration.load(str(original), "calibration")
+    except InputError as error:
+        store.notes.append(f"The calibration maps of {store.path.name} cannot be read: {error}.")
+        return None
+    now = tomlkit.parse(configuration.to_text(calibration)).unwrap()["calibration"]
+    if now != stored_table:
+        store.notes.append(f"The calibration in {original} has changed since {store.path.name} was made.")
+    return calibration

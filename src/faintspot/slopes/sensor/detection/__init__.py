@@ -1,0 +1,1 @@
+"""Detection of the lenslets in a frame: spots, lattice, illumination."""

@@ -1,0 +1,105 @@
+"""Layout found in a frame, with the lenslets and spots left out and the doubtful spots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from faintspot.slopes.kernels.driver.doubtful import Expected, flag_doubtful
+from faintspot.slopes.sensor.detection.lenslets import LensletGrid
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, neighbours_of
+from faintspot.slopes.sensor.windows import Windows, find_windows
+
+
+@dataclass(frozen=True)
+class FoundLayout:
+    """Layout found in a frame, with the lenslets and spots left out and the doubtful spots.
+
+    Parameters
+    ----------
+    layout : Layout
+        Illuminated sub-apertures whose windows are within the frame.
+    lenslets : LensletGrid
+        All illuminated lenslets, including those at the edge.
+    cut : (n, 2) array
+        x, y of the illuminated lenslets omitted because their window leaves the frame [px].
+    outside : (n, 2) array
+        x, y of the bright spots outside all windows that belong to none of these lenslets [px].
+    clipped : (n_subapertures,) array of bool
+        True where the spot is within its standard deviation (at least 1 px) of the edge of its window.
+    unlike : (n_subapertures,) array of bool
+        True where the displacement of the spot differs from those of all its neighbours.
+    """
+
+    layout: Layout
+    lenslets: LensletGrid
+    cut: NDArray[np.float64]
+    outside: NDArray[np.float64]
+    clipped: NDArray[np.bool_]
+    unlike: NDArray[np.bool_]
+
+    def __getitem__(self, chosen: NDArray[np.bool_]) -> FoundLayout:
+        """Return the result for the chosen (n_subapertures,) sub-apertures only."""
+        return replace(
+            self, layout=self.layout[chosen], clipped=self.clipped[chosen], unlike=self.unlike[chosen]
+        )
+
+
+def find_layout(frame: ArrayLike, **options: Any) -> FoundLayout:
+    """Find the sub-apertures of a frame and list those left out; see `Layout.from_frame`.
+
+    Raises
+    ------
+    InputError
+        If no regular array of spots is found, or no window is within the frame.
+    """
+    found = find_windows(frame, **options)
+    grid, within = found.lenslets, found.within
+    depth = _depth(found, grid.spots, np.arange(len(grid.spots)))[within]
+    return FoundLayout(
+        Layout.of_windows(found),
+        grid,
+        grid.centres[~within],
+        _outside(found),
+        depth < max(grid.spot_px, 1.0),
+        _unlike(grid)[within],
+    )
+
+
+def _depth(found: Windows, spots: NDArray[np.float64], of_window: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the distance [px] of each spot inside the edge of its window; negative outside."""
+    side = np.array(found.window[::-1])
+    from_first = spots - found.corners[of_window, ::-1] + 0.5
+    return np.asarray(np.minimum(from_first, side - from_first).min(axis=-1))
+
+
+def _outside(found: Windows) -> NDArray[np.float64]:
+    """Return the bright spots outside all windows, including windows cut by the edge of the frame."""
+    spots = found.lenslets.elsewhere
+    if len(spots) == 0:
+        return spots
+    middles = found.corners[:, ::-1] + 0.5 * (np.array(found.window[::-1]) - 1)
+    _, near = cKDTree(middles).query(spots, min(4, len(middles)), p=np.inf)
+    near = near.reshape(len(spots), -1)
+    return np.asarray(spots[(_depth(found, spots[:, None], near) < 0).all(axis=1)])
+
+
+def _unlike(grid: LensletGrid) -> NDArray[np.bool_]:
+    """Return which spots have displacements that differ from those of all (at least two) neighbours."""
+    x, y = np.asarray(grid.spots - grid.centres - grid.drifts, np.float32).T
+    n = len(x)
+    flags = np.zeros((1, n), np.uint8)
+    expected = Expected(
+        np.zeros((2, n), np.float32),
+        np.full((2, n), np.inf, np.float32),
+        neighbours_of(grid.cells, grid.geometry, diagonal=True),
+        np.float32(LEAST_DIFFERENCE * grid.pitch_px),
+    )
+    x, y = np.ascontiguousarray(x[None]), np.ascontiguousarray(y[None])
+    flag_doubtful(x, y, flags, expected, np.empty(n, np.float32))
+    return np.asarray(flags[0] != 0)

@@ -1,0 +1,395 @@
+"""Layout: positions of the sub-apertures on the detector."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import finite_array, number_between, numbers_between, one_of
+from faintspot.base.config.tables import (
+    check_fields,
+    chosen_fields,
+    errors_of_table,
+    read_tables,
+    save_tables,
+    table_of,
+)
+from faintspot.base.errors import InputError
+from faintspot.base.sizes import check_size
+from faintspot.base.toml_files import check_keys, checked_table
+from faintspot.slopes.sensor.window_checks import check_centres, check_inside, check_overlap, chosen_index
+from faintspot.slopes.sensor.window_size import pair_of_numbers, window_size
+
+if TYPE_CHECKING:
+    from faintspot.slopes.sensor.windows import Windows
+
+GRID_KEYS = ("shape", "pixels", "outer_radius", "inner_radius", "pitch", "origin", "frame_shape")
+GEOMETRIES = ("square", "hexagonal")
+OPTICS = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
+"""Fields that define scales on the sky and in the pupil."""
+_MOST_LENSLETS = 1 << 20
+_LARGEST_PX = 1e9
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Positions of the sub-apertures: one window of the same size for each illuminated lenslet.
+
+    Parameters
+    ----------
+    frame_shape : (int, int)
+        Height and width of a frame [px].
+    window : (int, int)
+        Height and width of each sub-aperture [px], 2 (quad cells) to 64.
+    corners : (n, 2) array of int
+        Row and column of the first pixel of each window.
+    centres : (n, 2) array, optional
+        x, y of each sub-aperture's centre in frame pixels (pixel i is centred at i), from which positions are
+        measured. The distance from the window centre is at most three times the longer side of the window.
+        Default: the window centre.
+    cells : (n, 2) array of int, optional
+        Row and column of each lenslet in its array, for maps.
+    geometry : {"square", "hexagonal"}
+    pitch_px : float, optional
+        Distance between neighbouring lenslets.
+    angle_deg : float
+        Angle of the rows of the lenslet array from +x towards +y.
+    pixel_scale_arcsec : float, optional
+        Angle on the sky per detector pixel, which converts slopes to angles.
+    subaperture_m, diameter_m : float, optional
+        Side of a sub-aperture (the pitch of the lenslets) and diameter of the telescope, in the entrance
+        pupil. Either one is sufficient for wavefronts in nm: illuminated sub-apertures are then taken to
+        span the pupil.
+
+    Raises
+    ------
+    InputError
+        If the layout is empty, a window leaves the frame, windows overlap, a centre is far from its window,
+        or there are more than 2^28 pixels or 2^20 lenslets.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
+    >>> len(layout), layout.frame_shape, layout.window
+    (36, (112, 112), (16, 16))
+    """
+
+    frame_shape: tuple[int, int]
+    window: tuple[int, int]
+    corners: NDArray[np.int64]
+    centres: NDArray[np.float64] = None  # type: ignore[assignment]
+    cells: NDArray[np.int64] = None  # type: ignore[assignment]
+    geometry: str = "square"
+    pitch_px: float | None = None
+    angle_deg: float = 0.0
+    pixel_scale_arcsec: float | None = None
+    subaperture_m: float | None = None
+    diameter_m: float | None = None
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        put(self, "frame_shape", pair_of_numbers("layout.frame_shape", self.frame_shape, 1, 2**31))
+        check_size("layout.frame_shape", self.frame_shape, what="pixels")
+        put(self, "window", window_size("layout.window", self.window))
+        corners = _rows_of_two("layout.corners", self.corners)
+        corners = numbers_between("layout.corners", corners, -(2**31), 2**31, integer=True)
+        middle = corners[:, ::-1] + 0.5 * (np.array(self.window[::-1]) - 1)
+        centres = middle if self.centres is None else _rows_of_two("layout.centres", self.centres)
+        pitch = np.array(self.window)
+        cells = (corners - corners.min(axis=0)) // pitch if self.cells is None else self.cells
+        cells = _rows_of_two("layout.cells", cells)
+        cells = numbers_between("layout.cells", cells, -_MOST_LENSLETS, _MOST_LENSLETS, integer=True)
+        for name, array in (("centres", centres), ("cells", cells)):
+            if len(array) != len(corners):
+                raise InputError(
+                    f"layout.{name}: expected {len(corners)} rows, one per corner, got {len(array)}"
+                )
+        check_size("layout.cells", (np.ptp(cells, axis=0) + 1).tolist(), _MOST_LENSLETS, "lenslets")
+        one_of("layout.geometry", self.geometry, GEOMETRIES)
+        for name in ("pitch_px", *OPTICS):
+            if (value := getattr(self, name)) is not None:
+                put(self, name, number_between(f"layout.{name}", value, 0.0, _LARGEST_PX, low_open=True))
+        put(self, "angle_deg", number_between("layout.angle_deg", self.angle_deg, -360, 360))
+        check_inside(corners, self.window, self.frame_shape)
+        check_centres(centres - middle, self.window)
+        check_overlap(corners, self.window)
+        for name, array in (("corners", corners), ("centres", centres.astype(np.float64)), ("cells", cells)):
+            array = array.copy()
+            array.flags.writeable = False
+            put(self, name, array)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Layout):
+            return NotImplemented
+        mine, theirs = vars(self), vars(other)
+        return all(np.array_equal(mine[name], theirs[name]) for name in mine)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        """Return a one-line summary, since arrays of a layout have hundreds of rows."""
+        pitch = "" if self.pitch_px is None else f", pitch_px={self.pitch_px:.4g}"
+        return (
+            f"<Layout: {len(self)} sub-apertures, frame_shape={self.frame_shape}, window={self.window}, "
+            f"geometry={self.geometry!r}{pitch}>"
+        )
+
+    def _repr_html_(self) -> str:
+        from faintspot.base.notebook import windows_picture
+
+        return windows_picture(self.corners, self.window, self.frame_shape)
+
+    def __len__(self) -> int:
+        """Return the number of sub-apertures."""
+        return len(self.corners)
+
+    def __getitem__(self, chosen: Any) -> Layout:
+        """Return the layout of some of the sub-apertures, in the given order.
+
+        Parameters
+        ----------
+        chosen : (n,) array of bool, slice or list of int
+            Sub-apertures to select: a mask of all, or their numbers.
+
+        Raises
+        ------
+        InputError
+            If a mask has the wrong length, a number is out of range or repeated, or none is selected.
+        """
+        index = chosen_index(chosen, len(self))
+        return replace(
+            self, corners=self.corners[index], centres=self.centres[index], cells=self.cells[index]
+        )
+
+    __iter__ = None  # otherwise Python would use __getitem__, which does not accept a single number
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of a window."""
+        return self.window[0] * self.window[1]
+
+    @property
+    def offsets(self) -> NDArray[np.float64]:
+        """Offsets x, y of the sub-aperture centres from the window centres, (n, 2) px."""
+        return self.centres - (self.corners[:, ::-1] + 0.5 * (np.array(self.window[::-1]) - 1))
+
+    @classmethod
+    def grid(
+        cls,
+        shape: tuple[int, int],
+        *,
+        pixels: int | tuple[int, int],
+        outer_radius: float | None = None,
+        inner_radius: float | None = None,
+        pitch: int | tuple[int, int] | None = None,
+        origin: tuple[int, int] = (0, 0),
+        frame_shape: tuple[int, int] | None = None,
+        **optics: Any,
+    ) -> Layout:
+        """Make a regular grid of sub-apertures under an annular pupil.
+
+        Parameters
+        ----------
+        shape : (int, int)
+            Rows and columns of lenslets.
+        pixels : int or (int, int)
+            Height and width of a window.
+        outer_radius, inner_radius : float, optional
+            Radii of the pupil in lenslets: a sub-aperture is illuminated if the distance of its centre from
+            the middle of the grid is between `inner_radius` and `outer_radius`. Default: all are
+            illuminated. (7, 7) with 3.5 and 0.5 gives the 36 sub-apertures of a 4.2 m telescope with
+            central obstruction.
+        pitch : int or (int, int), optional
+            Rows and columns between adjacent windows. Default: `pixels`.
+        origin : (int, int)
+            Row and column of the first pixel of the first window.
+        frame_shape : (int, int), optional
+            Default: the smallest frame that contains all windows.
+        **optics
+            pixel_scale_arcsec, subaperture_m and diameter_m, as for `Layout`.
+
+        Raises
+        ------
+        InputError
+            If no sub-aperture is illuminated, or as for `Layout`.
+        """
+        check_keys("", optics, OPTICS, what="argument")
+        n_rows, n_columns = pair_of_numbers("shape", shape, 1, _LARGEST_PX)
+        check_size("shape", (n_rows, n_columns), _MOST_LENSLETS, "lenslets")
+        window = window_size("pixels", pixels)
+        step = window if pitch is None else pair_of_numbers("pitch", pitch, 1, 10_000)
+        start = pair_of_numbers("origin", origin, 0, 2**31)
+        outer = np.inf if outer_radius is None else number_between("outer_radius", outer_radius, 0.0)
+        inner = 0.0 if inner_radius is None else number_between("inner_radius", inner_radius, 0.0)
+        cells = np.stack(np.meshgrid(np.arange(n_rows), np.arange(n_columns), indexing="ij"), -1).reshape(
+            -1, 2
+        )
+        distance = np.hypot(*(cells - 0.5 * (np.array([n_rows, n_columns]) - 1)).T)
+        cells = cells[(distance <= outer) & (distance >= inner)]
+        if len(cells) == 0:
+            raise InputError(
+                f"outer_radius = {outer:g}, inner_radius = {inner:g}: no sub-aperture is illuminated"
+            )
+        if frame_shape is None:
+            last = np.array(start) + (np.array([n_rows, n_columns]) - 1) * step + window
+            frame_shape = (int(last[0]), int(last[1]))
+        corners = np.array(start) + cells * step
+        return cls(frame_shape, window, corners, cells=cells, pitch_px=float(min(step)), **optics)
+
+    @classmethod
+    def stacked(cls, n: int, window: tuple[int, int], offsets: NDArray[np.float64] | None = None) -> Layout:
+        """Return the layout of n images stacked into one tall frame.
+
+        Parameters
+        ----------
+        n : int
+        window : (int, int)
+            Height and width of an image.
+        offsets : (n, 2) array, optional
+            x, y of each sub-aperture's centre from the centre of its image [px]. Default: 0.
+        """
+        ny, nx = window
+        corners = np.column_stack([ny * np.arange(n), np.zeros(n, np.int64)])
+        middles = corners[:, ::-1] + 0.5 * (np.array([nx, ny]) - 1)
+        return cls((n * ny, nx), window, corners, middles if offsets is None else middles + offsets)
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: ArrayLike,
+        *,
+        geometry: str = "auto",
+        pitch_px: float | None = None,
+        pixels: int | tuple[int, int] | None = None,
+        bad_pixels: ArrayLike | None = None,
+        move_windows: bool = False,
+        **options: Any,
+    ) -> Layout:
+        """Find the sub-apertures of a square or hexagonal lenslet array in a frame.
+
+        Parameters
+        ----------
+        frame : (h, w) or (n, h, w) array
+            Frame with spots, or several of the same field, which are averaged.
+        geometry : {"auto", "square", "hexagonal"}
+        pitch_px : float, optional
+            Distance between neighbouring lenslets, if known (to 20 %).
+        pixels : int or (int, int), optional
+            Window, or its height and width. Default: the largest square windows that do not overlap; a
+            pitch that is an integer within its error gives windows of that size.
+        bad_pixels : (h, w) array of bool, optional
+            True for pixels to ignore.
+        move_windows : bool
+            Whether all windows may be shifted together, by up to 0.35 of their side, to include spots at
+            the edge of the frame. Centres of gravity are less accurate in such windows.
+        **options
+            Passed on to `faintspot.slopes.sensor.detection.lenslets.find_lenslets`.
+
+        Returns
+        -------
+        Layout
+            Illuminated sub-apertures whose windows are within the frame. Windows are centred on the mean
+            lattice of the spots, unless they were shifted or follow spots that an aberration moves by more
+            than a quarter of the pitch; `centres` always contain the lattice.
+            `faintspot.slopes.sensor.found_layout.find_layout` lists the omitted lenslets and spots.
+
+        Raises
+        ------
+        InputError
+            If no regular array of spots is found.
+        """
+        from faintspot.slopes.sensor.windows import find_windows
+
+        found = find_windows(
+            frame,
+            pixels=pixels,
+            move_windows=move_windows,
+            geometry=geometry,
+            pitch_px=pitch_px,
+            bad_pixels=bad_pixels,
+            **options,
+        )
+        return cls.of_windows(found)
+
+    @classmethod
+    def of_windows(cls, found: Windows) -> Layout:
+        """Return the layout of the windows within the frame."""
+        grid, within = found.lenslets, found.within
+        return cls(
+            found.frame_shape,
+            found.window,
+            found.corners[within],
+            grid.centres[within],
+            grid.cells[within],
+            grid.geometry,
+            grid.pitch_px,
+            grid.angle_deg,
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Layout:
+        """Read the table [layout] of a configuration file (TOML)."""
+        return cls.from_tables(path, read_tables(path))
+
+    @classmethod
+    def from_tables(cls, path: str | Path, document: Mapping[str, dict[str, Any]]) -> Layout:
+        """Return the layout in the tables of a configuration file."""
+        values = table_of(path, document, "layout")
+        with errors_of_table(path, "layout"):
+            return cls.from_table(values)
+
+    def save(self, path: str | Path) -> None:
+        """Write the table [layout] of a configuration file (TOML); preserve other tables."""
+        save_tables(path, {"layout": self.to_table()})
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the table of a configuration file."""
+        return chosen_fields(self)
+
+    @classmethod
+    def from_table(cls, values: Mapping[str, Any]) -> Layout:
+        """Return the layout in a table of a configuration file, which may contain the arguments of `grid`.
+
+        Raises
+        ------
+        InputError
+            If a key is unknown, or a value is missing or invalid.
+        """
+        if "grid" not in values:
+            check_fields("layout", cls, values)
+            return cls(**values)
+        check_keys("layout.", values, ["grid", *OPTICS], what="key beside grid")
+        optics = {name: values[name] for name in OPTICS if name in values}
+        grid = checked_table("layout.grid", values["grid"])
+        check_keys("layout.grid.", grid, GRID_KEYS, required=("shape", "pixels"))
+        try:
+            return cls.grid(**grid, **optics)
+        except InputError as error:
+            text = str(error)
+            raise InputError(text if text.startswith("layout") else f"layout.grid.{text}") from None
+
+    def images(self, frame: ArrayLike) -> NDArray[Any]:
+        """Return the windows of a frame (h, w) or frames (n, h, w): (n_subapertures, ny, nx) or (n, ...)."""
+        array = np.asarray(frame)
+        if array.shape[-2:] != self.frame_shape:
+            raise InputError(f"frame: expected (height, width) = {self.frame_shape}, got {array.shape[-2:]}")
+        return array[(..., *self.window_pixels)]
+
+    @property
+    def window_pixels(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows (n, ny, 1) and columns (n, 1, nx) of the windows' pixels in the frame."""
+        rows = self.corners[:, 0, None, None] + np.arange(self.window[0])[:, None]
+        return rows, self.corners[:, 1, None, None] + np.arange(self.window[1])
+
+
+def _rows_of_two(name: str, value: Any) -> NDArray[Any]:
+    array = finite_array(name, value)
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise InputError(f"{name}: expected shape (n, 2), got {array.shape}")
+    return array

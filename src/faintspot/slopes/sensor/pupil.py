@@ -1,0 +1,101 @@
+"""Sub-apertures in the pupil of the telescope: their outlines, and the circle around them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.slopes.sensor.layout import Layout
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pupil:
+    """Disk of the telescope pupil in the frame."""
+
+    centre_px: tuple[float, float]
+    """Centre x, y in the frame [px]."""
+    radius_px: float
+    """Radius in the frame [px]; neighbouring lenslets are one pitch of the layout apart."""
+    radius_subapertures: float
+    """Radius in sub-aperture sides."""
+    radius_m: float | None
+    """Radius in the entrance pupil; None if the layout does not give its size."""
+
+
+def pupil_of(layout: Layout) -> Pupil:
+    """Return the disk of the pupil.
+
+    The centre is that of the rectangle along the rows of the lattice that contains all illuminated
+    sub-apertures. The diameter is its longer side, so that corners of a square array are outside; if both
+    `subaperture_m` and `diameter_m` are given, it is their ratio.
+
+    Raises
+    ------
+    InputError
+        If these two give a disk that does not contain all centres of sub-apertures.
+    """
+    pitch = lenslet_pitch(layout)
+    angle = np.deg2rad(layout.angle_deg)
+    along = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    rotated = layout.centres @ along  # x along the rows
+    low, high = rotated.min(axis=0), rotated.max(axis=0)
+    x, y = along @ ((low + high) / 2)
+    farthest = float(np.hypot(*(layout.centres - (x, y)).T).max())
+    radius = 0.5 * (float((high - low).max()) + pitch)
+    side, diameter = layout.subaperture_m, layout.diameter_m
+    if side is not None and diameter is not None:
+        radius = 0.5 * pitch * diameter / side
+        if farthest > radius:
+            raise InputError(
+                f"layout.diameter_m = {diameter:g} and layout.subaperture_m = {side:g}: "
+                f"{diameter / side:.3g} sub-apertures across, but lit ones lie "
+                f"{2 * farthest / pitch:.3g} apart"
+            )
+    elif side is not None:
+        diameter = 2 * radius / pitch * side
+    metres = None if diameter is None else diameter / 2
+    return Pupil((float(x), float(y)), radius, radius / pitch, metres)
+
+
+def inside_pupil(layout: Layout, pupil: Pupil) -> NDArray[np.bool_]:
+    """Return which sub-apertures have their centre within the disk, (n,)."""
+    away = np.hypot(*(layout.centres - pupil.centre_px).T)
+    return np.asarray(away <= pupil.radius_px * (1 + 1e-9))
+
+
+def lenslet_pitch(layout: Layout) -> float:
+    """Return the distance of neighbouring lenslets [px]; the side of the window if it is unknown."""
+    return float(max(layout.window)) if layout.pitch_px is None else layout.pitch_px
+
+
+def lenslet_outlines(layout: Layout, part: float = 1.0) -> Floats:
+    """Return the corners of each lenslet's square or hexagon in frame pixels, (n, 4 or 6, 2).
+
+    They are ordered from +x towards +y; `part` shrinks the lenslets, leaving gaps between them.
+    """
+    pitch = part * lenslet_pitch(layout)
+    if layout.geometry == "hexagonal":
+        angles, radius = 30.0 + 60.0 * np.arange(6), pitch / np.sqrt(3)
+    else:
+        angles, radius = 45.0 + 90.0 * np.arange(4), pitch / np.sqrt(2)
+    direction = np.deg2rad(angles + layout.angle_deg)
+    ring = radius * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
+    outlines: Floats = layout.centres[:, None, :] + ring
+    return outlines
+
+
+def subapertures_across(cells: NDArray[np.int64]) -> int:
+    """Return the number of sub-apertures across an array, from their rows and columns (n, 2)."""
+    return int(np.ptp(cells, axis=0).max()) + 1
+
+
+def side_m(cells: NDArray[np.int64], subaperture_m: float | None, diameter_m: float | None) -> float | None:
+    """Return the side of a sub-aperture, given or from the diameter of the pupil; None without either."""
+    if subaperture_m is None and diameter_m is not None:
+        return diameter_m / subapertures_across(cells)
+    return subaperture_m

@@ -1,0 +1,135 @@
+"""Windows around the lenslets found in a frame: size and position."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from faintspot.base.checks import real_array
+from faintspot.base.errors import InputError
+from faintspot.slopes.sensor.detection.lenslets import LensletGrid, find_lenslets
+from faintspot.slopes.sensor.window_size import LARGEST_WINDOW, window_size
+
+# Windows may be moved this far from their spots to be a pixel larger: no more than the rounding of their
+# corners to whole pixels.
+_SPREAD_PX = 0.5
+_LARGEST_SHIFT = 0.35  # of a window's side, by which `move_windows` may shift windows off their spots
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Windows of the lenslets found in a frame.
+
+    Parameters
+    ----------
+    frame_shape, window : (int, int)
+    corners : (n, 2) array of int
+        Row and column of the first pixel of each window.
+    within : (n,) array of bool
+        Whether the window is within the frame.
+    lenslets : LensletGrid
+        All illuminated lenslets, including those at the edge.
+    """
+
+    frame_shape: tuple[int, int]
+    window: tuple[int, int]
+    corners: NDArray[np.int64]
+    within: NDArray[np.bool_]
+    lenslets: LensletGrid
+
+
+def find_windows(
+    frame: ArrayLike,
+    *,
+    pixels: int | tuple[int, int] | None = None,
+    move_windows: bool = False,
+    **options: Any,
+) -> Windows:
+    """Find the lenslets of a frame, and a window for each.
+
+    Parameters
+    ----------
+    frame : (h, w) or (n, h, w) array
+    pixels : int or (int, int), optional
+        Window, see `faintspot.Layout.from_frame`.
+    move_windows : bool
+        Whether all windows may be shifted off the spots to include those at the edge of the frame.
+    **options
+        Passed on to `faintspot.slopes.sensor.detection.lenslets.find_lenslets`.
+
+    Raises
+    ------
+    InputError
+        If no regular array of spots is found, or no window is within the frame.
+    """
+    array = _finite_or_masked("frame", frame)
+    window = None if pixels is None else window_size("pixels", pixels)
+    grid = find_lenslets(array, **options)
+    shape = (int(array.shape[-2]), int(array.shape[-1]))
+    middles = (grid.centres + grid.drifts)[:, ::-1]
+    if window is None:
+        window = _largest_window(middles, grid.pitch_px)
+    middles = _spread(middles, window)
+    if move_windows:
+        moved = [_shift_inside(middles[:, i], window[i], shape[i]) for i in range(2)]
+        middles = np.stack(moved, axis=1)
+    corners = np.floor(middles - 0.5 * (np.array(window) - 1) + 0.5).astype(np.int64)
+    within = np.all((corners >= 0) & (corners + np.array(window) <= np.array(shape)), axis=1)
+    if not within.any():
+        raise InputError(
+            f"frame: the windows of all {len(corners)} lenslets found leave the frame; "
+            f"try pixels < {min(window)}"
+        )
+    return Windows(shape, window, corners, within, grid)
+
+
+def _finite_or_masked(name: str, value: ArrayLike) -> NDArray[Any]:
+    """Return a real array of two or three dimensions, which may contain NaN."""
+    array = real_array(name, value, minimum_dimensions=2)
+    if array.ndim > 3:
+        raise InputError(f"{name}: expected (h, w) or (n, h, w), got shape {array.shape}")
+    return array
+
+
+def _largest_window(middles: NDArray[np.float64], pitch_px: float) -> tuple[int, int]:
+    """Return the largest square window without overlap, with windows moved by at most half a pixel."""
+    distances = np.asarray(cKDTree(middles).query(middles, k=2, p=np.inf)[0])[:, 1]
+    clear = float(np.min(distances[np.isfinite(distances)], initial=pitch_px))
+    side = int(np.rint(clear))
+    if (side / clear - 1) * _half_extent(middles) > _SPREAD_PX:
+        side = int(clear)
+    side = min(side, LARGEST_WINDOW)
+    return side, side
+
+
+def _half_extent(middles: NDArray[np.float64]) -> float:
+    return float(np.max(np.ptp(middles, axis=0))) / 2
+
+
+def _spread(middles: NDArray[np.float64], window: tuple[int, int]) -> NDArray[np.float64]:
+    """Return window centres far enough apart for the window, if half a pixel is sufficient.
+
+    Centres at least a window apart keep that distance when rounded to whole pixels.
+    """
+    pairs = cKDTree(middles).query_pairs(max(window), p=np.inf, output_type="ndarray")
+    apart = np.abs(middles[pairs[:, 0]] - middles[pairs[:, 1]]) / np.array(window)
+    closest = float(np.min(apart.max(axis=1), initial=1.0))
+    if closest >= 1 or (1 / closest - 1) * _half_extent(middles) > _SPREAD_PX:
+        return middles
+    middle = (middles.min(axis=0) + middles.max(axis=0)) / 2
+    return np.asarray(middle + (middles - middle) * ((1 + 1e-9) / closest))
+
+
+def _shift_inside(centres: NDArray[np.float64], side: int, length: int) -> NDArray[np.float64]:
+    """Shift all windows along one axis, by the smallest shift that includes the most at the edge."""
+    shifts = np.arange(-_LARGEST_SHIFT * side, _LARGEST_SHIFT * side + 0.25, 0.5)
+    starts = np.floor(centres + shifts[:, None] - 0.5 * (side - 1) + 0.5)
+    inside = np.count_nonzero((starts >= 0) & (starts + side <= length), axis=1)
+    unmoved = np.floor(centres - 0.5 * (side - 1) + 0.5)
+    if inside.max() <= np.count_nonzero((unmoved >= 0) & (unmoved + side <= length)):
+        return centres
+    return np.asarray(centres + shifts[np.lexsort((np.abs(shifts), -inside))[0]])

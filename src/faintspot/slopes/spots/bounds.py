@@ -1,0 +1,354 @@
+"""Cramer-Rao bound on the position of a spot, and the photon efficiency of estimators.
+
+The bound holds for unbiased estimators. An estimator that knows that positions lie within some range can have
+a smaller error at low flux; see `prior_std_px`.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import number_between, numbers_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.slopes.camera.detector import Detector
+from faintspot.slopes.spots.derivatives import STEP_PX, images_with_derivatives
+from faintspot.slopes.spots.pixel_information import SMALLEST_MEAN_E, poisson_gaussian_information
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.shapes import image_shape, per_spot, position_array, spots
+
+Floats = NDArray[np.float64]
+
+MEAN_ABSOLUTE = math.sqrt(2 / math.pi)
+"""Mean absolute value of a standard normal distribution: slope error of an estimator at a bound of 1 px."""
+
+_NOISES = ("exact", "gaussian")
+_BRACKET = 1e12  # largest and, inverted, smallest flux tried by photon_efficiency, e-
+_FLUX_STEPS_PER_DECADE = 12
+
+
+class SpotImages(Protocol):
+    """Object that provides noiseless spot images at given positions, such as `faintspot.PSF`."""
+
+    def images(self, positions: Any, shape: tuple[int, int], flux_e: Any = 1.0) -> Floats:
+        """Return images (n, ny, nx) of spots at positions (n, 2)."""
+
+
+class _Spot(NamedTuple):
+    """Images of a spot with 1 e- in its window when centred, and their derivatives: (m, pixels)."""
+
+    image: Floats
+    along_x: Floats
+    along_y: Floats
+
+
+class _Noise(NamedTuple):
+    """Noise of each pixel [photo-electrons]; maps are flattened: (pixels,)."""
+
+    read_noise_e: Floats
+    background_e: Floats
+    excess: float
+    exact: bool
+
+
+def cramer_rao(
+    flux_e: ArrayLike,
+    *,
+    shape: tuple[int, int] = (16, 16),
+    profile: str = "diffraction",
+    size: float = 1.0,
+    elongation: float = 1.0,
+    angle_deg: float = 0.0,
+    psf: SpotImages | None = None,
+    detector: Detector | None = None,
+    positions: ArrayLike = (0.0, 0.0),
+    position_range_px: float | None = None,
+    unknown_flux: bool = True,
+    unknown_background: bool = False,
+    prior_std_px: float | None = None,
+    noise: str = "exact",
+) -> NDArray[np.float64]:
+    """Return the Cramer-Rao bound on the standard error of a spot's position.
+
+    The bound is the square root of the diagonal of the inverse Fisher information of (x, y, flux,
+    background). With normally distributed errors at the bound, the slope error R (mean absolute error) is
+    sqrt(2 / pi) times the mean of the two axes.
+
+    Parameters
+    ----------
+    flux_e : float or array_like, any shape
+        Electrons within the image of a centred spot, as in `faintspot.slopes.simulate.subapertures`; above 0.
+    shape : (int, int)
+        Rows and columns (ny, nx) of the image, at least 3 px each.
+    profile, size, elongation, angle_deg
+        Shape of the spot, see `faintspot.slopes.spots.shapes`. Ignored if `psf` is given.
+    psf : object with a method ``images(positions, shape, flux_e)``, optional
+        PSF of the spot, such as a `faintspot.PSF`. Pixels in which it is not positive are ignored. Noise in
+        the wings of a learnt PSF increases the apparent information if the read noise is low.
+    detector : Detector, optional
+        Detector that defines the noise; mean background and dark current are known unless
+        `unknown_background`. Quantisation counts as read noise of 1/12 ADU squared; full well and
+        saturation are ignored. Default: 0.1 e- read noise and no other noise.
+    positions : array_like, shape (2,) or (m, 2)
+        x and y [px]; the result is the mean over the positions.
+    position_range_px : float, optional
+        Use positions uniform within plus and minus this on each axis, instead of `positions`.
+    unknown_flux, unknown_background : bool
+        Whether they are estimated along with the position.
+    prior_std_px : float, optional
+        Standard deviation of the prior of an estimator: a normal distribution around the true position.
+        Adds 1 / prior_std_px^2 to the information on x and y (van Trees 1968), so that the result never
+        exceeds it. Positions uniform within +-a have a standard deviation a / sqrt(3). The bound is then
+        only a guide, since that distribution has edges (without flux, R is a / 2, not 0.46 a).
+    noise : {"exact", "gaussian"}
+        "exact": information of Poisson electrons plus Gaussian read noise, summed over the number of
+        electrons. "gaussian": sum over pixels of (dm/dx)^2 / variance, which is lower at low flux and equal
+        at high flux. With a multiplication register both are the latter, with twice the photon noise. This
+        is not a strict bound if single electrons can be distinguished and counted.
+
+    Returns
+    -------
+    ndarray, float64, shape of flux_e + (2,)
+        Standard error along x and y [px]; infinite if the image has no flux.
+
+    Raises
+    ------
+    InputError
+        If a value is not finite, out of its range or of the wrong shape.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> camera = fs.slopes.simulate.Detector(read_noise_e=1.0)
+    >>> print(fs.cramer_rao([50.0, 500.0], shape=(8, 8), detector=camera).round(3))
+    [[0.133 0.133]
+     [0.034 0.034]]
+    """
+    flux: Floats = numbers_between("flux_e", flux_e, 0.0, low_open=True)
+    ny, nx = image_shape("shape", shape)
+    if min(ny, nx) < 3:
+        raise InputError(f"shape: expected at least 3 rows and columns, got ({ny}, {nx})")
+    exact = one_of("noise", noise, _NOISES) == "exact"
+    prior = math.inf
+    if prior_std_px is not None:
+        prior = number_between("prior_std_px", prior_std_px, 0.0, low_open=True)
+    where = _positions(positions, position_range_px)
+    if psf is None:
+        form = {"profile": profile, "size": size, "elongation": elongation, "angle_deg": angle_deg}
+        render = functools.partial(spots, shape=(ny, nx), **form)  # type: ignore[arg-type]
+        step = 0.01 * number_between("size", size, 0.0, low_open=True)
+    else:
+        render = functools.partial(psf.images, shape=(ny, nx))
+        step = STEP_PX
+    spot = _with_derivatives(render, where, step)
+    blur = _noise(detector, (ny, nx), exact)
+    bound = np.empty((*flux.shape, 2))
+    for index in np.ndindex(flux.shape):
+        found = _covariances(float(flux[index]), spot, blur, unknown_flux, unknown_background, prior)
+        bound[index] = np.sqrt(np.diagonal(found, axis1=1, axis2=2)).mean(axis=0)
+    return bound
+
+
+def cramer_rao_covariance(
+    flux_e: ArrayLike,
+    psf: PSF,
+    shape: tuple[int, int] = (16, 16),
+    *,
+    detector: Detector | None = None,
+    noise: str = "exact",
+) -> NDArray[np.float64]:
+    """Return the bound on the covariance of x and y of each PSF's spot at the window centre, of unknown flux.
+
+    Elongated spots, such as those of `faintspot.LaserGuideStar`, have errors that are larger along one
+    direction: x and y are then correlated.
+
+    Parameters
+    ----------
+    flux_e : float or (n_psfs,) array
+        Electrons within the image of a centred spot; above 0.
+    psf : PSF
+    shape : (int, int)
+        Rows and columns of the image.
+    detector, noise
+        As for `cramer_rao`.
+
+    Returns
+    -------
+    (n_psfs, 2, 2) array
+        Covariance [px^2]; infinite variances and no covariance if an image has no information.
+
+    Raises
+    ------
+    InputError
+        As for `cramer_rao`.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> psf = fs.PSF.analytic("gaussian", elongation=3.0, angle_deg=45.0)
+    >>> bound = fs.cramer_rao_covariance(200.0, psf)[0]
+    >>> print(f"correlation of x and y: {bound[0, 1] / bound[0, 0]:.1f}")
+    correlation of x and y: 0.8
+    """
+    count = len(psf.samples)
+    flux = per_spot("flux_e", flux_e, count)
+    if not np.all(flux > 0):
+        raise InputError(f"flux_e = {flux.min():g}: expected numbers above 0")
+    size = image_shape("shape", shape)
+    blur = _noise(detector, size, one_of("noise", noise, _NOISES) == "exact")
+    bound = np.empty((count, 2, 2))
+    for plane in range(count):
+        render = functools.partial(psf.images, shape=size, which=plane)
+        spot = _with_derivatives(render, np.zeros((1, 2)), STEP_PX)
+        bound[plane] = _covariances(float(flux[plane]), spot, blur, True, False, math.inf)[0]
+    return bound
+
+
+def photon_efficiency(error_px: ArrayLike, flux_e: ArrayLike, **conditions: Any) -> NDArray[np.float64]:
+    """Return the fraction of its flux that an estimator would need if it reached the Cramer-Rao bound.
+
+    This is (flux at which the slope error R of the bound equals that of the estimator) / (flux used). The
+    limit is 1; a larger value means a bias towards the truth, for example by a prior.
+
+    Parameters
+    ----------
+    error_px : float or array_like
+        Slope error R of the estimator: mean absolute error of x and y [px], above 0. Multiply a root mean
+        square error per axis by `MEAN_ABSOLUTE`.
+    flux_e : float or array_like
+        Electrons used, defined as in `cramer_rao`; broadcast with `error_px`.
+    **conditions
+        Spot, detector, positions and unknowns, as for `cramer_rao`. With `prior_std_px`, errors that the
+        prior alone achieves have efficiency 0.
+
+    Returns
+    -------
+    ndarray, float64, shape of error_px and flux_e broadcast
+        Solved by interpolation on a grid of fluxes, accurate to 1e-3.
+
+    Raises
+    ------
+    InputError
+        As for `cramer_rao`, and if the bound does not reach the error between 1e-12 and 1e12 e-.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> round(float(fs.photon_efficiency(0.1, 100.0)), 2)
+    0.31
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    error: Floats = numbers_between("error_px", error_px, 0.0, low_open=True)
+    used: Floats = numbers_between("flux_e", flux_e, 0.0, low_open=True)
+    try:
+        error, used = np.broadcast_arrays(error, used)
+    except ValueError:
+        raise InputError(f"error_px, flux_e: shapes {error.shape} and {used.shape} do not fit") from None
+
+    def slope_error(flux: Floats) -> Floats:
+        bound: Floats = MEAN_ABSOLUTE * cramer_rao(flux, **conditions).mean(axis=-1)
+        return bound
+
+    low, high = _bracket(slope_error, float(error.min()), float(error.max()), float(np.median(used)))
+    steps = 3 + math.ceil(_FLUX_STEPS_PER_DECADE * math.log10(high / low))
+    grid = np.geomspace(low, high, steps)
+    bounds = slope_error(grid)
+    # With a prior, the bound is constant up to some flux: the curve starts at the last such point.
+    first = int(np.argmax(bounds < bounds[0] * (1 - 1e-9))) - 1
+    inverse = PchipInterpolator(-np.log(bounds[first:]), np.log(grid[first:]))
+    needed = np.where(error >= bounds[0], 0.0, np.exp(inverse(-np.log(np.minimum(error, bounds[0])))))
+    efficiency: Floats = needed / used
+    return efficiency
+
+
+def _bracket(slope_error: Any, smallest: float, largest: float, start: float) -> tuple[float, float]:
+    """Return two fluxes with slope errors above `largest` (if the prior permits) and below `smallest`."""
+    low = high = start
+    while slope_error(np.array(low)) < 1.01 * largest and low > 1 / _BRACKET:
+        low /= 10
+    while slope_error(np.array(high)) > 0.99 * smallest:
+        high *= 10
+        if high > _BRACKET:
+            raise InputError(f"error_px = {smallest:g}: expected an error that {_BRACKET:g} e- can reach")
+    return low, high
+
+
+def _positions(positions: Any, position_range_px: float | None) -> Floats:
+    """Return positions (m, 2); for a range, the nodes of a regular grid that represents it."""
+    if position_range_px is None:
+        array = np.asarray(positions)
+        return position_array(array[None] if array.ndim == 1 else array)
+    half = number_between("position_range_px", position_range_px, 0.0)
+    count = min(4 + math.ceil(4 * half), 24)
+    line = half * ((2 * np.arange(count) + 1) / count - 1)
+    return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+
+
+def _with_derivatives(render: Any, positions: Floats, step: float) -> _Spot:
+    """Return images and their derivatives, for a flux of 1 e- in the window of a centred spot."""
+    centred = float(np.sum(render(np.zeros((1, 2)))))
+    if not centred > 0:
+        raise InputError("psf: expected images with flux, got none")
+    found = images_with_derivatives(render, positions, step)
+    image, along_x, along_y = (np.reshape(each, (len(positions), -1)) / centred for each in found)
+    # The wings of a learnt PSF scatter around zero; their slope carries no information there.
+    illuminated = image > 0
+    return _Spot(np.where(illuminated, image, 0.0), along_x * illuminated, along_y * illuminated)
+
+
+def _noise(detector: Any, shape: tuple[int, int], exact: bool) -> _Noise:
+    """Return the noise of each pixel in photo-electrons, flattened."""
+    if detector is None:
+        detector = Detector(read_noise_e=0.1)
+    if not isinstance(detector, Detector):
+        raise InputError(f"detector: expected a Detector or None, got {type(detector).__name__}")
+    excess = detector.excess_noise_factor
+    # Take the background electrons from the variance that the detector itself reports.
+    dark = detector.variance(np.zeros(shape))
+    converter = detector.gain_e_per_adu**2 / 12 if detector.bits is not None else 0.0
+    read_variance = (np.square(detector.read_noise_e) + converter) / detector.em_gain**2
+    background = np.maximum(dark - read_variance, 0.0) / excess
+    read_noise = np.broadcast_to(np.sqrt(read_variance), shape)
+    return _Noise(read_noise.ravel(), background.ravel(), excess, exact and excess == 1)
+
+
+def _covariances(
+    flux: float, spot: _Spot, noise: _Noise, unknown_flux: bool, unknown_background: bool, prior: float
+) -> Floats:
+    """Return the bound on the covariance of x and y at each position, (m, 2, 2)."""
+    weight = _pixel_information(flux * spot.image + noise.background_e, noise)
+    derivatives = [flux * spot.along_x, flux * spot.along_y]
+    if unknown_flux:
+        derivatives.append(spot.image)
+    if unknown_background:
+        derivatives.append(np.ones_like(spot.image))
+    stack = np.stack(derivatives, axis=1)
+    information = np.einsum("map,mbp,mp->mab", stack, stack, weight, optimize=True)
+    information[:, [0, 1], [0, 1]] += 1 / prior**2
+    # In units of the error of each unknown, the matrix is well conditioned at any flux.
+    scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
+    illuminated = np.all(scale > 0, axis=1)
+    covariances = np.full((len(scale), 2, 2), np.diag([prior**2, prior**2]))
+    if illuminated.any():
+        scale = scale[illuminated]
+        inverse = np.linalg.inv(information[illuminated] / (scale[:, :, None] * scale[:, None, :]))
+        covariances[illuminated] = (inverse / (scale[:, :, None] * scale[:, None, :]))[:, :2, :2]
+    return covariances
+
+
+def _pixel_information(mean_e: Floats, noise: _Noise) -> Floats:
+    """Return the Fisher information of each pixel value about its mean [1 / e-^2]; (m, pixels)."""
+    if not noise.exact:
+        # The floor avoids division by zero for noise-free pixels.
+        variance = noise.excess * mean_e + np.square(noise.read_noise_e)
+        return 1 / np.maximum(variance, SMALLEST_MEAN_E)
+    information = np.empty_like(mean_e)
+    for read_noise in np.unique(noise.read_noise_e):
+        pixels = noise.read_noise_e == read_noise
+        information[:, pixels] = poisson_gaussian_information(mean_e[:, pixels], float(read_noise))
+    return information

@@ -1,0 +1,191 @@
+"""Table [laser] of a configuration or camera file: the elongated spots of a laser guide star."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.config.tables import errors_of_table, read_tables
+from faintspot.base.errors import InputError
+from faintspot.base.toml_files import check_keys
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.sensor.pupil import lenslet_pitch, pupil_of, side_m
+from faintspot.slopes.spots.fixed_weights import FixedWeights
+from faintspot.slopes.spots.laser import LaserGuideStar, gaussian_spot
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.sodium import SodiumProfile
+
+_FARTHEST_M = 1e3
+_BEYOND_PX = 3.0  # of the window, to which PSFs reach
+_LONGEST_S = 1e6
+_REQUIRED = "launch_m", "spot_fwhm_arcsec"
+
+
+@dataclass(frozen=True, eq=False)
+class LaserSpots:
+    """Laser guide star of a sensor.
+
+    Parameters
+    ----------
+    launch_m : (2,) array
+        x and y of the launch telescope from the centre of the pupil [m].
+    spot_fwhm_arcsec : float
+        Full width at half maximum of the spot at a single altitude, with turbulence [arcsec].
+    at_m : (2,) array, optional
+        x and y of the sub-aperture whose spots `tune` simulates [m]; the farthest from the launch telescope
+        has the longest spot.
+    profile : SodiumProfile, optional
+        Default: a Gaussian layer of 10 km at 90 km.
+    zenith_distance_deg, site_altitude_m : float
+        As for `faintspot.LaserGuideStar`.
+    matched_filter : bool
+        Whether weights of estimator "window" are the linear matched filter of these spots.
+    follow_every_s : float
+        Interval at which a running engine fits the profile again [s]; 0: never.
+    follow_time_constant_s : float
+        Time constant of the mean images that it is fitted to [s].
+
+    Raises
+    ------
+    InputError
+        If a value is missing or out of range.
+    """
+
+    launch_m: Any
+    spot_fwhm_arcsec: float
+    at_m: Any = None
+    profile: SodiumProfile = field(default_factory=SodiumProfile.gaussian)
+    zenith_distance_deg: float = 0.0
+    site_altitude_m: float = 0.0
+    matched_filter: bool = False
+    follow_every_s: float = 0.0
+    follow_time_constant_s: float = 4.0
+
+    def __post_init__(self) -> None:
+        for name in ("launch_m", "at_m"):
+            if getattr(self, name) is None and name not in _REQUIRED:
+                continue
+            place = numbers_between(f"laser.{name}", getattr(self, name), -_FARTHEST_M, _FARTHEST_M)
+            if place.shape != (2,):
+                raise InputError(f"laser.{name}: expected x and y, got shape {place.shape}")
+            object.__setattr__(self, name, place)
+        number_between("laser.spot_fwhm_arcsec", self.spot_fwhm_arcsec, 0.0, 60.0, low_open=True)
+        if not isinstance(self.matched_filter, bool):
+            raise InputError(f"laser.matched_filter = {self.matched_filter!r}: expected true or false")
+        number_between("laser.follow_every_s", self.follow_every_s, 0.0, _LONGEST_S)
+        number_between(
+            "laser.follow_time_constant_s", self.follow_time_constant_s, 0.0, _LONGEST_S, low_open=True
+        )
+
+    @classmethod
+    def from_table(cls, path: str | Path, table: Mapping[str, Any]) -> Self:
+        """Read the table of a file; `profile` is the name of a file of `SodiumProfile.save` beside it.
+
+        Raises
+        ------
+        InputError
+            For an unknown key, or a value that is missing or out of range.
+        """
+        check_keys(f"{path}: laser.", table, [item.name for item in fields(cls)], required=_REQUIRED)
+        values = dict(table)
+        with errors_of_table(path, "laser"):
+            if "profile" in values:
+                if not isinstance(values["profile"], str):
+                    raise InputError("laser.profile: expected the name of a file")
+                values["profile"] = SodiumProfile.load(Path(path).parent / values["profile"])
+            return cls(**values)
+
+    def star(self, places_m: ArrayLike, pixel_arcsec: float) -> LaserGuideStar:
+        """Return the star as sub-apertures at these places see it."""
+        spot = gaussian_spot(self.spot_fwhm_arcsec / pixel_arcsec)
+        known = self.zenith_distance_deg, self.site_altitude_m
+        return LaserGuideStar(places_m, self.launch_m, pixel_arcsec, spot, *known)
+
+    def star_of(self, layout: Layout) -> LaserGuideStar:
+        """Return the star as the sub-apertures of a layout see it, around the middle of the pupil.
+
+        Raises
+        ------
+        InputError
+            If the layout does not know the angle of a pixel and the size of a sub-aperture.
+        """
+        side = side_m(layout.cells, layout.subaperture_m, layout.diameter_m)
+        if layout.pixel_scale_arcsec is None or side is None:
+            raise InputError(
+                "layout: expected pixel_scale_arcsec, and subaperture_m or diameter_m, with a laser"
+            )
+        places = (layout.centres - pupil_of(layout).centre_px) / lenslet_pitch(layout)
+        return self.star(side * places, layout.pixel_scale_arcsec)
+
+    def psf(self, star: LaserGuideStar, window: tuple[int, int]) -> PSF:
+        """Return the PSF of the star's sub-apertures, with the layer at the focus."""
+        return psf_in_window(star, star.focused(self.profile), window)
+
+    def in_words(self, pixel_arcsec: float, window: tuple[int, int]) -> str:
+        """Describe the spot at `at_m`: its elongation, and the part of its flux that the window cuts off."""
+        star = self.star([self.at_m], pixel_arcsec)
+        profile = star.focused(self.profile)
+        x, y = star.elongation_px(profile)[0]
+        lost = 1.0 - float(star.images(profile, window).sum())
+        place, angle = "{:g}, {:g} m".format(*self.at_m), math.degrees(math.atan2(y, x))
+        return (
+            f"laser guide star: spots of the sub-aperture at {place}, elongated by {math.hypot(x, y):.1f} px "
+            f"along {angle:.0f} deg; the window cuts off {100 * max(lost, 0.0):.0f} % of their flux"
+        )
+
+
+def psf_in_window(star: LaserGuideStar, profile: SodiumProfile, window: tuple[int, int]) -> PSF:
+    """Return the PSF of every sub-aperture for windows (ny, nx), as far as spots in them may be seen."""
+    return star.psf(profile, radius_px=0.5 * max(window) + _BEYOND_PX)
+
+
+def matched_filter(psf: PSF, layout: Layout, calibration: Calibration, flux_e: ArrayLike) -> FixedWeights:
+    """Return the linear matched filter of a PSF for the noise of a camera.
+
+    Parameters
+    ----------
+    psf : PSF
+        That of every sub-aperture; of another number of PSFs the weights are for mean flux and noise.
+    layout : Layout
+    calibration : Calibration
+    flux_e : float or (n,) array
+        Flux of a spot [photo-electrons].
+
+    Raises
+    ------
+    InputError
+        If the read noise is not known, or as for `FixedWeights.matched`.
+    """
+    noise: Any = calibration.read_noise_photoelectrons
+    if noise is None:
+        raise InputError("laser.matched_filter: expected calibration.read_noise_e, got none")
+    each, own = calibration.read_noise_map(layout.frame_shape), len(psf.samples) == len(layout)
+    if each is not None and own:
+        noise = np.nan_to_num(layout.images(each), nan=noise)
+    flux_e = flux_e if own else float(np.mean(np.asarray(flux_e, np.float64)))
+    excess = calibration.excess_noise
+    return FixedWeights.matched(psf, layout.window, flux_e=flux_e, read_noise_e=noise, excess_noise=excess)
+
+
+def laser_of(path: str | Path, document: Mapping[str, dict[str, Any]]) -> LaserSpots | None:
+    """Return the laser guide star in the tables of a configuration file, or None."""
+    return LaserSpots.from_table(path, document["laser"]) if "laser" in document else None
+
+
+def load_laser(path: str | Path) -> LaserSpots | None:
+    """Return the laser guide star of a configuration file, or None.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or the table has an unknown key or a value out of range.
+    """
+    return laser_of(path, read_tables(path))

@@ -1,0 +1,285 @@
+"""Short-exposure spots of a lenslet in turbulence: speckled, with a known position."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import finite_array, number_between, numbers_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.base.generators import spawn
+from faintspot.slopes.spots.shapes import SMALLEST_SIZE, image_shape, per_spot
+from faintspot.slopes.spots.von_karman import structure_function
+
+Floats = NDArray[np.float64]
+
+LARGEST_D_OVER_R0 = 10.0
+"""Largest sub-aperture side accepted, in r0: the phase grid has four points per r0."""
+
+# Points across the sub-aperture. The image of the grid is periodic with a period of `points` lambda / d.
+_FEWEST_POINTS, _MOST_POINTS = 24, 40
+_LARGEST_OUTER_SCALE = 1e5
+_TRUTHS = ("gradient", "centre_of_gravity")
+_BLOCK_POINTS = 1 << 18  # image samples processed at a time: the temporary arrays stay in the cache
+
+
+class _PhaseModes(NamedTuple):
+    """Square root of a joint covariance for d = r0: phases and mean gradients are root @ white noise."""
+
+    phase: Floats  # (points^2, modes), rad
+    gradient: Floats  # (2, modes), rad per d
+
+
+def speckled_spots(
+    n: int,
+    *,
+    d_over_r0: ArrayLike,
+    shape: tuple[int, int] = (16, 16),
+    size: ArrayLike = 1.0,
+    position_range_px: float = 1.0,
+    positions: ArrayLike | None = None,
+    flux_e: ArrayLike = 1.0,
+    outer_scale_d: float | None = None,
+    natural_tilt: bool = False,
+    truth: str = "gradient",
+    rng: np.random.Generator | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return noiseless short-exposure images behind square sub-apertures, and the positions of their spots.
+
+    The phase of each image is drawn from its exact covariance over the sub-aperture, that of the Kolmogorov
+    structure function 6.88 (r / r0)^(5/3) (Fried 1966, JOSA 56, 1372) or, with an outer scale, of von
+    Karman turbulence. The amplitude is uniform (no scintillation). With d_over_r0 = 0 the images are the
+    "diffraction" spots of `faintspot.slopes.spots.shapes`.
+
+    By default, the mean gradient of the turbulent phase is replaced by the random (or given) position, so
+    that positions have the requested range at any strength of turbulence.
+
+    Parameters
+    ----------
+    n : int
+        Number of images.
+    d_over_r0 : float or array_like, shape (n,)
+        Side of the sub-aperture in units of the Fried parameter at the sensing wavelength, 0 to 10.
+    shape : (int, int)
+        Rows and columns (ny, nx) of each image, px.
+    size : float or array_like, shape (n,)
+        lambda / d = 2 px * size, at least 0.05. In images wider than 40 lambda / d too much of the flux is in
+        the outer parts.
+    position_range_px : float
+        Positions are uniform within plus and minus this, on each axis, px.
+    positions : array_like, shape (n, 2), optional
+        x and y in px, instead of random ones.
+    flux_e : float or array_like, shape (n,)
+        Electrons in the whole, infinite spot, as in `faintspot.slopes.spots.shapes`.
+    outer_scale_d : float, optional
+        Outer scale in units of the sub-aperture's side d, 0.1 to 1e5. Default: infinite (Kolmogorov).
+    natural_tilt : bool
+        Whether the mean gradient of the turbulence itself is kept and added to the position.
+    truth : {"gradient", "centre_of_gravity"}
+        "gradient": mean gradient of the phase over the sub-aperture as a displacement of the spot. This is
+        the quantity that a wavefront sensor is to measure, and the centre of gravity of all flux in and
+        outside the image. "centre_of_gravity": centre of gravity of the flux within the image, without
+        noise.
+    rng : numpy.random.Generator, optional
+        Generator from which separate ones for positions and phases are spawned.
+
+    Returns
+    -------
+    images : ndarray, float64, shape (n, ny, nx)
+        Mean electrons per pixel.
+    truth : ndarray, float64, shape (n, 2)
+        x and y, px.
+
+    Raises
+    ------
+    InputError
+        If a value is not finite or out of range, or `positions` have another shape.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from faintspot.slopes.simulate import speckled_spots
+    >>> rng = np.random.default_rng(1)
+    >>> sharp, _ = speckled_spots(100, d_over_r0=0.0, positions=np.zeros((100, 2)), rng=rng)
+    >>> speckled, _ = speckled_spots(100, d_over_r0=3.0, positions=np.zeros((100, 2)), rng=rng)
+    >>> round(float(speckled.max((1, 2)).mean() / sharp.max((1, 2)).mean()), 1)
+    0.5
+    """
+    n = int(number_between("n", n, 1, integer=True))
+    which = one_of("truth", truth, _TRUTHS)
+    position_rng, phase_rng = spawn(rng, 2)
+    half = number_between("position_range_px", position_range_px, 0)
+    if positions is None:
+        where = position_rng.uniform(-half, half, (n, 2))
+    else:
+        where = finite_array("positions", positions).astype(np.float64)
+        if where.shape != (n, 2):
+            raise InputError(f"positions: expected shape ({n}, 2), got {where.shape}")
+    images, gradients = speckled_images(
+        where,
+        d_over_r0=d_over_r0,
+        shape=shape,
+        size=size,
+        flux_e=flux_e,
+        outer_scale_d=outer_scale_d,
+        natural_tilt=natural_tilt,
+        rng=phase_rng,
+    )
+    return images, gradients if which == "gradient" else _centres_of_gravity(images)
+
+
+def speckled_images(
+    positions: Floats,
+    *,
+    d_over_r0: ArrayLike,
+    shape: tuple[int, int],
+    size: ArrayLike,
+    flux_e: ArrayLike,
+    outer_scale_d: float | None = None,
+    natural_tilt: bool = False,
+    rng: np.random.Generator,
+) -> tuple[Floats, Floats]:
+    """Return images and the displacements by the mean gradients; see `speckled_spots`.
+
+    The phases are the next draws of `rng`, so that several calls give the same images as one call.
+    """
+    n = len(positions)
+    ny, nx = image_shape("shape", shape)
+    strength = _per_image_d_over_r0(d_over_r0, n) ** (5 / 6)
+    width = 2.0 * per_spot("size", size, n, SMALLEST_SIZE)
+    flux = per_spot("flux_e", flux_e, n, 0.0)
+    scale = _outer_scale(outer_scale_d)
+    points = _points(max(ny, nx) / float(np.min(width)), float(np.max(strength)) ** (6 / 5))
+    modes = _phase_modes(points, scale)
+    nodes, weights = _pixel_samples(float(np.min(width)))
+    images = np.empty((n, ny, nx))
+    displaced = positions.copy()
+    block = max(1, _BLOCK_POINTS // (ny * nx * len(nodes) ** 2))
+    for start in range(0, n, block):
+        part = slice(start, start + block)
+        phase, gradient = _draw(modes, strength[part], rng)
+        if natural_tilt:
+            displaced[part] += gradient * (width[part, None] / (2 * np.pi))
+        images[part] = _intensities(phase, displaced[part], width[part], (ny, nx), nodes, weights)
+    return images * flux[:, None, None], displaced
+
+
+def _per_image_d_over_r0(value: Any, n: int) -> Floats:
+    checked = numbers_between("d_over_r0", value, 0.0, LARGEST_D_OVER_R0)
+    return per_spot("d_over_r0", checked, n, 0.0)
+
+
+def _outer_scale(value: Any) -> float:
+    """Return the outer scale in units of d, or infinity."""
+    if value is None:
+        return math.inf
+    return number_between("outer_scale_d", value, 0.1, _LARGEST_OUTER_SCALE)
+
+
+def _points(window_lambda_over_d: float, d_over_r0: float) -> int:
+    """Return the points across the sub-aperture for which periodic images stay outside the window."""
+    wanted = max(1.25 * window_lambda_over_d, 4 * d_over_r0)
+    return int(np.clip(2 * math.ceil(wanted / 2), _FEWEST_POINTS, _MOST_POINTS))
+
+
+@functools.lru_cache(maxsize=8)
+def _phase_modes(points: int, outer_scale: float) -> _PhaseModes:
+    """Return the square root of the covariance of phases and mean gradients, for d = r0 = 1.
+
+    The mean gradient of a phase over a square is exactly the difference of its means over opposite edges,
+    which are therefore part of the covariance. The common piston of all points is removed.
+    """
+    line = (np.arange(points) + 0.5) / points - 0.5
+    y, x = (axis.ravel() for axis in np.meshgrid(line, line, indexing="ij"))
+    half = np.full(points, 0.5)
+    x = np.concatenate([x, half, -half, line, line])
+    y = np.concatenate([y, line, line, half, -half])
+    n = points**2
+    distance = np.hypot(x[:, None] - x, y[:, None] - y)
+    structure = structure_function(distance, outer_scale)
+    from_piston = structure[:n].mean(axis=0)
+    covariance = 0.5 * (from_piston[:, None] + from_piston - structure - from_piston[:n].mean())
+    edges = np.repeat([[1.0, -1.0, 0, 0], [0, 0, 1, -1]], points, axis=1) / points
+    across = edges @ covariance[n:]
+    gradients = across[:, n:] @ edges.T
+    joint = np.block([[covariance[:n, :n], across[:, :n].T], [across[:, :n], gradients]])
+    variance, directions = np.linalg.eigh(joint)
+    positive = variance > 1e-12 * variance[-1]
+    root = directions[:, positive] * np.sqrt(variance[positive])
+    root.flags.writeable = False
+    return _PhaseModes(root[:n], root[n:])
+
+
+def _draw(modes: _PhaseModes, strength: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Draw phases (n, points, points) without their mean gradient, and that gradient (n, 2) [rad per d]."""
+    noise = rng.standard_normal((len(strength), modes.phase.shape[1])) * strength[:, None]
+    gradient = noise @ modes.gradient.T
+    points = math.isqrt(len(modes.phase))
+    phase = (noise @ modes.phase.T).reshape(-1, points, points)
+    line = (np.arange(points) + 0.5) / points - 0.5
+    phase -= gradient[:, 0, None, None] * line + gradient[:, 1, None, None] * line[:, None]
+    return phase, gradient
+
+
+def _pixel_samples(smallest_width: float) -> tuple[Floats, Floats]:
+    """Return offsets [px] and weights of the samples of a pixel along one axis (Gauss-Legendre).
+
+    The image has no frequency above 1 / width cycles per pixel; for a width of 2 px, three samples
+    integrate it to 1e-4 of the brightest pixel.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(2 + math.ceil(2 / smallest_width))
+    return nodes / 2, weights / 2
+
+
+def _intensities(
+    phase: Floats,
+    positions: Floats,
+    width: Floats,
+    shape: tuple[int, int],
+    nodes: Floats,
+    weights: Floats,
+) -> Floats:
+    """Return the pixel-integrated images (n, ny, nx) of phases, displaced to the positions.
+
+    Each point is a square of constant phase. Without turbulence these form the lenslet exactly, and the
+    image is sinc^2. The displacement is applied to the image rather than to the phase.
+    """
+    points = phase.shape[-1]
+    field = np.exp(1j * phase.astype(np.float32))
+    rows, columns = (
+        _fourier(length, positions[:, axis], width, points, nodes)
+        for length, axis in zip(shape, (1, 0), strict=True)
+    )
+    amplitude = rows @ field @ columns.transpose(0, 2, 1)
+    intensity = amplitude.real**2 + amplitude.imag**2
+    sampled = intensity.reshape(-1, shape[0], len(nodes), shape[1], len(nodes))
+    images: Floats = np.einsum("nypxq,p,q->nyx", sampled, weights, weights, optimize=True)
+    return images / np.square(width)[:, None, None]
+
+
+def _fourier(length: int, centre: Floats, width: Floats, points: int, nodes: Floats) -> NDArray[np.complex64]:
+    """Return the Fourier transform from sub-aperture points to image samples, shape (n, samples, points).
+
+    It is for one axis of the image and the samples of all pixels.
+    """
+    samples = ((np.arange(length) - (length - 1) / 2)[:, None] + nodes).ravel()
+    angle = (samples - centre[:, None]) / width[:, None]  # in lambda / d
+    square = np.sinc(angle / points) / points
+    line = (np.arange(points) + 0.5) / points - 0.5
+    wave = np.exp(((-2j * np.pi) * (angle[:, :, None] * line)).astype(np.complex64))
+    transform: NDArray[np.complex64] = wave * square[:, :, None].astype(np.float32)
+    return transform
+
+
+def _centres_of_gravity(images: Floats) -> Floats:
+    """Return the centre of gravity of each image, px from its centre."""
+    ny, nx = images.shape[1:]
+    total = images.sum(axis=(1, 2))
+    x = images.sum(axis=1) @ (np.arange(nx) - (nx - 1) / 2)
+    y = images.sum(axis=2) @ (np.arange(ny) - (ny - 1) / 2)
+    centres: Floats = np.stack([x, y], axis=1) / np.where(total > 0, total, 1.0)[:, None]
+    return centres

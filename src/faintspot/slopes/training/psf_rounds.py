@@ -1,0 +1,206 @@
+"""Learning PSFs round by round: register every spot with the PSF so far, stack, fit, again."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from faintspot.base.errors import InputError
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.training.psf_fit import FIRST_FORM, Form, choose_form, fit_psf, samples_of
+from faintspot.slopes.training.registration import Floats, Registered, Stack, Tables, register, start
+from faintspot.slopes.training.stacking import Sums, stack_spots
+
+_START_WIDTHS_PX = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+_START_SPOTS = 500
+_START_STEPS, _LATER_STEPS = 5, 3
+_DRAWN_SPOTS = 5000  # spots times draws of each: with fewer, the draws' own noise would count
+_CHOICES = 2  # last rounds but one in which the form is chosen
+_PSFS_COMPARED = 4
+_LARGEST_ERROR_PX = 1.0
+FEWEST_SPOTS = 20
+_TELLING_ATTENUATION = 0.3
+_NARROW, _HOPELESS = 0.8, 0.97  # mean resultant length of the phases: spread of 0.11 px and 0.04 px
+
+
+@dataclass(frozen=True)
+class LearningOptions:
+    """Options of PSF learning; see `faintspot.slopes.training.psf_learning`."""
+
+    radius_px: int
+    oversampling: int
+    rounds: int
+    search_px: float
+
+
+@dataclass(frozen=True)
+class State:
+    """PSFs, the background of each (electrons per pixel), how freely they follow the data, and the spots."""
+
+    psf: PSF
+    background_e: Floats
+    form: Form = FIRST_FORM
+    found: Registered | None = None
+
+
+def gaussian_psf(fwhm_px: float, options: LearningOptions) -> PSF:
+    """Return a round Gaussian PSF, pixels included."""
+    std = np.hypot(fwhm_px / 2.3548, 1 / np.sqrt(12))
+    reach = options.radius_px * options.oversampling
+    profile = np.exp(-0.5 * (np.arange(-reach, reach + 1) / options.oversampling / std) ** 2)
+    return PSF(np.outer(profile, profile), options.oversampling)
+
+
+def measured_width(stack: Stack) -> float:
+    """Return the FWHM of the Gaussian that the images answer to most strongly, px."""
+    images = stack.images[:: max(1, len(stack.images) // _START_SPOTS)]
+
+    def response(fwhm_px: float) -> float:
+        std = fwhm_px / 2.3548
+        peaks = gaussian_filter(images, std, mode="constant", axes=(1, 2)).max(axis=(1, 2))
+        return std * float(peaks.mean())  # a kernel of unit energy: the noise is the same at all widths
+
+    return max(_START_WIDTHS_PX, key=response)
+
+
+def learn(
+    stack: Stack,
+    index: NDArray[np.int64],
+    state: State,
+    options: LearningOptions,
+    rng: np.random.Generator,
+    progress: Callable[[], object],
+) -> State:
+    """Return the PSFs of the spots after all rounds; `index` says which PSF each spot has.
+
+    Raises
+    ------
+    InputError
+        When too few spots are bright enough.
+    """
+    halves = rng.permutation(len(index)) % 2 == 0
+    draws = -(-_DRAWN_SPOTS // len(index))
+    for number in range(options.rounds):
+        state = registered(stack, index, state, options)
+        to_come = options.rounds - 1 - number
+        sums, count = stacked(stack, index, state, halves, draws, options, rng)
+        if count.sum() < FEWEST_SPOTS:
+            raise InputError(
+                f"images: expected at least {FEWEST_SPOTS} spots whose position can be told to "
+                f"{_LARGEST_ERROR_PX:g} px, got {count.sum()} of {len(index)}"
+            )
+        state = refitted(sums, count, state, 0 < to_come <= _CHOICES, options, rng)
+        progress()
+    return state
+
+
+def registered(stack: Stack, index: NDArray[np.int64], state: State, options: LearningOptions) -> State:
+    """Return the state with the spots measured anew."""
+    tables = Tables.of(state.psf, options.radius_px)
+    images = stack.without(state.background_e[index])
+    found, steps = state.found, _LATER_STEPS
+    if found is None:
+        found, steps = start(images, tables, index, state.psf.fwhm_px, options.search_px), _START_STEPS
+    found = register(images, tables, index, found, options.search_px, steps)
+    return State(state.psf, state.background_e, state.form, found)
+
+
+def bright_enough(found: Registered) -> NDArray[np.bool_]:
+    """Return which spots tell their position."""
+    return np.all(found.error_px < _LARGEST_ERROR_PX, axis=1)  # type: ignore[no-any-return]
+
+
+def stacked(
+    stack: Stack,
+    index: NDArray[np.int64],
+    state: State,
+    halves: NDArray[np.bool_],
+    draws: int,
+    options: LearningOptions,
+    rng: np.random.Generator,
+) -> tuple[list[tuple[Sums, Sums]], NDArray[np.int64]]:
+    """Return the sums of both halves of each PSF's spots, and how many spots are in them."""
+    assert state.found is not None
+    good = bright_enough(state.found)
+    count = np.bincount(index[good], minlength=len(state.psf.samples))
+    sums = stack_spots(
+        stack.part(good),
+        Tables.of(state.psf, options.radius_px),
+        index[good],
+        state.found.part(good),
+        state.background_e,
+        halves[good],
+        draws,
+        rng,
+    )
+    return sums, count
+
+
+def refitted(
+    sums: list[tuple[Sums, Sums]],
+    count: NDArray[np.number[Any]],
+    state: State,
+    choose: bool,
+    options: LearningOptions,
+    rng: np.random.Generator,
+) -> State:
+    """Return the state with the PSFs fitted to the sums; a PSF with too few spots stays unchanged."""
+    known = count >= FEWEST_SPOTS
+    form = state.form
+    if choose and known.any():
+        compared = rng.permutation(np.flatnonzero(known))[:_PSFS_COMPARED]
+        form = choose_form([sums[i] for i in compared], float(count[compared].sum()), options.radius_px)
+    before = Tables.of(state.psf, options.radius_px).value.astype(np.float64)
+    samples, background = [], state.background_e.copy()
+    for i, (first, second) in enumerate(sums):
+        plane = before[i]
+        fit = fit_psf(first.combined(second), form, options.radius_px) if known[i] else None
+        if fit is not None and fit.plane.sum() > 0:
+            plane, background[i] = fit
+        samples.append(samples_of(plane, options.radius_px, options.oversampling))
+    return State(psf_of(np.stack(samples), options.oversampling), background, form, state.found)
+
+
+def psf_of(samples: Floats, oversampling: int) -> PSF:
+    """Return the PSFs with these samples."""
+    return PSF(samples, oversampling, np.arange(len(samples)) if len(samples) > 1 else None)
+
+
+def check_phases(index: NDArray[np.int64], found: Registered) -> None:
+    """Warn when spots lie at too few sub-pixel phases for the PSF between the pixels to be seen.
+
+    Their spread follows from the phases' mean resultant length, with the part of it taken out that errors of
+    the registration explain.
+
+    Raises
+    ------
+    InputError
+        When all PSFs' spots lie at one phase.
+    """
+    good = bright_enough(found)
+    kinds, count = index[good], np.bincount(index[good])
+    narrow, hopeless = np.zeros((2, len(count)), bool)
+    used = np.maximum(count, 1)
+    for axis in range(2):
+        turn = np.exp(2j * np.pi * found.positions[good, axis])
+        length = np.abs(np.bincount(kinds, turn.real) + 1j * np.bincount(kinds, turn.imag)) / used
+        loss = np.bincount(kinds, np.exp(-2 * (np.pi * found.error_px[good, axis]) ** 2)) / used
+        sure = length - 2 * (1 - length**2) / np.sqrt(2 * used)  # less two standard errors
+        telling = (loss > _TELLING_ATTENUATION) & (count >= FEWEST_SPOTS)
+        narrow |= telling & (sure > _NARROW * loss)
+        hopeless |= telling & (sure > _HOPELESS * loss)
+    what = "move the spots by fractions of a pixel, or learn one PSF for many sub-apertures"
+    if hopeless[count > 0].all():
+        raise InputError(f"frames: expected spots at many sub-pixel positions, got one for each PSF; {what}")
+    if narrow.any():
+        warnings.warn(
+            f"{np.count_nonzero(narrow)} of {len(count)} PSFs: spots differ by less than about 0.1 px in "
+            f"sub-pixel position, so the PSF between the pixels is a guess; {what}",
+            stacklevel=3,
+        )

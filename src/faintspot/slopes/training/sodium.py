@@ -1,0 +1,266 @@
+"""Sodium profile learnt from the mean images of a laser guide star's sub-apertures, and followed in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.errors import InputError
+from faintspot.slopes.spots.laser import LaserGuideStar
+from faintspot.slopes.spots.sodium import SodiumProfile
+
+Floats = NDArray[np.float64]
+
+_ROUNDS = 3  # fluxes and weights follow the profile
+_RIDGE = 1e-9  # relative to the mean information on an altitude
+_CENTRED = 1e4  # information that the spots are centred, relative to that of the images
+_LEAST_VARIANCE = 1e-6  # relative to the mean of the images
+_SMOOTHNESS = 0.1
+_LARGEST_BLUR_FWHM = 2.0
+
+
+class SodiumFit(NamedTuple):
+    """Sodium profile and flux of each sub-aperture; see `fit_sodium_profile`."""
+
+    profile: SodiumProfile
+    flux_e: Floats
+    """Flux of the whole spots [electrons], (n,)."""
+    chi_square: float
+    """Sum of the squared deviations of the mean images, in units of their variance."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeanImages:
+    """Running mean of images of all sub-apertures and of their slopes; immutable.
+
+    Parameters
+    ----------
+    images_e : (n, ny, nx) or (n_frames, n, ny, nx) array
+        Calibrated images [electrons] of one frame, or of several, which are averaged.
+    slopes_px : (n, 2) or (n_frames, n, 2) array
+        x and y of the spots in these frames, px from the window centres.
+    time_constant_frames : float
+        Number of frames after which the weight of a frame has decreased by a factor of e.
+    frames : float
+        Number of frames averaged. Default: that of `images_e`.
+
+    Raises
+    ------
+    InputError
+        If values are not finite, or shapes differ.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from faintspot.slopes.training import MeanImages
+    >>> mean = MeanImages(np.zeros((4, 8, 8)), np.zeros((4, 2)))
+    >>> float(mean.updated(np.ones((4, 8, 8)), np.zeros((4, 2))).images_e.mean())
+    0.5
+    """
+
+    images_e: Any
+    slopes_px: Any
+    time_constant_frames: float = 10000.0
+    frames: float | None = None
+
+    def __post_init__(self) -> None:
+        images, slopes = finite_array("images_e", self.images_e), finite_array("slopes_px", self.slopes_px)
+        if images.ndim not in (3, 4) or slopes.shape != (*images.shape[:-2], 2):
+            raise InputError(
+                "images_e, slopes_px: expected shapes (n, ny, nx) and (n, 2), "
+                f"got {images.shape} and {slopes.shape}"
+            )
+        number_between("time_constant_frames", self.time_constant_frames, 1.0)
+        seen = 1 if images.ndim == 3 else len(images)
+        frames = number_between("frames", seen if self.frames is None else self.frames, 0.0, low_open=True)
+        for name, values, usual in (("images_e", images, 3), ("slopes_px", slopes, 2)):
+            mean = (
+                values.astype(np.float64) if values.ndim == usual else values.mean(axis=0, dtype=np.float64)
+            )
+            object.__setattr__(self, name, mean)
+        object.__setattr__(self, "frames", float(frames))
+
+    def updated(
+        self, images_e: ArrayLike, slopes_px: ArrayLike, *, frames: float | None = None
+    ) -> MeanImages:
+        """Return the mean with one further frame, with several, or with the mean of `frames` of them.
+
+        Raises
+        ------
+        InputError
+            As for the class.
+        """
+        new = MeanImages(images_e, slopes_px, frames=frames)
+        if new.images_e.shape != self.images_e.shape:
+            raise InputError(f"images_e: expected shape {self.images_e.shape}, got {new.images_e.shape}")
+        assert self.frames is not None
+        assert new.frames is not None
+        part = max(
+            new.frames / (self.frames + new.frames), 1.0 - np.exp(-new.frames / self.time_constant_frames)
+        )
+        return replace(
+            self,
+            images_e=self.images_e + part * (new.images_e - self.images_e),
+            slopes_px=self.slopes_px + part * (new.slopes_px - self.slopes_px),
+            frames=new.frames / part,
+        )
+
+
+def fit_sodium_profile(
+    mean: MeanImages,
+    star: LaserGuideStar,
+    profile: SodiumProfile,
+    *,
+    dark_variance_e2: ArrayLike = 0.0,
+    smoothness: float = _SMOOTHNESS,
+) -> SodiumFit:
+    """Return the sodium profile that all sub-apertures see, from their mean images.
+
+    The images are linear in the profile: non-negative least squares with the variance of each pixel as
+    weight, the spots' centre of gravity at the focus, and a little smoothness. Call it every few seconds with
+    the last result to follow the layer.
+
+    Parameters
+    ----------
+    mean : MeanImages
+    star : LaserGuideStar
+        Its spot includes the motion of the spots during the mean: see `fit_spot`.
+    profile : SodiumProfile
+        The profile so far, whose altitudes are kept. It gives the first weights.
+    dark_variance_e2 : float or (n, ny, nx) array
+        Variance of a dark pixel in one frame [electrons^2]; large for pixels to be ignored.
+    smoothness : float
+        Expected second difference of the density, as a fraction of its peak.
+
+    Raises
+    ------
+    InputError
+        If shapes differ, a value is out of range, or the images have no flux.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> from faintspot.slopes.training import MeanImages, fit_sodium_profile
+    >>> star = fs.LaserGuideStar(
+    ...     [[0.0, 0.0], [4.0, 0.0]], [-4.0, 0.0], pixel_arcsec=0.5, spot=fs.PSF.analytic("gaussian")
+    ... )
+    >>> true = star.focused(fs.SodiumProfile.peaks([87e3, 93e3], [4e3, 4e3], [1.0, 1.0]))
+    >>> mean = MeanImages(100.0 * star.images(true, (12, 12)), np.zeros((2, 2)), frames=1000)
+    >>> found = fit_sodium_profile(mean, star, fs.SodiumProfile.gaussian())
+    >>> print(f"{true.std_m / 1e3:.1f} km, {found.profile.std_m / 1e3:.1f} km")
+    3.5 km, 3.5 km
+    """
+    dark = numbers_between("dark_variance_e2", dark_variance_e2, 0.0)
+    expected = number_between("smoothness", smoothness, 0.0, low_open=True)
+    data, shape = mean.images_e, mean.images_e.shape
+    if len(star) != len(data):
+        raise InputError(f"images_e: expected {len(star)} sub-apertures as the star, got {len(data)}")
+    if dark.shape not in ((), shape):
+        raise InputError(f"dark_variance_e2: expected one number or shape {shape}, got {dark.shape}")
+    if not data.sum() > 0:
+        raise InputError(f"images_e: expected flux, got a sum of {data.sum():g}")
+    responses = star.responses(profile.altitudes_m, shape[1:], mean.slopes_px)
+    flat = responses.reshape(len(data), -1, responses.shape[-1])
+    measured = data.reshape(len(data), -1)
+    variance = np.broadcast_to(dark, shape).reshape(measured.shape)
+    density, centred = profile.density, star.defocus(profile.altitudes_m)
+    for _ in range(_ROUNDS):
+        shapes = flat @ density
+        flux = np.maximum(measured.sum(axis=1) / np.maximum(shapes.sum(axis=1), 1e-3), 0.0)
+        weights = _weights(flux, shapes, variance, measured, mean.frames)
+        flux = np.maximum(
+            _ratio((weights * shapes * measured).sum(axis=1), (weights * shapes**2).sum(axis=1)), 0.0
+        )
+        known = flux[:, None, None] * flat
+        weighted = (weights[:, :, None] * known).reshape(-1, known.shape[-1])
+        normal = weighted.T @ known.reshape(weighted.shape)
+        right = weighted.T @ measured.ravel()
+        density = _solved(normal, right, centred, expected * density.max())
+        density = SodiumProfile(profile.altitudes_m, density).density
+    shapes = flat @ density
+    away = measured - flux[:, None] * shapes
+    chi_square = float((_weights(flux, shapes, variance, measured, mean.frames) * away**2).sum())
+    return SodiumFit(SodiumProfile(profile.altitudes_m, density), flux, chi_square)
+
+
+def fit_spot(
+    mean: MeanImages,
+    star: LaserGuideStar,
+    profile: SodiumProfile,
+    *,
+    dark_variance_e2: ArrayLike = 0.0,
+    smoothness: float = _SMOOTHNESS,
+) -> tuple[LaserGuideStar, SodiumFit]:
+    """Return the star with its spot blurred as much as the mean images show, and the profile.
+
+    Parameters are those of `fit_sodium_profile`; the star's spot is the narrowest possible one.
+
+    Raises
+    ------
+    InputError
+        As for `fit_sodium_profile`.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import numpy as np, faintspot as fs
+    >>> from faintspot.slopes.training import MeanImages, fit_spot
+    >>> profile, known = fs.SodiumProfile.gaussian(), {"pixel_arcsec": 0.5}
+    >>> star = fs.LaserGuideStar(
+    ...     [[0.0, 0.0], [4.0, 0.0]], [-4.0, 0.0], spot=fs.PSF.analytic("gaussian", size=1.2), **known
+    ... )
+    >>> mean = MeanImages(100.0 * star.images(profile, (12, 12)), np.zeros((2, 2)), frames=1000)
+    >>> narrow = replace(star, spot=fs.PSF.analytic("gaussian", size=0.8))
+    >>> found, _ = fit_spot(mean, narrow, profile)
+    >>> print(star.spot.fwhm_px.round(1), found.spot.fwhm_px.round(1))
+    [[2.5 2.5]] [[2.5 2.5]]
+    """
+    from scipy.optimize import minimize_scalar
+
+    def blurred(blur_px: float) -> LaserGuideStar:
+        return replace(star, spot=star.spot.blurred(blur_px))
+
+    def fitted(blur_px: float) -> SodiumFit:
+        known: dict[str, Any] = {"dark_variance_e2": dark_variance_e2, "smoothness": smoothness}
+        return fit_sodium_profile(mean, blurred(blur_px), profile, **known)
+
+    widest = _LARGEST_BLUR_FWHM * float(star.spot.fwhm_px.mean())
+    best = minimize_scalar(
+        lambda blur: fitted(blur).chi_square, bounds=(0.0, widest), method="bounded", options={"xatol": 0.01}
+    )
+    return blurred(float(best.x)), fitted(float(best.x))
+
+
+def _weights(flux: Floats, shapes: Floats, dark: Floats, measured: Floats, frames: float | None) -> Floats:
+    """Return the inverse variance of each pixel of the mean images."""
+    least = _LEAST_VARIANCE * float(measured.mean())
+    assert frames is not None
+    weights: Floats = frames / np.maximum(flux[:, None] * shapes + dark, least)
+    return weights
+
+
+def _ratio(above: Floats, below: Floats) -> Floats:
+    return np.divide(above, below, out=np.zeros_like(above), where=below > 0)
+
+
+def _solved(normal: Floats, right: Floats, centred: Floats, second_difference: float) -> Floats:
+    """Return the non-negative solution of normal equations whose spots are centred, and smooth."""
+    from scipy.linalg import solve_triangular
+    from scipy.optimize import nnls
+
+    count = len(right)
+    scale = float(np.trace(normal)) / count
+    curvature = np.diff(np.eye(count), 2, axis=0) / second_difference
+    total = normal + curvature.T @ curvature + _RIDGE * scale * np.eye(count)
+    centred = centred / np.abs(centred).max()
+    total += _CENTRED * scale * np.outer(centred, centred)
+    try:
+        root = np.linalg.cholesky(total)
+        solution: Floats = nnls(root.T, solve_triangular(root, right, lower=True), maxiter=30 * count)[0]
+    except (RuntimeError, np.linalg.LinAlgError):
+        raise InputError("images_e: expected images of spots, got ones that no profile fits") from None
+    return solution

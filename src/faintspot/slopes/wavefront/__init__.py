@@ -1,0 +1,29 @@
+"""Wavefronts from slopes: Zernike modes, their fit, figures and files."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from faintspot.base.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from faintspot.slopes.wavefront.discrepancy import Discrepancy as Discrepancy
+    from faintspot.slopes.wavefront.discrepancy import slope_discrepancy as slope_discrepancy
+    from faintspot.slopes.wavefront.files import save_wavefront as save_wavefront
+    from faintspot.slopes.wavefront.fit import Wavefront as Wavefront
+    from faintspot.slopes.wavefront.fit import fit_wavefront as fit_wavefront
+    from faintspot.slopes.wavefront.zernike import zernike as zernike
+
+_HOMES = {
+    "Discrepancy": "faintspot.slopes.wavefront.discrepancy",
+    "Wavefront": "faintspot.slopes.wavefront.fit",
+    "fit_wavefront": "faintspot.slopes.wavefront.fit",
+    "save_wavefront": "faintspot.slopes.wavefront.files",
+    "slope_discrepancy": "faintspot.slopes.wavefront.discrepancy",
+    "zernike": "faintspot.slopes.wavefront.zernike",
+}
+
+__all__ = sorted(_HOMES)
+
+
+__getattr__ = lazy_attributes(__name__, _HOMES)

@@ -1,0 +1,109 @@
+"""Figure of a wavefront: maps with and without tip and tilt, and its coefficients."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from faintspot.base.report.drawing import FLUX_GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
+from faintspot.base.report.figure_data import FigureWithData
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.sensor.pupil import lenslet_outlines
+from faintspot.slopes.wavefront.fit import Wavefront, total
+from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_SIGNED_COLOURS = "RdBu_r"
+_MOST_OUTLINED = 1500
+
+
+@styled
+def wavefront_figure(
+    wavefront: Wavefront, layout: Layout, name: str, *, file: str = "wavefront"
+) -> FigureWithData:
+    """Draw the mean wavefront over the pupil and its coefficients with standard errors."""
+    several = int(np.count_nonzero(wavefront.fitted)) > 1
+    figure = new_figure(WIDTH, 9.6)
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(5.6, 4))[:, 0]
+    what = "mean wavefront" if several else "wavefront"
+    for axes, tilt in zip(above.subplots(1, 2), (True, False), strict=True):
+        rms = float(total(wavefront.mean, tilt=tilt))
+        title = what if tilt else f"{what} without tip and tilt"
+        _map(axes, wavefront, layout, tilt=tilt)
+        axes.set_title(f"{title}: {rms:.3g} {wavefront.unit} rms", fontsize=12)
+    rest = len(wavefront.modes) > 2
+    widths = {"width_ratios": (1, max(3, min(len(wavefront.modes) / 2, 9)))} if rest else {}
+    panels = below.subplots(1, 2 if rest else 1, squeeze=False, **widths)[0]
+    for axes, part in zip(panels, (slice(0, 2), slice(2, None)), strict=False):
+        _bars(axes, wavefront, part, several)
+    panels[0].set_ylabel(f"coefficient ({wavefront.unit})")
+    if several:
+        handles, labels = panels[-1].get_legend_handles_labels()
+        below.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+    above.suptitle(name, fontsize=14)
+    caption = (
+        f"{what.capitalize()} over the disk of the pupil, in the frame's directions, with the "
+        "illuminated sub-apertures outlined; it increases in the direction in which spots "
+        "are displaced. Below: its coefficients in "
+        "Noll's order ± standard error"
+        + (", and in grey the rms of each over the frames (motion and noise)." if several else ".")
+    )
+    header = ("noll", "n", "m", "name", "coefficient", "standard_error", "rms_of_frames", "unit")
+    rows = [
+        (int(j), *noll_to_nm(int(j)), mode_name(int(j)), *numbers, wavefront.unit)
+        for j, *numbers in zip(
+            wavefront.modes,
+            wavefront.mean,
+            wavefront.mean_standard_error,
+            wavefront.rms_of_frames,
+            strict=True,
+        )
+    ]
+    return FigureWithData(file, f"Wavefront of {name}", caption, figure, header, rows)
+
+
+def _map(axes: Axes, wavefront: Wavefront, layout: Layout, *, tilt: bool) -> None:
+    """Draw the mean wavefront at its position in the frame, with the illuminated sub-apertures outlined."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.patches import Circle
+
+    pupil, sheet = wavefront.pupil, wavefront.sheet(tilt=tilt)
+    (x, y), radius = pupil.centre_px, pupil.radius_px
+    largest = float(np.nanmax(np.abs(sheet))) or 1.0
+    half = radius * len(sheet) / (len(sheet) - 1)  # the outermost points are on the circle
+    extent = (x - half, x + half, y - half, y + half)
+    image = axes.imshow(sheet, cmap=_SIGNED_COLOURS, vmin=-largest, vmax=largest, extent=extent)
+    if len(layout) <= _MOST_OUTLINED:
+        outlines: Any = list(lenslet_outlines(layout))
+        axes.add_collection(
+            PolyCollection(outlines, facecolors="none", edgecolors="#00000030", linewidths=0.6)
+        )
+    axes.add_patch(Circle((x, y), radius, fill=False, color="black", lw=0.8))
+    reach = 1.12 * radius
+    axes.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal")
+    axes.set(xlabel="column (px)", ylabel="row (px)")
+    colour_bar(axes, image, wavefront.unit)
+
+
+def _bars(axes: Axes, wavefront: Wavefront, part: slice, several: bool) -> None:
+    modes = wavefront.modes[part]
+    if several:
+        axes.bar(modes, wavefront.rms_of_frames[part], 0.85, color=FLUX_GREY, label="rms over the frames")
+    axes.bar(
+        modes,
+        wavefront.mean[part],
+        0.5,
+        color=METHOD_COLOURS[1],
+        yerr=np.nan_to_num(wavefront.mean_standard_error[part]),
+        ecolor="black",
+        capsize=2 if len(modes) < 50 else 0,
+        label="mean over the frames ± standard error" if several else None,
+    )
+    axes.axhline(0, color="black", lw=0.8)
+    axes.set_xlim(modes[0] - 0.7, modes[-1] + 0.7)
+    step = -(-len(modes) // 30)
+    axes.set_xticks(modes[::step], [f"Z{j}" for j in modes[::step]])
+    axes.tick_params(axis="x", labelsize=10)

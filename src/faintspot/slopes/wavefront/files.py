@@ -1,0 +1,155 @@
+"""Wavefronts in files: CSV, JSON or FITS, by the ending of the name."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from faintspot.base.errors import InputError
+from faintspot.base.files import write_atomically
+from faintspot.base.report.figure_data import csv_text
+from faintspot.io.optional_packages import load_fits
+from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
+from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm
+
+
+def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
+    """Write a wavefront to a file, replacing an existing one.
+
+    Parameters
+    ----------
+    path : path
+        .csv: a row for the mean and one for each frame, with rms, coefficients and standard errors. .json:
+        the same by name, and the modes. .fits: the map of the mean wavefront, the table MODES, and the images
+        COEFFICIENTS and STANDARD_ERRORS (a row for each frame). A frame that could not be fitted is empty,
+        null or NaN.
+    wavefront : Wavefront
+
+    Raises
+    ------
+    InputError
+        When the ending is unknown, or the file cannot be written.
+    MissingExtraError
+        When astropy is needed and not installed.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> from faintspot.slopes.wavefront import save_wavefront
+    >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5, pixel_scale_arcsec=0.5, subaperture_m=0.6)
+    >>> frames, _ = fs.slopes.simulate.sensor_frames(
+    ...     layout.corners, layout.window, layout.frame_shape, 5, flux_e=1000.0,
+    ...     positions=np.tile([0.3, 0.0], (len(layout), 1)), rng=np.random.default_rng(1),
+    ... )
+    >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frames)
+    >>> save_wavefront("wavefront.csv", fs.fit_wavefront(slopes, layout, modes=5))
+    """
+    path = Path(path)
+    check_ending(path)
+    write_atomically(path, _WRITERS[path.suffix.lower()](wavefront))
+
+
+def check_ending(path: Path) -> None:
+    """Refuse an unknown ending before the work."""
+    if path.suffix.lower() not in _WRITERS:
+        raise InputError(f"{path}: expected a name ending in {', '.join(_WRITERS)}")
+
+
+def _csv(wavefront: Wavefront) -> str:
+    unit = "nm" if wavefront.unit == "nm" else "px_subaperture"
+    numbers = [f"z{j}" for j in wavefront.modes]
+    header = ["frame", f"rms_{unit}", f"rms_without_tilt_{unit}", *(f"{name}_{unit}" for name in numbers)]
+    header += [f"{name}_standard_error_{unit}" for name in numbers]
+    rows = [("mean", *_row(wavefront.mean, wavefront.mean_standard_error))]
+    for frame, values in enumerate(zip(wavefront.coefficients, wavefront.standard_errors, strict=True)):
+        rows.append((str(frame), *_row(*values)))
+    return csv_text(header, rows)
+
+
+def _row(coefficients: Floats, errors: Floats) -> tuple[Any, ...]:
+    values = (total(coefficients), total(coefficients, tilt=False), *coefficients, *errors)
+    return tuple(f"{value:.7g}" if np.isfinite(value) else "" for value in values)
+
+
+def _json(wavefront: Wavefront) -> str:
+    modes = [
+        {"noll": int(j), "n": n, "m": m, "name": mode_name(int(j)), "mean": mean, "standard_error": error}
+        for j, (n, m), mean, error in zip(
+            wavefront.modes,
+            (noll_to_nm(int(j)) for j in wavefront.modes),
+            _plain(wavefront.mean),
+            _plain(wavefront.mean_standard_error),
+            strict=True,
+        )
+    ]
+    values = {
+        "unit": wavefront.unit,
+        "pupil_radius_m": wavefront.pupil.radius_m,
+        "pupil_radius_subapertures": wavefront.pupil.radius_subapertures,
+        "standard_errors_from": wavefront.errors_from,
+        "condition": wavefront.condition,
+        "mean": {
+            "rms": float(total(wavefront.mean)),
+            "rms_without_tilt": float(total(wavefront.mean, tilt=False)),
+            "modes": modes,
+        },
+        "frames": {
+            "rms": _plain(wavefront.rms()),
+            "rms_without_tilt": _plain(wavefront.rms(tilt=False)),
+            "residual_px": _plain(wavefront.residual_px),
+            "coefficients": _plain(wavefront.coefficients),
+            "standard_errors": _plain(wavefront.standard_errors),
+        },
+    }
+    return json.dumps(values, indent=1, allow_nan=False)
+
+
+def _plain(values: Floats) -> Any:
+    """Return an array as lists with None for unknown values."""
+    plain = values.astype(object)
+    plain[~np.isfinite(values)] = None
+    return plain.tolist()
+
+
+def _fits(wavefront: Wavefront) -> bytes:
+    fits = load_fits()
+    unit = "nm" if wavefront.unit == "nm" else "pixel"
+    primary = fits.PrimaryHDU(wavefront.sheet().astype(np.float32))
+    primary.header["BUNIT"] = (
+        unit,
+        "times sub-apertures" if unit == "pixel" else "mean wavefront over the disk",
+    )
+    primary.header["CREATOR"] = "faintspot"
+    primary.header["SUBAPRAD"] = (wavefront.pupil.radius_subapertures, "radius of the disk, sub-apertures")
+    if wavefront.pupil.radius_m is not None:
+        primary.header["PUPILRAD"] = (wavefront.pupil.radius_m, "radius of the disk, m")
+    primary.header["ERRFROM"] = (wavefront.errors_from, "source of the standard errors")
+    orders = np.array([noll_to_nm(int(j)) for j in wavefront.modes])
+    columns = [
+        fits.Column("NOLL", "J", array=wavefront.modes),
+        fits.Column("N", "J", array=orders[:, 0]),
+        fits.Column("M", "J", array=orders[:, 1]),
+        fits.Column("MEAN", "D", unit, array=wavefront.mean),
+        fits.Column("STANDARD_ERROR", "D", unit, array=wavefront.mean_standard_error),
+    ]
+    table = fits.BinTableHDU.from_columns(columns, name="MODES")
+    images = [
+        fits.ImageHDU(values, name=name)
+        for name, values in (
+            ("COEFFICIENTS", wavefront.coefficients),
+            ("STANDARD_ERRORS", wavefront.standard_errors),
+        )
+    ]
+    for image in images:
+        image.header["BUNIT"] = unit
+    stream = io.BytesIO()
+    fits.HDUList([primary, table, *images]).writeto(stream, checksum=True)
+    return stream.getvalue()
+
+
+_WRITERS: dict[str, Callable[[Wavefront], str | bytes]] = {".csv": _csv, ".json": _json, ".fits": _fits}

@@ -1,0 +1,254 @@
+"""Wavefronts from slopes: Zernike modes fitted by least squares to the valid sub-apertures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
+from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, pupil_of
+from faintspot.slopes.wavefront.zernike import mean_gradients, zernike
+
+Floats = NDArray[np.float64]
+
+LARGEST_CONDITION = 100.0
+"""Largest condition number of the modes' gradients, each scaled to 1: the noise amplification allowed."""
+_HIGHEST_ORDER, _USUAL_CONDITION = 8, 20.0  # defaults; higher orders are rarely needed
+_TILTS = 2
+_NM_PER_ARCSEC_M = 1e9 * np.pi / (180 * 3600)
+
+
+@dataclass(frozen=True)
+class Wavefront:
+    """Zernike coefficients of the wavefront in one frame or several.
+
+    The wavefront is the optical path difference minus its mean; it increases in the direction of the spots'
+    displacement. All values refer to the whole disk of the pupil: a central obscuration has no modes of its
+    own.
+    """
+
+    modes: NDArray[np.int64]
+    """Noll indices, (k,), from 2."""
+    coefficients: Floats
+    """Coefficients, (n_frames, k): rms over the disk, as each mode has mean square 1; NaN if not `fitted`."""
+    standard_errors: Floats
+    """Standard errors of the coefficients from the slopes' noise, (n_frames, k); NaN if unknown."""
+    errors_from: str
+    """Source of the errors: "slopes" (their standard errors) or "residuals" (their scatter about the fitted
+    modes, which counts modes that are not fitted as noise)."""
+    residual_px: Floats
+    """Rms of the slopes about the fitted modes, px per axis, (n_frames,)."""
+    unit: str
+    """Unit: "nm", or "px × sub-aperture" (slopes in pixels times lengths in sub-apertures)."""
+    pupil: Pupil
+    condition: float
+    """Condition number of the fit with every sub-aperture that is ever valid."""
+
+    @property
+    def fitted(self) -> NDArray[np.bool_]:
+        """Whether enough sub-apertures were valid to separate the modes, (n_frames,)."""
+        return np.asarray(np.isfinite(self.coefficients).all(axis=1))
+
+    @property
+    def mean(self) -> Floats:
+        """Coefficients of the mean wavefront, (k,)."""
+        mean: Floats = self.coefficients[self.fitted].mean(axis=0)
+        return mean
+
+    @property
+    def mean_standard_error(self) -> Floats:
+        """Standard error of the mean, (k,), from the scatter over frames; for one frame, its own."""
+        kept = self.coefficients[self.fitted]
+        if len(kept) == 1:
+            error: Floats = self.standard_errors[self.fitted][0]
+        else:
+            error = kept.std(axis=0, ddof=1) / np.sqrt(len(kept))
+        return error
+
+    @property
+    def rms_of_frames(self) -> Floats:
+        """Root mean square of each coefficient over the frames, (k,)."""
+        rms: Floats = np.sqrt(np.mean(self.coefficients[self.fitted] ** 2, axis=0))
+        return rms
+
+    def rms(self, *, tilt: bool = True) -> Floats:
+        """Return the rms of each frame's wavefront over the disk, (n_frames,)."""
+        return total(self.coefficients, tilt=tilt)
+
+    def sheet(self, coefficients: Floats | None = None, *, points: int = 201, tilt: bool = True) -> Floats:
+        """Return a wavefront as a map over the disk, (points, points), NaN outside.
+
+        Parameters
+        ----------
+        coefficients : (k,) array, optional
+            Default: those of the mean wavefront.
+        points : int
+            Points along the diameter; rows go along y, columns along x, the outermost at the disk's edge.
+        tilt : bool
+            Whether to include tip and tilt.
+        """
+        values = self.mean if coefficients is None else coefficients
+        line = np.linspace(-1, 1, points)
+        y, x = np.meshgrid(line, line, indexing="ij")
+        inside = np.hypot(x, y) <= 1
+        sheet = np.full((points, points), np.nan)
+        sheet[inside] = 0.0
+        start = 0 if tilt else _TILTS
+        for j, value in zip(self.modes[start:], values[start:], strict=True):
+            sheet[inside] += value * zernike(int(j), x[inside], y[inside])
+        return sheet
+
+
+def total(coefficients: Floats, *, tilt: bool = True) -> Floats:
+    """Return the rms of wavefronts over the disk: the root sum of squares along the last axis."""
+    rms: Floats = np.sqrt(np.sum(coefficients[..., 0 if tilt else _TILTS :] ** 2, axis=-1))
+    return rms
+
+
+def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -> Wavefront:
+    """Fit Zernike modes to slopes, each frame by least squares over its valid sub-apertures.
+
+    The model of a slope is the mean gradient of a mode over the lenslet's square or hexagon, integrated
+    exactly. A sub-aperture cut by the pupil's edge counts as whole. One whose centre is outside is left out,
+    because modes have no meaning outside their disk.
+
+    Parameters
+    ----------
+    slopes : Slopes
+        Slopes of one frame or several; relative to a reference, the wavefront is, too.
+    layout : Layout
+        With `pixel_scale_arcsec`, and `subaperture_m` or `diameter_m`, the wavefront is in nm.
+    modes : int, optional
+        Number of modes, from tip and tilt on. Default: all up to the highest radial order (at most 8) with no
+        more than three modes for four sub-apertures and a good condition number. Orders that are not fitted
+        leak into the two highest fitted ones.
+
+    Raises
+    ------
+    InputError
+        When slopes and layout do not fit together, no slope is valid, or the valid sub-apertures cannot
+        separate so many modes.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5, pixel_scale_arcsec=0.5, subaperture_m=0.6)
+    >>> frames, _ = fs.slopes.simulate.sensor_frames(
+    ...     layout.corners, layout.window, layout.frame_shape, 5, flux_e=1000.0,
+    ...     positions=np.tile([0.3, 0.0], (len(layout), 1)), rng=np.random.default_rng(1),
+    ... )
+    >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frames)
+    >>> wavefront = fs.fit_wavefront(slopes, layout, modes=5)
+    >>> tip, *others = wavefront.mean
+    >>> print(f"tip {tip:.0f} nm, no other mode more than {np.abs(others).max():.0f} nm")
+    tip 774 nm, no other mode more than 5 nm
+    """
+    x, y, valid = (np.atleast_2d(getattr(slopes, name)) for name in ("x", "y", "valid"))
+    if x.ndim != 2 or x.shape[1] != len(layout):
+        raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {x.shape[-1]}")
+    pupil = pupil_of(layout)
+    valid = valid & inside_pupil(layout, pupil)
+    illuminated = np.asarray(valid.any(axis=0))
+    if not illuminated.any():
+        raise InputError("slopes: expected valid sub-apertures to fit a wavefront, found none")
+    gradients, condition = _chosen_gradients(modes, layout, pupil, illuminated)
+    unit, scale = _unit(layout, pupil)
+    errors = np.concatenate(
+        [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
+    )
+    used = np.tile(valid, 2)
+    known = bool(np.isfinite(errors[used]).all())
+    noise = np.square(errors, dtype=np.float64), np.atleast_2d(slopes.covariance_xy).astype(np.float64)
+    measured = np.concatenate([x, y], axis=1).astype(np.float64)
+    coefficients, standard_errors, residual = _fit(measured, used, gradients, noise if known else None)
+    return Wavefront(
+        np.arange(2, 2 + gradients.shape[1]),
+        scale * coefficients,
+        scale * standard_errors,
+        "slopes" if known else "residuals",
+        residual,
+        unit,
+        pupil,
+        condition,
+    )
+
+
+def _chosen_gradients(
+    modes: int | None, layout: Layout, pupil: Pupil, illuminated: NDArray[np.bool_]
+) -> tuple[Floats, float]:
+    """Return the mean gradients (2 n, k) of the modes to fit (all x, then all y) and their condition."""
+    n = int(np.count_nonzero(illuminated))
+    if modes is None:
+        counts = [order * (order + 3) // 2 for order in range(_HIGHEST_ORDER, 0, -1)]
+        counts, limit = [count for count in counts if count <= 0.75 * n] or [_TILTS], _USUAL_CONDITION
+    else:
+        counts = [int(number_between("modes", modes, _TILTS, 2 * n, integer=True))]
+        limit = LARGEST_CONDITION
+    outlines = (lenslet_outlines(layout) - pupil.centre_px) / pupil.radius_px
+    gradients = np.concatenate(mean_gradients(np.arange(2, 2 + counts[0]), outlines))
+    for count in counts:
+        condition = _condition(gradients[np.tile(illuminated, 2), :count])
+        if condition <= limit:
+            return gradients[:, :count], condition
+    raise InputError(
+        f"modes = {count}: {n} valid sub-apertures cannot separate so many (condition number "
+        f"{condition:.3g}, expected at most {LARGEST_CONDITION:g}); use fewer"
+    )
+
+
+def _unit(layout: Layout, pupil: Pupil) -> tuple[str, float]:
+    """Return the unit of coefficients, and its value for one pixel times the disk's radius."""
+    if layout.pixel_scale_arcsec is None or pupil.radius_m is None:
+        return "px × sub-aperture", pupil.radius_subapertures
+    return "nm", layout.pixel_scale_arcsec * pupil.radius_m * _NM_PER_ARCSEC_M
+
+
+def _condition(gradients: Floats) -> float:
+    """Return the condition number of the modes' gradients (2 n, k), each scaled to length 1."""
+    lengths = np.linalg.norm(gradients, axis=0)
+    if len(gradients) < gradients.shape[1] or not lengths.all():
+        return np.inf
+    return float(np.linalg.cond(gradients / lengths))
+
+
+def _fit(
+    slopes: Floats, valid: NDArray[np.bool_], gradients: Floats, noise: tuple[Floats, Floats] | None
+) -> tuple[Floats, Floats, Floats]:
+    """Return coefficients, their standard errors and the residuals' rms, for a radius and px of 1.
+
+    Frames with the same valid sub-apertures share one pseudo-inverse. `noise` are the slopes' variances, all
+    x, then all y, and the covariances of x and y; without it, it is estimated from the residuals.
+    """
+    frames, k = len(slopes), gradients.shape[1]
+    coefficients, standard_errors = np.full((frames, k), np.nan), np.full((frames, k), np.nan)
+    residual = np.full(frames, np.nan)
+    patterns, of_frame = np.unique(np.packbits(valid, axis=1), axis=0, return_inverse=True)
+    for number in range(len(patterns)):
+        which = np.flatnonzero(of_frame.ravel() == number)
+        used = valid[which[0]]
+        if not _condition(gradients[used]) <= LARGEST_CONDITION:
+            continue
+        inverse = np.linalg.pinv(gradients[used])
+        measured = slopes[np.ix_(which, used)]
+        fitted = measured @ inverse.T
+        left = measured - fitted @ gradients[used].T
+        coefficients[which] = fitted
+        residual[which] = np.sqrt(np.mean(left**2, axis=1))
+        freedom = measured.shape[1] - k
+        if noise is not None:
+            along, across = np.split(inverse, 2, axis=1)
+            variance = noise[0][np.ix_(which, used)] @ (inverse**2).T
+            both = noise[1][np.ix_(which, used[: len(used) // 2])]
+            variance = variance + 2 * both @ (along * across).T
+        elif freedom > 0:
+            of_slopes = np.sum(left**2, axis=1, keepdims=True) / freedom
+            variance = of_slopes * np.sum(inverse**2, axis=1)
+        else:
+            continue
+        standard_errors[which] = np.sqrt(variance)
+    return coefficients, standard_errors, residual

@@ -1,0 +1,71 @@
+"""What people write is understood, or refused in one line; and quickly."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.refusals import refused
+
+from faintspot.base.config.written_changes import parse_changes, parse_subapertures
+from faintspot.base.errors import InputError
+
+
+def test_parsing_changes() -> None:
+    texts = ["noise_std=2.5", " keep_brightest = 20", "denoise=TRUE", "flux_e=none", "rule=threshold"]
+    assert parse_changes([*texts, "tolerance=1e-3,0.1", "steps=3"]) == {
+        "noise_std": 2.5,
+        "keep_brightest": 20,
+        "denoise": True,
+        "flux_e": None,
+        "rule": "threshold",
+        "tolerance": [1e-3, 0.1],
+        "steps": 3,
+    }
+
+
+@pytest.mark.parametrize(
+    "texts", [[], ["noise_std"], ["=2"], ["noise_std="], ["noise_std=1,,2"], ["rule=a", "rule=b"]]
+)
+def test_changes_that_cannot_be_parsed(texts: list[str]) -> None:
+    with refused():
+        parse_changes(texts)
+
+
+def test_parsing_subapertures() -> None:
+    assert parse_subapertures("4,5,10-13") == [4, 5, 10, 11, 12, 13]
+    assert parse_subapertures(" 7 , 3-3, 2-4 ") == [7, 3, 2, 4]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "a", "1,", "3-1", "-1", "1-2-3", "1.5", "0-99999999999", "0-1000000", "²"]
+)
+def test_subapertures_that_cannot_be_parsed(text: str) -> None:
+    with pytest.raises(InputError, match="sub-apertures"):
+        parse_subapertures(text)
+
+
+@given(st.lists(st.integers(0, 50), min_size=1, unique=True))
+def test_subapertures_come_back_in_order(places: list[int]) -> None:
+    assert parse_subapertures(",".join(map(str, places))) == places
+
+
+@given(st.text(max_size=20))
+def test_any_text_is_parsed_or_refused_in_one_line(text: str) -> None:
+    for parse in (parse_subapertures, lambda line: parse_changes([line])):
+        said = ""
+        try:
+            parse(text)
+        except InputError as error:
+            said = str(error)
+        assert len(said.splitlines()) <= 1
+
+
+def test_commands_that_only_ask_import_nothing_that_takes_time() -> None:
+    modules = "faintspot.cli.realtime.command, faintspot.base.config.written_changes"
+    code = f"import {modules}, sys; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"numba", "scipy", "faintspot.slopes.pipeline.slope_pipeline"} & set(done.stdout.split())

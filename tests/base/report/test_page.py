@@ -1,0 +1,117 @@
+"""One page made of sections: everything is in it, escaped, and nothing from elsewhere."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+
+import pytest
+from tests.slopes.recorded.recorded_cases import Page as Reader
+
+from faintspot.base.errors import InputError
+from faintspot.base.report.drawing import new_figure
+from faintspot.base.report.figure_data import FigureWithData
+from faintspot.base.report.page import (
+    Badge,
+    Cell,
+    Page,
+    Section,
+    Table,
+    configuration_section,
+    html_of,
+    write_page,
+)
+
+pytestmark = pytest.mark.usefixtures("coarse_pictures")
+
+
+def sections() -> list[Section]:
+    rows: list[list[str | Cell]] = [
+        ["<a>", Cell("text", Badge("holds", "good"), "small", [("item", "remark")], ("last", "more"))]
+    ]
+    return [
+        Section("first", "First <1>", ["A paragraph & more."], points=["a point"], missing="None of it."),
+        Section(
+            "tables",
+            "Tables",
+            tables=[
+                Table(["", "b"], rows, "A caption."),
+                Table(["c"], [["d"]], csv=("rows.csv", "c\nd,é\n"), folded="1 row"),
+            ],
+        ),
+        Section(
+            "last",
+            "Last",
+            figures=[
+                FigureWithData("data", "With data", "Caption 1.", new_figure(1, 1), ["x", "y"], [[1, 2.5]]),
+                FigureWithData("picture", "Without", "Caption 2.", new_figure(2, 1)),
+            ],
+        ),
+        configuration_section("noise_std = 1 # <b>"),
+    ]
+
+
+def page(**changes: object) -> Page:
+    return Page("A <title>", {"Sources": "a & b"}, sections(), **changes)  # type: ignore[arg-type]
+
+
+def test_everything_is_on_the_page() -> None:
+    reader = Reader(html_of(page(warnings=["look <here>"], remark="Units.")))
+    assert reader.ids == ["first", "tables", "last", "configuration"]
+    for words in (
+        "A <title>",
+        "a & b",
+        "look <here>",
+        "What to look at first",
+        "First <1>",
+        "a point",
+        "None of it.",
+        "holds",
+        "remark",
+        "A caption.",
+        "1 row",
+        "Caption 2.",
+        "The configuration as TOML text",
+        "noise_std = 1 # <b>",
+        "Units.",
+    ):
+        assert words in reader.text
+    links = [value for value in reader.values("href") if value.startswith("#")]
+    assert links == ["#first", "#tables", "#last", "#configuration", "#last"]
+
+
+def test_links_lead_nowhere_else() -> None:
+    reader = Reader(html_of(page()))
+    for attribute in ("src", "href"):
+        assert all(value.startswith(("data:", "#")) for value in reader.values(attribute))
+    assert "script" not in [tag for tag, _ in reader.tags]
+
+
+def test_figures_with_data_can_be_saved_and_pictures_are_png() -> None:
+    reader = Reader(html_of(page()))
+    saved = {
+        found["download"]: base64.b64decode((found["href"] or "").partition(",")[2])
+        for tag, found in reader.tags
+        if tag == "a" and "download" in found
+    }
+    assert saved["data.csv"] == b"x,y\n1,2.5\n"
+    assert saved["data.png"].startswith(b"\x89PNG")
+    assert saved["rows.csv"].decode() == "c\nd,é\n"
+    assert set(saved) == {"data.csv", "data.png", "rows.csv"}
+    assert [source[:15] for source in reader.values("src")] == ["data:image/svg+", "data:image/png;"]
+
+
+def test_an_unknown_configuration_is_said() -> None:
+    assert configuration_section(" ").missing == "The configuration of this run is not known."
+    assert configuration_section("", "Specification").title == "Specification"
+
+
+def test_files_lie_beside_the_page(tmp_path: Path) -> None:
+    written = write_page(page(), tmp_path / "a.html")
+    assert written[0] == tmp_path / "a.html"
+    assert {path.name for path in written[1:]} == {"data.png", "data.svg", "data.csv"}
+    assert {path.parent for path in written[1:]} == {tmp_path / "a-figures"}
+    assert all(path.exists() for path in written)
+    (tmp_path / "b-figures").write_text("a file")
+    with pytest.raises(InputError, match="choose another folder"):
+        write_page(page(), tmp_path / "b.html")

@@ -1,0 +1,367 @@
+"""faintspot layout: from a frame to a configuration that faintspot slopes accepts, and a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.cli.cli_cases import Commands
+from tests.shared_data import shared_file
+
+from faintspot import Calibration, Layout, Settings
+from faintspot.io import read_slopes
+from faintspot.slopes.simulate import Detector, sensor_frames
+
+pytest.importorskip("matplotlib")
+
+SHAPE = (150, 160)
+OFFSET_ADU = 100.0
+
+
+def lattice(geometry: str) -> NDArray[np.float64]:
+    """Return x, y of 7 x 7 spots, 20 px apart, within SHAPE."""
+    rows, columns = (axis.ravel() for axis in np.mgrid[:7, :7])
+    if geometry == "square":
+        return np.stack([18.3 + 20 * columns, 14.6 + 20 * rows], axis=1)
+    return np.stack([13.3 + 20 * columns + 10 * (rows % 2), 22.6 + 20 * np.sqrt(0.75) * rows], axis=1)
+
+
+def frames(geometry: str = "square", n_frames: int = 3) -> NDArray[Any]:
+    """Frames with spots of 2000 e- near the lattice points, 3 e- of read noise, an offset of 100 ADU."""
+    points = lattice(geometry)
+    corners = np.floor(points[:, ::-1]).astype(int) - 7
+    wanted = points - (corners[:, ::-1] + 7.5)
+    simulated, _ = sensor_frames(
+        corners,
+        (16, 16),
+        SHAPE,
+        n_frames,
+        flux_e=2000.0,
+        positions=np.tile(wanted, (n_frames, 1, 1)),
+        detector=Detector(3.0, offset_adu=OFFSET_ADU, bits=16),
+        rng=np.random.default_rng(1),
+    )
+    return np.asarray(simulated)
+
+
+@pytest.fixture
+def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw nothing, which takes most of a second, where the picture is not what is tested."""
+    monkeypatch.setattr(
+        "faintspot.slopes.recorded.layout_picture.layout_picture", lambda *given, **named: None
+    )
+
+
+def is_png(path: Path) -> bool:
+    content = path.read_bytes()
+    return content.startswith(b"\x89PNG\r\n") and len(content) > 5000
+
+
+@pytest.mark.parametrize("geometry", [pytest.param("square", marks=pytest.mark.portable), "hexagonal"])
+def test_simulated_frames(folder: Path, run: Commands, geometry: str) -> None:
+    """Lattice points within 0.2 px: 3 frames of 49 spots leave 0.01 px, the fit of a common grid less."""
+    np.save("a.npy", frames(geometry))
+    result = run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--pixels", 16)
+    assert result.err == ""
+    layout = Layout.load("new.toml")
+    assert layout.geometry == geometry
+    assert len(layout) == 49
+    assert layout.pitch_px == pytest.approx(20.0, abs=0.1)
+    distances = np.hypot(*(layout.centres[:, None] - lattice(geometry)[None]).transpose(2, 0, 1))
+    assert np.sort(distances.min(axis=1))[-1] < 0.2
+    assert is_png(folder / "new.png")
+    *_, picture, following = result.out.splitlines()
+    assert picture == "  picture: new.png"
+    assert following == "Next: faintspot slopes a.npy --config new.toml -o slopes.zarr"
+    run.ok(*following.removeprefix("Next: faintspot ").split())
+    stored = read_slopes("slopes.zarr")
+    assert stored.variables["valid"].all()
+    # Brightest pixels of 2000 e- at 3 e-: far below 0.2 px a slope.
+    assert np.abs(stored.variables["x"]).mean() < 0.2
+
+
+@pytest.mark.portable
+@pytest.mark.usefixtures("no_picture")
+def test_slopes_do_not_depend_on_the_unit_of_the_frames(folder: Path, run: Commands) -> None:
+    found, settings = [], []
+    for name, scale in (("small", 1e-4), ("as_they_are", 1.0), ("large", 1e4)):
+        np.save(f"{name}.npy", (scale * frames()).astype(np.float32))
+        run.ok("layout", f"{name}.npy", "-o", f"{name}.toml", "--pixels", 16)
+        run.ok("slopes", f"{name}.npy", "-c", f"{name}.toml", "-o", f"{name}.npz")
+        stored = read_slopes(f"{name}.npz").variables
+        assert stored["valid"].all()
+        found.append(np.stack([stored["x"], stored["y"]]))
+        settings.append(Settings.load(f"{name}.toml"))
+    np.testing.assert_allclose(found[0], found[1], atol=1e-4)
+    np.testing.assert_allclose(found[2], found[1], atol=1e-4)
+    assert settings[0] == settings[1] == settings[2]
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_gain_goes_into_the_calibration(folder: Path, run: Commands) -> None:
+    np.save("a.npy", frames())
+    run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--gain-e-per-adu", "2", "--pixels", 16)
+    assert Calibration.load("new.toml") == Calibration(dark=100.0, gain_e_per_adu=2.0)
+
+
+@pytest.mark.portable
+@pytest.mark.usefixtures("no_picture")
+def test_dark_file(folder: Path, run: Commands) -> None:
+    dark = np.random.default_rng(2).uniform(50, 150, SHAPE)
+    np.save("a.npy", frames().astype(np.float32) - OFFSET_ADU + dark)
+    np.savez("d.npz", dark=dark, other=np.ones((3, 3)))
+    run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "d.npz:dark", "--pixels", 16)
+    assert len(Layout.load("new.toml")) == 49
+    np.testing.assert_allclose(Calibration.load("new.toml").dark, dark)
+    run.ok("slopes", "a.npy", "-c", "new.toml")
+    arguments = ("layout", "a.npy", "-o", "other.toml", "--dark")
+    run.refused(*arguments, "nix.fits", naming=("nix.fits", "no such file"))
+    run.refused(*arguments, "nan", naming=("dark", "finite"))
+    run.refused(*arguments, "d.npz:other", naming=("dark", "(150, 160)", "(3, 3)"))
+    assert not (folder / "other.toml").exists()
+
+
+def test_options(folder: Path, run: Commands) -> None:
+    np.savez("a b.npz", night=frames(), day=frames())
+    result = run.ok(
+        *("layout", "a b.npz", "--key", "night", "-o", "new.toml", "--picture", "p.png"),
+        *("--pitch-px", "20.5", "--pixels", "12", "--geometry", "square"),
+    )
+    assert Layout.load("new.toml").window == (12, 12)
+    assert is_png(folder / "p.png")
+    assert not (folder / "new.png").exists()
+    assert "slopes 'a b.npz' --key night --config" in result.out
+    wrong = (("--pixels", "1"), ("--pitch-px", "-1"), ("--gain-e-per-adu", "0"), ("--gain-e-per-adu", "nan"))
+    for option, value in wrong:
+        result = run.refused("layout", "a b.npz", "--key", "night", "-o", "o.toml", option, value)
+        assert option.removeprefix("--").replace("-", "_") in result.error.replace("-", "_")
+    assert not (folder / "o.toml").exists()
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_exists_already_and_overwrite_keeps_the_calibration(folder: Path, run: Commands) -> None:
+    np.save("a.npy", frames())
+    run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--gain-e-per-adu", "2")
+    before = (folder / "new.toml").read_bytes()
+    run.refused("layout", "a.npy", "-o", "new.toml", naming=("new.toml", "already exists", "--overwrite"))
+    assert (folder / "new.toml").read_bytes() == before
+    run.ok("layout", "a.npy", "-o", "new.toml", "--overwrite", "--pixels", "10", "--dark", "90")
+    assert Layout.load("new.toml").window == (10, 10)
+    assert Calibration.load("new.toml") == Calibration(dark=90.0, gain_e_per_adu=2.0)
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_dark_frames_give_the_noise_of_each_pixel(folder: Path, run: Commands) -> None:
+    """Variances of 40 darks are known to 23 %; bad pixels that are known stay, those that blink join them."""
+    noise = np.random.default_rng(3).lognormal(1.0, 0.5, SHAPE)
+    blinking = [(20, 30, 60.0)]
+    camera = Detector(noise, offset_adu=100.0, gain_e_per_adu=2.0, blinking_pixels=blinking)
+    np.save("a.npy", frames())
+    np.save("darks.npy", camera.expose(np.zeros((40, *SHAPE)), np.random.default_rng(4)))
+    np.save("list.npy", [[3, 5]])
+    options = ("--dark", "darks.npy", "--gain-e-per-adu", 2, "--pixels", 16, "--bad-pixels", "list.npy")
+    output = run.ok("layout", "a.npy", "-o", "new.toml", *options)
+    assert "read noise of each pixel" in output.out
+    calibration = Calibration.load("new.toml")
+    assert [20, 30] in np.asarray(calibration.bad_pixels).tolist()
+    assert [3, 5] in np.asarray(calibration.bad_pixels).tolist()
+    ratio = np.delete(np.asarray(calibration.read_noise_e) / noise, 20 * SHAPE[1] + 30)
+    assert np.sqrt(np.mean(np.log(ratio) ** 2)) < 0.15
+    run.ok("layout", "a.npy", "-o", "number.toml", *options, "--read-noise-e", 3)
+    assert Calibration.load("number.toml").read_noise_e == 3.0
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_maps_of_the_camera(folder: Path, run: Commands) -> None:
+    """A cube of darks is averaged, a flat divided by its mean, bad pixels come as a map or a list."""
+    rng = np.random.default_rng(2)
+    dark, flat = rng.uniform(50, 150, SHAPE), rng.uniform(0.8, 1.2, SHAPE)
+    bad = np.zeros(SHAPE, bool)
+    bad[3, 5] = bad[40, 41] = True
+    cube = (frames().astype(np.float32) - OFFSET_ADU) * flat + dark
+    np.save("a.npy", cube)
+    np.save("dark.npy", np.stack([dark - 3, dark + 3]))
+    np.save("flat.npy", np.stack([20000 * flat, 20000 * flat]))
+    np.save("map.npy", bad)
+    np.save("list.npy", np.argwhere(bad))
+    options = ("--dark", "dark.npy", "--flat", "flat.npy", "--read-noise-e", "3", "--pixels", 16)
+    run.ok("layout", "a.npy", "-o", "new.toml", *options, "--bad-pixels", "map.npy")
+    calibration = Calibration.load("new.toml")
+    np.testing.assert_allclose(calibration.dark, dark)
+    np.testing.assert_allclose(calibration.flat, flat / flat.mean())
+    assert calibration.read_noise_e == 3.0
+    np.save("noise.npy", flat)
+    run.ok("layout", "a.npy", "-o", "noise.toml", "--read-noise-e", "noise.npy", "--pixels", 16)
+    np.testing.assert_allclose(np.asarray(Calibration.load("noise.toml").read_noise_e), flat)
+    assert len(Layout.load("new.toml")) == 49
+    run.ok("layout", "a.npy", "-o", "other.toml", *options, "--bad-pixels", "list.npy")
+    assert np.asarray(Calibration.load("other.toml").bad_pixels).tolist() == [[3, 5], [40, 41]]
+    np.save("dark.npy", dark[:, :10])
+    run.refused("layout", "a.npy", "-o", "o.toml", *options, naming=("dark", "(150, 160)"))
+    run.refused("layout", "a.npy", "-o", "o.toml", "--read-noise-e", "-1", naming=("read_noise_e",))
+    np.save("flat.npy", np.zeros(SHAPE))
+    run.refused("layout", "a.npy", "-o", "o.toml", "--flat", "flat.npy", naming=("flat.npy", "above 0"))
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_scales_on_the_sky_and_in_the_pupil(folder: Path, run: Commands) -> None:
+    np.save("a.npy", frames())
+    scales = ("--pixel-scale-arcsec", 0.4, "--subaperture-m", 0.6, "--diameter-m", 4.2)
+    run.ok("layout", "a.npy", "-o", "new.toml", *scales)
+    layout = Layout.load("new.toml")
+    assert (layout.pixel_scale_arcsec, layout.subaperture_m, layout.diameter_m) == (0.4, 0.6, 4.2)
+    run.ok(
+        "layout", "a.npy", "-o", "new.toml", "--overwrite", "--pixel-scale-arcsec", 0.5
+    )  # keeps the others
+    layout = Layout.load("new.toml")
+    assert (layout.pixel_scale_arcsec, layout.subaperture_m, layout.diameter_m) == (0.5, 0.6, 4.2)
+    run.refused("layout", "a.npy", "-o", "o.toml", "--diameter-m", 0, naming=("diameter_m = 0",))
+    assert not Path("o.toml").exists()
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_which_lenslets(folder: Path, run: Commands) -> None:
+    np.save("a.npy", frames())
+    arguments = ("layout", "a.npy", "--overwrite", "-o", "new.toml")
+    run.ok(*arguments, "--pixels", "12,16")
+    whole = Layout.load("new.toml")
+    assert whole.window == (12, 16)
+    run.ok(*arguments, "--pixels", "12,16", "--exclude", "0,7-13, 48")
+    chosen = np.setdiff1d(np.arange(49), [0, *range(7, 14), 48])
+    assert Layout.load("new.toml") == whole[chosen]
+    run.ok(*arguments, "--pupil", "78,75,45,10")
+    radius = np.hypot(*(Layout.load("new.toml").centres - (78, 75)).T)
+    assert 10 <= radius.min() <= radius.max() <= 45
+    assert len(radius) == np.count_nonzero(np.abs(np.hypot(*(lattice("square") - (78, 75)).T) - 27.5) <= 17.5)
+    run.ok(*arguments, "--roi", "0,0,110,90")
+    assert len(Layout.load("new.toml")) == 4 * 5  # rows and columns of nodes in it
+    run.ok(*arguments, "--illuminated-fraction", "0.9")
+    assert len(Layout.load("new.toml")) > 40
+    for option, value, words in (
+        ("--exclude", "3,x", "such as 3,17,40-45"),
+        ("--exclude", "40-49", "from 0 to 48"),
+        ("--exclude", "5-2", "from 0 to 48"),
+        ("--exclude", "0-48", "no sub-aperture is left"),
+        ("--pupil", "1,2", "X,Y,R or X,Y,R,INNER"),
+        ("--pupil", "80,80,-3", "radius"),
+        ("--roi", "0,0,1000,10", "within the frame's 160 columns"),
+        ("--pixels", "12,14,16", "height and width"),
+        ("--pixels", "1,12", "pixels = 1"),
+        ("--illuminated-fraction", "2", "illuminated-fraction = 2"),
+        ("--pitch-px", "2", "spots of quad cells overlap"),
+    ):
+        assert words in run.refused("layout", "a.npy", "-o", "o.toml", option, value).error
+    assert not (folder / "o.toml").exists()
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_numbers_are_plain_and_doubt_is_said(folder: Path, run: Commands) -> None:
+    np.save("a.npy", 400.0 * (frames().astype(float) - OFFSET_ADU))
+    out = run.ok("layout", "a.npy", "-o", "new.toml").out
+    assert "e+" not in out
+    assert "doubtful" not in out
+    array = frames().astype(float) - OFFSET_ADU
+    array[:, :, 80:] *= 0.4
+    np.save("b.npy", array)
+    assert "  doubtful: " in run.ok("layout", "b.npy", "-o", "b.toml").out
+
+
+def test_pure_noise(folder: Path, run: Commands) -> None:
+    np.save("a.npy", np.random.default_rng(3).normal(100, 5, (3, 128, 128)))
+    run.refused("layout", "a.npy", "-o", "new.toml", naming=("a.npy", "no square or hexagonal", "--pitch-px"))
+    np.save("b.npy", np.full((3, 128, 128), np.nan))
+    run.refused("layout", "b.npy", "-o", "new.toml", naming=("b.npy", "every pixel is NaN"))
+    np.save("c.npy", np.ones((128, 128)))
+    run.refused("layout", "c.npy", "-o", "new.toml", naming=("c.npy",))
+    assert not list(folder.glob("new*"))
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_nan_pixels_and_frames_do_not_count(folder: Path, run: Commands) -> None:
+    cube = frames().astype(np.float32)
+    cube[0] = np.nan
+    cube[:, 30, 40] = np.inf
+    np.save("a.npy", cube)
+    assert run.ok("layout", "a.npy", "-o", "new.toml", "--pixels", 16).err == ""
+    assert len(Layout.load("new.toml")) == 49
+
+
+def test_places_that_cannot_be_written(folder: Path, run: Commands) -> None:
+    np.save("a.npy", frames())
+    run.refused("layout", "a.npy", "-o", "nix/new.toml", naming=("nix/new",))
+    run.refused("layout", "a.npy", "-o", "new.toml", "--picture", "nix/p.png", naming=("nix/p.png",))
+    assert not (folder / "new.toml").exists()
+    run.refused("layout", "nix.fits", "-o", "new.toml", naming=("nix.fits", "no such file"))
+
+
+@pytest.mark.parametrize(
+    ("name", "geometry", "shape", "lowest", "highest"),
+    [
+        ("data/ciao_bench_60x224x224.npz", "square", None, 49, 49),
+        ("data/auto_wfs_0037_ave.fits.gz", "square", (14, 14), 144, 152),
+        ("data/mmirs_wfs_0150.fits.gz", "square", (14, 14), 150, 158),
+        ("data/test_newf9.fits.gz", "hexagonal", None, 141, 149),
+    ],
+)
+def test_real_frames(
+    folder: Path, run: Commands, name: str, geometry: str, shape: Any, lowest: int, highest: int
+) -> None:
+    result = run.ok("layout", shared_file(name), "-o", "real.toml")
+    layout = Layout.load("real.toml")
+    assert layout.geometry == geometry
+    assert lowest <= len(layout) <= highest
+    if shape is not None:
+        assert np.all(np.abs(layout.cells.max(axis=0) + 1 - shape) <= 1)
+    assert is_png(folder / "real.png")
+    run.ok("slopes", shared_file(name), "-c", "real.toml", "-o", "s.npz")
+    assert read_slopes("s.npz").variables["valid"].mean() > 0.95
+    assert "Next: " in result.out
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_lenslets_at_the_edge_are_left_out_or_windows_moved(folder: Path, run: Commands) -> None:
+    """The spots of the first column lie 8 px from the edge, half a window of 20 px does not fit."""
+    np.save("a.npy", frames()[:, :, 10:])
+    result = run.ok("layout", "a.npy", "-o", "new.toml")
+    assert "7 lit lenslets at the frame's edge left out" in result.out
+    assert "7 at small x;" in result.out
+    assert len(Layout.load("new.toml")) == 42
+    assert np.abs(Layout.load("new.toml").offsets).max() < 1.1
+    result = run.ok("layout", "a.npy", "-o", "moved.toml", "--move-windows")
+    assert len(Layout.load("moved.toml")) == 49
+    assert "windows moved off the spots" in result.out
+    assert "left out" not in result.out
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_dark_level_and_hot_pixels_of_the_frame(run: Commands, folder: Path) -> None:
+    array = frames()
+    array[:, 5, 70] = 4000
+    array[:, 80, 3] = 3000
+    np.save(folder / "frames.npy", array)
+    result = run("layout", "frames.npy", "-o", "new.toml", "--mask-hot-pixels")
+    assert result.code == 0
+    assert "2 hot pixels masked" in result.out
+    calibration = Calibration.load(folder / "new.toml")
+    assert calibration.bad_pixels.tolist() == [[5, 70], [80, 3]]
+    # The median of some hundred background pixels with 3 e- of noise and faint wings of the spots.
+    assert calibration.dark == pytest.approx(OFFSET_ADU, abs=1.5)
+    assert not calibration.vouches_for_dark
+    assert run("layout", "frames.npy", "-o", "new.toml", "--dark", "70", "--overwrite").code == 0
+    assert Calibration.load(folder / "new.toml").vouches_for_dark
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_settings_without_a_layout_are_kept(
+    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    settings = Settings(estimator="weighted", spot_fwhm_px=2.5)
+    settings.save("tuned.toml")
+    np.save("spots.npy", frames())
+    assert "settings that tuned.toml has are kept" in run.ok("layout", "spots.npy", "-o", "tuned.toml").out
+    assert Settings.load("tuned.toml") == settings
+    assert "already exists" in run.refused("layout", "spots.npy", "-o", "tuned.toml").error

@@ -1,0 +1,85 @@
+"""faintspot layout --grid: quad cells from frames to slopes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.cli.cli_cases import Commands
+
+from faintspot import Calibration, Layout, Settings
+from faintspot.io import read_slopes
+from faintspot.slopes.simulate import Detector, sensor_frames
+
+QUAD = Layout.grid((8, 8), pixels=2, outer_radius=4.2, inner_radius=1.0)
+
+
+@pytest.fixture(autouse=True)
+def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "faintspot.slopes.recorded.layout_picture.layout_picture", lambda frame, layout, path: None
+    )
+
+
+def save_frames(layout: Layout = QUAD) -> None:
+    frames, _ = sensor_frames(
+        layout.corners,
+        layout.window,
+        layout.frame_shape,
+        20,
+        flux_e=500.0,
+        position_range_px=0.3,
+        detector=Detector(read_noise_e=2.0, offset_adu=100.0),
+        rng=np.random.default_rng(1),
+    )
+    np.save("a.npy", frames)
+
+
+def test_quad_cells(folder: Path, run: Commands) -> None:
+    save_frames()
+    out = run.ok("layout", "a.npy", "--grid", "8x8", "-o", "new.toml").out
+    assert Layout.load("new.toml").corners.tolist() == QUAD.corners.tolist()
+    assert Settings.load("new.toml").estimator.name == "centroid"
+    assert Calibration.load("new.toml").dark == pytest.approx(100.0, abs=0.5)  # of the cells that are dark
+    run.ok(*out.splitlines()[-1].removeprefix("Next: faintspot ").split())
+    images = QUAD.images(np.load("a.npy").astype(float)) - Calibration.load("new.toml").dark
+    halves = images.sum(axis=-2)
+    expected = 0.5 * (halves[..., 1] - halves[..., 0]) / images.sum(axis=(-2, -1))
+    np.testing.assert_allclose(read_slopes("slopes.zarr").variables["x"], expected, atol=1e-5)
+
+
+def test_there_is_nothing_to_tune(folder: Path, run: Commands) -> None:
+    save_frames()
+    run.ok("layout", "a.npy", "--grid", "8x8", "-o", "new.toml")
+    run.refused(
+        "tune", "--recording", "a.npy", "--layout", "new.toml", "-o", "o.toml", naming=("quad cells",)
+    )
+    camera = ("--read-noise-e", "2", "--pixels", "2", "--fwhm-px", "1.8", "--flux-e", "300")
+    run.refused("tune", *camera, "-o", "o.toml", naming=("quad cells",))
+
+
+def test_a_larger_grid_has_the_usual_settings(folder: Path, run: Commands) -> None:
+    save_frames(Layout.grid((4, 4), pixels=12, outer_radius=2.0))
+    run.ok("layout", "a.npy", "--grid", "4x4", "-o", "new.toml", "--dark", "100", "--exclude", "0")
+    assert len(Layout.load("new.toml")) == 11
+    assert Settings.load("new.toml").estimator.name != "centroid"
+
+
+def test_windows_that_are_smaller_than_the_pitch_are_said(folder: Path, run: Commands) -> None:
+    np.save("a.npy", np.random.default_rng(1).normal(100, 1, (262, 262)))
+    assert "of a pitch of 131 px" in run.ok("layout", "a.npy", "--grid", "2x2", "-o", "new.toml").out
+
+
+@pytest.mark.parametrize(
+    ("options", "naming"),
+    [
+        (("--grid", "8"), "--grid 8"),
+        (("--grid", "8x8", "--pitch-px", "2"), "--pitch-px"),
+        (("--grid", "80x8"), "cells of at least"),
+        (("--grid", "8x8", "--illuminated-fraction", "2"), "--illuminated-fraction"),
+    ],
+)
+def test_refused(folder: Path, run: Commands, options: tuple[str, ...], naming: str) -> None:
+    save_frames()
+    run.refused("layout", "a.npy", *options, "-o", "o.toml", naming=(naming,))

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tests.cli.cli_cases import Commands
+from tests.experiments.experiment_cases import SEARCH, small
+
+import faintspot.cli
+from faintspot.experiments.closed_loop import budget, magnitude
+from faintspot.loop.control.configuration import load_control
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop, shipped_loops
+from faintspot.slopes.pipeline import configuration
+
+pytest.importorskip("hcipy")
+pytest.importorskip("matplotlib")
+
+pytestmark = pytest.mark.machine_time("starts other processes")
+
+
+@pytest.fixture(autouse=True)
+def _small_experiments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(faintspot.cli._COMMANDS, "loop", "")
+    monkeypatch.setattr(magnitude, "QUICK", SEARCH)
+    terms = {name: budget.TERMS[name] for name in ("nothing", "slope error")}
+    monkeypatch.setattr(budget, "TERMS", terms)
+    monkeypatch.chdir(tmp_path)
+    faint = small().replace("camera", em_gain=100.0).replace("run", photons_per_subaperture=(40.0, 400.0))
+    Path("small.toml").write_text(faint.to_text(), encoding="utf-8")
+
+
+def test_list_and_show(run: Commands) -> None:
+    listed = run("loop", "list").out.splitlines()
+    assert [line.split()[0] for line in listed] == shipped_loops()
+    shown = run("loop", "show", "canary").out
+    assert LoopConfiguration.from_text(shown) == load_loop("canary")
+
+
+def test_magnitude(run: Commands) -> None:
+    result = run(
+        "loop", "magnitude", "small.toml", "--quick", "--workers", 0, "--methods", "brightest", "-o", "here"
+    )
+    assert result.code == 0, result.err
+    assert result.out.splitlines()[1].startswith("brightest pixels")
+    assert result.out.splitlines()[-1] == "here/report.html: open it in a browser"
+    assert "brightest pixels" in Path("here/report.html").read_text(encoding="utf-8")
+    again = run("report", "here", "-o", "page.html")
+    assert again.out == "page.html: open it in a browser\n"
+    assert Path("page.html").is_file()
+
+
+def test_budget(run: Commands) -> None:
+    result = run("loop", "budget", "small.toml", "--quick", "--workers", 0, "--methods", "centroid")
+    assert result.code == 0, result.err
+    lines = result.out.splitlines()
+    assert lines[1].startswith("centre of gravity")
+    assert "slope error" in lines[2]
+    assert lines[-1] == "small-quick/report.html: open it in a browser"
+
+
+def test_engine_files_close_the_loop(run: Commands) -> None:
+    """What `loop tune` has chosen stays, and an engine has all that it needs."""
+    Path("bench").mkdir()
+    Path("bench/faintspot.toml").write_text('[estimator]\nname = "centroid"\n', encoding="utf-8")
+    result = run("loop", "engine", "small.toml", "-o", "bench", "--frame-rate-hz", 100)
+    assert result.out.endswith("next: faintspot realtime run --config bench/faintspot.toml --close-loop\n")
+    settings = configuration.load_all("bench/faintspot.toml").settings
+    control = load_control("bench/faintspot.toml")
+    assert settings.estimator.name == "centroid"
+    assert control is not None
+    assert control.options.gain == load_loop("small.toml").control.gain
+    assert control.reference is not None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["magnitude", "nowhere.toml"], "nowhere.toml: no such file; none of the shipped configurations"),
+        (["show", "nowhere"], "nowhere: no such file"),
+        (["engine", "small.toml", "--frame-rate-hz", "0"], "frame_rate_hz"),
+        (["magnitude", "small.toml", "--methods", "kog"], "method = 'kog': expected one of"),
+        (["magnitude", "small.toml", "--flux-e", "1,x"], "--flux-e: expected numbers with commas, got 'x'"),
+        (["magnitude", "small.toml", "--flux-e", "-1"], "photons"),
+        (["budget", "small.toml", "-o", "no/where"], "the folder no does not exist"),
+        (["budget", "open_loop"], "expected 'closed' for an error budget"),
+    ],
+)
+def test_errors_are_one_line(run: Commands, arguments: list[str], message: str) -> None:
+    result = run("loop", *arguments)
+    assert result.code == 2
+    assert message in result.error

@@ -1,0 +1,87 @@
+"""faintspot realtime control, and what status says of a loop, with an engine in the process of the test."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from faintspot.cli.realtime.control import control
+from faintspot.cli.realtime.run import run
+from faintspot.cli.shared.engine_requests import summary
+from faintspot.engine.request_handlers import commands_of
+from faintspot.engine.requests.private_socket import socket_path
+from faintspot.engine.requests.requests import ControlServer
+from faintspot.loop.control.configuration import Control
+
+pytest.importorskip("pyshmem")
+
+from tests.engine.bench import LAYOUT, Bench, simulated
+
+pytestmark = pytest.mark.machine_time("starts other processes")
+
+MATRIX = np.random.default_rng(1).standard_normal((2 * len(LAYOUT), 10))
+
+
+def said(*arguments: str) -> str:
+    result = CliRunner().invoke(control, arguments, standalone_mode=False)
+    return result.output if result.exception is None else str(result.exception)
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with (
+        Bench(control=Control(MATRIX)) as made,
+        ControlServer(socket_path(made.name), commands_of(made.engine)),
+    ):
+        yield made
+
+
+def test_the_loop_by_the_command_line(bench: Bench) -> None:
+    name = ["--name", bench.name]
+    assert said("status", *name) == "loop open: integrator, gain 0.4; not closed since the engine began\n"
+    assert said("close", *name).startswith("loop closed: integrator, gain 0.4, slopes of")
+    assert "gain 0.25" in said("gain", *name, "0.25")
+    assert "gain = 2.5: expected a number from 0 to 2" in said("gain", *name, "2.5")
+    bench.measure(simulated(3))
+    assert "expected it open to flatten the mirror" in said("flat", *name)
+    assert said("open", *name) == "loop open: integrator, gain 0.25; asked to\n"
+    assert said("flat", *name) == said("status", *name)
+    everything = json.loads(said("status", *name, "--json"))
+    assert (everything["state"], everything["commands"]) == ("open", 10)
+    assert everything["latency"]["count"] == 3
+    assert "loop open: integrator" in summary(bench.engine.status())
+    assert bench.records["commands"].any()
+
+
+def test_an_engine_without_control() -> None:
+    with Bench() as bench, ControlServer(socket_path(bench.name), commands_of(bench.engine)):
+        assert said("status", "--name", bench.name) == "no loop: the engine makes no commands\n"
+        assert "add [control] to its configuration" in said("close", "--name", bench.name)
+        assert "loop" not in summary(bench.engine.status())
+
+
+@pytest.mark.parametrize(
+    ("control", "options", "message"),
+    [
+        ("", ["--close-loop"], "--close-loop: expected [control] in"),
+        ("[control]\n", [], "control.interaction_matrix: expected a value"),
+        ('[control]\ninteraction_matrix = "m.npy"\n', [], "expected 32 rows for 16 sub-apertures"),
+        ('[control]\ninteraction_matrix = "nan.npy"\n', [], "expected finite numbers, got 1 NaN"),
+    ],
+)
+def test_what_a_start_refuses(tmp_path: Path, control: str, options: list[str], message: str) -> None:
+    path: Any = tmp_path / "faintspot.toml"
+    path.write_text(f'[layout.grid]\nshape = [4, 4]\npixels = 8\n[estimator]\nname = "brightest"\n{control}')
+    np.save(tmp_path / "m.npy", MATRIX[:-2])
+    np.save(tmp_path / "nan.npy", np.where(MATRIX[2, 3] == MATRIX, np.nan, MATRIX))
+    arguments = ["--config", str(path), "--name", f"fs_test_{uuid4().hex[:8]}", *options]
+    result = CliRunner().invoke(run, arguments, standalone_mode=False)
+    assert message in str(result.exception)
+    assert "\n" not in str(result.exception)

@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("tornado")
+pytest.importorskip("pyshmem")
+pytest.importorskip("zarr")
+
+from tests.engine.page.cases import LAYOUT, N, records
+
+from faintspot.engine.telemetry.segment import image_type, layout_values
+from faintspot.io.telemetry.recording import TelemetryStore
+
+pytestmark = pytest.mark.machine_time("starts other processes")
+
+COMMAND = [sys.executable, "-m", "faintspot", "live"]
+
+
+def refused(*arguments: str) -> str:
+    done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    return done.stderr
+
+
+def test_what_cannot_be_shown_is_one_line(tmp_path: Path) -> None:
+    assert "no such file or directory" in refused(str(tmp_path / "night.zarr"))
+    assert "expected an IP address" in refused("--bind", "everywhere", "--port", "0")
+    assert "name = '../x'" in refused("--name", "../x", "--port", "0")
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_page_is_served_until_it_is_ended(tmp_path: Path, end: signal.Signals) -> None:
+    images = image_type(LAYOUT.frame_shape, N, LAYOUT.window)
+    made = records(0, 100)
+    attributes = {"layout": layout_values(LAYOUT), "settings": "", "methods": []}
+    store = TelemetryStore(tmp_path / "night.zarr", made.dtype, images, attributes)
+    store.append(made, np.empty(0, images), {})
+    command = [*COMMAND, "night.zarr", "--port", "0"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            url, _, token = process.stdout.readline().strip().partition("#")
+            assert len(token) >= 32
+            with urllib.request.urlopen(url) as page:
+                assert b"<title>faintspot</title>" in page.read()
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(urllib.request.Request(url, headers={"Host": "example.org"}))
+            process.send_signal(end)
+            assert process.wait(60) == 0
+        finally:
+            process.kill()

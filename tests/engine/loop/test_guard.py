@@ -1,0 +1,121 @@
+"""The guard against a window's slopes: those of spots that have left it are small."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.loop.control.control_cases import INTERACTION
+
+from faintspot.engine.loop.control_loop import ControlLoop
+from faintspot.engine.loop.guard import LostSpots
+from faintspot.loop.control.configuration import Control, ControlOptions
+from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
+from faintspot.slopes.sensor.layout import Layout
+
+LAYOUT = Layout.grid((3, 3), pixels=16)
+N, COMMANDS = len(LAYOUT), INTERACTION.shape[1]
+FLUX_E, WINDOW_PX = 100.0, 1.5
+OPTIONS = ControlOptions(gain=0.4, guard_frames=20, proven_frames=200)
+
+
+class Star:
+    """A star behind a mirror, seen through Gaussian windows that are divided by its expected flux."""
+
+    def __init__(self) -> None:
+        self._rng, self.flux_e, self.turbulence_px, self.sign = np.random.default_rng(3), FLUX_E, 0.5, 1.0
+        self._turbulence = np.zeros(COMMANDS)
+
+    def slopes(self, commands: np.ndarray) -> Slopes:
+        """Return the slopes of the next frame."""
+        change = self._rng.normal(0, 0.15 * self.turbulence_px, COMMANDS) / COMMANDS**0.5
+        self._turbulence = 0.99 * self._turbulence + change
+        place = INTERACTION @ (self._turbulence + self.sign * commands)
+        within = np.exp(-0.5 * np.square(place).reshape(2, N).sum(axis=0) / WINDOW_PX**2)
+        slopes = Slopes(*(np.zeros(N, kind) for kind in RESULT_TYPES))
+        seen = within * self.flux_e + self._rng.normal(0, 5.0, N)
+        x, y = (place * np.tile(within, 2) * self.flux_e / FLUX_E).reshape(2, N)
+        return replace(slopes, x=x.astype("f4"), y=y.astype("f4"), flux=seen.astype("f4"))
+
+
+class Run:
+    """A loop that has been closed on a star for a number of frames."""
+
+    def __init__(self, frames: int, options: ControlOptions = OPTIONS) -> None:
+        self.star, self.loop = Star(), ControlLoop(Control(INTERACTION, None, options), LAYOUT)
+        self._sent, self._number = [np.zeros(COMMANDS)] * options.delay_frames, 0
+        self.frames(30)
+        self.loop.close()
+        self.frames(frames)
+        assert self.loop.closed
+
+    def frames(self, count: int) -> None:
+        """Let frames come."""
+        for _ in range(count):
+            slopes = self.star.slopes(self._sent.pop(0))
+            self._sent.append(self.loop.follow(slopes, self._number).copy())
+            self.loop.look_after(slopes.flux)
+            self._number += 1
+
+    def frames_until_open(self, most: int = 300) -> int:
+        """Return how many frames came until the loop was open."""
+        for count in range(most):
+            if not self.loop.closed:
+                return count
+            self.frames(1)
+        return most
+
+
+@pytest.mark.parametrize(
+    ("event", "opens"),
+    [({"sign": -1.0}, True), ({"flux_e": 16.0}, False), ({"turbulence_px": 0.9}, False)],
+)
+def test_spots_that_leave_the_windows_open_the_loop(event: dict[str, float], opens: bool) -> None:
+    """A loop of the wrong sign does; a star that fades by two magnitudes and strong turbulence do not."""
+    run = Run(100)
+    vars(run.star).update(event)
+    assert (run.frames_until_open() < 300) == opens
+    if opens:
+        assert "of the flux left" in run.loop.opened_because
+        run.frames(3)
+        assert not run.loop.follow(run.star.slopes(np.zeros(COMMANDS)), 10_000).any()
+
+
+def test_one_bad_frame_does_not_open_the_loop() -> None:
+    run = Run(100)
+    seen = run.star.slopes
+
+    def bad(commands: np.ndarray) -> Slopes:
+        return replace(seen(commands), x=np.full(N, 6.0, "f4"))
+
+    run.star.slopes = bad  # type: ignore[method-assign]
+    run.frames(1)
+    run.star.slopes = seen  # type: ignore[method-assign]
+    run.frames(100)
+    assert run.loop.closed
+
+
+@pytest.mark.parametrize(
+    ("frames", "asked", "again"), [(250, "", True), (100, "", False), (250, "open", False)]
+)
+def test_a_proven_loop_is_closed_again(frames: int, asked: str, again: bool) -> None:
+    """Once its cause has passed; not a loop that was new, nor one that somebody has opened since."""
+    run = Run(frames)
+    run.star.sign = -1.0
+    assert run.frames_until_open() < 300
+    run.star.sign = 1.0
+    if asked:
+        run.loop.open()
+    run.frames(100)
+    assert run.loop.closed == again
+    status = run.loop.status()
+    assert (status["closed_again_because"] is not None) == again
+    assert (status["opened_because"] is None) == again
+
+
+def test_flux_that_is_not_finite_counts_as_none() -> None:
+    spots = LostSpots(INTERACTION, 10)
+    for _ in range(30):
+        spots.take(np.ones(COMMANDS), np.full(N, np.nan, "f4"))
+    assert not spots.lost

@@ -1,0 +1,28 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tests.engine.page.cases import unpacked
+
+from faintspot.engine.page.messages import packed, plain
+
+
+def test_message_holds_values_and_arrays_as_they_were() -> None:
+    arrays: dict[str, NDArray[Any]] = {
+        "odd": np.arange(5, dtype=np.uint8),
+        "none": np.zeros((0, 3), np.float32),
+        "table": np.arange(6.0).reshape(2, 3),
+        "strided": np.arange(8, dtype=np.int32)[::2],
+    }
+    kind, values, found = unpacked(packed("now", {"é": 1, "missing": float("nan")}, arrays))
+    assert (kind, values) == ("now", {"é": 1, "missing": None})
+    for name, array in arrays.items():
+        assert found[name].dtype == array.dtype
+        np.testing.assert_array_equal(found[name], array)
+
+
+def test_plain_values_are_what_json_can_hold() -> None:
+    given = {"a": np.float64("inf"), 3: (np.int64(2), [float("-inf")]), "array": np.array([1.5, np.nan])}
+    assert plain(given) == {"a": None, "3": [2, [None]], "array": [1.5, None]}

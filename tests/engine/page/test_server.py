@@ -1,0 +1,305 @@
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("tornado")
+pytest.importorskip("zarr")
+
+from tests.engine.page.cases import LAYOUT, Client, Noted, Played, Refused, asked, connected, next_of, served
+from tornado.httpclient import AsyncHTTPClient
+
+from faintspot.base.errors import InputError
+from faintspot.engine.page import server as server_module
+from faintspot.engine.page.access import Access
+from faintspot.engine.page.server import LARGEST_REQUEST, MOST_CLIENTS, LiveServer
+from faintspot.slopes.sensor.layout import Layout
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No pauses: they are for people."""
+    monkeypatch.setattr(server_module, "UPDATE_S", 0.01)
+    monkeypatch.setattr(server_module, "_REST_S", 0.005)
+    monkeypatch.setattr(server_module, "_WRONG_TOKEN_S", 0.01)
+    monkeypatch.setattr(server_module, "_PAUSE_S", 0.001)
+
+
+def noted(server: LiveServer) -> list[dict[str, Any]]:
+    assert isinstance(server.client_requests, Noted)
+    return server.client_requests.asked
+
+
+async def status_of(server: LiveServer, path: str = "/", **headers: str) -> int:
+    url = f"http://127.0.0.1:{server.port}{path}"
+    response = await AsyncHTTPClient().fetch(url, headers=headers, raise_error=False)
+    return int(response.code)
+
+
+async def refused_with(server: LiveServer, **headers: str) -> int:
+    with pytest.raises(Refused) as refused:
+        await connected(server, **headers)
+    return int(refused.value.args[0])
+
+
+async def closed(client: Client) -> int:
+    while await client.read() is not None:
+        pass
+    assert client.close_code is not None
+    return client.close_code
+
+
+def test_page_and_its_files_need_nothing_else() -> None:
+    async def check(server: LiveServer) -> None:
+        url = f"http://127.0.0.1:{server.port}/"
+        page = await AsyncHTTPClient().fetch(url)
+        assert page.headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self'")
+        assert page.headers["X-Content-Type-Options"] == "nosniff"
+        assert b"<script type=" in page.body
+        assert b"http://" not in page.body
+        assert b"https://" not in page.body
+        for name, kind in (("page.js", "text/javascript"), ("page.css", "text/css")):
+            content = await AsyncHTTPClient().fetch(url + name)
+            assert content.headers["Content-Type"].startswith(kind)
+            assert b"https://" not in content.body
+        for path in ("/nothing.js", "/../server.py", "/%2e%2e/server.py", "/__init__.py", "/etc/passwd"):
+            assert await status_of(server, path) == 404
+
+    served(check)
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "example.org", "example.org:80", "127.0.0.1.example.org", "[", "", "a:b:c", "[::1]example.org",
+        "[::1].example.org:80", "127.0.0.1:80.example.org", "127.0.0.1:80@example.org", "localhost:",
+        "[127.0.0.1]",
+    ],
+)  # fmt: skip
+def test_forged_host_is_refused(host: str) -> None:
+    async def check(server: LiveServer) -> None:
+        assert await status_of(server, "/", Host=host) in (400, 403)
+        assert await refused_with(server, Host=host, Origin=f"http://{host}") in (400, 403)
+
+    served(check)
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://example.org", "http://127.0.0.1:1", "null", "", "https://127.0.0.1"]
+)
+def test_forged_origin_is_refused(origin: str) -> None:
+    async def check(server: LiveServer) -> None:
+        assert await refused_with(server, Origin=origin) == 403
+
+    served(check)
+
+
+@pytest.mark.parametrize("suffix", [".example.org", "@example.org", "0", "/", "/page", " "])
+def test_origin_that_only_begins_as_the_page_is_refused(suffix: str) -> None:
+    headers = {"Host": "127.0.0.1:8642", "Origin": "http://127.0.0.1:8642"}
+    assert Access.permits_origin(headers)
+    assert not Access.permits_origin(headers | {"Origin": headers["Origin"] + suffix})
+
+    async def check(server: LiveServer) -> None:
+        assert await refused_with(server, Origin=f"http://127.0.0.1:{server.port}.example.org") == 403
+
+    served(check)
+
+
+def test_forwarded_port_is_the_same_host() -> None:
+    async def check(server: LiveServer) -> None:
+        connection = await connected(server, Host="localhost:9000", Origin="http://localhost:9000")
+        assert (await asked(connection, do="hello"))["ok"]
+
+    served(check)
+
+
+def test_watching_needs_no_token_here_and_changes_do() -> None:
+    async def check(server: LiveServer) -> None:
+        watcher = await connected(server)
+        assert await asked(watcher, do="hello") == {"id": 7, "ok": True, "may_change": False}
+        values, _ = await next_of(watcher, "sensor")
+        assert values["subapertures"] == len(LAYOUT)
+        values, arrays = await next_of(watcher, "now")
+        later, _ = await next_of(watcher, "now")
+        assert later["frame"] > values["frame"]
+        assert arrays["x"].shape == (len(LAYOUT),)
+        _, pictures = await next_of(watcher, "pictures")
+        assert pictures["raw"].shape == LAYOUT.frame_shape
+        refused = await asked(watcher, do="set", changes=["noise_std=1"])
+        assert not refused["ok"]
+        assert "token" in refused["error"]
+        wrong = await asked(watcher, do="hello", token="guess")
+        assert not wrong["ok"]
+        assert not (await asked(watcher, do="set"))["ok"]
+        right = await asked(watcher, do="hello", token=server.access.token)
+        assert right["may_change"]
+        assert (await asked(watcher, do="set", changes=["noise_std=1"]))["text"] == "noted"
+        unknown = await asked(watcher, do="format")
+        assert unknown["error"].startswith("do = 'format': expected one of set")
+
+    assert [request["changes"] for request in noted(served(check))] == [["noise_std=1"]]
+
+
+def test_bound_elsewhere_even_reading_needs_the_token() -> None:
+    async def check(server: LiveServer) -> None:
+        for token in (None, "", "guess", 5, ["a"]):
+            stranger = await connected(server)
+            answer = await asked(stranger, do="hello", token=token)
+            assert not answer["ok"]
+            assert await closed(stranger) == 1008
+        friend = await connected(server)
+        assert (await asked(friend, do="hello", token=server.access.token))["may_change"]
+        await next_of(friend, "now")
+
+    served(check, address="0.0.0.0")
+
+
+def test_a_stranger_who_says_nothing_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module, "_HELLO_S", 0.1)
+
+    async def check(server: LiveServer) -> None:
+        silent = await connected(server)
+        assert await closed(silent) == 1008
+        while server.clients:
+            await asyncio.sleep(0.01)
+
+    served(check)
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        "", "{", "[]", "null", '"hello"', "1e999", '{"do": 5}', '{"token": "x"}', "[" * 5000, "\x00\ud7ff",
+        b"\xff\xfe", b"", '{"do": "set", "id": NaN}',
+        '{"do": "set", "id": Infinity}', '{"do": "set", "id": -1e999}',
+        '{"do": "set", "id": "\\ud800"}', '{"do": "hello", "token": "\\udfff"}',
+        '{"do": "set", "a": [{"b": NaN}]}',
+    ],
+)  # fmt: skip
+def test_garbage_closes_that_client_alone(garbage: str | bytes, caplog: pytest.LogCaptureFixture) -> None:
+    async def check(server: LiveServer) -> None:
+        good, bad = await connected(server), await connected(server)
+        for connection in (good, bad):
+            await asked(connection, do="hello", token=server.access.token)
+        await bad.send(garbage)
+        assert await closed(bad) in (1008, 1007)
+        assert (await asked(good, do="set"))["ok"]
+        await next_of(good, "now")
+
+    served(check)
+    assert not caplog.records
+
+
+def test_errors_are_logged_at_the_servers_pace(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(value: object) -> None:
+        raise RuntimeError("a fault")
+
+    monkeypatch.setattr(server_module, "plain", fail)
+    monkeypatch.setattr(server_module, "_rate_limit", server_module._RateLimit())
+
+    async def check(server: LiveServer) -> None:
+        for _ in range(20):
+            client = await connected(server)
+            await client.send(json.dumps({"do": "hello"}))
+            while await client.read() is not None:
+                pass
+
+    served(check)
+    assert len(caplog.records) == 1
+
+
+def test_huge_message_closes_that_client_alone() -> None:
+    async def check(server: LiveServer) -> None:
+        good, bad = await connected(server), await connected(server)
+        for connection in (good, bad):
+            await asked(connection, do="hello", token=server.access.token)
+        await bad.send(json.dumps({"do": "set", "changes": "x" * LARGEST_REQUEST}))
+        assert await closed(bad) in (1009, 1006)
+        await next_of(good, "now")
+
+    assert not noted(served(check))
+
+
+def test_flood_is_answered_one_by_one_and_holds_up_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module, "_PAUSE_S", 0.05)
+
+    async def check(server: LiveServer) -> None:
+        good, bad = await connected(server), await connected(server)
+        for connection in (good, bad):
+            await asked(connection, do="hello", token=server.access.token)
+        for _ in range(500):
+            await bad.send(json.dumps({"do": "set"}))
+        for _ in range(20):
+            await next_of(good, "now")
+        assert (await asked(good, do="set"))["ok"]
+        bad.close()
+
+    assert len(noted(served(check))) < 100
+
+
+def test_more_clients_than_there_is_room_for_are_refused() -> None:
+    async def check(server: LiveServer) -> None:
+        clients = [await connected(server) for _ in range(MOST_CLIENTS)]
+        assert await refused_with(server) == 503
+        clients[0].close()
+        while len(server.clients) == MOST_CLIENTS:
+            await asyncio.sleep(0.01)
+        await connected(server)
+
+    served(check)
+
+
+def test_slow_client_misses_messages_and_holds_up_nobody() -> None:
+    """A picture is 1.3 MB: sockets hold a few, and all the others are dropped rather than kept."""
+    large = Layout.grid((2, 2), pixels=16, frame_shape=(800, 800))
+    source = Played(large)
+
+    async def check(server: LiveServer) -> None:
+        quick = await connected(server)
+        await asked(quick, do="hello")
+        slow = await connected(server)
+        await asked(slow, do="hello")
+        seen = [(await next_of(quick, "pictures"))[0]["frame"] for _ in range(60)]
+        assert np.all(np.diff(seen) > 0)
+        assert len(server.clients) == 2
+        # It reads again: a few that the sockets held, then the newest.
+        got = [-1]
+        while got[-1] < seen[-1]:
+            got.append((await next_of(slow, "pictures"))[0]["frame"])
+        assert len(got) < 30
+        assert np.diff(got).max() > 20
+
+    served(check, source)
+
+
+def test_port_that_is_taken_and_no_address() -> None:
+    async def check(server: LiveServer) -> None:
+        with pytest.raises(InputError, match=f"127.0.0.1:{server.port}: cannot listen there"):
+            LiveServer(Played(), Noted(), Access("127.0.0.1"), port=server.port)
+
+    served(check)
+    with pytest.raises(InputError, match=r"bind = 'here': expected an IP address"):
+        Access("here")
+
+
+def test_this_machines_name_is_a_host() -> None:
+    access = Access("127.0.0.1")
+    assert access.permits_host(f"{socket.gethostname()}:8642")
+    assert access.permits_host("[::1]:8642")
+    assert not access.permits_host(None)
+
+
+def test_address_has_the_token_where_no_server_sees_it() -> None:
+    async def check(server: LiveServer) -> None:
+        assert server.url == f"http://127.0.0.1:{server.port}/#{server.access.token}"
+        assert len(server.access.token) >= 32
+
+    served(check)

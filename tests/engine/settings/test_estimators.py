@@ -1,0 +1,208 @@
+"""Estimators of files in a running engine: in, out, and given up when they fail; no frame is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from tests.engine.bench import SETTINGS, Bench, make, simulated
+from tests.engine.estimator_files import PEAK, write
+
+import faintspot as fs
+from faintspot.cli.realtime.command import command
+from faintspot.engine.request_handlers import commands_of
+from faintspot.engine.requests.private_socket import socket_path
+from faintspot.engine.requests.requests import ControlServer
+from faintspot.engine.settings.estimator_file import load_estimators
+from faintspot.engine.settings.estimator_trial import Trial
+from faintspot.slopes.estimators import estimators
+from faintspot.slopes.estimators.registry import restore
+
+pytest.importorskip("pyshmem")
+
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+BRIGHT = 60000
+FAILING = f"if {BRIGHT / 2} < images.max() < {BRIGHT}:\n    {{}}\nreturn sensor.zero + 0.25"
+
+
+class Camera(Bench):
+    """Sends frames one after the other, and asks the engine."""
+
+    def __init__(self) -> None:
+        super().__init__(deadline_s=0.2)  # a shared machine may take long
+        self.ask, self.camera = commands_of(self.engine), self.ring()
+        self.data, self.sent = simulated(2), 0
+        self.bright = self.data[0].copy()
+        self.bright[3, 3] = BRIGHT
+        self.attached()
+
+    def shoot(self, frame: Any = None, n: int = 1) -> int:
+        """Send frames; return the number of the last one."""
+        for _ in range(n):
+            self.send(self.camera, self.sent, self.data[self.sent % 2] if frame is None else frame)
+            self.sent += 1
+        return self.sent - 1
+
+    def change(self, **values: Any) -> None:
+        self.engine.live.propose(values)
+        self.shoot(n=2)  # the first one may have been waited for already
+
+    def assert_measured_with(self, settings: fs.Settings, frame: int) -> None:
+        np.testing.assert_array_equal(self.slopes[frame], make(settings)(self.data[frame % 2]).vector)
+
+
+@pytest.fixture
+def camera() -> Iterator[Camera]:
+    before = estimators()
+    camera = Camera()
+    try:
+        yield camera
+    finally:
+        camera.close()
+        restore(before)
+
+
+@pytest.fixture
+def tried_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process for the trial takes seconds to begin."""
+    monkeypatch.setattr(Trial, "elsewhere", Trial.here)
+
+
+def mine(path: Path, **options: Any) -> fs.Settings:
+    """The settings with the estimator of a file."""
+    kind = load_estimators(path).kinds["mine"]
+    return SETTINGS.replace(estimator=kind(**options))
+
+
+def test_load_set_swap_unload(camera: Camera, tmp_path: Path) -> None:
+    path = write(tmp_path)
+    assert camera.ask["load"]({"source": str(path)}) == {"estimators": ["mine"], "frame": None}
+    assert camera.engine.status()["loaded"] == {"mine": str(path)}
+    camera.assert_measured_with(SETTINGS, camera.shoot())
+
+    camera.change(estimator="mine", share=0.5)
+    camera.assert_measured_with(mine(path, share=0.5), camera.shoot())
+
+    with pytest.raises(fs.InputError, match="swap"):
+        camera.ask["load"]({"source": str(path)})
+    write(tmp_path, PEAK.replace("self.share", "0.5 * self.share"))
+    camera.ask["swap"]({"source": str(path)})  # options stay
+    camera.shoot(n=2)
+    camera.assert_measured_with(mine(path, share=0.5), camera.shoot())
+
+    camera.ask["unload"]({"estimator": "mine"})
+    camera.shoot(n=2)
+    camera.assert_measured_with(SETTINGS, camera.shoot())
+    with pytest.raises(fs.InputError, match="estimator = 'mine'"):
+        camera.engine.live.propose({"estimator": "mine"})
+    with pytest.raises(fs.InputError, match="loaded"):
+        camera.ask["unload"]({"estimator": "mine"})
+    counters = camera.engine.counters
+    assert counters.processed == counters.frames_in == camera.sent
+    assert counters.estimator_failures == counters.dropped == 0
+
+
+@pytest.mark.usefixtures("tried_here")
+def test_a_compiled_estimator(camera: Camera, tmp_path: Path) -> None:
+    path = tmp_path / "compiled.py"
+    path.write_text(
+        "from dataclasses import dataclass\nfrom faintspot.slopes.estimators import register\n"
+        "from faintspot.slopes.estimators.built_in.centroid import CentreOfGravity\n"
+        "@register\n@dataclass(frozen=True, eq=False, kw_only=True)\n"
+        "class Mine(CentreOfGravity):\n    name = 'mine'\n"
+    )
+    camera.ask["load"]({"source": str(path)})
+    camera.change(estimator="mine")
+    camera.assert_measured_with(SETTINGS.replace(estimator="centroid"), camera.shoot())
+    camera.ask["unload"]({"estimator": "mine"})
+    camera.shoot(n=2)
+    camera.assert_measured_with(SETTINGS, camera.shoot())
+
+
+@pytest.mark.usefixtures("tried_here")
+def test_a_frame_that_fails_is_flagged_and_counted(camera: Camera, tmp_path: Path) -> None:
+    camera.ask["load"]({"source": str(write(tmp_path, FAILING.format("raise ValueError('bright')")))})
+    camera.change(estimator="mine")
+    bad = camera.shoot(camera.bright)
+    good = camera.shoot()
+    assert camera.engine.counters.estimator_failures == 1
+    records = {int(each["frame"]): each for each in camera.records}
+    assert np.all(records[bad]["flags"] & 1)
+    assert np.all(camera.slopes[bad] == 0)
+    assert np.all(camera.slopes[good] == 0.25)
+    assert camera.engine.status()["estimator_fault"] is None
+
+
+@pytest.mark.usefixtures("tried_here")
+@pytest.mark.parametrize("fault", ["raise RuntimeError('out of order')", "time.sleep(60)"])
+def test_one_that_goes_on_failing_is_given_up(camera: Camera, tmp_path: Path, fault: str) -> None:
+    """The built-in estimator before takes over with the next frame, with the settings as they are now."""
+    camera.ask["load"]({"source": str(write(tmp_path, FAILING.format(fault)))})
+    camera.change(estimator="mine")
+    camera.change(search_range_px=2.0)
+    camera.shoot(camera.bright, n=3)
+    camera.assert_measured_with(SETTINGS.replace(search_range_px=2.0), camera.shoot())
+    status = camera.engine.status()
+    assert status["estimator"] == SETTINGS.estimator.name
+    assert "mine" in status["estimator_fault"]
+    assert camera.engine.counters.processed == camera.sent
+    taken = camera.engine.live.taken()[-1][2]
+    assert (taken["estimator"], taken["estimator_fault"]) == ("tv", status["estimator_fault"])
+
+
+@pytest.mark.usefixtures("tried_here")
+def test_a_fault_in_an_method_ends_taking_turns(camera: Camera, tmp_path: Path) -> None:
+    camera.ask["load"]({"source": str(write(tmp_path, FAILING.format("raise ValueError")))})
+    camera.engine.interleave("set,mine", 1)
+    camera.shoot(n=3)
+    camera.shoot(camera.bright, n=8)
+    assert camera.engine.status()["methods"] == ["set"]
+    camera.assert_measured_with(SETTINGS, camera.shoot())
+    # "set" has a number of its own again, after those of the methods that took turns.
+    assert camera.records["method"][-1] == 3
+
+
+@pytest.mark.usefixtures("tried_here")
+def test_what_is_refused_changes_nothing(camera: Camera, tmp_path: Path) -> None:
+    path = write(tmp_path)
+    camera.ask["load"]({"source": str(path)})
+    camera.change(estimator="mine")
+    before = camera.engine.live.change_number
+    write(tmp_path, "return images[1:]")
+    with pytest.raises(fs.InputError, match="my_estimator"):
+        camera.ask["swap"]({"source": str(path)})
+    for fields in ({}, {"source": 3}, {"source": ""}):
+        with pytest.raises(fs.InputError, match="source"):
+            camera.ask["load"](dict(fields))
+    write(tmp_path)
+    camera.assert_measured_with(mine(path), camera.shoot())
+    assert camera.engine.live.change_number == before
+    # What passes in the other process may be too slow in this one.
+    write(tmp_path, "time.sleep(1)\nreturn sensor.zero")
+    with pytest.raises(fs.InputError, match="us a frame"):
+        camera.ask["swap"]({"source": str(path)})
+    write(tmp_path)
+    camera.assert_measured_with(mine(path), camera.shoot())
+
+
+@pytest.mark.usefixtures("tried_here")
+def test_the_commands(camera: Camera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(*arguments: str) -> str:
+        result = CliRunner().invoke(command, [*arguments, "--name", camera.name], catch_exceptions=False)
+        assert result.exit_code == 0
+        return result.output
+
+    monkeypatch.chdir(tmp_path)
+    path = write(tmp_path)
+    with ControlServer(socket_path(camera.name), commands_of(camera.engine)):
+        assert str(path) in run("load", path.name, "--use")  # relative to the client's folder
+        camera.shoot(n=2)
+        camera.assert_measured_with(mine(path), camera.shoot())
+        run("swap", path.name)
+        run("unload", "mine")
+        with pytest.raises(fs.InputError, match="No such file"):
+            run("load", "none.py")

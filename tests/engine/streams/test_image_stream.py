@@ -1,0 +1,387 @@
+"""Streams of ImageStreamIO and dao: read and written as the offsets of their headers say, or refused."""
+
+from __future__ import annotations
+
+import os
+import struct
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.engine.commands import start
+from tests.engine.image_files import DaoFile, IsioFile
+from tests.patience import LIMIT_S, wait_for
+
+from faintspot.base.errors import InputError
+from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.pixels.pixel_segment import FOLDER
+from faintspot.engine.streams.bridge import StreamBridge
+from faintspot.engine.streams.image_layout import IncompatibleStreamError
+from faintspot.engine.streams.image_stream import ImageStream, ImageStreamWriter
+from faintspot.engine.streams.stream import Follower, open_stream
+from faintspot.engine.streams.stream_out import StreamOut
+
+pyshmem = pytest.importorskip("pyshmem")
+pytestmark = [
+    pytest.mark.machine_time("clocks, threads and other processes"),
+    pytest.mark.portable,
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs shared memory as Linux has it"),
+]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
+    monkeypatch.chdir(tmp_path)  # dao's names are paths of up to 79 characters
+    return tmp_path
+
+
+def isio(folder: Path, sizes: tuple[int, ...] = (5, 3), dtype: str = "u2", **changes: Any) -> IsioFile:
+    return IsioFile(folder / "cam.im.shm", sizes, dtype, **changes)
+
+
+def values_of(stream: ImageStream) -> Any:
+    publication = stream.read(None, 1.0)
+    assert publication is not None
+    return publication.values
+
+
+@pytest.mark.parametrize("dtype", ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"])
+def test_isio_is_read(folder: Path, dtype: str) -> None:
+    file = isio(folder, dtype=dtype)
+    stream = ImageStream("isio", "cam")
+    assert (stream.shape, stream.dtype, stream.count, stream.same()) == ((3, 5), np.dtype(dtype), 0, True)
+    sent = np.arange(15).reshape(3, 5)  # x is the first axis, and the last of NumPy's
+    file.write(sent)
+    publication = stream.read(None, 1.0)
+    assert publication is not None
+    assert (publication.number, publication.total) == (0, 1)
+    np.testing.assert_array_equal(publication.values, sent)
+    out = np.zeros((3, 5), np.float32)
+    file.write(sent + 1)
+    assert stream.read(out, 1.0) is not None
+    np.testing.assert_array_equal(out, sent + 1)
+    assert stream.number == 1
+    stream.close()
+
+
+def test_a_circular_buffer_gives_its_newest_slice(folder: Path) -> None:
+    file = isio(folder, (5, 3, 4), "f4", imagetype=0x20001, buffered=2)
+    stream = ImageStream("isio", "cam")
+    assert stream.shape == (3, 5)
+    for number in range(6):
+        file.write(np.full((3, 5), number), slice_number=number % 4)
+        assert np.all(values_of(stream) == number)
+    file.put(272, "Q", 99)  # whatever it says, it stays within the buffer
+    assert values_of(stream).shape == (3, 5)
+
+
+def test_dao_is_read(folder: Path) -> None:
+    file = DaoFile(folder / "cam.im.shm", (4, 2), "f4", keywords=3)
+    stream = ImageStream("dao", "./cam.im.shm")
+    file.write(np.arange(8))
+    assert (stream.shape, stream.count, stream.number) == ((2, 4), 1, 0)
+    np.testing.assert_array_equal(values_of(stream), np.arange(8).reshape(2, 4))
+    assert stream.maker_lives() is None
+    assert stream.wait(1, 0.01) is False
+
+
+@pytest.mark.parametrize("posts", [True, False])
+def test_waiting_ends_with_a_post_or_the_counter(folder: Path, posts: bool) -> None:
+    file = isio(folder)
+    stream = ImageStream("isio", "cam")
+    assert stream.wait(0, 0.01) is False
+    timer = threading.Timer(0.05, lambda: file.write(np.ones((3, 5)), posts=posts))
+    timer.daemon = True
+    timer.start()
+    assert stream.wait(0, LIMIT_S)
+    assert stream.count == 1
+    timer.join(LIMIT_S)
+
+
+def test_a_semaphore_is_taken_and_given_back(folder: Path) -> None:
+    file = isio(folder)
+    file.put(file.readers, "i", os.getppid())  # somebody living has the first
+    file.put(file.readers + 4, "i", 2**22 - 1)  # and somebody dead the second
+    stream = ImageStream("isio", "cam")
+    assert file.get(file.readers + 4, "i") == os.getpid()
+    file.write(np.ones((3, 5)))
+    assert stream.wait(0, 1.0)
+    stream.close()
+    assert file.get(file.readers, "i") == os.getppid()
+    assert file.get(file.readers + 4, "i") == 0
+
+
+def test_what_is_being_written_is_not_read(folder: Path) -> None:
+    file = isio(folder)
+    stream = ImageStream("isio", "cam")
+    file.write(np.ones((3, 5)))
+    file.put(288, "B", 1)
+    assert stream.read(None, 0.02) is None
+    file.put(288, "B", 0)
+    assert stream.read(None, 0.02) is not None
+
+
+def test_a_file_that_is_cut_or_replaced(folder: Path) -> None:
+    file = isio(folder)
+    stream = ImageStream("isio", "cam")
+    file.path.unlink()
+    assert stream.same() is None
+    isio(folder)
+    assert stream.same() is False
+    other = ImageStream("isio", "cam")
+    os.truncate(folder / "cam.im.shm", 10)
+    assert other.same() is False
+    assert other.read(None, 0.01) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "naming"),
+    [
+        ({"version": b"1.00"}, "has version '1.00', expected '2.00'"),
+        ({"nelement": 16}, r"2 axes \[5, 3\] of 16 values"),
+        ({"naxis": 4}, "4 axes"),
+        ({"naxis": 0}, "0 axes"),
+        ({"code": 11}, "values of type 11, expected real numbers"),
+        ({"location": 0}, "memory of a GPU"),
+        ({"code": 10}, "bytes, expected"),
+    ],
+)
+def test_other_metadata_are_refused(folder: Path, changes: dict[str, Any], naming: str) -> None:
+    isio(folder, **changes)
+    with pytest.raises(IncompatibleStreamError, match=naming):
+        open_stream("isio:cam")
+
+
+def test_what_is_no_stream_is_refused(folder: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        open_stream("isio:cam")
+    (folder / "cam.im.shm").write_bytes(b"text")
+    with pytest.raises(IncompatibleStreamError, match="is not a stream"):
+        open_stream("isio:cam")
+    os.mkfifo(folder / "pipe.im.shm")
+    with pytest.raises(IncompatibleStreamError, match="is not a stream"):
+        open_stream("isio:pipe")
+    (folder / "sub.im.shm").mkdir()
+    with pytest.raises(IncompatibleStreamError, match="directory"):
+        open_stream("isio:sub")
+    content = DaoFile(folder / "dao.im.shm", (4, 2), "f4").memory[:]
+    (folder / "dao.im.shm").write_bytes(content + b"more")
+    with pytest.raises(IncompatibleStreamError, match="it may have another version"):
+        open_stream("dao:./dao.im.shm")
+    for bad in ("isio:a/b", "isio:", "dao:x y", f"dao:/{'x' * 90}"):
+        with pytest.raises(InputError, match="expected"):
+            Follower(bad, print, lambda shape, dtype: "", lambda: "")
+
+
+def test_random_metadata_never_end_the_process(folder: Path) -> None:
+    """Damaged headers are refused, or describe a file of exactly that size."""
+    rng = np.random.default_rng(0)
+    original = bytes(isio(folder).memory)
+    for _ in range(500):
+        content = bytearray(original)
+        for place in rng.integers(100, 320, 4):
+            content[place] = rng.integers(256)
+        (folder / "bad.im.shm").write_bytes(content)
+        try:
+            stream = open_stream("isio:bad")
+        except IncompatibleStreamError:
+            continue
+        stream.read(None, 0.0)
+        stream.close()
+
+
+def test_isio_is_written(folder: Path) -> None:
+    writer = ImageStreamWriter("isio", "slopes", (6,))
+    path = folder / "slopes.im.shm"
+    assert [each.name for each in folder.iterdir()] == ["slopes.im.shm"]
+    writer.publish(np.arange(6, dtype=np.float32), 41)
+    writer.publish(np.arange(6, dtype=np.float32) + 1, 42)
+    content = path.read_bytes()
+    data = 384
+    assert len(content) == data + 24 + 128 + 320 + 32 + 4 * 40 + 640
+    assert content[:5] == b"2.00\0"
+    assert content[32:39] == b"slopes\0"
+    assert content[112] == 2
+    assert struct.unpack_from("<3I", content, 116) == (6, 1, 0)
+    assert struct.unpack_from("<Q", content, 128) == (6,)
+    assert (content[136], content[224], struct.unpack_from("<b", content, 240)) == (9, 1, (-1,))
+    assert struct.unpack_from("<Q", content, 144) == (2,)
+    assert struct.unpack_from("<i", content, 216) == (os.getpid(),)
+    assert struct.unpack_from("<Q", content, 232) == (path.stat().st_ino,)
+    assert struct.unpack_from("<HH", content, 258) == (10, 10)
+    assert struct.unpack_from("<QQ", content, 264) == (2, 0)
+    assert (content[288], struct.unpack_from("<H", content, 290)) == (0, (1,))
+    assert struct.unpack_from("<Q", content, 312) == (24,)
+    np.testing.assert_array_equal(np.frombuffer(content, "f4", 6, data), np.arange(6) + 1)
+    keyword = data + 24
+    assert (content[keyword : keyword + 6], content[keyword + 16 : keyword + 17]) == (b"FRAME\0", b"L")
+    assert struct.unpack_from("<qQ", content, keyword + 24) == (42, 0)
+    assert struct.unpack_from("<Q", content, keyword + 40) == (2,)
+    assert struct.unpack_from("<10i", content, keyword + 128 + 352) == (-1,) * 10
+    seconds = struct.unpack_from("<q", content, 184)[0]
+    assert abs(seconds - time.clock_gettime(time.CLOCK_TAI)) < 60
+    reader = ImageStream("isio", "slopes")
+    assert (reader.shape, reader.maker_lives()) == ((1, 6), True)
+    assert reader.wait(2, 0.01) is False
+    writer.publish(np.zeros(6, np.float32), 43)
+    assert reader.wait(2, 1.0)
+    writer.close()
+    assert list(folder.iterdir()) == []
+
+
+def test_nobody_waits_and_nothing_overflows(folder: Path) -> None:
+    writer = ImageStreamWriter("isio", "slopes", (6,))
+    for number in range(30):
+        writer.publish(np.zeros(6, np.float32), number)
+    content = (folder / "slopes.im.shm").read_bytes()
+    first = 384 + 24 + 128
+    assert [struct.unpack_from("<I", content, first + 32 * k)[0] for k in range(11)] == [10] * 11
+    writer.close()
+
+
+def test_who_may_take_a_name(folder: Path) -> None:
+    isio(folder, pid=os.getppid())
+    with pytest.raises(InputError, match="a living process made this stream"):
+        ImageStreamWriter("isio", "cam", (6,))
+    (folder / "cam.im.shm").unlink()
+    isio(folder, pid=2**22 - 1)
+    ImageStreamWriter("isio", "cam", (6,)).close()
+    (folder / "cam.im.shm").write_text("something else")
+    with pytest.raises(InputError, match="is not a stream; remove it or choose another name"):
+        ImageStreamWriter("isio", "cam", (6,))
+    os.mkfifo(folder / "pipe.im.shm")
+    with pytest.raises(InputError, match="is not a stream"):
+        ImageStreamWriter("isio", "pipe", (6,))
+    with pytest.raises(InputError, match="cannot be made"):
+        ImageStreamWriter("dao", "no/cam.im.shm", (6,))
+
+
+def test_dao_is_written_where_it_is_or_made(folder: Path, name: str) -> None:
+    path = Path(f"{name}.im.shm")
+    file = DaoFile(path, (6, 1), "f4")
+    writer = ImageStreamWriter("dao", f"./{path}", (6,))
+    writer.publish(np.arange(6, dtype=np.float32), 7)
+    np.testing.assert_array_equal(file.values(), np.arange(6))
+    assert (file.get(152, "Q"), file.get(176, "B")) == (1, 0)
+    assert abs(file.get(136, "q") - time.time_ns()) < 60e9
+    assert (FOLDER / f"sem.{name}_sem09").exists()
+    writer.close()
+    assert not path.exists()
+    assert not (FOLDER / f"sem.{name}_sem09").exists()
+    writer = ImageStreamWriter("dao", f"./{path}", (6,))
+    writer.publish(np.ones(6, np.float32), 7)
+    content = path.read_bytes()
+    assert len(content) == 4296 + 24 + 120
+    assert content[: len(str(path))] == str(path).encode()
+    assert (content[80], struct.unpack_from("<2I", content, 84), content[104]) == (2, (6, 1), 9)
+    assert struct.unpack_from("<Q", content, 152) == (1,)
+    assert struct.unpack_from("<q", content, 4296 + 24 + 24) == (7,)
+    with pytest.raises(InputError, match=r"expected a stream of \[4, 1\] float32 values"):
+        ImageStreamWriter("dao", f"./{path}", (4,))
+    writer.close()
+
+
+def test_frames_go_into_the_ring(folder: Path, name: str) -> None:
+    lines: list[str] = []
+    bridge = StreamBridge("isio:cam", name, say=lines.append, spins=False)
+    assert bridge.step() is False
+    assert lines == ["stream isio:cam: is not there; waiting"]
+    file = isio(folder)
+    wait_for(lambda: bridge.step() or any("3 x 5 pixels" in line for line in lines))
+    ring = PixelRing.attach(name)
+    for number in range(3):
+        file.write(np.full((3, 5), number + 7))
+        wait_for(bridge.step)
+        assert ring.progress() == (number, 3)
+        assert np.all(ring.slot(number) == number + 7)
+    file.path.unlink()
+    wait_for(lambda: bridge.step() or any("was removed" in line for line in lines))
+    isio(folder, (7,), "f4")
+    wait_for(lambda: bridge.step() or any("expected frames" in line for line in lines))
+    bridge.close()
+
+
+def test_counters_that_are_mad(folder: Path, name: str) -> None:
+    lines: list[str] = []
+    file = isio(folder)
+    bridge = StreamBridge("isio:cam", name, say=lines.append, spins=False)
+    wait_for(lambda: bridge.step() or bool(lines))
+    for counter in (2**64 - 2, 3):  # written by somebody else, or going back
+        file.put(264, "Q", counter)
+        file.write(np.ones((3, 5), np.uint16))
+        wait_for(bridge.step)
+    assert (bridge.counters.taken, bridge.counters.not_ahead) == (2, 1)
+    assert (bridge.counters.missed, bridge.counters.restarts) == (0, 1)  # the jump, not what lies between
+    bridge.close()
+
+
+def test_slopes_come_out(folder: Path, name: str) -> None:
+    lines: list[str] = []
+    out = StreamOut(f"{name}_slopes", "isio:wfs_slopes", lines.append)
+    assert out.step() is False
+    stream = pyshmem.create(f"{name}_slopes", shape=(8,), dtype=np.float32)
+    stream.write(np.arange(8, dtype=np.float32), frame_id=5)
+    wait_for(out.step)
+    reader = ImageStream("isio", "wfs_slopes")
+    np.testing.assert_array_equal(values_of(reader), [np.arange(8)])
+    stream.write(np.ones(8, np.float32), frame_id=6)
+    wait_for(out.step)
+    assert (reader.count, out.counters.taken, out.counters.missed) == (2, 2, 0)
+    stream.unlink()
+    wait_for(lambda: out.step() or any("was removed" in line for line in lines))
+    another = pyshmem.create(f"{name}_slopes", shape=(4,), dtype=np.float32)
+    another.write(np.ones(4, np.float32))
+    wait_for(out.step)
+    assert ImageStream("isio", "wfs_slopes").shape == (1, 4)
+    another.unlink()
+    out.close()
+    assert list(folder.glob("*.im.shm")) == []
+    with pytest.raises(InputError, match="expected isio:NAME or dao:FILE"):
+        StreamOut(f"{name}_slopes", "slopes")
+
+
+def test_command_both_ways(folder: Path, name: str) -> None:
+    file = isio(folder)
+    slopes = pyshmem.create(f"{name}_slopes", shape=(8,), dtype=np.float32)
+    arguments = ["isio:cam", "--to", "isio:cam_slopes", "--name", name, "--frames", "3"]
+    process = start("from faintspot.cli.realtime.sources import bridge; bridge()", *arguments)
+    try:
+        wait_for(lambda: (FOLDER / name).exists() or process.poll() is not None)
+        wait_for(lambda: (folder / "cam_slopes.im.shm").exists() or process.poll() is not None)
+        reader = ImageStream("isio", "cam_slopes")
+        slopes.write(np.arange(8, dtype=np.float32), frame_id=1)
+        wait_for(lambda: reader.count == 1)
+        ring = PixelRing.attach(name)
+        for number in range(3):
+            file.write(np.full((3, 5), number))
+            # The whole frame: one that is written while this is copied would replace it.
+            wait_for(lambda number=number: ring.progress() >= (number, 3) or ring.closed)
+        out, errors = process.communicate(timeout=LIMIT_S)
+    finally:
+        process.kill()
+        process.communicate()
+        slopes.unlink()
+    assert (process.returncode, errors) == (0, "")
+    assert f"{name}: 3 frames, 0 missed" in out
+    assert f"{name}: 1 times slopes, 0 missed" in out
+    assert not (folder / "cam_slopes.im.shm").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "naming"),
+    [
+        ([], "expected a stream of frames, --to or --commands"),
+        (["--to", "isio:b", "--frames", "3"], "--frames"),
+        (["--to", "b"], "expected isio:NAME or dao:FILE"),
+        (["isio:a/b"], "isio:a/b"),
+    ],
+)
+def test_command_refuses(arguments: list[str], naming: str) -> None:
+    from faintspot.cli.realtime.sources import bridge
+
+    with pytest.raises(InputError, match=naming):
+        bridge.main(arguments, standalone_mode=False)

@@ -1,0 +1,138 @@
+"""The page of recorded telemetry, from a store whose lost frames and differences are known."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.slopes.recorded.recorded_cases import Page
+
+from faintspot.base.errors import InputError
+from faintspot.engine.telemetry.figures import latency_figure
+from faintspot.engine.telemetry.numbers import change_rows, gaps, methods_in_turn, quantities, timing
+from faintspot.engine.telemetry.page import report_of_telemetry
+from faintspot.engine.telemetry.segment import image_type, layout_values, record_type
+from faintspot.io.telemetry.recording import Telemetry, TelemetryStore, read_telemetry
+from faintspot.slopes.sensor.layout import Layout
+
+LAYOUT = Layout.grid((4, 4), pixels=8)
+N = len(LAYOUT)
+EVERY, FRAMES = 5, 2000
+LOST = slice(700, 712)
+RMS_PX, FLUX_E = {0: 0.20, 1: 0.16}, {0: 300.0, 1: 280.0}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Make a store of 2000 frames at 1 kHz, twelve of them lost, with two methods in turns of five frames."""
+    rng = np.random.default_rng(3)
+    records = np.zeros(FRAMES, record_type(N))
+    number = np.arange(FRAMES)
+    method = number // EVERY % 2
+    records["frame"], records["method"] = number + 10, method
+    records["last_row_time_ns"] = 1_000_000 * number
+    records["published_time_ns"] = records["last_row_time_ns"] + 50_000 + 10_000 * method
+    wave = (
+        0.3 + np.sin(number / 300)[:, None]
+    )  # of the air, the same in both methods; taken off over many turns
+    for axis in "xy":
+        records[axis] = 0.5 + np.vectorize(RMS_PX.get)(method)[:, None] * rng.normal(size=(FRAMES, N))
+        records[f"standard_error_{axis}"] = 0.1
+    records["flux"] = np.vectorize(FLUX_E.get)(method)[:, None] + 50 * wave
+    attributes = {
+        "name": "bench",
+        "layout": layout_values(LAYOUT),
+        "settings": '[estimator]\nname = "tv"\n',
+        "methods": ["none", "tv"],
+        "dropped_records": 3,
+    }
+    kinds = record_type(N), image_type(LAYOUT.frame_shape, N, LAYOUT.window)
+    store = TelemetryStore(tmp_path / "night.zarr", *kinds, attributes)
+    changes = [{"frame": 510, "number": 1, "changes": {"noise_std": 2.5}, "where": [1, 2]}]
+    kept = np.delete(records, LOST)
+    store.append(kept, np.empty(0, kinds[1]), {"changes": changes, "ended_because": "seconds"})
+    return store.path
+
+
+@pytest.fixture
+def night(path: Path) -> Telemetry:
+    return read_telemetry(path)
+
+
+def test_rates_and_lost_frames(night: Telemetry) -> None:
+    found = timing(night)
+    assert found.rate_hz == pytest.approx(1000)
+    assert found.longest_interval_s == pytest.approx(1e-3)
+    assert found.latency_s[-1] == pytest.approx(60e-6)
+    assert [(gap.after_frame, gap.lost) for gap in gaps(night)] == [(709, 12)]
+    frame, time_s, *words = change_rows(night)[0]
+    assert (frame, *words) == (510, "noise_std = 2.5", "1, 2")
+    assert time_s == pytest.approx(0.5)
+    assert len(change_rows(night)) == 1
+
+
+def test_a_changed_profile_is_shown_without_its_table(night: Telemetry) -> None:
+    profile = {"altitude_km": list(range(60)), "mean_km": 91.5, "spot_fwhm_arcsec": 1.2}
+    changed = replace(night, changes=[{"frame": 510, "changes": {"sodium": profile}, "where": None}])
+    ((_, _, what, where),) = change_rows(changed)
+    assert where == "all"
+    assert "91.5" in what
+    assert "59" not in what
+
+
+def test_methods_in_turn_differ_as_they_were_made(night: Telemetry) -> None:
+    values = quantities(night)
+    rms = methods_in_turn(night, values["rms of slopes about their mean (px)"])
+    flux = methods_in_turn(night, values["flux (e-)"])
+    assert [method.method for method in rms] == ["none", "tv"]
+    assert rms[0].difference is None
+    for compared, true in ((rms, RMS_PX[1] - RMS_PX[0]), (flux, FLUX_E[1] - FLUX_E[0])):
+        difference = compared[1].difference
+        assert difference is not None
+        assert difference.high < 0
+        # 5 % of it: 200 turns of 5 frames of 32 slopes have 0.5 %, the wave of the air differs between turns.
+        assert difference.value == pytest.approx(true, rel=0.05)
+    # The wave is common to both methods: in the difference it hardly counts, in the means it does.
+    assert flux[1].difference.standard_error < 0.2 * flux[1].mean.standard_error  # type: ignore[union-attr]
+
+
+def test_page(path: Path) -> None:
+    page = Page(report_of_telemetry(path))
+    assert page.ids[:4] == ["timing", "lost", "methods", "changes"]
+    assert {"numbers", "flux", "slopes", "jitter", "wavefront", "configuration"} <= set(page.ids)
+    assert "frame" not in page.ids
+    for words in (
+        "1000 frames a second",
+        "noise_std = 2.5",
+        "12 frames (0.6 %) are not in the record",
+        "bench",
+    ):
+        assert words in page.text
+
+
+def test_key_numbers_are_those_of_each_method(path: Path) -> None:
+    """The methods have 0.20 and 0.16 px of noise; together they would have 0.18."""
+    text = Page(report_of_telemetry(path)).text
+    numbers = text[text.index("method noise (px)") :]
+    noise = [float(numbers.split(f" {name} ", 1)[1].split()[0]) for name in ("none", "tv")]
+    assert noise == pytest.approx([RMS_PX[0], RMS_PX[1]], rel=0.05)
+
+
+@pytest.mark.parametrize("n_frames", [1, 7, 99])
+def test_latencies_of_a_short_record_are_drawn(path: Path, n_frames: int) -> None:
+    night = read_telemetry(path)
+    arrays = {f.name: getattr(night, f.name) for f in fields(night)}
+    short = {name: value[:n_frames] if np.shape(value)[:1] == (len(night.frame),) else value
+             for name, value in arrays.items()}  # fmt: skip
+    axes = latency_figure(Telemetry(**short)).figure.axes[1]
+    assert all(np.size(line.get_xdata()) >= min(n_frames, 20) for line in axes.lines)
+    assert all(line.get_marker() == "o" for line in axes.lines)
+
+
+def test_without_frames(tmp_path: Path) -> None:
+    kinds = record_type(N), image_type(LAYOUT.frame_shape, N, LAYOUT.window)
+    TelemetryStore(tmp_path / "empty.zarr", *kinds, {"layout": layout_values(LAYOUT)})
+    with pytest.raises(InputError, match="no frame is recorded yet"):
+        report_of_telemetry(tmp_path / "empty.zarr")

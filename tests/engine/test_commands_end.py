@@ -1,0 +1,55 @@
+"""Sources of frames end in order when they are interrupted, and leave nothing behind."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.engine.commands import start
+from tests.patience import LIMIT_S, wait_for
+
+from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.pixels.pixel_segment import FOLDER
+
+pyshmem = pytest.importorskip("pyshmem")
+pytestmark = [
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
+    pytest.mark.machine_time("clocks, threads and other processes"),
+]
+
+
+@pytest.mark.parametrize(
+    ("command", "number"),
+    [
+        ("realtime_sources.bridge", signal.SIGINT),
+        ("realtime_sources.replay", signal.SIGTERM),
+        ("realtime_camera.camera", signal.SIGINT),
+        ("realtime_camera.camera", signal.SIGTERM),
+    ],
+)
+def test_ends_in_order(name: str, tmp_path: Path, command: str, number: signal.Signals) -> None:
+    module, function = command.split(".")
+    np.save(tmp_path / "frames.npy", np.ones((30, 6, 5), np.uint16))
+    (tmp_path / "faintspot.toml").write_text("[layout.grid]\nshape = [3, 4]\npixels = 8\n")
+    options = {
+        "bridge": [f"{name}_in"],
+        "replay": [str(tmp_path / "frames.npy"), "--frame-rate-hz", "200", "--repeat"],
+        "camera": ["--config", str(tmp_path / "faintspot.toml"), "--frame-rate-hz", "200", "--distinct", "5"],
+    }[function]
+    stream = pyshmem.create(f"{name}_in", shape=(6, 5), dtype=np.uint16)
+    code = f"from faintspot.cli.{module} import {function}; {function}()"
+    process = start(code, *options, "--name", name)
+    wait_for(lambda: (FOLDER / name).exists() or process.poll() is not None)
+    ring = PixelRing.attach(name)
+    enough = 40 if function == "replay" else 0  # more than there are in the file
+    wait_for(lambda: stream.write(np.ones((6, 5), np.uint16)) or ring.progress()[0] >= enough)
+    process.send_signal(number)
+    out, errors = process.communicate(timeout=LIMIT_S)
+    assert (process.returncode, errors) == (0, "")
+    assert "frames, " in out.splitlines()[-1]
+    assert ring.closed
+    assert ring.progress()[1] == ring.shape[0]
+    assert not (FOLDER / name).exists()
+    stream.unlink()

@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.experiments.experiment_cases import HERE, SEARCH, StopsAfter, assert_same_files, small
+
+from faintspot.base.errors import InputError
+from faintspot.experiments.closed_loop.budget import TERMS, budget_run, run_budget
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, method_kind
+from faintspot.experiments.closed_loop.results import BudgetResult
+from faintspot.experiments.running import WorkerPool
+from faintspot.loop.simulation.files import BUDGET_FILE
+from faintspot.loop.simulation.simulation import simulate_loop
+
+pytest.importorskip("hcipy")
+KIND = method_kind("brightest")
+CHOICE = {LOOP_GAIN: 0.5, "keep_brightest": 16}
+
+FAINT = small().replace("camera", photons_per_subaperture=40.0).replace("run", frames=300, settle_frames=40)
+
+
+@functools.cache
+def strehl(term: str) -> float:
+    return float(budget_run(KIND, FAINT, CHOICE, term, 0, lambda frames: None)["strehl"])
+
+
+def test_without_nothing_it_is_the_loop_itself() -> None:
+    record = simulate_loop(FAINT, [KIND.method(FAINT, CHOICE)])
+    assert strehl("nothing") == pytest.approx(record.mean_strehl(), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "term", ["photon and read noise", "fitting and aliasing", "slope error", "slope error and servo lag"]
+)
+def test_without_an_error_the_strehl_ratio_is_higher(term: str) -> None:
+    assert strehl(term) > strehl("nothing") + 0.01
+
+
+def test_less_error_less_loss() -> None:
+    assert strehl("slope error and servo lag") > strehl("slope error") > strehl("photon and read noise")
+
+
+def test_gain_of_the_run_is_near_the_calibrated_one() -> None:
+    """The calibration sees wavefronts as in the loop: what is left of the gain's error costs little."""
+    assert strehl("centroid gain error") == pytest.approx(strehl("nothing"), abs=0.08)
+
+
+def test_unknown_term() -> None:
+    with pytest.raises(InputError, match="term = 'noise'"):
+        strehl("noise")
+
+
+def test_experiment_and_resume(tmp_path: Path) -> None:
+    def run(folder: Path, place: WorkerPool) -> BudgetResult:
+        return run_budget(small(), folder, ["brightest"], search=SEARCH, place=place)
+
+    whole, again = tmp_path / "whole", tmp_path / "again"
+    result = run(whole, HERE)
+    assert result.terms == tuple(TERMS)
+    assert result.strehl.shape == result.residual_nm.shape == (1, len(TERMS), 2)
+    assert np.isfinite(result.strehl).all()
+    with pytest.raises(KeyboardInterrupt):
+        run(again, WorkerPool(0, progress=StopsAfter(200)))
+    run(again, HERE)
+    assert_same_files(whole, again, BUDGET_FILE)
+
+
+def test_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="methods: expected at least one"):
+        run_budget(small(), tmp_path, [], place=HERE)
+    with pytest.raises(InputError, match=r"control.mode = 'open'"):
+        run_budget(small().replace("control", mode="open"), tmp_path, place=HERE)

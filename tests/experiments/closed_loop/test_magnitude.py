@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.experiments.experiment_cases import (
+    HERE,
+    SEARCH,
+    StopsAfter,
+    assert_same_files,
+    assert_same_units,
+    small,
+)
+
+from faintspot.base.errors import InputError
+from faintspot.experiments.closed_loop.magnitude import quick_run, run_magnitude
+from faintspot.experiments.closed_loop.results import MagnitudeResult
+from faintspot.experiments.running import WorkerPool
+from faintspot.loop.simulation.files import MAGNITUDE_FILE
+
+pytest.importorskip("hcipy")
+METHODS = ("centroid", "brightest")
+PHOTONS = (400.0, 40.0)
+
+
+def run(folder: Path, place: WorkerPool, methods: tuple[str, ...] = METHODS) -> MagnitudeResult:
+    return run_magnitude(small(), folder, methods, PHOTONS, search=SEARCH, place=place)
+
+
+TOLD: list[tuple[int, int]] = []
+"""Progress of the whole experiment."""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("magnitude")
+    run(folder, WorkerPool(0, progress=lambda done, total: TOLD.append((done, total))))
+    return folder
+
+
+def test_one_progress_of_all_stages(whole: Path) -> None:
+    done, total = np.transpose(TOLD)
+    assert (np.diff(done) >= 0).all()
+    assert done[-1] == total[-1]
+    assert (total == total[0]).all()
+
+
+def test_result(whole: Path) -> None:
+    result = MagnitudeResult.load(whole / MAGNITUDE_FILE)
+    assert result.labels == ("centre of gravity", "brightest pixels")
+    np.testing.assert_array_equal(result.photons, [40, 400])
+    assert result.magnitudes[0] - result.magnitudes[1] == pytest.approx(2.5)
+    assert result.strehl.shape == result.centroid_gain.shape == (2, 2, 2)
+    assert (result.strehl[:, 1] > result.strehl[:, 0]).all()  # ten times the flux: 0.1 and more
+    assert result.settings.shape == result.choices.shape == (2, 2)
+    assert "keep_brightest" in result.settings[1, 0]
+
+
+@pytest.mark.parametrize("calls", [2, 120])
+def test_interrupted_and_started_again(tmp_path: Path, whole: Path, calls: int) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, WorkerPool(0, progress=StopsAfter(calls)))
+    run(tmp_path, HERE)
+    assert_same_files(tmp_path, whole, "*.npz")
+    assert_same_units(tmp_path, whole)
+
+
+def test_methods_can_be_added(tmp_path: Path, whole: Path) -> None:
+    folder = shutil.copytree(whole, tmp_path / "copy")
+    one = run(folder, WorkerPool(0, progress=StopsAfter(0)), ("centroid",))  # nothing is left to do
+    assert one.labels == ("centre of gravity",)
+    both = run(folder, HERE)
+    np.testing.assert_array_equal(both.strehl, MagnitudeResult.load(whole / MAGNITUDE_FILE).strehl)
+    three = run(folder, HERE, (*METHODS, "ml"))
+    assert three.names == ("centroid", "brightest", "ml")
+    np.testing.assert_array_equal(three.strehl[:2], both.strehl)
+
+
+def test_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^method = 'kog': expected one of 'brightest'"):
+        run_magnitude(small(), tmp_path, ("kog",), PHOTONS, place=HERE)
+    with pytest.raises(InputError, match="methods: expected at least one"):
+        run_magnitude(small(), tmp_path, (), PHOTONS, place=HERE)
+    with pytest.raises(InputError, match="photons: expected at least one"):
+        run_magnitude(small(), tmp_path, METHODS, place=HERE)
+    with pytest.raises(InputError, match="photons"):
+        run_magnitude(small(), tmp_path, METHODS, (0.0,), place=HERE)
+
+
+def test_quick_is_never_longer() -> None:
+    assert quick_run(small()) == small()

@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.experiments.result_cases import made_up_budget, made_up_magnitude
+
+from faintspot.base.errors import InputError
+from faintspot.base.report.page import html_of
+from faintspot.experiments.closed_loop.page import loop_page, loop_sections, loop_warnings, write_loop_report
+from faintspot.experiments.closed_loop.verdict import NOWHERE, LoopResults
+from faintspot.loop.simulation.files import MAGNITUDE_FILE
+
+pytest.importorskip("hcipy")
+
+
+def test_the_page_holds_everything(tmp_path: Path) -> None:
+    made_up_magnitude().save(tmp_path / MAGNITUDE_FILE)
+    made_up_budget().save(tmp_path / "budget.npz")
+    written = write_loop_report(tmp_path, tmp_path / "report.html")
+    assert written[0] == tmp_path / "report.html"
+    assert {path.name for path in written[1:]} == {
+        f"{name}.{ending}" for name in ("magnitude", "gain", "budget") for ending in ("png", "svg", "csv")
+    }
+    page = written[0].read_text(encoding="utf-8")
+    assert "limiting magnitude" in page
+    assert page.count("data:image/svg+xml") == 3
+    for bad in ("nan", "None", "{{"):
+        assert f">{bad}" not in page
+    rows = (tmp_path / "report-figures" / "magnitude.csv").read_text().splitlines()
+    assert len(rows) == 1 + 4 * 5
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_the_page_says_when_tv_gains_nothing() -> None:
+    page = html_of(loop_page(LoopResults(made_up_magnitude(-0.3))))
+    assert NOWHERE in page
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_what_was_not_run_is_said() -> None:
+    page = html_of(loop_page(LoopResults(budget=made_up_budget())))
+    assert "Not run: “faintspot loop magnitude” does that." in page
+    assert "Nothing to compare yet." in page
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_unfinished_results_make_a_page() -> None:
+    whole = made_up_magnitude()
+    strehl = whole.strehl.copy()
+    strehl[1, 2:] = np.nan
+    strehl[3] = np.nan
+    results = LoopResults(magnitude=dataclasses.replace(whole, strehl=strehl))
+    assert "runs are still missing" in loop_warnings(results)[0]
+    page = html_of(loop_page(results))
+    assert ">nan" not in page
+    nothing = LoopResults(magnitude=dataclasses.replace(whole, strehl=np.full_like(strehl, np.nan)))
+    assert ">nan" not in html_of(loop_page(nothing))
+
+
+def test_few_realisations_are_warned_of() -> None:
+    lines = loop_warnings(LoopResults(made_up_magnitude(realisations=2)))
+    assert any("fewer than 5" in line for line in lines)
+
+
+def test_sections_have_different_names() -> None:
+    names = [section.name for section in loop_sections(LoopResults(made_up_magnitude()))]
+    assert len(set(names)) == len(names)
+
+
+def test_an_empty_folder_is_refused_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no results of a loop"):
+        write_loop_report(tmp_path, tmp_path / "report.html")

@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from faintspot.base.errors import InputError
+from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
+from faintspot.loop.simulation.files import (
+    BUDGET_FILE,
+    MAGNITUDE_FILE,
+    holds_loop_results,
+    make_folder,
+)
+
+
+def magnitude_result() -> MagnitudeResult:
+    rng = np.random.default_rng(1)
+    strehl = rng.uniform(0, 1, (2, 3, 4))
+    strehl[1, 2, 3] = np.nan
+    return MagnitudeResult(
+        ("ml", "b"),
+        ("a", "b"),
+        np.array([10.0, 20.0, 40.0]),
+        np.array([12.0, 11.2, 10.5]),
+        strehl,
+        rng.uniform(0, 1, (2, 3, 4)),
+        np.full((2, 3), "[settings]"),
+        np.full((2, 3), '{"loop_gain": 0.5}'),
+        "name = 'x'",
+    )
+
+
+def assert_equal(one: Any, other: Any) -> None:
+    assert type(one) is type(other)
+    for name, value in vars(one).items():
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(value, getattr(other, name))
+            assert value.dtype == getattr(other, name).dtype
+        else:
+            assert value == getattr(other, name)
+
+
+def test_magnitude_is_read_as_written(tmp_path: Path) -> None:
+    result = magnitude_result()
+    assert not holds_loop_results(tmp_path)
+    result.save(tmp_path / MAGNITUDE_FILE)
+    assert holds_loop_results(tmp_path)
+    assert_equal(MagnitudeResult.load(tmp_path / MAGNITUDE_FILE), result)
+    assert [path.name for path in tmp_path.iterdir()] == [MAGNITUDE_FILE]
+
+
+def test_budget_is_read_as_written(tmp_path: Path) -> None:
+    values = np.zeros((1, 2, 3)), np.ones((1, 2, 3))
+    result = BudgetResult(("brightest",), ("nothing", "noise"), ("a",), *values)
+    result.save(tmp_path / BUDGET_FILE)
+    assert_equal(BudgetResult.load(tmp_path / BUDGET_FILE), result)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    with pytest.raises(InputError, match="no such file"):
+        MagnitudeResult.load(path)
+    path.write_bytes(b"nothing")
+    with pytest.raises(InputError, match="expected a magnitude experiment") as error:
+        MagnitudeResult.load(path)
+    assert "\n" not in str(error.value)
+    magnitude_result().save(path)
+    with pytest.raises(InputError, match="expected an error budget of format 2"):
+        BudgetResult.load(path)
+
+
+def test_folders_that_cannot_be(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist: create it first"):
+        make_folder(tmp_path / "a" / "b")
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be made"):
+        make_folder(tmp_path / "file")

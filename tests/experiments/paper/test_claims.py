@@ -1,0 +1,162 @@
+"""Verdicts: each claim is decided by the numbers, both ways."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.experiments.study_cases import METHODS, Cell, cells, dataset, power_law
+
+from faintspot.experiments.paper.claims import fixed_mode, guidance, verdicts
+from faintspot.experiments.study import built_in as paper
+from faintspot.experiments.study.curves import Outcome, against_tv, combined
+
+HOLDS, IN_PART, FAILS = Outcome.HOLDS, Outcome.IN_PART, Outcome.FAILS
+Gain = Callable[[Cell, str, str], float]
+
+
+def quick_cells() -> list[Cell]:
+    return [asdict(cell) for cell in paper.paper_study(quick=True).cells()]
+
+
+def study(gain: Callable[[Cell], float], every: list[Cell] | None = None, **options: Any) -> Any:
+    """A study in which TV has `gain` times the flux."""
+
+    def of_method(cell: Cell, method: str, mode: str) -> float:
+        return gain(cell) if method == "tv" else 1.0
+
+    return dataset(quick_cells() if every is None else every, power_law(of_method), **options)
+
+
+def outcome(number: int, data: Any) -> Outcome:
+    return verdicts(data)[number - 1].outcome
+
+
+# Claim, a gain with which it holds, one with which it does not.
+DECIDED: list[tuple[int, Callable[[Cell], float], Callable[[Cell], float]]] = [
+    (1, lambda cell: 2.8, lambda cell: 0.8),
+    (2, lambda cell: 2.5, lambda cell: 0.8),
+    (3, lambda cell: 2.5 / cell["size"], lambda cell: 1.5 * cell["size"]),
+    (4, lambda cell: 1.5, lambda cell: cell["pixels"] / 10),
+    (6, lambda cell: 1.4 + 0.2 * np.log10(cell["read_noise_e"]), lambda cell: 0.9),
+    (7, lambda cell: 3.0, lambda cell: 0.7),
+    (8, lambda cell: 1.2, lambda cell: 0.8),
+]
+
+
+@pytest.mark.parametrize(("number", "good", "bad"), DECIDED, ids=[str(item[0]) for item in DECIDED])
+def test_claim_is_decided_by_the_numbers(number: int, good: Gain, bad: Gain) -> None:
+    assert outcome(number, study(good)) is HOLDS  # type: ignore[arg-type]
+    assert outcome(number, study(bad)) is FAILS  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("number", [1, 2, 7])
+def test_a_smaller_gain_than_claimed_holds_in_part(number: int) -> None:
+    assert outcome(number, study(lambda cell: 1.75)) is IN_PART
+    assert outcome(number, study(lambda cell: 1.2)) is FAILS
+
+
+def test_dependence_on_k_is_measured_in_best_k_and_over_the_fixed_ones() -> None:
+    flat, steep = (
+        (lambda method: 0.5 if method == "brightest" else 0.1),
+        (lambda method: 0.1 if method == "brightest" else 0.5),
+    )
+    good, bad = (verdicts(study(lambda cell: 1.0, rise_with_k=rise))[4] for rise in (flat, steep))
+    assert good.best.outcome is HOLDS
+    assert bad.best.outcome is FAILS
+    assert good.fixed.outcome is IN_PART  # the same at every fixed k in both methods: not decided
+
+
+def test_fixed_k_decides_over_the_fixed_modes() -> None:
+    def gain(cell: Cell, method: str, mode: str) -> float:
+        return {"fixed40": 0.8, "fixed60": 0.6}.get(mode, 1.0) if method == "brightest" else 1.0
+
+    assert verdicts(dataset(quick_cells(), power_law(gain)))[4].fixed.outcome is HOLDS
+
+
+def test_some_cells_worse_holds_in_part_and_says_where() -> None:
+    data = study(lambda cell: 0.7 if cell["flux_e"] == 10 else 1.3)
+    verdict = verdicts(data)[7]
+    assert verdict.outcome is IN_PART
+    assert "10 e-" in verdict.best.cases[0].finding
+
+
+def test_no_difference_is_called_worse_in_five_per_cent_of_studies() -> None:
+    """100 studies without any difference: at most 12 false alarms (4 x 10^-3 of the binomial of 5 %)."""
+    rng = np.random.default_rng(5)
+    exact = study(lambda cell: 1.0, cells(), correlation=0.6)
+    alarms = 0
+    for _ in range(100):
+        noisy = exact.copy(deep=True)
+        mean, covariance = exact["error"].values, exact["error_covariance"].values
+        for i, m in np.ndindex(mean.shape[0], mean.shape[2]):
+            noisy["error"].values[i, :, m] = rng.multivariate_normal(mean[i, :, m], covariance[i, m])
+        rows = [row for row in against_tv(noisy, "best") if row.method == "brightest"]
+        alarms += any(row.larger > 0 for row in rows)
+    assert alarms <= 12
+
+
+def test_verdicts_are_the_same_for_the_same_study() -> None:
+    data = study(lambda cell: 1.3)
+    assert verdicts(data) == verdicts(data)
+
+
+def test_what_is_missing_is_said() -> None:
+    partial = study(lambda cell: 1.3, cells(fluxes=(10.0, 100.0)))
+    found = verdicts(partial)
+    assert found[0].outcome is Outcome.NOT_MEASURED
+    assert found[0].best.in_words() == "no finished cells for it"
+    assert (
+        verdicts(partial.sel(estimator=["brightest", "smoothed"], estimator2=["brightest", "smoothed"])) == []
+    )
+
+
+def test_without_fixed_modes_only_best_k_decides() -> None:
+    data = study(lambda cell: 2.8).sel(mode=["best"])
+    assert fixed_mode(data) == "fixed40"
+    assert verdicts(data)[0].fixed.cases == []
+    assert verdicts(data)[0].outcome is HOLDS
+    assert fixed_mode(study(lambda cell: 1.0).sel(mode=["best", "fixed20"])) == "fixed20"
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "together"),
+    [
+        ([HOLDS, HOLDS], HOLDS),
+        ([FAILS, FAILS], FAILS),
+        ([HOLDS, FAILS], IN_PART),
+        ([IN_PART, FAILS], IN_PART),
+        ([HOLDS, Outcome.NOT_MEASURED], HOLDS),
+        ([], Outcome.NOT_MEASURED),
+    ],
+)
+def test_outcomes_are_combined(outcomes: list[Outcome], together: Outcome) -> None:
+    assert combined(outcomes) is together
+
+
+def test_guidance_follows_the_numbers() -> None:
+    def with_gains(tv: float, gaussian: float) -> str:
+        def gain(cell: Cell, method: str, mode: str) -> float:
+            return {"tv": tv, "smoothed": gaussian}.get(
+                method, 0.6 if mode != "best" and method == "brightest" else 1.0
+            )
+
+        return " ".join(guidance(dataset(quick_cells(), power_law(gain))))
+
+    good, bad, equal = with_gains(1.6, 1.2), with_gains(0.9, 1.2), with_gains(1.3, 1.3)
+    assert "Advice: use TV in the" in good
+    assert "a median of 1.60" in good
+    assert "Advice: do not use TV" in bad
+    assert "a median of 0.75" in bad  # over Gaussian smoothing
+    assert "Advice: tune k first" in equal
+
+
+def test_against_tv_counts_cells() -> None:
+    rows = {row.method: row for row in against_tv(study(lambda cell: 1.2, cells()), "best")}
+    assert set(rows) == set(METHODS) - {"tv"}
+    assert (rows["brightest"].smaller, rows["brightest"].larger, rows["brightest"].cells) == (0, 5, 5)
+    assert rows["brightest"].mean_ratio > 1.08
+    assert rows["brightest"].smallest == 0

@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from tests.experiments.planner_cases import answered
+
+from faintspot import Calibration, InputError, Layout, SlopePipeline
+from faintspot.base.statistics import slope_error
+from faintspot.experiments.planner import text as answer_text
+from faintspot.experiments.planner.answer import Answer
+from faintspot.experiments.planner.figures import tune_figure
+from faintspot.slopes.estimators import estimators
+from faintspot.slopes.simulate import Detector, sensor_frames
+
+LAYOUT = Layout.grid((4, 4), pixels=12)
+
+
+def with_layout(answer: Answer, name: str) -> Answer:
+    question = dataclasses.replace(answer.question, layout=LAYOUT)
+    return dataclasses.replace(answer, question=question, equal=(name,))
+
+
+@pytest.mark.parametrize("name", list(estimators()))
+def test_the_configuration_gives_the_error_that_was_promised(name: str, tmp_path: Path) -> None:
+    answer = with_layout(answered(), name)
+    answer.save(tmp_path / "faintspot.toml")
+    pipeline = SlopePipeline.from_file(tmp_path / "faintspot.toml")
+    frames, truth = sensor_frames(
+        LAYOUT.corners,
+        LAYOUT.window,
+        LAYOUT.frame_shape,
+        64,
+        flux_e=200.0,
+        detector=Detector(read_noise_e=3.0),
+        rng=np.random.default_rng(8),
+    )
+    slopes = pipeline(frames)
+    found = slope_error(slopes.x, slopes.y, truth)
+    # Two samples of 512 and 1024 spots: 3 % and 2 %.
+    assert found.value == pytest.approx(answer[name].statistics.error.value, rel=0.15)
+
+
+def test_tables_survive_a_layout_that_comes_later(tmp_path: Path) -> None:
+    path = tmp_path / "faintspot.toml"
+    answered().save(path)
+    LAYOUT.save(path)
+    pipeline = SlopePipeline.from_file(path)
+    assert pipeline.settings == answered().best.settings
+    assert pipeline.calibration.read_noise_e == 3.0
+
+
+def test_maps_of_the_calibration_are_kept() -> None:
+    answer = answered()
+    dark = np.full((4, 4), 7.0)
+    question = dataclasses.replace(answer.question, calibration=Calibration(dark=dark), gain_e_per_adu=2.0)
+    calibration = dataclasses.replace(answer, question=question).calibration
+    np.testing.assert_array_equal(calibration.dark, dark)
+    assert (calibration.gain_e_per_adu, calibration.read_noise_e) == (2.0, 3.0)
+
+
+def test_magnitudes_are_relative_without_photometry() -> None:
+    answer = answered()
+    assert answer.magnitudes([200.0, 100.0]) == pytest.approx([0.0, 0.7526], abs=1e-4)
+    assert "fainter" in answer.magnitude_label
+
+
+def test_results_by_name() -> None:
+    answer = answered()
+    with pytest.raises(InputError, match="'tvs': expected one that was tried: brightest, tv"):
+        answer["tvs"]
+
+
+def test_the_recommendation_in_words() -> None:
+    answer = with_layout(answered(budget="0.1"), "ml")
+    lines = answer_text.recommendation(answer)
+    assert lines[0].startswith('Recommended: maximum likelihood (estimator "ml"')
+    text = " ".join(lines)
+    assert "over brightest pixels" in text
+    assert "TV denoising" in text
+    assert "need not know" in text
+    assert "limiting flux for R = 0.1 px" in text
+    assert "assumed profile" in " ".join(answer_text.foundations(answer))
+
+
+def test_a_star_that_is_too_faint_is_called_so() -> None:
+    answer = answered(read_noise_e=30.0, flux_e=20.0)
+    assert answer.is_hopeless
+    assert "too faint" in " ".join(answer_text.recommendation(answer))
+
+
+def test_the_limit_is_sought_beyond_the_plot() -> None:
+    answer = answered(budget="0.02")
+    limit = answer.best.limiting_flux_e
+    assert limit is not None
+    assert 0 < limit.value < np.inf
+    assert answer.flux_e[-1] > 10 ** (0.4 * 0.75) * 200 * 1.01
+    assert answer.flux_e[answer.at_star] == pytest.approx(200.0)
+    assert "all that was tried" not in " ".join(answer_text.recommendation(answer))
+    # R of the recommended method at its limit is the budget: straight line in log-log between the points.
+    found = np.exp(np.interp(np.log(limit.value), np.log(answer.flux_e), np.log(answer.best.error_px)))
+    assert found == pytest.approx(0.02, rel=0.05)
+
+
+def test_the_figure_shows_every_method_and_the_limit() -> None:
+    answer = answered(budget="0.1")
+    axes = tune_figure(answer).axes[0]
+    labels = axes.get_legend_handles_labels()[1]
+    assert len(labels) == len(answer.results) + 2  # the bound, and no estimate at all
+    assert any("recommended" in label for label in labels)
+    assert any("limit" in text.get_text() for text in axes.texts)
+
+
+def test_a_notebook_shows_the_recommendation_and_every_estimator() -> None:
+    answer = answered()
+    rows = ElementTree.fromstring(answer._repr_html_()).findall("tr")
+    assert len(rows) == 1 + len(answer.results)
+    assert str(rows[0].findtext("td")).startswith(answer.best.method.label)
+    rms = [float(str(row.findtext("td")).split()[1]) for row in rows[1:]]
+    assert rms == sorted(rms)  # the best first

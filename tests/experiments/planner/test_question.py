@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from faintspot.base.errors import InputError
+from faintspot.experiments import Question
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.psf import PSF
+
+KNOWN: dict[str, Any] = {"read_noise_e": 3.0, "pixels": 16, "fwhm_px": 2.0, "flux_e": 100.0}
+OPTICS: dict[str, Any] = {"subaperture_m": 0.5, "wavelength_nm": 600.0, "pixel_scale_arcsec": 0.125}
+STAR: dict[str, Any] = {"subaperture_m": 0.5, "frame_rate_hz": 500.0, "magnitude": 10.0}
+
+
+def without(name: str) -> dict[str, Any]:
+    return {key: value for key, value in KNOWN.items() if key != name}
+
+
+def test_width_follows_from_the_optics() -> None:
+    question = Question(**without("fwhm_px"), **OPTICS)
+    # lambda / d = 1.2e-6 rad = 0.2475 arcsec = 1.98 px
+    assert question.fwhm_px == pytest.approx(0.886 * 1.98, rel=1e-3)
+    assert question.size == pytest.approx(0.99, rel=1e-3)
+
+
+def test_r0_tells_whether_spots_are_speckled() -> None:
+    calm = Question(**without("fwhm_px"), **OPTICS, r0_m=1.0)
+    rough = Question(**without("fwhm_px"), **OPTICS, r0_m=0.15)
+    assert calm.d_over_r0 == 0.0
+    assert rough.d_over_r0 == pytest.approx(0.5 / (0.15 * 1.2**1.2))
+
+
+def test_magnitude_gives_electrons() -> None:
+    question = Question(**without("flux_e"), **STAR)
+    assert question.photometry is not None
+    assert question.star_flux_e == pytest.approx(float(question.photometry.electrons(10.0)))
+
+
+@pytest.mark.parametrize(("fwhm_px", "expected"), [(1.5, 1.0), (4.0, 2.0)])
+def test_search_range_follows_the_width(fwhm_px: float, expected: float) -> None:
+    assert Question(**without("fwhm_px"), fwhm_px=fwhm_px).search_range_px == expected
+
+
+@pytest.mark.parametrize(
+    ("budget", "expected"), [("0.1", 0.1), (0.1, 0.1), ("0.1 px", 0.1), ("0.05arcsec", 0.4), ("50mas", 0.4)]
+)
+def test_budget_in_any_unit(budget: Any, expected: float) -> None:
+    assert Question(**KNOWN, pixel_scale_arcsec=0.125, budget=budget).budget_px == pytest.approx(expected)
+
+
+def test_window_is_that_of_the_layout() -> None:
+    question = Question(**without("pixels"), layout=Layout.grid((2, 2), pixels=(12, 10)))
+    assert question.shape == (12, 10)
+
+
+def test_width_of_a_psf_is_without_the_pixel() -> None:
+    question = Question(**without("fwhm_px"), psf=PSF.analytic("gaussian"))
+    assert question.fwhm_px == pytest.approx(2.0, rel=0.02)  # linear interpolation of the half maximum
+
+
+@pytest.mark.parametrize(
+    ("changes", "naming"),
+    [
+        ({"read_noise_e": None}, "read_noise_e"),
+        ({"read_noise_e": -1.0}, "read_noise_e"),
+        ({"read_noise_e": "three"}, "read_noise_e"),
+        ({"pixels": None}, "pixels"),
+        ({"pixels": 1}, "pixels"),
+        ({"pixels": 15.5}, "pixels"),
+        ({"em_gain": 0.5}, "em_gain"),
+        ({"background_e": -0.1}, "background_e"),
+        ({"fwhm_px": None}, "fwhm_px"),
+        ({"fwhm_px": 50.0}, "fwhm_px"),
+        ({"profile": "airy"}, "profile"),
+        ({"flux_e": None}, "flux_e"),
+        ({"flux_e": 0.0}, "flux_e"),
+        ({"flux_e": 1e-3}, "flux_e"),
+        ({"magnitude": 10.0}, "expected one of them"),
+        ({"flux_e": None, "magnitude": 10.0}, "subaperture_m"),
+        ({"flux_e": None, **STAR, "magnitude": 40.0}, "magnitude"),
+        ({"r0_m": 0.1}, "subaperture_m"),
+        ({**OPTICS, "r0_m": 0.01}, "r0_m"),
+        ({**OPTICS, "r0_m": 0.1, "profile": "gaussian"}, "profile"),
+        ({"throughput": 40.0}, "throughput"),
+        ({"band": "Z"}, "band"),
+        ({"search_range_px": 9.0}, "search_range_px"),
+        ({"budget": "0.1 furlong"}, "budget"),
+        ({"budget": "-0.1"}, "budget"),
+        ({"budget": "50mas"}, "pixel_scale_arcsec"),
+        ({"layout": Layout.grid((2, 2), pixels=12)}, "pixels"),
+    ],
+)
+def test_what_cannot_be_is_named_in_one_line(changes: dict[str, Any], naming: str) -> None:
+    with pytest.raises(InputError, match=naming) as error:
+        Question(**{**KNOWN, **changes})
+    assert "\n" not in str(error.value)

@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.experiments.planner_cases import QUICK
+from tests.shared_data import shared_file
+
+from faintspot.base.errors import InputError
+from faintspot.experiments import question_from_frames, tune
+from faintspot.experiments.planner.promise import frames_to_check
+from faintspot.experiments.planner.text import UNCHECKED, recommendation
+from faintspot.io.frames import read_array
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.simulate import Detector, sensor_frames
+
+LAYOUT = Layout.grid((6, 6), pixels=12)
+CAMERA = Detector(read_noise_e=4.0, gain_e_per_adu=0.5, offset_adu=100.0)
+
+
+def recorded(n_frames: int = 30) -> tuple[np.ndarray, np.ndarray]:
+    """Return frames of a static field and darks."""
+    rng = np.random.default_rng(4)
+    positions = rng.uniform(-0.6, 0.6, (len(LAYOUT), 2))
+    frames, _ = sensor_frames(
+        LAYOUT.corners,
+        LAYOUT.window,
+        LAYOUT.frame_shape,
+        n_frames,
+        flux_e=3000.0,
+        positions=positions,
+        detector=CAMERA,
+        rng=rng,
+    )
+    return frames, CAMERA.expose(np.zeros((20, *LAYOUT.frame_shape)), rng)
+
+
+def test_camera_flux_and_spot_are_measured() -> None:
+    frames, darks = recorded()
+    question = question_from_frames(frames, darks, layout=LAYOUT)
+    assert question.gain_e_per_adu == pytest.approx(0.5, rel=0.05)  # 30 frames of 36 spots
+    assert question.read_noise_e == pytest.approx(4.0, rel=0.06)  # as the gain
+    assert question.star_flux_e == pytest.approx(3000.0, rel=0.06)  # spots off the middle lose a little
+    assert question.fwhm_px == pytest.approx(1.77, rel=0.1)
+    assert any("PSF learnt" in fact for fact in question.facts)
+
+
+def test_a_learnt_psf_is_used_and_the_trained_method_left_out() -> None:
+    frames, darks = recorded()
+    question = question_from_frames(frames, darks, layout=LAYOUT, flux_e=100.0)
+    answer = tune(question, **QUICK)
+    assert "trained" in answer.left_out
+    assert answer["ml"].method.psf is question.psf
+    assert answer["ml"].settings.weight_floor == 1e-3
+
+
+def test_what_is_given_is_not_measured() -> None:
+    frames, _ = recorded(2)
+    question = question_from_frames(
+        frames[0], layout=LAYOUT, gain_e_per_adu=0.5, read_noise_e=4.0, fwhm_px=1.8, flux_e=50.0
+    )
+    assert (question.read_noise_e, question.fwhm_px, question.star_flux_e) == (4.0, 1.8, 50.0)
+    assert question.psf is None
+
+
+def test_a_faint_recording_has_the_range_of_its_spots() -> None:
+    rng = np.random.default_rng(3)
+    layout, camera = Layout.grid((6, 6), pixels=16), Detector(read_noise_e=3.0, offset_adu=100.0)
+    frames, _ = sensor_frames(
+        layout.corners,
+        layout.window,
+        layout.frame_shape,
+        30,
+        flux_e=30.0,
+        positions=rng.uniform(-0.5, 0.5, (len(layout), 2)),
+        detector=camera,
+        rng=rng,
+    )
+    known: dict[str, Any] = {"layout": layout, "gain_e_per_adu": 1.0, "read_noise_e": 3.0, "fwhm_px": 1.77}
+    question = question_from_frames(frames, **known)
+    assert question.search_range_px == 1.0  # 7.9 where noise is taken for spots
+    assert question.star_flux_e == pytest.approx(30.0, rel=0.15)
+    dark = question_from_frames(camera.expose(np.zeros(frames.shape), rng), **known, flux_e=30.0)
+    assert dark.search_range_px == 1.0
+    assert any("the flux is too low" in fact for fact in dark.facts)
+
+
+def test_a_single_frame_is_not_checked() -> None:
+    frames, _ = recorded(1)
+    known: dict[str, Any] = {"layout": LAYOUT, "gain_e_per_adu": 0.5, "read_noise_e": 4.0, "fwhm_px": 1.77}
+    answer = tune(question_from_frames(frames, **known), **QUICK)
+    assert answer.promise is None
+    assert any(line.startswith(UNCHECKED) for line in recommendation(answer))
+
+
+def test_only_so_many_frames_are_used_as_are_needed() -> None:
+    layout = Layout.grid((40, 40), pixels=16)
+    assert frames_to_check(layout) == 8
+    assert frames_to_check(Layout.grid((2, 2), pixels=64)) == 256
+    assert frames_to_check(Layout.grid((2, 2), pixels=16)) == 1024
+
+
+def test_a_single_frame_does_not_tell_the_gain() -> None:
+    frames, darks = recorded(2)
+    with pytest.raises(InputError, match="gain_e_per_adu"):
+        question_from_frames(frames[0], layout=LAYOUT)
+    with pytest.raises(InputError, match="darks"):
+        question_from_frames(frames[0], darks[:, :10], layout=LAYOUT)
+
+
+def test_flux_that_differs_between_subapertures_is_simulated_so() -> None:
+    rng = np.random.default_rng(6)
+    flux = np.where(np.arange(36) % 2, 500.0, 1500.0)
+    frames, _ = sensor_frames(
+        LAYOUT.corners,
+        LAYOUT.window,
+        LAYOUT.frame_shape,
+        12,
+        flux_e=flux,
+        positions=rng.uniform(-0.6, 0.6, (12, 36, 2)),
+        detector=CAMERA,
+        rng=rng,
+    )
+    question = question_from_frames(frames, layout=LAYOUT, gain_e_per_adu=0.5)
+    assert question.star_flux_e == pytest.approx(1000.0, rel=0.03)
+    assert question.relative_flux is not None
+    np.testing.assert_allclose(question.relative_flux, flux / 1000.0, rtol=0.06)  # 6 frames, 2 % each
+
+
+def test_unreliable_gain_is_not_used() -> None:
+    frames = read_array(f"{shared_file('data/ciao_bench_60x224x224.npz')}:frames")
+    with pytest.raises(InputError, match=r"gain_e_per_adu.*disagree"):
+        question_from_frames(frames)
+    question = question_from_frames(frames, gain_e_per_adu=2.0, flux_e=200.0)
+    assert question.layout is not None
+    assert len(question.layout) == 49  # those that the frame's edge does not cut
+    assert question.fwhm_px == pytest.approx(3.7, abs=0.2)

@@ -1,0 +1,82 @@
+"""The report page of a study: complete, self-contained, honest about what is missing."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import asdict
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.experiments.study_cases import dataset, power_law
+
+from faintspot.base.errors import InputError
+from faintspot.experiments.report.page import report_of_study, study_report
+from faintspot.experiments.study import built_in as paper
+from faintspot.experiments.study.specification import StudySpecification, Sweep
+
+pytestmark = pytest.mark.usefixtures("undrawn_pictures")
+
+
+def of(specification: StudySpecification, **options: Any) -> Any:
+    def gain(cell: Any, method: str, mode: str) -> float:
+        return 1.4 if method == "tv" else 1.0
+
+    data = dataset([asdict(cell) for cell in specification.cells()], power_law(gain), **options)
+    data.attrs["specification"] = specification.to_text()
+    return data
+
+
+class TestPage:
+    def test_is_complete_and_in_order(self) -> None:
+        html = study_report(of(paper.paper_study(quick=True)))
+        sections = re.findall(r'<section id="([^"]+)"', html)
+        assert sections[:4] == ["verdicts", "guidance", "baselines", "gains"]
+        assert sections[4:11] == ["fig1", "fig2", "fig3", "fig4", "fig5", "fig6", "fig7"]
+        assert sections[-2:] == ["cases", "specification"]
+        assert html.count('<tr><th scope="row">') >= 8
+        assert "not finished" not in html
+        parser = HTMLParser()
+        parser.feed(html)
+        parser.close()
+
+    def test_needs_nothing_else(self) -> None:
+        html = study_report(of(paper.paper_study(quick=True, figures=["fig3"])))
+        links = re.findall(r'(?:href|src)="([^"]*)"', html)
+        assert links
+        assert all(link.startswith(("data:", "#")) for link in links)
+        assert "<script" not in html
+
+    def test_of_an_unfinished_study_says_so(self) -> None:
+        data = of(paper.paper_study(quick=True), unfinished=tuple(range(1, 40)))
+        html = study_report(data)
+        assert "This study is not finished" in html
+        assert "39 cells are still missing" in html
+        assert "not measured" in html
+
+    def test_of_another_study_has_its_sweeps(self) -> None:
+        sweep = Sweep("emccd", flux_e=(20, 60, 200), em_gain=(1, 300), background_e=2)
+        html = study_report(of(StudySpecification("my <study>", [sweep])))
+        assert "<h2>emccd</h2>" in html
+        assert 'id="fig1"' not in html
+        assert "my &lt;study&gt;" in html
+
+    def test_of_methods_without_tv_has_no_verdict(self) -> None:
+        data = of(paper.paper_study(quick=True, figures=["fig3"]))
+        html = study_report(
+            data.sel(estimator=["brightest", "smoothed"], estimator2=["brightest", "smoothed"])
+        )
+        assert "No verdicts" in html
+
+
+def test_study_without_a_finished_cell_is_refused() -> None:
+    data = of(paper.paper_study(quick=True, figures=["fig3"]))
+    data["done"][:] = False
+    with pytest.raises(InputError, match="none of its 8 cells is finished"):
+        study_report(data)
+
+
+def test_what_is_no_study_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError):
+        report_of_study(tmp_path / "nothing.zarr")

@@ -1,0 +1,151 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.loop.control.control_cases import TURBULENCE
+from tests.loop.control.frozen_flow import frozen_slopes
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.layers import Identification, Identified
+from faintspot.loop.control.identification.vibrations import mode_shapes
+from faintspot.loop.control.telemetry import OpenLoopTelemetry
+
+RATE_HZ = 250.0
+CELLS = np.array([[row, column] for row in range(5) for column in range(5)], np.float64)
+AIR = replace(
+    TURBULENCE,
+    positions_m=CELLS * 0.6,
+    fraction=np.array([0.6, 0.4]),
+    wind_m_per_s=np.array([[6.0, 2.0], [-5.0, 14.0]]),
+)
+UNKNOWN = replace(AIR, r0_m=1.0, outer_scale_m=20.0, fraction=np.ones(1), wind_m_per_s=np.zeros((1, 2)))
+
+
+def observed(
+    air: object = AIR, frames: int = 1500, noise_px: float = 0.5, seed: int = 1
+) -> OpenLoopTelemetry:
+    """Return slopes with noise, whose errors are said to be 1.2 times too large."""
+    rng = np.random.default_rng(seed)
+    assert isinstance(air, type(AIR))
+    slopes = frozen_slopes(air, frames, RATE_HZ, rng)
+    slopes += noise_px * rng.standard_normal(slopes.shape)
+    return OpenLoopTelemetry(slopes, np.full(slopes.shape, (1.2 * noise_px) ** 2), np.ones(slopes.shape))
+
+
+def expect_winds(found: Identified, within_m_per_s: float) -> None:
+    """The strongest layers are those of AIR, within three of their standard errors and so many m/s."""
+    order = np.argsort(-found.turbulence.fraction)[: len(AIR.fraction)]
+    off = found.turbulence.wind_m_per_s[order] - AIR.wind_m_per_s
+    assert np.abs(off).max() < within_m_per_s
+    assert np.all(np.abs(off) < 4 * found.wind_error_m_per_s[order])
+    assert found.turbulence.fraction[order] == pytest.approx(AIR.fraction, abs=0.12)
+
+
+def test_two_layers_are_found() -> None:
+    found = Identification(observed(), UNKNOWN, RATE_HZ).layers()
+    assert 2 <= len(found.turbulence.fraction) <= 3
+    expect_winds(found, 0.8)
+    assert found.noise_factor == pytest.approx(1.2**-2, rel=0.03)
+    assert found.turbulence.r0_m == pytest.approx(AIR.r0_m, rel=0.1)
+    assert found.vibrations == ()
+    assert found.slope_model().layers == len(found.turbulence.fraction)
+
+
+def test_gradients_of_smaller_squares_are_found() -> None:
+    """Slopes of bright stars that follow the least-squares tilt, with unequal centroid gains."""
+    telemetry = observed(replace(AIR, averaged=0.7), noise_px=0.1)
+    gains = 1 + 0.1 * np.random.default_rng(5).standard_normal(telemetry.open_loop_px.shape[1])
+    unequal = replace(telemetry, open_loop_px=gains * telemetry.open_loop_px)
+    for seen in (telemetry, unequal):
+        found = Identification(seen, UNKNOWN, RATE_HZ).layers()
+        assert found.turbulence.averaged == 0.7
+        order = np.argsort(-found.turbulence.fraction)[:2]
+        assert found.turbulence.wind_m_per_s[order] == pytest.approx(AIR.wind_m_per_s, abs=0.4)
+        assert found.turbulence.fraction[order] == pytest.approx(AIR.fraction, abs=0.1)
+
+
+def test_gaps_and_missing_subapertures() -> None:
+    """A twentieth of the slopes, sixty frames and three sub-apertures were not measured."""
+    telemetry = observed()
+    missing = np.random.default_rng(3).random(telemetry.open_loop_px.shape) < 0.05
+    missing[400:420] = missing[900:940] = True
+    missing[:, [3, 7, 12, 28, 32, 37]] = True
+    lost = OpenLoopTelemetry(
+        np.where(missing, 50.0, telemetry.open_loop_px),
+        np.where(missing, np.inf, telemetry.variance_px2),
+        np.where(missing, 0.0, 1.0),
+    )
+    expect_winds(Identification(lost, UNKNOWN, RATE_HZ).layers(), 1.0)
+
+
+def test_slopes_that_tell_little_do_not_count() -> None:
+    """A fifth of the slopes is mostly an estimator's prior, with three times the stated error."""
+    telemetry = observed()
+    rng = np.random.default_rng(4)
+    poor = rng.random(telemetry.open_loop_px.shape) < 0.2
+    wrong = 0.5 * np.sqrt(90.0) * rng.standard_normal(poor.shape)
+    tail = OpenLoopTelemetry(
+        telemetry.open_loop_px + np.where(poor, wrong, 0.0),
+        np.where(poor, 10.0, 1.0) * telemetry.variance_px2,
+        telemetry.trust,
+    )
+    found = Identification(tail, UNKNOWN, RATE_HZ).layers()
+    expect_winds(found, 1.0)
+    # Interpolation in their place halves the noise of a fifth.
+    assert found.noise_factor == pytest.approx(1.2**-2, rel=0.2)
+
+
+def test_turbulence_that_stands_still() -> None:
+    """In windows of half a second winds below 2 m/s look alike: no layer is faster than that by much."""
+    still = replace(AIR, fraction=np.ones(1), wind_m_per_s=np.array([[0.4, 0.0]]))
+    found = Identification(observed(still), UNKNOWN, RATE_HZ).layers()
+    assert np.hypot(*found.turbulence.wind_m_per_s.T).max() < 4.0
+
+
+def test_known_winds_have_their_strengths() -> None:
+    identification = Identification(observed(), UNKNOWN, RATE_HZ)
+    found = identification.of_winds(AIR.wind_m_per_s)
+    assert found.turbulence.fraction == pytest.approx(AIR.fraction, abs=0.1)
+    assert found.criterion < identification.anywhere().criterion
+    assert found.covariances_px2().shape == (2, 3, 50, 50)
+    assert identification.anywhere().covariances_px2().shape == (1, 3, 50, 50)
+
+
+def test_a_vibration_is_found_and_part_of_the_model() -> None:
+    """A tilt of 45 Hz on top of turbulence: the winds stay what they are."""
+    telemetry = observed()
+    shape = mode_shapes(AIR.positions_m)[1]
+    shaking = (
+        np.sqrt(50) * 0.4 * np.sqrt(2) * np.sin(2 * np.pi * 45.0 / RATE_HZ * np.arange(len(telemetry)) + 1)
+    )
+    shaken = replace(telemetry, open_loop_px=telemetry.open_loop_px + shaking[:, None] * shape)
+    found = Identification(shaken, UNKNOWN, RATE_HZ).layers()
+    (vibration,) = found.vibrations
+    assert vibration.mode == "tilt"
+    assert vibration.frequency_hz == pytest.approx(45.0, abs=0.1)
+    assert vibration.rms_px == pytest.approx(0.4, rel=0.15)
+    expect_winds(found, 0.8)
+    model = found.slope_model()
+    assert model.layers == len(found.turbulence.fraction) + 1
+    assert np.abs(np.linalg.eigvals(model.onward)).max() < 1.0
+
+
+def test_a_single_aperture_has_no_focus() -> None:
+    """Tip and tilt alone: layers are told by how fast they change."""
+    single = replace(UNKNOWN, positions_m=np.zeros((1, 2)), subaperture_m=3.0)
+    slopes = np.random.default_rng(2).standard_normal((600, 2)).cumsum(axis=0) * 0.1
+    telemetry = OpenLoopTelemetry(slopes, np.full(slopes.shape, 0.01), np.ones(slopes.shape))
+    found = Identification(telemetry, single, RATE_HZ).layers()
+    assert found.vibrations == ()
+    assert np.isfinite(found.slope_model().both).all()
+
+
+def test_too_little_is_refused() -> None:
+    telemetry = observed(frames=100)
+    with pytest.raises(InputError, match="telemetry: expected 32 frames without a gap"):
+        Identification(telemetry.part(0, 20), UNKNOWN, RATE_HZ)
+    unmeasured = replace(telemetry, variance_px2=np.full(telemetry.variance_px2.shape, np.inf))
+    with pytest.raises(InputError, match="measured in half of the frames, got none"):
+        Identification(unmeasured, UNKNOWN, RATE_HZ)

@@ -1,0 +1,114 @@
+"""What was learnt is the same after it was in a file, and goes on from any mirror without a jump."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.loop.control.control_cases import COVARIANCES, FRAME_S, INTERACTION, PLANT, TURBULENCE, telemetry
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.configuration import Control, ControlOptions
+from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, learn
+from faintspot.loop.control.identification.model import Learnt, Model
+from faintspot.loop.control.kalman.compiled import CompiledKalman
+from faintspot.slopes.camera.calibration import Calibration
+
+KINDS = [kind for kind in CONTROLS if kind != INTEGRATOR]
+FRAMES = telemetry(600, 0.3)
+
+
+@pytest.fixture(scope="module")
+def learnt() -> dict[str, Learnt]:
+    return {kind: learn(kind, PLANT, FRAMES, TURBULENCE, 1 / FRAME_S) for kind in KINDS}
+
+
+def commands(controller: Any, line: CommandDelayLine, frames: int = 60) -> np.ndarray:
+    sent = []
+    for slopes in FRAMES.open_loop_px[:frames]:
+        controller.update(slopes + INTERACTION @ line.acting, np.full(18, 0.3))
+        sent.append(line.latest.copy())
+    return np.array(sent)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, Learnt], tmp_path: Path) -> None:
+    path = tmp_path / "model.npz"
+    learnt[kind].model.save(path)
+    lines = [CommandDelayLine(12, 2) for _ in range(2)]
+    again = Learnt(PLANT, Model.load(path, PLANT))
+    sent = [
+        commands(each.controller(line), line) for each, line in zip((learnt[kind], again), lines, strict=True)
+    ]
+    np.testing.assert_array_equal(sent[0], sent[1])
+    assert np.abs(sent[0]).max() > 0.1
+    options = ControlOptions(controller=kind, leak=PLANT.leak, gain=1.0)
+    control = Control(INTERACTION, None, options, path)
+    line = control.line()
+    engines = commands(control.controller(line), line)
+    expected, tolerance = sent[0], 1e-9
+    if kind == "modal":  # not guarded: the gains are in the compiled integrator's matrix, in float32
+        tolerance = 1e-6
+        other = CommandDelayLine(12, 2)
+        expected = commands(learnt[kind].model.controller(PLANT, other), other)
+    np.testing.assert_allclose(engines, expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, Learnt]) -> None:
+    """Slopes of a mirror that takes off all there is: the next command is nearly the same."""
+    line = CommandDelayLine(12, 2)
+    controller = learnt[kind].controller(line)
+    commands(controller, line)
+    held = -PLANT.reconstructor.clean @ COVARIANCES[0] @ np.random.default_rng(2).standard_normal(18)
+    line.hold(held)
+    controller.begin()
+    controller.update(np.zeros(18), np.full(18, 0.3))
+    assert np.linalg.norm(line.latest - held) < 0.35 * np.linalg.norm(held)
+
+
+def test_another_controller_of_the_same_loop(learnt: dict[str, Learnt]) -> None:
+    """The integrator needs no model; only the filter tells estimators what it expects, if nothing is said."""
+    control = Control(INTERACTION, None, ControlOptions(gain=0.3), learnt["kalman"].model)
+    filtered = control.with_controller("kalman")
+    assert isinstance(filtered.controller(filtered.line()), CompiledKalman)
+    assert (control.prediction, filtered.prediction) == ("none", "controller")
+    assert filtered.with_controller("integrator").options == control.options
+    assert control.with_controller("integrator") is control
+    with pytest.raises(InputError, match="expected a model of controller 'modal', got one of 'kalman'"):
+        control.with_controller("modal")
+
+
+def test_what_is_refused(learnt: dict[str, Learnt], tmp_path: Path) -> None:
+    path = tmp_path / "model.npz"
+    model = learnt["kalman"].model
+
+    def refused(message: str, options: ControlOptions, file: Any = path) -> None:
+        with pytest.raises(InputError) as caught:
+            Control(INTERACTION, None, options, file)
+        assert message in str(caught.value)
+
+    kalman = ControlOptions(controller="kalman")
+    refused("model: expected a file with the learnt model", kalman, None)
+    model.save(path)
+    refused("expected a model of controller 'polc'", ControlOptions(controller="polc"))
+    with pytest.raises(InputError, match="which need the camera's read noise"):
+        Control(INTERACTION, None, kalman, model).check_errors(Calibration())
+    Control(INTERACTION, None, kalman, model).check_errors(Calibration(read_noise_e=1.0))
+    Control(INTERACTION).check_errors(Calibration())
+    refused('prediction = "stream"', ControlOptions(controller="kalman", prediction="stream"))
+    arrays = dict(np.load(path))
+    np.savez(path, **{**arrays, "first": arrays["first"][0]})
+    refused("first: expected shape (1, 18, 18), got (18, 18)", kalman)
+    np.savez(path, **{**arrays, "first": np.tile(arrays["first"], (2, 1, 1))})
+    layers = len(arrays["first"])
+    refused(f"second: expected shape ({2 * layers}, 18, 18), got ({layers}, 18, 18)", kalman)
+    np.savez(path, **{**arrays, "variance_px2": np.full(18, np.nan)})
+    refused("variance_px2: expected finite numbers", kalman)
+    np.savez(path, **{**arrays, "kind": "pid"})
+    refused("kind = 'pid': expected one of", kalman)
+    np.savez(path, kind="kalman")
+    refused("model.npz", kalman)

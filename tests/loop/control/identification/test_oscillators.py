@@ -1,0 +1,69 @@
+"""Tip and tilt of a single sub-aperture: oscillators in place of winds."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.loop.control.driven import driven, oscillator
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.learning import GAINS, KALMAN, Plant, learn
+from faintspot.loop.control.identification.loop_delay import loop_delay
+from faintspot.loop.control.identification.oscillators import fitted_oscillators
+from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.control.telemetry import OpenLoopTelemetry
+from faintspot.loop.telemetry.open_loop import site_of_loop
+from faintspot.loop.telemetry.recorded_loop import RecordedLoop
+
+_RATE_HZ, _FRAMES, _NOISE = 500.0, 8000, 0.5
+_TURBULENCE, _VIBRATION, _BROAD = (
+    oscillator(1.5, 0.5, 1.0),
+    oscillator(20.0, 0.003, 0.3),
+    oscillator(45.0, 0.3, 0.4),
+)
+_CELLS = np.zeros((1, 2), np.int64)
+_SITE = site_of_loop(
+    RecordedLoop("tip-tilt", np.zeros((1, 2)), np.zeros(1, np.int64), _RATE_HZ, "px", _CELLS)
+)
+
+
+def _seen(seed: int) -> NDArray[np.float64]:
+    """Return tip and tilt, (frames, 2)."""
+    rng = np.random.default_rng(seed)
+    moving = [driven(rng, _FRAMES, _RATE_HZ, 2, _TURBULENCE, _VIBRATION, _BROAD) for _ in range(2)]
+    return np.array(moving).T + _NOISE * rng.standard_normal((_FRAMES, 2))
+
+
+def test_oscillators_and_noise_are_found() -> None:
+    found, noise = fitted_oscillators(_seen(1), _RATE_HZ, 2)
+    assert noise == pytest.approx(np.full(2, _NOISE**2), rel=0.1)
+    for mode in ("tip", "tilt"):
+        of_mode = [each for each in found if each.mode == mode]
+        narrow = min(of_mode, key=lambda each: each.damping)
+        # Its phase is lost within 3 s, which makes 0.1 Hz in 16 s.
+        assert narrow.frequency_hz == pytest.approx(20.0, abs=0.3)
+        assert narrow.rms_px == pytest.approx(_VIBRATION.rms_px, rel=0.4)
+
+
+def test_the_learnt_filter_beats_the_best_integrator() -> None:
+    plant = Plant(np.eye(2), make_reconstructor(np.eye(2)), 2, 0.01)
+    learning, scoring = (
+        OpenLoopTelemetry(slopes, np.full(slopes.shape, _NOISE**2), np.ones(slopes.shape))
+        for slopes in map(_seen, (2, 3))
+    )
+    learnt = learn(KALMAN, plant, learning, _SITE, _RATE_HZ)
+    assert learnt.found is not None
+    assert learnt.found.oscillators
+    gain, plain = plant.best_gain(GAINS, scoring, np.eye(2))
+    left = plant.left(partial(learnt.model.controller, plant), scoring, np.eye(2))
+    # Noise is 0.5 of either, whatever the control; of the rest, the filter leaves at most three quarters.
+    assert left - 2 * _NOISE**2 < 0.75 * (plain - 2 * _NOISE**2), gain
+
+
+def test_delay_is_not_told() -> None:
+    run = np.zeros(_FRAMES, np.int64)
+    with pytest.raises(InputError, match="expected 3 sub-apertures"):
+        loop_delay(_seen(4), np.zeros((_FRAMES, 2)), run, _SITE, _RATE_HZ)

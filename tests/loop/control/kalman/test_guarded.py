@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from tests.loop.control.control_cases import COVARIANCES, INTERACTION, PHASE, PLANT, telemetry
+
+from faintspot.loop.control.base import Expected
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.integrator import Integrator
+from faintspot.loop.control.kalman.guarded import Guarded
+from faintspot.loop.control.kalman.predictive import PseudoOpenLoop
+
+FRAMES = telemetry(900, 0.2)
+
+
+class Runaway:
+    """A controller that has learnt nonsense."""
+
+    undoes_prior = True
+
+    def __init__(self, line: CommandDelayLine) -> None:
+        self._line = line
+
+    def expected(self) -> Expected:
+        return Expected(np.zeros(18), None)
+
+    def update(self, slopes_px: np.ndarray, standard_error_px: np.ndarray, covariance: object = None) -> None:
+        self._line.put(0.9 * self._line.latest + 0.4 * (PLANT.reconstructor(slopes_px)))
+
+
+def _guarded(line: CommandDelayLine, learnt: object, prior: np.ndarray | None = None) -> Guarded:
+    plain = partial(PLANT.integrator, 0.4)
+    return Guarded(line, INTERACTION, PHASE, learnt, plain, prior_std_px=prior)  # type: ignore[arg-type]
+
+
+def test_nonsense_is_replaced() -> None:
+    """A hundred frames after the start the integrator has taken over, as if it had been there always."""
+    lines = [CommandDelayLine(12, 2) for _ in range(2)]
+    guarded, alone = _guarded(lines[0], Runaway), PLANT.integrator(0.4, lines[1])
+    for number, slopes in enumerate(FRAMES.open_loop_px):
+        for controller, line in zip((guarded, alone), lines, strict=True):
+            controller.update(slopes + INTERACTION @ line.acting, np.full(18, 0.2))
+        if number > 100:
+            np.testing.assert_allclose(lines[0].latest, lines[1].latest, atol=1e-9)
+    assert guarded.chosen == 1
+
+
+class Still:
+    """A controller whose command is always the same."""
+
+    undoes_prior = True
+
+    def __init__(self, line: CommandDelayLine, value: float) -> None:
+        self._line, self._command = line, np.full(12, value)
+
+    def expected(self) -> Expected:
+        return Expected(np.zeros(18), None)
+
+    def begin(self) -> None: ...
+
+    def update(self, slopes_px: np.ndarray, standard_error_px: np.ndarray, covariance: object = None) -> None:
+        self._line.put(self._command)
+
+
+def test_commands_go_over_from_one_controller_to_another_in_equal_steps() -> None:
+    """From 0.5 of another one to the 1 of the first controller, then to the 0 of the second."""
+    line, sent = CommandDelayLine(12, 2), []
+    makers = partial(Still, value=1.0), partial(Still, value=0.0)
+    guarded = Guarded(line, INTERACTION, PHASE, *makers)
+    line.hold(np.full(12, 0.5))
+    guarded.begin()
+    guarded.hand_over()
+    for number in range(30):
+        if number == 15:
+            guarded.fall_back()
+        guarded.update(np.zeros(18), np.full(18, 0.2))
+        sent.append(line.latest[0])
+    wanted = [*np.linspace(0.55, 1.0, 10), *[1.0] * 5, *np.linspace(0.9, 0.0, 10), *[0.0] * 5]
+    np.testing.assert_allclose(sent, wanted, atol=1e-12)
+
+
+@pytest.mark.parametrize("prior", [None, np.full(18, 0.5)])
+def test_alike_nothing_changes(prior: np.ndarray | None) -> None:
+    """Two integrators that differ by nothing; posteriors are drawn to what each expects."""
+    lines = [CommandDelayLine(12, 2) for _ in range(2)]
+    guarded, alone = (
+        _guarded(lines[0], partial(PLANT.integrator, 0.4), prior),
+        PLANT.integrator(0.4, lines[1]),
+    )
+    noise = 0.2
+    share = 1.0 if prior is None else 0.5**2 / (0.5**2 + noise**2)
+    for slopes in FRAMES.open_loop_px[:300]:
+        for controller, line in zip((guarded, alone), lines, strict=True):
+            mean = controller.expected().mean_px
+            posterior = mean + share * (slopes + INTERACTION @ line.acting - mean)
+            controller.update(posterior, np.full(18, noise * np.sqrt(share)))
+    assert guarded.chosen == 0
+    np.testing.assert_allclose(lines[0].latest, lines[1].latest, atol=1e-6)
+
+
+def test_pseudo_open_loop_control_takes_off_what_does_not_change() -> None:
+    """Without noise, all of it that the mirror sees; slopes that were not measured do not matter."""
+    line = CommandDelayLine(12, 2)
+    matrix = PLANT.reconstructor.clean
+    control = PseudoOpenLoop(line, INTERACTION, COVARIANCES[0], COVARIANCES[0], matrix, 0.5)
+    wavefront = np.random.default_rng(3).standard_normal(12)
+    error = np.full(18, 1e-4)
+    for _ in range(60):
+        control.update(INTERACTION @ (wavefront + line.acting), error)
+    assert np.linalg.norm(line.acting + wavefront) < 0.05 * np.linalg.norm(wavefront)
+    assert isinstance(PLANT.integrator(0.3, line), Integrator)
+    wild = INTERACTION @ (wavefront + line.acting)
+    wild[4], error[4] = 1e3, np.inf
+    before = line.latest.copy()
+    control.update(wild, error)
+    assert np.abs(line.latest - before).max() < 0.5 * np.abs(wavefront).max()

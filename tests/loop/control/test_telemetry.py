@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from tests.loop.control.control_cases import FRAME_S, PHASE, PLANT, TURBULENCE, telemetry
+
+from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, learn
+from faintspot.loop.control.modal_gains import GAINS, largest_stable_gain, modal_gains
+from faintspot.loop.control.telemetry import OpenLoopTelemetry, usual_noise, without_prior
+
+
+def test_a_prior_is_taken_out_again() -> None:
+    """A Gaussian posterior gives back the frame's own slope and variance."""
+    rng = np.random.default_rng(1)
+    mean, slope = rng.standard_normal((2, 50))
+    prior, noise = rng.uniform(0.2, 1.0, (2, 50))
+    variance = 1 / (1 / prior**2 + 1 / noise**2)
+    posterior = variance * (mean / prior**2 + slope / noise**2)
+    alone, found, trust = without_prior(posterior, np.sqrt(variance), mean, prior)
+    informed = noise**2 < 50 * prior**2  # less is taken for that
+    np.testing.assert_allclose(alone[informed], slope[informed], rtol=1e-6)
+    np.testing.assert_allclose(found[informed], noise[informed] ** 2, rtol=1e-6)
+    np.testing.assert_allclose((mean + trust * (alone - mean))[informed], posterior[informed], rtol=1e-6)
+
+
+def test_posteriors_wider_than_the_prior_stay_harmless() -> None:
+    _, variance, trust = without_prior(np.ones(3), np.array([2.0, 1.0, np.inf]), np.zeros(3), np.ones(3))
+    np.testing.assert_allclose(variance, [50.0, 50.0, np.inf])
+    np.testing.assert_allclose(trust, [1 / 51, 1 / 51, 0.0])
+
+
+def test_usual_noise_gives_the_mean_information() -> None:
+    """Of one sub-aperture, against whole matrices; without y in one frame, and nothing in another."""
+    rng = np.random.default_rng(1)
+    roots = rng.standard_normal((20, 2, 2))
+    noise = roots @ roots.swapaxes(1, 2) + np.eye(2)
+    information = np.linalg.inv(noise)
+    variance, covariance = np.diagonal(noise, axis1=1, axis2=2).copy(), noise[:, 0, 1].copy()
+    variance[3, 1], variance[7], covariance[[3, 7]] = np.inf, np.inf, 0.0
+    information[3], information[7] = np.diag([1 / variance[3, 0], 0.0]), 0.0
+    zeros = np.zeros_like(variance)
+    found, shared = usual_noise(OpenLoopTelemetry(zeros, variance, zeros, covariance[:, None]))
+    usual = np.linalg.inv(information.mean(axis=0))
+    np.testing.assert_allclose(found, np.diag(usual))
+    np.testing.assert_allclose(shared, usual[0, 1])
+
+
+@pytest.mark.parametrize("kind", [kind for kind in CONTROLS if kind != INTEGRATOR])
+def test_what_has_learnt_leaves_less(kind: str) -> None:
+    """On other frames of the same air, than the integrator with the gain that is best there."""
+    learnt = learn(kind, PLANT, telemetry(1200, 0.5), TURBULENCE, 1 / FRAME_S)
+    other = telemetry(1500, 0.5, seed=6).scaled(learnt.noise_factor)
+    plain = min(
+        PLANT.left(partial(PLANT.integrator, gain), other, PHASE) for gain in (0.1, 0.2, 0.3, 0.4, 0.5)
+    )
+    # Of a gain for each mode, in a mirror without any order, no more can be asked than to be no worse.
+    assert PLANT.left(learnt.controller, other, PHASE) < plain * (1.01 if kind == "modal" else 0.99)
+
+
+def test_gains_make_up_for_slopes_drawn_to_zero() -> None:
+    frames = telemetry(600, 0.5)
+    drawn = OpenLoopTelemetry(frames.open_loop_px, frames.variance_px2, np.full(frames.trust.shape, 0.8))
+    whole, larger = (
+        learn("modal", PLANT, each, TURBULENCE, 1 / FRAME_S).model.arrays["gains"] for each in (frames, drawn)
+    )
+    below = larger < larger.max()
+    assert below.any()
+    np.testing.assert_allclose(larger[below], whole[below] / 0.8)
+
+
+def test_the_best_gain_is_that_of_a_loop_run_through() -> None:
+    rng = np.random.default_rng(4)
+    walk = np.cumsum(rng.standard_normal((20_000, 2)), axis=0)
+    modes = walk - walk.mean(axis=0) + np.array([0.5, 6.0]) * rng.standard_normal(walk.shape)
+
+    def left(gain: float) -> np.ndarray:
+        command, underway = np.zeros(2), [np.zeros(2)] * 2
+        squares = np.zeros(2)
+        for mode in modes:
+            residual = mode + underway.pop(0)
+            squares += residual**2
+            command = 0.99 * command - gain * residual
+            underway.append(command)
+        return squares
+
+    stable = GAINS[largest_stable_gain(2) > GAINS]
+    run_through = stable[np.argmin([left(gain) for gain in stable], axis=0)]
+    found = modal_gains(modes, 2, 0.01)
+    assert np.all(np.abs(np.searchsorted(stable, found) - np.searchsorted(stable, run_through)) <= 1)
+    assert found[0] > 1.5 * found[1]

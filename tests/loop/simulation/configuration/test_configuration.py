@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.refusals import refused
+
+from faintspot.base.errors import InputError
+from faintspot.loop.simulation import LoopConfiguration, load_loop, shipped_loops
+
+REGIMES = {
+    "canary",
+    "canary_faint",
+    "emccd",
+    "camera_3e",
+    "laboratory_16e",
+    "window_10",
+    "diffraction_limit",
+    "elongated_3e",
+    "elongated_10e",
+    "open_loop",
+    "eight_metre",
+    "lgs_eight_metre",
+}
+
+
+def test_every_regime_is_shipped() -> None:
+    assert set(shipped_loops()) == REGIMES
+
+
+@pytest.mark.parametrize("name", sorted(REGIMES))
+def test_shipped_configurations_read_and_write(name: str) -> None:
+    loop = load_loop(name)
+    assert loop.name == name
+    assert loop == load_loop(f"{name}.toml")
+    assert LoopConfiguration.from_text(loop.to_text()) == loop
+    assert hash(loop) == hash(load_loop(name))
+    assert loop.run.photons_per_subaperture
+
+
+def test_a_file_goes_before_a_shipped_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("canary.toml").write_text('name = "mine"\n[camera]\nphotons_per_subaperture = 3\n')
+    assert load_loop("canary.toml").name == "mine"
+
+
+def test_flux_by_magnitude() -> None:
+    loop = LoopConfiguration().replace("camera", photons_per_subaperture=None, magnitude=11.0)
+    assert loop.photons == pytest.approx(float(loop.photometry.electrons(11.0)))
+    assert 100 < loop.photons < 500
+
+
+def test_sizes_of_the_default() -> None:
+    loop = LoopConfiguration()
+    assert loop.subaperture_m == pytest.approx(0.6)
+    assert loop.spot_width_px == pytest.approx(2.0)
+
+
+BAD = [
+    ("control", {"delay_frames": -1}, "control.delay_frames = -1"),
+    ("control", {"delay_frames": 0}, "control.delay_frames = 0"),
+    ("control", {"delay_frames": 1.5}, "whole number"),
+    ("control", {"mode": "ajar"}, "control.mode"),
+    ("telescope", {"diameter_m": 0.0}, "telescope.diameter_m"),
+    ("telescope", {"diameter_m": float("nan")}, "telescope.diameter_m"),
+    ("sensor", {"subaperture_m": 5.0}, "telescope.diameter_m = 4.2: expected at least one sub-aperture"),
+    ("sensor", {"subaperture_m": 0.3}, "expected enough to cover"),
+    ("sensor", {"samples": 6}, "sensor.samples = 6: expected at least 9"),
+    ("sensor", {"pixels": 3}, "sensor.pixels"),
+    ("sensor", {"spot_elongation": 8.0}, "sensor.samples"),
+    ("atmosphere", {"fraction": (1.0,)}, "one value for each layer"),
+    ("atmosphere", {"fraction": (0.0, 0.0, 0.0, 0.0)}, "above 0"),
+    ("atmosphere", {"r0_m": (0.2, 0.1)}, "[lowest, highest]"),
+    ("atmosphere", {"wind_speed_m_per_s": 3.0}, "expected a list"),
+    ("camera", {"magnitude": 10.0}, "either photons_per_subaperture or magnitude"),
+    ("camera", {"photons_per_subaperture": None}, "either photons_per_subaperture or magnitude"),
+    ("camera", {"photons_per_subaperture": 0.0}, "camera.photons_per_subaperture"),
+    ("camera", {"band": "Q"}, "band"),
+    ("mirror", {"tip_tilt": "yes"}, "mirror.tip_tilt"),
+    ("run", {"settle_frames": 2000}, "run.settle_frames = 2000"),
+    ("run", {"frame": 3}, "run.frame: unknown key; did you mean frames?"),
+    ("engine", {}, "unknown section"),
+]
+
+
+@pytest.mark.parametrize(("section", "values", "message"), BAD)
+def test_impossible_values_are_refused_in_one_line(
+    section: str, values: dict[str, Any], message: str
+) -> None:
+    with refused(message):
+        LoopConfiguration().replace(section, **values)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[telescop]", "telescop: unknown table; did you mean telescope?"),
+        ("[sensor]\npixel = 3", "sensor.pixel: unknown key; did you mean pixels?"),
+        ("sensor = 3", "expected a table"),
+        ("[sensor", "not a TOML file"),
+        ('name = ""', "name"),
+    ],
+)
+def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "loop.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_loop(path)
+    assert message in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_names_what_is_shipped() -> None:
+    with pytest.raises(InputError, match=r"no such file.*canary"):
+        load_loop("nothing.toml")
+
+
+def test_a_folder_of_results_does_not_hide_a_shipped_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "canary").mkdir()
+    assert load_loop("canary").name == "canary"
+
+
+def test_slowed_loops_are_the_same_in_frames() -> None:
+    loop = LoopConfiguration()
+    slowed = loop.slowed_to(loop.control.frame_rate_hz / 5)
+    for speed, before in zip(
+        slowed.atmosphere.wind_speed_m_per_s, loop.atmosphere.wind_speed_m_per_s, strict=True
+    ):
+        assert speed / slowed.control.frame_rate_hz == pytest.approx(before / loop.control.frame_rate_hz)
+    assert slowed.photons == loop.photons
+    with pytest.raises(InputError, match="frame_rate_hz"):
+        loop.slowed_to(0.0)

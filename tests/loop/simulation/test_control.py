@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.experiments.experiment_cases import small
+
+import faintspot as fs
+from faintspot.base.errors import InputError
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, NOISE_SCALE, method_kind
+from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR
+from faintspot.loop.simulation import LoopConfiguration, Method, simulate_loop
+from faintspot.loop.simulation.control import learnt_control, telemetry_of
+from faintspot.loop.simulation.methods import PRIOR
+from faintspot.loop.simulation.simulation import DisabledErrors
+from faintspot.loop.simulation.telescope.model import prepare
+
+LEARNT = [kind for kind in CONTROLS if kind != INTEGRATOR]
+FAINT = (
+    small()
+    .replace("camera", photons_per_subaperture=40.0, read_noise_e=2.0)
+    .replace("control", telemetry_frames=400)
+    .replace("run", frames=300, settle_frames=50)
+)
+MAP = fs.Settings("map", prior_std_px=0.5)
+
+
+def _method(control: str = INTEGRATOR, gain: float = 0.4) -> Method:
+    return Method("map", MAP, gain, predict_prior=True, correct_gain=False, control=control)
+
+
+def test_the_integrator_is_the_recursion() -> None:
+    """To the last bit: every command is the one before and what the reconstructor makes of the slopes."""
+    configuration = FAINT.replace("run", frames=80, settle_frames=20)
+    method = Method("plain", fs.Settings("brightest", keep_brightest=20), gain=0.35)
+    record = simulate_loop(configuration, [method])
+    reconstructor, latest = prepare(configuration).reconstructor, np.zeros(record.commands.shape[1])
+    for frame in range(record.frames - 2):
+        measured = reconstructor(record.slopes_px[frame].astype(np.float64) / record.centroid_gain[0])
+        latest = (1 - 0.01) * latest - 0.35 * measured
+        np.testing.assert_array_equal(record.commands[frame + 2], latest.astype(np.float32))
+
+
+@pytest.mark.parametrize(("assumed", "kinds"), [(1.0, LEARNT), (3.0, ["kalman"])])
+def test_never_below_the_integrator(assumed: float, kinds: list[str]) -> None:
+    """The same slopes on the same air, the integrator's gain the best of three; also with wrong winds.
+
+    Three runs of 250 scored frames: differences are paired, and 0.015 is three of their standard errors.
+    """
+    configuration = FAINT
+    if assumed != 1:
+        wrong = {"assumed_wind_factor": assumed, "assumed_wind_turn_deg": 90.0}
+        configuration = FAINT.replace("control", winds="assumed", **wrong)
+
+    def strehl(method: Method) -> float:
+        return float(
+            np.mean([simulate_loop(configuration, [method], realisation=r).mean_strehl() for r in range(3)])
+        )
+
+    plain = max(strehl(_method(gain=gain)) for gain in (0.2, 0.4, 0.6))
+    for kind in kinds:
+        assert strehl(_method(kind)) > plain - 0.015
+
+
+def test_the_filter_s_certainty_is_the_estimator_s_prior() -> None:
+    method, learnt = learnt_control(FAINT, _method("kalman"), 1, simulate_loop)
+    assert learnt is not None
+    assert learnt.expected_std_px is not None
+    prior = getattr(method.settings, PRIOR)
+    np.testing.assert_allclose(
+        np.square(prior), np.square(learnt.expected_std_px).reshape(2, -1).mean(axis=0)
+    )
+    assert learnt_control(FAINT, _method("kalman"), 1, simulate_loop)[1] is learnt  # learnt once
+    assert learnt_control(FAINT, _method(), 1, simulate_loop)[1] is None
+
+
+def test_telemetry_knows_what_was_expected() -> None:
+    """Of an estimator whose prior is so narrow that it gives nothing else: open-loop slopes are -I latest."""
+    method = replace(_method(), settings=fs.Settings("map", prior_std_px=1e-3))
+    record = simulate_loop(FAINT.replace("run", frames=100, settle_frames=20), [method])
+    telemetry = telemetry_of(record, method)
+    assert np.isfinite(telemetry.open_loop_px).all()
+    assert telemetry.trust.max() < 0.1
+
+
+def test_control_needs_a_closed_loop_and_the_whole_run() -> None:
+    with pytest.raises(InputError, match="expected 'integrator' in open loop"):
+        simulate_loop(FAINT.replace("control", mode="open"), [_method("polc")])
+    with pytest.raises(InputError, match="integrator alone"):
+        simulate_loop(FAINT, [_method(), _method("kalman")], [0] * 30 + [1] * 30)
+    with pytest.raises(InputError, match=r"method.control = 'pid'"):
+        _method("pid")
+
+
+def test_true_slopes_have_no_prior() -> None:
+    short = FAINT.replace("run", frames=60, settle_frames=20)
+    record = simulate_loop(short, [_method("kalman")], disabled_errors=DisabledErrors(true_slopes=True))
+    assert np.isfinite(record.commands).all()
+    assert record.mean_strehl() > 0.5
+
+
+def test_names_of_methods_say_their_control() -> None:
+    for name in ("map+kalman", "brightest+polc", "ml_weighted+modal", "map_predicted+polc"):
+        assert method_kind(name).name == name
+    assert method_kind("map+integrator") == method_kind("map")
+    kind = method_kind("map+kalman")
+    assert kind.is_predicted
+    assert "predictive Kalman filter" in kind.label
+    tuned = kind.tuned(FAINT)
+    assert {LOOP_GAIN, NOISE_SCALE} <= set(tuned)
+    assert PRIOR not in tuned
+    method = kind.method(FAINT, {name: each.first[0] for name, each in tuned.items()})
+    assert (method.control, method.noise_scale) == ("kalman", tuned[NOISE_SCALE].first[0])
+    with pytest.raises(InputError, match="control of the method = 'lqg'"):
+        method_kind("map+lqg")
+
+
+def test_assumed_winds_are_of_the_configuration() -> None:
+    changed = FAINT.replace("control", winds="assumed", assumed_wind_factor=1.5)
+    assert LoopConfiguration.from_text(changed.to_text()).control == changed.control
+    with pytest.raises(InputError, match=r"control\.winds"):
+        FAINT.replace("control", winds="guessed")

@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.loop.simulation.loop_cases import faint, plain
+
+import faintspot as fs
+from faintspot.base.errors import InputError
+from faintspot.loop.simulation import LoopRecord, Method, simulate_loop
+
+pytest.importorskip("hcipy")
+
+
+@pytest.fixture(scope="module")
+def record() -> LoopRecord:
+    return simulate_loop(
+        faint().replace("run", frames=12, settle_frames=4), [plain("a"), plain("b")], [0, 1] * 6
+    )
+
+
+def test_a_record_comes_back_as_it_was(record: LoopRecord, tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    record.save(path)
+    again = LoopRecord.load(path)
+    for item in fields(LoopRecord):
+        old, new = getattr(record, item.name), getattr(again, item.name)
+        assert type(old) is type(new), item.name
+        np.testing.assert_array_equal(old, new)
+        if isinstance(old, np.ndarray):
+            assert old.dtype == new.dtype
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run.npz"]
+
+
+def test_mean_strehl_is_of_scored_frames(record: LoopRecord) -> None:
+    assert record.mean_strehl(1) == pytest.approx(record.strehl[5::2].mean())
+    with pytest.raises(InputError, match="method = 2"):
+        record.mean_strehl(2)
+
+
+def test_files_that_are_no_records_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        LoopRecord.load(tmp_path / "none.npz")
+    text = tmp_path / "text.npz"
+    text.write_text("hello")
+    with pytest.raises(InputError, match="expected a record of a loop"):
+        LoopRecord.load(text)
+    other = tmp_path / "other.npz"
+    np.savez(other, a=1)
+    with pytest.raises(InputError, match="expected a record of a loop"):
+        LoopRecord.load(other)
+
+
+def test_a_place_that_cannot_be_written_is_named(record: LoopRecord, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be written"):
+        record.save(tmp_path / "nowhere" / "run.npz")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"label": ""}, {"settings": None}, {"gain": -1.0}, {"gain": float("nan")}, {"window_pixels": 1}],
+)
+def test_bad_methods_are_refused(values: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=r"method\."):
+        Method(**{"label": "a", "settings": fs.Settings("brightest"), **values})

@@ -1,0 +1,217 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tests.loop.simulation.loop_cases import PLAIN, expected_variance, faint, plain, quiet
+
+import faintspot as fs
+from faintspot.base.errors import InputError
+from faintspot.loop.simulation import LoopRecord, Method, load_loop, simulate_loop
+from faintspot.loop.simulation.simulation import measure_gains
+from faintspot.loop.simulation.telescope.atmosphere import make_atmosphere
+from faintspot.loop.simulation.telescope.calibration import make_pipeline
+from faintspot.loop.simulation.telescope.mirror import BestFit
+from faintspot.loop.simulation.telescope.model import prepare
+
+pytest.importorskip("hcipy")
+
+
+@pytest.fixture(scope="module")
+def record() -> LoopRecord:
+    return simulate_loop(faint(), [plain()])
+
+
+def test_shapes_and_units(record: LoopRecord) -> None:
+    assert record.slopes_px.shape == (200, 72)
+    assert record.valid.shape == (200, 36)
+    assert record.standard_error_px.shape == (200, 72)
+    assert record.commands.shape == (200, 54)
+    assert record.interaction_matrix.shape == (72, 54)
+    assert record.scored.sum() == 160
+    assert all(np.isfinite(values).all() for values in (record.slopes_px, record.commands, record.strehl))
+    np.testing.assert_array_equal(record.commands[:2], 0)  # two frames of delay
+    assert np.any(record.commands[2])
+
+
+def test_the_loop_closes_and_stays_closed(record: LoopRecord) -> None:
+    """At 200 photons and 1 e-, r0 0.15 m, the H-band Strehl ratio is 0.5 to 0.75."""
+    assert record.strehl[0] < 0.2
+    assert 0.5 < record.mean_strehl() < 0.75
+    assert record.strehl[40:].min() > 0.25
+    assert record.residual_nm[40:].max() < 350
+
+
+def test_runs_repeat_bit_for_bit(record: LoopRecord) -> None:
+    again = simulate_loop(faint(), [plain()])
+    np.testing.assert_array_equal(again.slopes_px, record.slopes_px)
+    np.testing.assert_array_equal(again.strehl, record.strehl)
+
+
+def test_methods_see_the_same_atmosphere_and_photons(record: LoopRecord) -> None:
+    both = [plain(), Method("tv", fs.Settings(noise_std=1.0, keep_brightest=80))]
+    schedule = np.repeat([0, 1], 100)
+    mixed = simulate_loop(faint(), both, schedule)
+    np.testing.assert_array_equal(mixed.slopes_px[:100], record.slopes_px[:100])
+    np.testing.assert_array_equal(mixed.strehl[:102], record.strehl[:102])  # commands act two frames later
+    assert not np.array_equal(mixed.slopes_px[100], record.slopes_px[100])
+    assert mixed.mean_strehl(1) == pytest.approx(mixed.strehl[100:].mean())
+    assert mixed.labels == ("plain", "tv")
+
+
+def test_realisations_differ(record: LoopRecord) -> None:
+    other = simulate_loop(faint().replace("run", frames=5, settle_frames=1), [plain()], realisation=1)
+    assert not np.array_equal(other.strehl[:5], record.strehl[:5])
+
+
+def test_slopes_follow_the_interaction_matrix() -> None:
+    """Pseudo-open loop: residual slopes are those of the air plus those of the mirror.
+
+    With true slopes; the interaction matrix is measured by centres of gravity, which differ by a few
+    per cent from the mean gradient in partly lit sub-apertures.
+    """
+    loop = quiet().replace("run", frames=60)
+    record = simulate_loop(loop, [Method("true", PLAIN, true_slopes=True)], seed=4)
+    atmosphere, sensor = make_atmosphere(loop, 4), prepare(loop).sensor
+    frames = np.arange(20, 60)
+    expected = np.array([sensor.mean_slopes_px(atmosphere.wavefront_nm((k + 0.5) / 250)) for k in frames])
+    open_loop = record.slopes_px[frames] - record.commands[frames] @ record.interaction_matrix.T
+    assert np.std(open_loop - expected) < 0.02 * np.std(expected)
+
+
+def test_noise_free_loop_lies_between_fitting_error_and_its_budget() -> None:
+    """Never better than the best fit; worse by servo lag and aliasing.
+
+    Lag: the mirror fits the wavefront of 2 frames and a little earlier, so the difference of wavefronts 1 to
+    6 frames apart brackets it (an integrator of gain 0.5 lags like a pure delay of 2 + 1 / 0.5 frames).
+    Aliasing adds up to 0.4 of the fitting variance (Rigaut, Veran & Lai 1998, SPIE 3353, 1038).
+    """
+    loop = quiet()
+    record = simulate_loop(loop, [Method("true", PLAIN, true_slopes=True, gain=0.5)])
+    optics, atmosphere = prepare(loop), make_atmosphere(loop, loop.run.seed)
+    fit = BestFit.of(optics.mirror, optics.pupil)
+    fitting, lag = [], []
+    for frame in range(40, 200, 5):
+        now, before, long_before = (atmosphere.wavefront_nm((frame + 0.5 - late) / 250) for late in (0, 1, 6))
+        left = fit.residual(now)
+        fitting.append(optics.pupil.rms(left) ** 2)
+        lag.append(
+            [optics.pupil.rms(now - old - fit.residual(now - old)) ** 2 for old in (before, long_before)]
+        )
+    low, high = np.mean(lag, axis=0)
+    variance = np.mean(record.residual_nm[40:] ** 2)
+    assert np.mean(fitting) + low < variance < 1.4 * np.mean(fitting) + high
+    marechal = np.exp(-variance * (2 * np.pi / 1650) ** 2)
+    assert record.mean_strehl() == pytest.approx(marechal, abs=0.02)
+
+
+def test_without_correction_the_strehl_is_that_of_theory() -> None:
+    """Weak turbulence, r0 1.2 m: exp(-variance), the variance from the von Karman structure function.
+
+    Three realisations of 150 independent wavefronts: the variance scatters by 15 %.
+    """
+    loop = quiet().replace("atmosphere", r0_m=1.2).replace("control", gain=0.0, frame_rate_hz=5.0)
+    loop = loop.replace("run", frames=150, settle_frames=0)
+    optics = prepare(loop)
+    method = Method("none", PLAIN, true_slopes=True)
+    records = [simulate_loop(loop, [method], realisation=number) for number in range(3)]
+    variance = np.mean([record.residual_nm**2 for record in records]) * (2 * np.pi / 500) ** 2
+    expected = expected_variance(optics.pupil.amplitude, optics.pupil.spacing_m, 1.2, 25.0)
+    assert variance == pytest.approx(expected, rel=0.2)
+    strehl = np.mean([record.mean_strehl() for record in records])
+    assert strehl == pytest.approx(np.exp(-expected * (500 / 1650) ** 2), abs=0.04)
+
+
+def test_open_loop_control() -> None:
+    loop = load_loop("open_loop").replace("run", frames=160, settle_frames=40)
+    settings = fs.Settings("brightest", keep_brightest=150)
+    bright = loop.replace("camera", photons_per_subaperture=2000.0)
+    corrected = simulate_loop(bright, [Method("corrected", settings)])
+    not_corrected = simulate_loop(bright, [Method("not", settings, correct_gain=False)])
+    assert corrected.mean_strehl() > 0.5
+    assert corrected.mean_strehl() > not_corrected.mean_strehl()
+    assert not corrected.closed
+    # The sensor sees the whole wavefront: slopes do not shrink when the mirror acts.
+    assert np.std(corrected.slopes_px[100:]) > 0.7 * np.std(corrected.slopes_px[:3])
+
+
+def test_centroid_gain_falls_with_noise_and_brightest_pixels() -> None:
+    loop, gains = faint(), []
+    for photons, noise, kept in ((1e5, 0.0, 255), (200.0, 1.0, 80), (200.0, 3.0, 20)):
+        camera = {"photons_per_subaperture": photons, "read_noise_e": noise}
+        case = loop.replace("camera", **camera)
+        method = Method("k", fs.Settings("brightest", keep_brightest=kept))
+        pipeline = make_pipeline(case, prepare(case).sensor, method)
+        gains.append(measure_gains(case, [pipeline], seed=1)[0])
+    assert gains[0] == pytest.approx(0.93, abs=0.06)  # wings beyond the window
+    assert gains[0] > gains[1] > gains[2] > 0.05
+
+
+def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
+    loop = faint().replace("camera", read_noise_e=3.0, photons_per_subaperture=400.0)
+    settings = fs.Settings("brightest", keep_brightest=80)
+    corrected, not_corrected = (
+        simulate_loop(loop, [Method("k", settings, gain=0.3, correct_gain=flag)]) for flag in (True, False)
+    )
+    assert corrected.centroid_gain[0] < 0.8
+    assert corrected.mean_strehl() > not_corrected.mean_strehl()
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        Method(
+            "ml", fs.Settings(estimator="ml", search_range_px=4, model_error=0.3), weighted_reconstructor=True
+        ),
+        Method("map", fs.Settings(estimator="map", prior_std_px=1.0, model_error=0.3), predict_prior=True),
+        Method("weighted", fs.Settings(estimator="weighted", search_range_px=4)),
+        Method("smoothed", fs.Settings(estimator="smoothed", keep_brightest=80)),
+        Method("window", fs.Settings("brightest", keep_brightest=50), window_pixels=10),
+        Method("auto", fs.Settings(noise_std="auto", keep_brightest="auto")),
+    ],
+    ids=lambda method: method.label,
+)
+def test_every_kind_of_method_closes_the_loop(method: Method) -> None:
+    loop = load_loop("diffraction_limit").replace("run", frames=100, settle_frames=40)
+    record = simulate_loop(loop.replace("camera", photons_per_subaperture=400.0), [method])
+    assert record.mean_strehl() > 0.3
+
+
+def test_invalid_sub_apertures_do_no_harm() -> None:
+    loop = faint().replace("run", frames=60)
+    method = Method("nothing", fs.Settings(estimator="thresholded", threshold_e=1e6))
+    record = simulate_loop(loop, [method])
+    assert not record.valid.any()
+    np.testing.assert_array_equal(record.commands, 0)
+
+
+@pytest.mark.parametrize(
+    ("methods", "schedule", "message"),
+    [
+        ([], None, "methods"),
+        ([plain()], [0, 1], "schedule = 1"),
+        ([plain()], [[0]], "schedule"),
+        ([plain()] * 2, [0.5], "whole number"),
+        ([Method("wide", PLAIN, window_pixels=20)], [0], "window_pixels = 20"),
+    ],
+)
+def test_impossible_runs_are_refused(methods: list[Method], schedule: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        simulate_loop(faint(), methods, schedule)  # type: ignore[arg-type]
+
+
+def test_more_actuators_than_slopes_can_control_are_refused() -> None:
+    with pytest.raises(InputError, match=r"commands .* are more than 72 slopes"):
+        prepare(quiet().replace("mirror", actuators=12))
+
+
+def test_eight_metres_are_made() -> None:
+    """The optics of a large telescope, with fewer sub-apertures so that it takes seconds."""
+    loop = load_loop("eight_metre").replace("sensor", subapertures=16, pixels=6)
+    assert len(prepare(loop).sensor.layout) > 150
+
+
+def test_progress_is_told() -> None:
+    told: list[tuple[int, int]] = []
+    loop = faint().replace("run", frames=3, settle_frames=0)
+    simulate_loop(loop, [plain()], progress=lambda done, total: told.append((done, total)))
+    assert told == [(1, 3), (2, 3), (3, 3)]

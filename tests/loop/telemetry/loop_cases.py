@@ -1,0 +1,58 @@
+"""A recorded loop whose turbulence, noise, delay and gain are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from tests.loop.control.frozen_flow import frozen_slopes
+
+from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.simulation.configuration.configuration import ARCSEC
+from faintspot.loop.telemetry.recorded_loop import RecordedLoop
+from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+
+RATE_HZ, NOISE_PX, LOOP_GAIN = 250.0, 0.3, 0.35
+CELLS = np.argwhere(np.ones((5, 5)))
+CORNERS = np.argwhere(np.ones((6, 6)))
+AIR = SlopeTurbulence(
+    np.asarray(CELLS[:, ::-1] * 0.6, np.float64),
+    0.6,
+    0.2 * ARCSEC,
+    0.2,
+    25.0,
+    np.array([0.7, 0.3]),
+    np.array([[8.0, 3.0], [-6.0, 14.0]]),
+)
+
+
+@lru_cache(maxsize=4)
+def recorded(delay: int = 2, centroid_gain: float = 1.0, frames: int = 2600) -> RecordedLoop:
+    """Return a loop of an integrator; slopes are bilinear between corners of the sub-apertures."""
+    rng = np.random.default_rng(7)
+    atmosphere = frozen_slopes(AIR, frames, RATE_HZ, rng)
+    apart = CORNERS - CELLS[:, None]
+    inside = ((apart == 0) | (apart == 1)).all(axis=2)
+    interaction = np.vstack([inside * (apart[..., axis] - 0.5) for axis in (1, 0)])
+    matrix = make_reconstructor(interaction).matrix
+    slopes, commands = np.empty_like(atmosphere), np.zeros((frames, len(CORNERS)))
+    for frame in range(frames):
+        held = commands[frame - delay] if frame >= delay else np.zeros(len(CORNERS))
+        noise = NOISE_PX * rng.standard_normal(len(interaction))
+        slopes[frame] = centroid_gain * (atmosphere[frame] + interaction @ held) + noise
+        commands[frame] = 0.99 * commands[frame - 1] - LOOP_GAIN * matrix @ slopes[frame]
+    known = replace(_EMPTY, slopes=slopes[50:], frame=np.arange(50, frames), cells=CELLS)
+    return replace(known, commands=commands[50:], interaction=interaction)
+
+
+_EMPTY = RecordedLoop(
+    "case",
+    np.zeros((1, 50)),
+    np.zeros(1, np.int64),
+    RATE_HZ,
+    "px",
+    CELLS,
+    subaperture_m=0.6,
+    pixel_scale_arcsec=0.2,
+)

@@ -1,0 +1,144 @@
+"""Recordings of loops from files of several formats, and files that are wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.cli.cli_cases import Commands
+from tests.loop.telemetry.loop_cases import CELLS, recorded
+
+from faintspot.base.errors import InputError
+from faintspot.loop.telemetry.recorded_loop import RecordedLoop, read_recorded_loop
+
+WORDS = """
+slope_unit = "px"
+frame_rate_hz = 250
+subaperture_m = 0.6
+pixel_scale_arcsec = 0.2
+"""
+
+
+def arrays() -> dict[str, Any]:
+    loop = recorded()
+    return {"slopes": loop.slopes, "commands": loop.commands, "interaction_matrix": loop.interaction}
+
+
+def same(found: RecordedLoop) -> None:
+    loop = recorded()
+    assert np.allclose(found.slopes, loop.slopes)
+    assert found.commands is not None
+    assert loop.commands is not None
+    assert np.allclose(found.commands, loop.commands)
+    assert np.array_equal(found.cells, CELLS)
+    assert (found.frame_rate_hz, found.subaperture_m, found.pixel_scale_arcsec) == (250.0, 0.6, 0.2)
+
+
+def test_npz_with_words(tmp_path: Path) -> None:
+    np.savez(tmp_path / "night.npz", **arrays())
+    (tmp_path / "system.toml").write_text(WORDS)
+    same(read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml"))
+
+
+def test_toml_that_names_arrays(tmp_path: Path) -> None:
+    """Slopes as CSV in pairs, commands of the opposite sign, times with a gap."""
+    found = arrays()
+    pairs = found["slopes"].reshape(-1, 2, 25).swapaxes(1, 2).reshape(-1, 50)
+    header = ",".join(f"s{number}" for number in range(50))
+    np.savetxt(tmp_path / "slopes.csv", pairs, delimiter=",", header=header, comments="")
+    np.save(tmp_path / "commands.npy", -found["commands"])
+    np.save(tmp_path / "matrix.npy", found["interaction_matrix"])
+    times = np.arange(len(pairs)) / 250
+    times[100:] += 7 / 250
+    np.save(tmp_path / "times.npy", times)
+    names = 'slopes = "slopes.csv"\ncommands = "commands.npy"\ninteraction_matrix = "matrix.npy"\n'
+    (tmp_path / "night.toml").write_text(WORDS + names + 'time_s = "times.npy"\nslope_order = "pairs"\n')
+    loop = read_recorded_loop(tmp_path / "night.toml")
+    same(loop)
+    assert np.flatnonzero(np.diff(loop.frame) > 1).tolist() == [99]
+    assert np.diff(loop.frame).max() == 8
+    assert any("sign" in each for each in loop.remarks)
+
+
+def test_control_matrix_and_mask(tmp_path: Path) -> None:
+    found = arrays()
+    control = np.linalg.pinv(found.pop("interaction_matrix"), rcond=0.03)
+    mask = np.zeros((7, 7))
+    mask[1:6, 1:6] = 1
+    np.savez(tmp_path / "night.npz", **found, control_matrix=control, cells=mask, frame_rate_hz=250.0)
+    (tmp_path / "system.toml").write_text('slope_unit = "arcsec"')
+    loop = read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml")
+    assert loop.interaction is not None
+    assert loop.interaction.shape == (50, 36)
+    assert np.array_equal(loop.cells, CELLS + 1)
+    assert loop.pixel_scale_arcsec == 1.0
+
+
+def test_aot_file(tmp_path: Path) -> None:
+    aotpy = pytest.importorskip("aotpy")
+    found = arrays()
+    mirror = aotpy.DeformableMirror("DM", n_valid_actuators=36, telescope=aotpy.MainTelescope("T"))
+    mirror.telescope.enclosing_diameter = 3.0
+    system = aotpy.AOSystem(ao_mode="SCAO", main_telescope=mirror.telescope)
+    source = aotpy.NaturalGuideStar("S")
+    mask = aotpy.Image("mask", np.arange(25).reshape(5, 5))
+    sensor = aotpy.ShackHartmann("WFS", source=source, n_valid_subapertures=25, subaperture_mask=mask)
+    sensor.measurements = aotpy.Image("slopes", found["slopes"].reshape(-1, 2, 25))
+    sensor.detector = aotpy.Detector("D", pixel_scale=0.2 * np.pi / 180 / 3600)
+    system.sources, system.wavefront_sensors = [source], [sensor]
+    system.wavefront_correctors = [mirror]
+    matrix = found["interaction_matrix"].reshape(2, 25, 36).swapaxes(0, 1)
+    system.loops = [
+        aotpy.ControlLoop(
+            "loop",
+            input_sensor=sensor,
+            commanded_corrector=mirror,
+            commands=aotpy.Image("commands", found["commands"]),
+            interaction_matrix=aotpy.Image("matrix", matrix),
+            framerate=250.0,
+            delay=2.0,
+        )
+    ]
+    system.write_to_file(tmp_path / "night.fits")
+    with pytest.raises(InputError, match="slope_unit: unknown; give it in a TOML file with --system"):
+        read_recorded_loop(tmp_path / "night.fits")
+    (tmp_path / "unit.toml").write_text('slope_unit = "px"')
+    loop = read_recorded_loop(tmp_path / "night.fits", tmp_path / "unit.toml")
+    assert np.allclose(loop.slopes, recorded().slopes)
+    assert loop.delay_frames == 2.0
+    assert loop.subaperture_m == pytest.approx(0.6)
+    assert loop.pixel_scale_arcsec == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"commands": np.zeros((7, 36))}, "commands: expected 2550 frames"),
+        ({"interaction_matrix": np.ones((50, 35))}, r"interaction_matrix: expected shape \(50, 36\)"),
+        ({"slopes": np.zeros((9, 51))}, r"slopes: expected shape \(frames, 2 n\)"),
+        ({"cells": np.zeros((4, 2))}, r"cells: expected shape \(25, 2\)"),
+        ({"time_s": np.zeros(2550)}, "time_s: expected 2550 increasing times"),
+        ({"slope": 1.0}, "did you mean slopes"),
+    ],
+)
+def test_what_is_wrong(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    np.savez(tmp_path / "night.npz", **(arrays() | change))
+    (tmp_path / "system.toml").write_text(WORDS)
+    with pytest.raises(InputError, match=message):
+        read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml")
+
+
+def test_command(tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page and its numbers of 500 frames, from which other choices are not known."""
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("jinja2")
+    monkeypatch.chdir(tmp_path)
+    found = arrays() | {name: arrays()[name][:500] for name in ("slopes", "commands")}
+    np.savez("night.npz", **found)
+    Path("system.toml").write_text(WORDS)
+    run.ok("telemetry", "night.npz", "--system", "system.toml")
+    assert "Other choices of control" in Path("night.html").read_text()
+    assert Path("night.json").stat().st_size > 1000
+    run.refused("telemetry", "absent.npz", naming=("no such file",))

@@ -1,0 +1,196 @@
+"""What a recording of a loop tells: within its errors of a truth that is known, and what it does not tell."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.loop.control.driven import driven, oscillator
+from tests.loop.telemetry.loop_cases import AIR, LOOP_GAIN, NOISE_PX, RATE_HZ, recorded
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER, MODES
+from faintspot.loop.telemetry.measured import Measured
+from faintspot.loop.telemetry.open_loop import open_loop_of
+from faintspot.loop.telemetry.page import page_of_loop
+from faintspot.loop.telemetry.report import LoopReport, report_of_loop
+
+
+@pytest.fixture(scope="module")
+def report() -> LoopReport:
+    """Report of a loop that lost frames 1000 to 1019."""
+    loop = recorded()
+    kept = np.delete(np.arange(len(loop.slopes)), slice(1000, 1020))
+    assert loop.commands is not None
+    return report_of_loop(
+        replace(loop, slopes=loop.slopes[kept], frame=loop.frame[kept], commands=loop.commands[kept])
+    )
+
+
+def value(report: LoopReport, part: str, name: str) -> Measured:
+    return next(each for each in report.parts[part].known if each.name == name)
+
+
+def test_loop_and_frames(report: LoopReport) -> None:
+    assert value(report, "frames", "lost frames").value == 20
+    delay = value(report, "loop", "delay")
+    assert abs(delay.value - 2) < 3 * delay.error < 0.8
+    assert value(report, "loop", "actuators that reached a limit").value == 0
+
+
+def test_noise(report: LoopReport) -> None:
+    """To 5 %: turbulence within two frames is no parabola."""
+    assert value(report, "noise", "noise of a slope").value == pytest.approx(NOISE_PX, rel=0.05)
+    assert report.noise_px is not None
+    assert report.noise_px == pytest.approx(np.full(50, NOISE_PX), rel=0.2)
+
+
+def test_a_fast_vibration_is_no_noise() -> None:
+    """A tip of 90 Hz at 250 frames/s is no parabola within five frames."""
+    loop = recorded()
+    slopes = loop.slopes.copy()
+    slopes[:, :25] += 0.6 * np.sin(2 * np.pi * 90 / RATE_HZ * loop.frame)[:, None]
+    known = LoopDelay(2.0, 0.0, 1.0, 0.0)
+    noise = np.sqrt(open_loop_of(replace(loop, slopes=slopes), known).variance)
+    assert noise == pytest.approx(np.full(50, NOISE_PX), rel=0.2)
+    assert np.sqrt(np.square(noise).mean()) == pytest.approx(NOISE_PX, rel=0.03)
+
+
+def test_turbulence(report: LoopReport) -> None:
+    """Winds to 1 m/s; r0 within three errors, as ten seconds hold few independent wavefronts."""
+    r0 = value(report, "turbulence", "r0 at 500 nm")
+    assert abs(r0.value - AIR.r0_m) < 3 * r0.error < 0.1
+    for number, (x, y) in enumerate(AIR.wind_m_per_s, 1):
+        speed = value(report, "turbulence", f"layer {number}: speed").value
+        direction = math.radians(value(report, "turbulence", f"layer {number}: direction").value)
+        assert speed * math.cos(direction) == pytest.approx(x, abs=1.0)
+        assert speed * math.sin(direction) == pytest.approx(y, abs=1.0)
+
+
+def test_other_choices(report: LoopReport) -> None:
+    """The filter leaves less than the best integrator; an integrator of the loop's gain leaves as much."""
+    found = {each.name: each for each in report.choices if each.name != "integrator"}
+    assert found[FILTER].residual.value < found[BEST].residual.value
+    assert found[MODES].residual.value < found[AS_RUN].residual.value + 3 * found[MODES].residual.error
+    curve = [each for each in report.choices if each.name == "integrator"]
+    like = min(curve, key=lambda each: abs(each.gain - LOOP_GAIN))
+    assert like.residual.value == pytest.approx(found[AS_RUN].residual.value, rel=0.1)
+    assert 0 < found[FILTER].strehl.value < 1
+
+
+def numbers(values: Any) -> Iterator[dict[str, Any]]:
+    """Yield every measured value within plain values."""
+    if isinstance(values, dict):
+        if "low" in values:
+            yield values
+        for each in values.values():
+            yield from numbers(each)
+    elif isinstance(values, list):
+        for each in values:
+            yield from numbers(each)
+
+
+def test_every_number_has_an_interval(report: LoopReport) -> None:
+    plain = json.loads(json.dumps(report.as_values(), allow_nan=False))
+    found = list(numbers(plain))
+    assert len(found) > 40
+    for each in found:
+        assert each["value"] is None or each["low"] <= each["value"] <= each["high"]
+
+
+def test_limits_of_actuators() -> None:
+    loop = recorded()
+    assert loop.commands is not None
+    limit = float(np.quantile(np.abs(loop.commands[:150]), 0.99))
+    rows = slice(0, 150)
+    clipped = np.clip(loop.commands, -limit, limit)[rows]
+    short = replace(loop, slopes=loop.slopes[rows], frame=loop.frame[rows], commands=clipped)
+    given = report_of_loop(replace(short, largest_command=limit))
+    found = value(given, "loop", "actuators that reached a limit")
+    assert found.value == np.count_nonzero((np.abs(loop.commands[rows]) >= limit).any(axis=0))
+
+
+def test_without_commands() -> None:
+    loop = replace(recorded(), commands=None, interaction=None)
+    report = report_of_loop(loop)
+    assert "no commands" in report.parts["turbulence"].missing
+    assert not report.parts["turbulence"].known
+    assert not report.choices
+
+
+def test_open_loop() -> None:
+    """An open loop has no delay; its turbulence is known all the same."""
+    loop = recorded()
+    assert loop.commands is not None
+    assert loop.interaction is not None
+    held = np.zeros_like(loop.slopes)
+    held[2:] = (loop.commands @ loop.interaction.T)[:-2]
+    rows = slice(2, 1202)
+    still = replace(
+        loop, slopes=(loop.slopes - held)[rows], frame=loop.frame[rows], commands=np.zeros((1200, 36))
+    )
+    report = report_of_loop(still)
+    assert "open" in report.parts["loop"].missing
+    assert value(report, "noise", "noise of a slope").value == pytest.approx(NOISE_PX, rel=0.05)
+    assert report.parts["turbulence"].known
+
+
+def test_few_frames() -> None:
+    loop = recorded()
+    assert loop.commands is not None
+    report = report_of_loop(
+        replace(loop, slopes=loop.slopes[:50], frame=loop.frame[:50], commands=loop.commands[:50])
+    )
+    assert all("48 frames" in report.parts[name].missing for name in ("noise", "turbulence", "choices"))
+
+
+def test_large_slopes_not_measured() -> None:
+    """Without the largest third of the slopes the others tell no turbulence."""
+    loop = recorded()
+    large = np.abs(loop.slopes) > np.quantile(np.abs(loop.slopes), 0.67)
+    report = report_of_loop(replace(loop, slopes=np.where(large, np.nan, loop.slopes)))
+    for name in ("turbulence", "vibrations", "spectra", "choices"):
+        assert "33% of the slopes" in report.parts[name].missing
+    assert not report.parts["turbulence"].known
+
+
+def test_constant_slopes() -> None:
+    loop = recorded()
+    with pytest.raises(InputError, match="expected slopes that vary"):
+        report_of_loop(replace(loop, slopes=np.full_like(loop.slopes, 0.1)))
+
+
+def test_a_single_sub_aperture() -> None:
+    """Neither delay, winds nor r0 are known; vibrations and other choices are."""
+    rng = np.random.default_rng(3)
+    frames = 4000
+    moving = [
+        driven(rng, frames, 500.0, 2, oscillator(1.5, 0.5, 1.0), oscillator(20, 0.002, 0.4)) for _ in "xy"
+    ]
+    slopes, commands = 0.3 * rng.standard_normal((frames, 2)), np.zeros((frames, 2))
+    for frame in range(frames):
+        slopes[frame] += np.array(moving)[:, frame] + commands[max(frame - 2, 0)]
+        commands[frame] = commands[frame - 1] - 0.2 * slopes[frame]
+    loop = replace(
+        recorded(),
+        slopes=slopes,
+        frame=np.arange(frames),
+        cells=np.zeros((1, 2), np.int64),
+        commands=commands,
+        interaction=np.eye(2),
+        frame_rate_hz=500.0,
+    )
+    found = report_of_loop(loop)
+    assert math.isnan(value(found, "loop", "delay").value)
+    assert not found.parts["turbulence"].known
+    assert found.parts["turbulence"].missing
+    assert value(found, "vibrations", "frequency of tip").value == pytest.approx(20.0, abs=0.3)
+    left = {each.name: each.residual for each in found.choices}
+    assert left[FILTER].value + left[FILTER].error < left[BEST].value
+    assert "with fitting and aliasing" not in page_of_loop(found)

@@ -1,0 +1,49 @@
+"""Turned and stretched slopes are told from those of wavefronts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.loop.telemetry.loop_cases import recorded
+
+from faintspot.loop.control.identification.layers import Identification
+from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.telemetry.measured import Measured
+from faintspot.loop.telemetry.open_loop import open_loop_of, site_of_loop
+from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
+
+
+def found(change: np.ndarray, missing: float = 0.0) -> list[Measured]:
+    """Return rotation and gain of a loop whose x and y slopes were changed by a matrix (2, 2)."""
+    loop = recorded()
+    assert loop.interaction is not None
+    whole = np.kron(change, np.eye(len(loop.cells)))
+    slopes = loop.slopes @ whole.T
+    slopes[:, np.random.default_rng(1).random(slopes.shape[1]) < missing] = np.nan
+    loop = replace(loop, slopes=slopes, interaction=whole @ loop.interaction)
+    seen = open_loop_of(loop, LoopDelay(2.0, 0.0, 1.0, 0.0))
+    identified = Identification(seen.telemetry, site_of_loop(loop), loop.frame_rate_hz)
+    return recorded_discrepancy(loop, seen, identified.of_winds(np.zeros((1, 2))))
+
+
+@pytest.mark.parametrize(("degrees", "gain", "missing"), [(0.0, 1.0, 0.0), (5.0, 1.0, 0.1), (0.0, 1.2, 0.0)])
+def test_rotation_and_gain(degrees: float, gain: float, missing: float) -> None:
+    angle = np.radians(degrees)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turned, stretched = found(np.diag([gain, 1.0]) @ turn, missing)
+    assert abs(turned.value - degrees) < 3 * turned.error < 2
+    assert abs(stretched.value - gain) < 3 * stretched.error < 0.2
+
+
+def test_too_few_slopes() -> None:
+    """Of a single sub-aperture, all slopes are those of a wavefront."""
+    loop = recorded()
+    slopes = np.full_like(loop.slopes, np.nan)
+    slopes[:, [0, 25]] = loop.slopes[:, [0, 25]]
+    seen = open_loop_of(replace(loop, slopes=slopes), LoopDelay(2.0, 0.0, 1.0, 0.0))
+    identified = Identification(seen.telemetry, site_of_loop(loop), loop.frame_rate_hz)
+    for each in recorded_discrepancy(loop, seen, identified.of_winds(np.zeros((1, 2)))):
+        assert not np.isfinite(each.value)
+        assert "too few" in each.remark

@@ -1,0 +1,177 @@
+"""Read noise and gain of simulated detectors whose values are known, and of a real camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.shared_data import shared_file
+from tests.simulated import frames_of
+
+from faintspot.base.errors import InputError
+from faintspot.slopes.camera.photon_transfer import measure_detector
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.simulate import Detector
+
+CAMERA = Detector(5.0, gain_e_per_adu=2.0, offset_adu=100.0, bits=14)
+MULTIPLYING = Detector(40.0, em_gain=100.0, gain_e_per_adu=20.0, offset_adu=200.0)
+LAYOUT = Layout.grid((6, 6), pixels=16)
+
+
+def recorded(
+    detector: Detector, flux_e: float, *, movement_px: float = 0.0, seed: int = 1, n_frames: int = 40
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Frames of spots that jitter, and dark frames."""
+    rng = np.random.default_rng(seed)
+    still = rng.uniform(-1, 1, (len(LAYOUT), 2))
+    positions = still + movement_px * rng.standard_normal((n_frames, len(LAYOUT), 2))
+    frames, _ = frames_of(LAYOUT, n_frames, flux_e=flux_e, positions=positions, detector=detector, rng=rng)
+    return frames, detector.expose(np.zeros((30, *LAYOUT.frame_shape)), rng)
+
+
+@pytest.mark.parametrize("movement_px", [0.0, 0.05])
+@pytest.mark.parametrize(("detector", "flux_e"), [(CAMERA, 5000.0), (MULTIPLYING, 300.0)])
+def test_darks_and_frames_give_back_the_detector(
+    detector: Detector, flux_e: float, movement_px: float
+) -> None:
+    frames, darks = recorded(detector, flux_e, movement_px=movement_px)
+    found = measure_detector(frames, darks, layout=LAYOUT, em_gain=detector.em_gain)
+    assert found.reliable, found.notes
+    # 9216 pixels and 30 frames: 0.2 % statistical; rounding to whole ADU adds 1/12 ADU^2 to 6.25 (0.7 %).
+    expected = float(np.mean(detector.read_noise_e)) / detector.gain_e_per_adu
+    rounding = 1 / 12 if detector.bits else 0.0
+    assert found.read_noise_adu == pytest.approx(np.sqrt(expected**2 + rounding), rel=0.012)
+    # Standard error 1.5 to 2 %, times 4.
+    assert found.gain_e_per_adu == pytest.approx(detector.gain_e_per_adu, rel=0.08)
+    assert found.gain_e_per_adu_error is not None
+    assert found.gain_e_per_adu_error < 0.03 * detector.gain_e_per_adu
+    assert found.dark_level_adu == pytest.approx(detector.offset_adu, abs=0.05)
+    assert found.read_noise_e == pytest.approx(float(np.mean(detector.read_noise_e)), rel=0.09)
+
+
+def test_the_stated_error_of_the_gain_is_the_scatter() -> None:
+    found = [measure_detector(*recorded(CAMERA, 2000.0, seed=seed, n_frames=20)) for seed in range(8)]
+    gains = np.array([measured.gain_e_per_adu for measured in found], dtype=float)
+    errors = np.array([measured.gain_e_per_adu_error for measured in found], dtype=float)
+    # Eight values: chi-squared of 7 degrees of freedom is below 24.3 and above 0.6 in 99.8 % of cases.
+    assert 0.6 < np.sum(np.square((gains - gains.mean()) / errors)) < 24.3
+    assert abs(gains.mean() - 2.0) < 4 * errors.mean() / np.sqrt(8)
+
+
+def test_without_darks_the_darkest_pixels_serve() -> None:
+    frames, _ = recorded(CAMERA, 5000.0)
+    found = measure_detector(frames, layout=LAYOUT)
+    # The darkest of 9216 pixels lie by a few standard errors of a mean (0.4 ADU) below the level.
+    assert found.dark_level_adu == pytest.approx(100.0, abs=2.0)
+    assert found.read_noise_adu == pytest.approx(2.5, rel=0.05)
+    assert found.gain_e_per_adu == pytest.approx(2.0, rel=0.08)
+    known = measure_detector(frames, dark_level_adu=100.0)
+    assert known.dark_level_adu == 100.0
+    assert known.dark_level_adu_error == 0.0
+    assert "dark level: given" in known.notes
+
+
+def test_hot_pixels_and_a_drifting_level_do_not_matter() -> None:
+    rng = np.random.default_rng(3)
+    hot = [(3, 5, 4000.0), (40, 41, 900.0), (70, 12, 20000.0)]
+    camera = Detector(6.0, gain_e_per_adu=3.0, offset_adu=50.0, hot_pixels=hot)
+    darks = camera.expose(np.zeros((20, 80, 80)), rng) + np.linspace(0, 4, 20)[:, None, None]
+    found = measure_detector(darks=darks)
+    # 6400 pixels, 20 frames: 0.3 % standard error.
+    assert found.read_noise_adu == pytest.approx(2.0, rel=0.015)
+    assert found.dark_level_adu == pytest.approx(52.0, abs=0.1)
+    assert found.gain_e_per_adu is None
+    assert found.read_noise_e is None
+    assert found.reliable
+
+
+def test_flickering_brightness_is_taken_out() -> None:
+    rng = np.random.default_rng(4)
+    y, x = np.indices((64, 64))
+    flux = 100 + 800 * np.exp(-((x % 16 - 7.3) ** 2 + (y % 16 - 8.1) ** 2) / 18)
+    flicker = 1 + 0.1 * rng.standard_normal((50, 1, 1))
+    frames = CAMERA.expose(flux * flicker, rng)
+    found = measure_detector(frames, dark_level_adu=100.0)
+    # 10 % of 900 e- is 90 e-, three times the photon noise, were it left in.
+    assert found.reliable, found.notes
+    assert found.gain_e_per_adu == pytest.approx(2.0, rel=0.08)
+
+
+@pytest.mark.parametrize("movement_px", [0.3, 1.0])
+def test_too_much_movement_is_said(movement_px: float) -> None:
+    frames, darks = recorded(CAMERA, 5000.0, movement_px=movement_px)
+    found = measure_detector(frames, darks, layout=LAYOUT)
+    assert not found.reliable
+    assert "moves too much" in found.notes[-1]
+    assert found.read_noise_adu == pytest.approx(2.5, rel=0.02)
+
+
+def test_flux_too_faint_for_a_gain_is_said() -> None:
+    frames, darks = recorded(CAMERA, 2.0, n_frames=10)
+    found = measure_detector(frames, darks)
+    assert not found.reliable
+    assert "more flux" in found.notes[-1]
+
+
+def test_saturation_is_said_and_a_range_avoids_it() -> None:
+    rng = np.random.default_rng(5)
+    flux = np.tile(np.linspace(50.0, 1500.0, 96), (96, 1))
+    camera = Detector(5.0, gain_e_per_adu=2.0, offset_adu=100.0, full_well_e=1000.0)
+    frames = camera.expose(np.broadcast_to(flux, (40, 96, 96)), rng)
+    assert not measure_detector(frames, dark_level_adu=100.0).reliable
+    found = measure_detector(frames, dark_level_adu=100.0, range_adu=(0.0, 400.0))
+    assert found.reliable, found.notes
+    assert found.gain_e_per_adu == pytest.approx(2.0, rel=0.04)
+
+
+def test_inputs_are_not_changed() -> None:
+    frames, darks = recorded(CAMERA, 500.0, n_frames=5)
+    before = frames.copy(), darks.copy()
+    measure_detector(frames, darks)
+    np.testing.assert_array_equal(frames, before[0])
+    np.testing.assert_array_equal(darks, before[1])
+
+
+def test_constant_frames_give_no_nan() -> None:
+    found = measure_detector(np.full((4, 32, 32), 7.0), np.zeros((4, 32, 32)))
+    assert found.read_noise_adu == 0.0
+    assert found.gain_e_per_adu is None
+    assert not found.reliable
+    assert measure_detector(np.full((4, 32, 32), 7.0)).read_noise_adu == 0.0
+
+
+def test_a_real_camera() -> None:
+    with np.load(shared_file("data/ciao_bench_60x224x224.npz")) as file:
+        frames = file["frames"]
+    layout = Layout.from_frame(frames.mean(axis=0))
+    whole = measure_detector(frames, layout=layout)
+    # Its photon-transfer curve has a bend near 450 ADU: 0.24 ADU below and 0.52 ADU above it per ADU.
+    assert not whole.reliable
+    assert whole.read_noise_adu == pytest.approx(7.9, abs=0.4)
+    bright = measure_detector(frames, layout=layout, range_adu=(500.0, 3000.0))
+    assert bright.reliable, bright.notes
+    assert bright.gain_e_per_adu == pytest.approx(1.9, abs=0.15)
+    faint = measure_detector(frames, layout=layout, range_adu=(0.0, 400.0))
+    assert faint.gain_e_per_adu == pytest.approx(4.2, abs=0.4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({}, "frames, darks"),
+        ({"frames": np.zeros((1, 20, 20))}, "frames"),
+        ({"frames": np.zeros((20, 20))}, "frames"),
+        ({"darks": np.full((3, 20, 20), np.nan)}, "darks"),
+        ({"frames": np.zeros((3, 20, 20)), "darks": np.zeros((3, 20, 21))}, "darks"),
+        ({"frames": np.zeros((3, 20, 20)), "layout": LAYOUT}, "layout"),
+        ({"frames": np.zeros((3, 20, 20)), "em_gain": 0.5}, "em_gain"),
+        ({"frames": np.zeros((3, 20, 20)), "range_adu": (2.0, 1.0)}, "range_adu"),
+        ({"frames": np.zeros((3, 20, 20)), "range_adu": (5.0, 9.0)}, "range_adu"),
+        ({"frames": np.zeros((3, 20, 20)), "dark_level_adu": np.inf}, "dark_level_adu"),
+    ],
+)
+def test_wrong_values_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        measure_detector(**arguments)

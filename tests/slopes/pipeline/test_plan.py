@@ -1,0 +1,181 @@
+"""What an estimator lacks is said in one line; measured flux, configuration files and tables."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.refusals import refused
+from tests.simulated import frames_of
+
+import faintspot as fs
+from faintspot.slopes.estimators import spot_tables
+from faintspot.slopes.pipeline import configuration
+
+LAYOUT = fs.Layout.grid((3, 4), pixels=12)
+NOISE = fs.Calibration(dark=0.0, read_noise_e=1.0)
+
+
+def frames(n: int, flux_e: float, seed: int = 1) -> tuple[Any, Any]:
+    return frames_of(
+        LAYOUT, n, flux_e=flux_e, detector=fs.slopes.simulate.Detector(1.0), rng=np.random.default_rng(seed)
+    )
+
+
+def score() -> fs.TrainedScore:
+    tables = np.random.default_rng(3).normal(0.0, 0.01, (1, 2, 2, 2, 33, 33)).astype(np.float32)
+    return fs.TrainedScore(tables, np.array([50.0, 500.0]), np.full((1, 2, 2), 0.1))
+
+
+class TestWhatIsMissing:
+    @pytest.mark.parametrize("estimator", ["matched", "ml", "map"])
+    def test_psf(self, estimator: str) -> None:
+        with pytest.raises(fs.InputError, match=r"psf: expected a PSF .*learn_psf"):
+            fs.SlopePipeline(LAYOUT, fs.Settings(estimator=estimator), NOISE)
+
+    def test_read_noise(self) -> None:
+        with pytest.raises(fs.InputError, match=r"calibration\.read_noise_e"):
+            fs.SlopePipeline(LAYOUT, fs.Settings(estimator="ml"), psf=fs.PSF.analytic())
+
+    def test_score(self) -> None:
+        with pytest.raises(fs.InputError, match=r"score: expected a TrainedScore .*train_estimator"):
+            fs.SlopePipeline(LAYOUT, fs.Settings(estimator="trained"), NOISE)
+
+    def test_width(self) -> None:
+        with pytest.raises(fs.InputError, match=r"settings\.spot_fwhm_px"):
+            fs.SlopePipeline(LAYOUT, fs.Settings(estimator="weighted"), NOISE)
+        with pytest.raises(fs.InputError, match=r"settings\.spot_fwhm_px"):
+            fs.SlopePipeline(LAYOUT, fs.Settings(noise_std="auto"), NOISE)
+
+    def test_level(self) -> None:
+        with pytest.raises(fs.InputError, match=r"estimator\.threshold_e"):
+            fs.SlopePipeline(LAYOUT, fs.Settings(estimator="thresholded"), NOISE)
+
+    def test_index_of_another_sensor(self) -> None:
+        psf = fs.PSF.analytic(size=[1.0, 1.5], index=[0, 1, 1])
+        with pytest.raises(fs.InputError, match=r"psf.index: expected 12 numbers"):
+            fs.SlopePipeline(LAYOUT, fs.Settings(estimator="ml"), NOISE, psf=psf)
+
+    def test_prior_of_another_shape(self) -> None:
+        pipeline = fs.SlopePipeline(LAYOUT, fs.Settings(estimator="map"), NOISE, psf=fs.PSF.analytic())
+        with pytest.raises(fs.InputError, match=r"prior: expected shape \(12, 2\)"):
+            pipeline(np.zeros(LAYOUT.frame_shape), prior=np.zeros((11, 2)))
+
+
+class TestMeasuredFlux:
+    def test_is_each_frames_own(self) -> None:
+        """Frames measured together and one by one are the same, though their flux differs."""
+        faint, bright = frames(2, 60.0)[0], frames(2, 900.0)[0]
+        both = np.concatenate([faint, bright])
+        settings = fs.Settings(noise_std="auto", keep_brightest="auto", spot_fwhm_px=1.9)
+        pipeline = fs.SlopePipeline(LAYOUT, settings, NOISE)
+        together = pipeline(both)
+        for i, frame in enumerate(both):
+            alone = fs.SlopePipeline(LAYOUT, settings, NOISE)(frame)
+            assert np.array_equal(together.x[i], alone.x)
+            assert np.array_equal(together.flags[i], alone.flags)
+
+    @pytest.mark.parametrize("estimator", ["trained", "map"])
+    def test_is_close_to_the_flux_given(self, estimator: str) -> None:
+        """Of 12 spots of 400 e- the mean flux is known to 3 %, which moves no slope by more than 0.03 px."""
+        frame, _ = frames(1, 400.0)
+        parts: dict[str, Any] = {"psf": fs.PSF.analytic(), "score": score()}
+        measured = fs.SlopePipeline(LAYOUT, fs.Settings(estimator=estimator), NOISE, **parts)(frame[0])
+        given = fs.SlopePipeline(LAYOUT, fs.Settings(estimator=estimator, flux_e=400.0), NOISE, **parts)
+        assert np.abs(measured.x - given(frame[0]).x).max() < 0.03
+
+    @pytest.mark.parametrize("value", [0.0, -1e6, 1e30, np.nan, np.inf])
+    def test_frames_without_sense_are_survived(self, value: float) -> None:
+        frame = np.full(LAYOUT.frame_shape, value, np.float32)
+        for settings in (
+            fs.Settings(noise_std="auto", keep_brightest="auto", spot_fwhm_px=1.9),
+            fs.Settings(estimator="trained"),
+            fs.Settings(estimator="map"),
+        ):
+            slopes = fs.SlopePipeline(LAYOUT, settings, NOISE, psf=fs.PSF.analytic(), score=score())(frame)
+            assert np.isfinite(slopes.vector).all()
+
+
+class TestConfiguration:
+    def test_psf_and_score_come_back(self, tmp_path: Path) -> None:
+        path = tmp_path / "faintspot.toml"
+        psf = fs.PSF.analytic(elongation=2.0, angle_deg=30.0, radius_px=8.0)
+        for item in (LAYOUT, fs.Settings(estimator="ml"), NOISE, psf, score()):
+            configuration.save(path, item)
+        again = configuration.load_all(path)
+        assert again.psf is not None
+        assert np.allclose(again.psf.samples, psf.samples)
+        assert again.score == score()
+        frame = frames(1, 300.0)[0][0]
+        expected = fs.SlopePipeline(LAYOUT, fs.Settings(estimator="ml"), NOISE, psf=psf)(frame)
+        assert np.array_equal(fs.SlopePipeline.from_file(path)(frame).x, expected.x)
+
+    def test_analytic_psf(self, tmp_path: Path) -> None:
+        path = tmp_path / "faintspot.toml"
+        for item in (LAYOUT, fs.Settings(estimator="ml"), NOISE):
+            configuration.save(path, item)
+        with path.open("a") as file:
+            file.write('\n[psf]\nprofile = "gaussian"\nsize = 1.2\n')
+        psf = configuration.load_all(path).psf
+        assert psf is not None
+        assert np.allclose(psf.samples, fs.PSF.analytic("gaussian", size=1.2).samples)
+
+    @pytest.mark.parametrize(
+        ("table", "message"),
+        [
+            ("[psf]\nfile = 3\n", "psf.file: expected the name of a file"),
+            ('[psf]\nfile = "none.npz"\n', "none.npz: no such file"),
+            ('[psf]\nprofile = "gaussian"\nsise = 1.0\n', "psf.sise: unknown key"),
+            ('[psf]\nprofile = "moffat"\n', "expected one of 'diffraction', 'gaussian'"),
+            ('[score]\nfiel = "a.npz"\n', "score.fiel: unknown key"),
+        ],
+    )
+    def test_mistakes(self, tmp_path: Path, table: str, message: str) -> None:
+        path = tmp_path / "faintspot.toml"
+        configuration.save(path, LAYOUT)
+        configuration.save(path, fs.Settings("brightest"))
+        with path.open("a") as file:
+            file.write("\n" + table)
+        with refused(message):
+            configuration.load_all(path)
+
+
+class TestTables:
+    def test_taps_sum_to_one(self) -> None:
+        taps = spot_tables.gaussian_taps(np.array([0.5, 1.3, 3.0]), (16, 16))
+        assert np.allclose(taps[:, 0] + 2 * taps[:, 1:].sum(axis=1), 1.0, atol=1e-6)
+
+    def test_gain_of_gaussian_spots(self) -> None:
+        """A Gaussian weight sees 1 / (1 + (spot / weight)^2) of a displacement of a Gaussian spot.
+
+        The pixel widens the spot; sampled at whole pixels this holds to 1 %.
+        """
+        psf = fs.PSF.analytic("gaussian", size=2.0)
+        spot = float(psf.fwhm_px[0, 0])
+        weight = np.array([3.0, 5.0])
+        both = np.repeat(weight[:, None], 2, axis=1)
+        known = spot_tables.model_of_weights(both, np.full((2, 2), spot), psf, (16, 16), 16)
+        assert np.allclose(known.gain[:, 0], 1.0 + (spot / weight) ** 2, rtol=0.01)
+
+    def test_least_flux_grows_with_noise_and_range(self) -> None:
+        psf = fs.PSF.analytic()
+        by_noise = [spot_tables.least_flux(psf, 0, noise**2, 1.0, 1.0, 16) for noise in (0.1, 1.0, 3.0, 16.0)]
+        assert all(a < b for a, b in itertools.pairwise(by_noise))
+        by_range = [spot_tables.least_flux(psf, 0, 9.0, 1.0, reach, 16) for reach in (1.0, 2.0, 8.0)]
+        assert all(a < b for a, b in itertools.pairwise(by_range))
+
+    def test_posterior_of_known_flux_integrates_the_likelihood(self) -> None:
+        """The table gives the log-likelihood ratio of Poisson pixels of variance v + m."""
+        psf, v, flux = fs.PSF.analytic(), 0.5, 40.0
+        grid, spacing = spot_tables.posterior_grid(1.0, 1.9, (8, 8))
+        made = spot_tables.posterior_tables(
+            psf, np.array([0]), np.array([flux]), np.array([v]), 1.0, grid, spacing, (8, 8), 16
+        )
+        image = np.random.default_rng(2).poisson(psf.images([[0.2, -0.4]], (8, 8), flux)[0])
+        mean = np.maximum(psf.images(grid, (8, 8), flux), 0.0)
+        expected = ((image + v) * np.log((mean + v) / v) - mean).sum(axis=(1, 2))
+        found = (made.tables[0, :, :, :8] * image).sum(axis=(1, 2)) + made.constants[0]
+        assert np.allclose(found, expected, rtol=1e-5, atol=1e-4)

@@ -1,0 +1,175 @@
+"""The report page: complete, self-contained, and honest about what is missing."""
+
+from __future__ import annotations
+
+import base64
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.slopes.recorded.recorded_cases import SETTINGS, Page, sensor, simulated, two_methods
+
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.recorded.report.page import slopes_report
+from faintspot.slopes.recorded.statistics import MeasuredSlopes
+from faintspot.slopes.sensor.layout import Layout
+
+SECTIONS = ["numbers", "frame", "flux", "slopes", "iterations", "jitter", "configuration"]
+
+
+def page_of(of: Layout, frames: Any, true: Any = None, **changes: Any) -> Page:
+    methods, stages = two_methods(of, frames)
+    arguments: dict[str, Any] = {
+        "layout": of,
+        "stages": stages,
+        "truth": true,
+        "title": "A <test> & more",
+        "facts": {"Sources": "frames.fits"},
+        "configurations": {"Configuration": "[settings]\nnoise_std = 0.3 # <b>"},
+    }
+    return Page(slopes_report(methods, **(arguments | changes)))
+
+
+def plain_page(methods: list[MeasuredSlopes], layout: Layout | None) -> Page:
+    """The page of methods alone, without pictures of frames."""
+    configurations = {"Configuration": ""}
+    return Page(
+        slopes_report(methods, layout=layout, stages=None, title="t", facts={}, configurations=configurations)
+    )
+
+
+def test_page_has_all_sections_and_pictures_and_needs_nothing_else() -> None:
+    layout = sensor()
+    page = page_of(layout, *simulated(layout, 6))
+    assert page.ids == SECTIONS
+    for attribute in ("src", "href", "srcset", "data", "action"):
+        for value in page.values(attribute):
+            assert value.startswith(("data:image/png;base64,", "#")), value[:50]
+    assert "script" not in [tag for tag, _ in page.tags]
+    assert "@import" not in page.html
+    assert "url(" not in page.html
+    assert "prefers-color-scheme: dark" in page.html
+    assert "@media print" in page.html
+
+    images = [found for tag, found in page.tags if tag == "img"]
+    assert len(images) == 7
+    for image in images:
+        assert image["alt"]
+        data = base64.b64decode((image["src"] or "").partition(",")[2])
+        assert data.startswith(b"\x89PNG")
+        assert data.endswith(b"IEND\xaeB`\x82")
+    assert [tag for tag, _ in page.tags].count("figcaption") == 7
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_texts_are_escaped_and_numbers_are_those_of_the_methods() -> None:
+    layout = sensor()
+    frames, truth = simulated(layout, 6)
+    page = page_of(layout, frames, truth)
+    assert "A <test> & more" in page.text
+    assert "noise_std = 0.3 # <b>" in page.text
+    assert "frames.fits" in page.text
+    methods = two_methods(layout, frames)[0]
+    assert f"{np.median(methods[0].flux[methods[0].valid]):#.3g}".rstrip(".") + " e-" in page.text
+    errors = (np.abs(methods[0].x - truth[..., 0]) + np.abs(methods[0].y - truth[..., 1])) / 2
+    assert f"{errors.mean():#.4g} ±" in page.text
+    assert "flux gain against 'no TV'" in page.text
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_without_truth_no_slope_error_is_given() -> None:
+    layout = sensor()
+    page = page_of(layout, simulated(layout, 4)[0])
+    assert "slope error R" not in page.text
+    assert "upper bound" in page.text
+
+
+def test_one_frame_says_that_there_is_no_jitter() -> None:
+    layout = sensor()
+    page = page_of(layout, *simulated(layout, 1))
+    assert "There is one frame only: no jitter can be given." in page.text
+    for words in ("valid frames", "jitter (px)", "slope jitter", "Maps of the jitter", "median flux of"):
+        assert words not in page.text
+    assert page.ids == [name for name in SECTIONS if name != "jitter"]
+
+
+@pytest.mark.parametrize("n_frames", [1, 3])
+def test_one_subaperture(n_frames: int) -> None:
+    layout = sensor((1, 1))
+    assert "1 of 8 × 8 px" in page_of(layout, *simulated(layout, n_frames)).text
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_everything_invalid(value: float) -> None:
+    layout = sensor()
+    page = page_of(layout, np.full((3, *layout.frame_shape), value, np.float32), np.zeros((3, 9, 2)))
+    assert "No measurement is valid" in page.text
+    assert "nan" not in page.text.lower().split()
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_one_method_and_hexagonal_layout() -> None:
+    corners = np.array([[0, 2], [0, 12], [9, 7]])
+    layout = Layout((20, 22), (8, 8), corners, geometry="hexagonal", pitch_px=10.0)
+    frames, _ = simulated(layout, 3)
+    method = MeasuredSlopes.of(
+        "no TV", SlopePipeline(layout, SETTINGS.replace(estimator="brightest"))(frames)
+    )
+    page = plain_page([method], layout)
+    text = page.text
+    assert "hexagonal" in text
+    assert "iterations" not in page.ids
+    assert "INFEASIBLE_STRENGTH" not in text
+    assert "no frame was given" in text
+    assert "The configuration of this run is not known." in text
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_without_layout_the_page_says_so() -> None:
+    layout = sensor()
+    page = page_of(layout, simulated(layout, 3)[0], layout=None)
+    assert page.text.count("the layout of the sub-apertures is not known") == 4
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_warnings_say_what_to_do_next() -> None:
+    x = np.zeros((4, 5))
+    flags = np.zeros((4, 5), np.uint8)
+    flags[:, 0] = 1  # NO_FLUX
+    flags[:, 1] = 8  # SATURATED
+    flags[:, 2] = 32  # NOT_CONVERGED
+    method = MeasuredSlopes("TV", x, x, x + 5, flags, x.astype(int) + 7)
+    text = plain_page([method], None).text
+    assert "20.0 % of the measurements had no flux" in text
+    assert "20.0 % of the measurements were saturated" in text
+    assert "raise max_iterations" in text
+    assert "1 of 5 sub-apertures were never valid (no. 0)" in text
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_parts_that_do_not_fit_are_refused_in_one_line() -> None:
+    layout = sensor()
+    frames, truth = simulated(layout, 2)
+    for changes in (
+        {"layout": sensor((2, 2))},
+        {"truth": truth[:1]},
+        {"example_frame": 2},
+        {"stages": {"TV": SlopePipeline(layout, SETTINGS).explain(frames)}},
+    ):
+        with pytest.raises(InputError) as error:
+            page_of(layout, frames, **changes)
+        assert "\n" not in str(error.value)
+    methods = two_methods(layout, frames)[0]
+    for wrong in ([], [methods[0], methods[0]], [methods[0], two_methods(layout, frames[:1])[0][1]]):
+        with pytest.raises(InputError, match="methods: expected"):
+            plain_page(wrong, layout)
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_missing_jinja2_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    layout = sensor((1, 1))
+    with pytest.raises(MissingExtraError, match=r"faintspot\[web\]"):
+        page_of(layout, simulated(layout, 1)[0])

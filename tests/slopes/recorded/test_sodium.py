@@ -1,0 +1,118 @@
+"""Sodium profile of recorded frames: found from a single layer, written by the command, and reported."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.cli.cli_cases import Commands
+from tests.slopes.recorded.recorded_cases import Page
+
+import faintspot as fs
+from faintspot.base.errors import InputError
+from faintspot.io import open_frames
+from faintspot.slopes.recorded.report.sodium_section import sodium_sections_of_changes
+from faintspot.slopes.recorded.report.stored import report_of_stored
+from faintspot.slopes.recorded.sodium import sodium_of_frames
+from faintspot.slopes.spots.laser_spots import LaserSpots
+
+LAYOUT = fs.Layout.grid((6, 6), pixels=10, pixel_scale_arcsec=0.5, subaperture_m=1.3)
+LASER = LaserSpots([-5.0, 0.0], 0.8)  # narrower than the spots are
+STAR = replace(LASER.star_of(LAYOUT), spot=fs.PSF.analytic("gaussian", size=1.2))
+TRUE = STAR.focused(fs.SodiumProfile.peaks([86e3, 95e3], [4e3, 3e3], [0.6, 0.4]))
+DARK_ADU, FRAMES = 20.0, 300
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frames whose spots are displaced by up to 0.3 px and move; one pixel is hot."""
+    frames, _ = fs.slopes.simulate.sensor_frames(
+        LAYOUT.corners,
+        LAYOUT.window,
+        LAYOUT.frame_shape,
+        FRAMES,
+        flux_e=200.0,
+        psf=STAR.psf(TRUE),
+        position_range_px=0.3,
+        jitter_px=0.2,
+        detector=fs.slopes.simulate.Detector(1.0, offset_adu=DARK_ADU),
+        rng=np.random.default_rng(1),
+    )
+    frames[:, 14, 25] = 1e4
+    folder = tmp_path_factory.mktemp("sodium")
+    np.save(folder / "frames.npy", frames)
+    return folder
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Commands:
+    return Commands(capsys)
+
+
+def calibration() -> fs.Calibration:
+    return fs.Calibration(DARK_ADU, read_noise_e=1.0, bad_pixels=np.array([[14, 25]]))
+
+
+def test_profile_and_spot_are_found(recording: Path) -> None:
+    """Two peaks from one: 12 % of the flux is elsewhere, of 30 % in the first estimate; the spot to 5 %."""
+    with open_frames([recording / "frames.npy"]) as source:
+        known, places = found = sodium_of_frames(source, LAYOUT, calibration(), LASER)
+    profile = known.fit.profile
+    density = np.interp(TRUE.altitudes_m, profile.altitudes_m, profile.density, 0.0, 0.0)
+    assert 0.5 * np.trapezoid(np.abs(density - TRUE.density), TRUE.altitudes_m) < 0.12
+    motion = 0.2**2
+    width = 0.5 * np.hypot(2.4, 2.355 * np.sqrt(motion))
+    assert known.spot_fwhm_arcsec == pytest.approx(width, rel=0.05)
+    np.testing.assert_allclose(known.fit.flux_e, 200.0, rtol=0.05)
+    # The lattice of the spots, whose displacements are random, is that of the windows.
+    wrong = replace(LAYOUT, centres=1.01 * LAYOUT.centres + 0.5)
+    np.testing.assert_allclose(found.lattice_of(wrong).centres, LAYOUT.centres, atol=0.15)
+    assert np.abs(places).max() < 0.5
+
+
+def test_command_and_report(recording: Path, run: Commands) -> None:
+    """What the command has learnt is what a pipeline of the configuration then knows."""
+    path = recording / "faintspot.toml"
+    for item in (LAYOUT, calibration(), fs.Settings("ml", search_range_px=2.0)):
+        item.save(path)
+    refused = run("sodium", recording / "frames.npy", "--config", path)
+    assert refused.code == 2
+    assert "[laser]" in refused.error
+    done = run(
+        "sodium", recording / "frames.npy", "--config", path, "--launch-m", "-5", "0", "--frames", "200"
+    )
+    assert done.code == 0, done.err
+    assert (recording / "faintspot.sodium.npz").exists()
+    psf = fs.SlopePipeline.from_file(path).spot[0]
+    assert psf is not None
+    assert len(psf.samples) == len(LAYOUT)
+    assert psf.fwhm_px[5, 0] > 1.1 * psf.fwhm_px[0, 0]  # farther from the launch
+    slopes = recording / "slopes.npz"
+    assert run("slopes", recording / "frames.npy", "-c", path, "-o", slopes).code == 0
+    assert "Sodium profile" in " ".join(Page(report_of_stored([slopes])).words)
+
+
+def test_profiles_of_a_recorded_engine() -> None:
+    followed = {
+        "altitude_km": [80.0, 90.0, 100.0],
+        "flux_per_km": [0.0, 0.1, 0.0],
+        "before_per_km": [0.02, 0.08, 0.02],
+        "spot_fwhm_arcsec": 1.2,
+    }
+    changes: list[dict[str, Any]] = [{"changes": {"noise_std": 2.0}}, {"changes": {"sodium": followed}}]
+    (section,) = sodium_sections_of_changes(changes)
+    assert len(section.figures[0].rows) == 6
+    assert sodium_sections_of_changes(changes[:1]) == []
+    assert sodium_sections_of_changes([{"changes": {"sodium": "too long"}}]) == []
+
+
+def test_frames_without_spots_and_a_layout_without_angles_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "none.npy", np.zeros((3, *LAYOUT.frame_shape)))
+    with open_frames([tmp_path / "none.npy"]) as source:
+        with pytest.raises(InputError):
+            sodium_of_frames(source, LAYOUT, fs.Calibration(), LASER)
+        with pytest.raises(InputError, match="pixel_scale_arcsec"):
+            sodium_of_frames(source, replace(LAYOUT, pixel_scale_arcsec=None), fs.Calibration(), LASER)

@@ -1,0 +1,222 @@
+"""Which lenslets are lit, on simulated sensors that differ in all that a finder might take for granted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.refusals import refused
+from tests.slopes.sensor.sensor_cases import spot_frame
+
+from faintspot.slopes.sensor.detection.lenslets import LensletGrid, find_lenslets
+
+RATIOS = {"square": 1j, "hexagonal": np.exp(1j * np.pi / 3)}
+
+
+class Sensor:
+    """An annular pupil on a lattice that fills the frame, and one frame of it."""
+
+    def __init__(
+        self,
+        seed: int,
+        *,
+        geometry: str = "square",
+        pitch_px: float = 20.0,
+        lenslets: int = 12,
+        inner: float = 0.3,
+        spider: float = 0.0,
+        flux_e: float = 2000.0,
+        scatter: float = 0.15,
+        outside: float = 0.0,
+        width: float = 0.07,
+        background_e: float = 20.0,
+        haze_e: float = 0.0,
+        hot_pixels: int = 0,
+        **detector: Any,
+    ) -> None:
+        self.rng = rng = np.random.default_rng(seed)
+        self.size = size = int((lenslets + 3) * pitch_px)
+        self.pitch_px = pitch_px
+        step = pitch_px * np.exp(1j * np.radians(rng.uniform(-20, 20)))
+        count = np.arange(-2 * lenslets, 2 * lenslets + 1)
+        grid = count + count[:, None] * RATIOS[geometry]
+        offset = step * (grid.ravel() + rng.uniform(-0.5, 0.5) + 1j * rng.uniform(-0.5, 0.5))
+        nodes = offset + (1 + 1j) * (size - 1) / 2
+        seen = (np.minimum(nodes.real, nodes.imag) > 2) & (np.maximum(nodes.real, nodes.imag) < size - 3)
+        offset, self.nodes = offset[seen], nodes[seen]
+        radius = np.abs(offset) / (pitch_px * lenslets / 2)
+        self.illuminated = (radius < 1) & (radius > inner)
+        self.illuminated &= np.minimum(np.abs(offset.real), np.abs(offset.imag)) >= spider * pitch_px
+        self.flux_e = flux_e * np.exp(scatter * rng.standard_normal(len(radius)))
+        self.flux_e[~self.illuminated] *= outside
+        self.width_px = max(width * pitch_px, 0.8)
+        margin = 2 * int(np.ceil(4 * self.width_px)) + 2
+        y, x = np.mgrid[-margin : size + margin, -margin : size + margin] - size / 2
+        self.background_e = background_e + haze_e * np.exp(-2 * (x**2 + y**2) / (pitch_px * lenslets) ** 2)
+        self.hot_pixels = hot_pixels
+        self.detector = detector
+        self.seed = seed
+
+    def frame(self) -> NDArray[np.float64]:
+        image = spot_frame(
+            self.nodes,
+            (self.size, self.size),
+            flux_e=self.flux_e,
+            spread_px=0.06 * self.pitch_px,
+            width_px=self.width_px,
+            seed=self.seed,
+            background_e=self.background_e,
+            **self.detector,
+        )
+        row, column = self.rng.integers(0, self.size, (2, self.hot_pixels))
+        image[row, column] += self.rng.uniform(50, 3000, self.hot_pixels)
+        return np.asarray(image)
+
+    def wrong(self, grid: LensletGrid) -> tuple[int, int]:
+        """Return how many lit lenslets are missing, and how many found ones are not lit."""
+        found = grid.centres[:, 0] + 1j * grid.centres[:, 1]
+        near = np.abs(found[:, None] - self.nodes[self.illuminated]) < 0.3 * self.pitch_px
+        return int(np.count_nonzero(~near.any(axis=0))), int(np.count_nonzero(~near.any(axis=1)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        {},
+        {"geometry": "hexagonal"},
+        {"pitch_px": 8.0, "lenslets": 20, "width": 0.11},
+        {"pitch_px": 33.3, "lenslets": 9, "inner": 0.0},
+        {"spider": 0.6},
+        {"geometry": "hexagonal", "spider": 0.6, "lenslets": 16},
+        {"lenslets": 5, "inner": 0.0},
+        {"haze_e": 500.0},
+        {"width": 0.2, "haze_e": 1000.0, "flux_e": 20000.0},
+        {"hot_pixels": 60},
+        {"scatter": 0.5},
+        {"gain_e_per_adu": 5.0, "flux_e": 5000.0},
+        {"gain_e_per_adu": 10.0, "flux_e": 3000.0, "bits": 8, "offset_adu": 0.0, "background_e": 0.0},
+        {"outside": 0.1},
+        {"outside": 0.1, "scatter": 0.4},
+        {"outside": 0.2, "lenslets": 15},
+    ],
+    ids=lambda sensor: ", ".join(f"{name} {value}" for name, value in sensor.items()) or "plain",
+)
+def test_pupil_is_found_whole(sensor: dict[str, Any], seed: int) -> None:
+    """One lenslet in fifty may fall either way: a dim or displaced one at the pupil's edge."""
+    truth = Sensor(seed, **sensor)
+    missing, false = truth.wrong(find_lenslets(truth.frame()))
+    assert missing <= max(1, 0.02 * np.count_nonzero(truth.illuminated))
+    assert false <= max(1, 0.02 * np.count_nonzero(truth.illuminated))
+
+
+@pytest.mark.parametrize("part", [0.2, 0.25, 0.3, 0.4])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_dim_edge_is_taken_or_left_whole(part: float, seed: int) -> None:
+    """Its lenslets scatter by 15 %, and the dividing flux lies where few are."""
+    truth = Sensor(seed, lenslets=14)
+    offset = truth.nodes.real + 0.3 * truth.nodes.imag
+    dim = truth.illuminated & (offset > np.quantile(offset[truth.illuminated], 0.88))
+    truth.flux_e[dim] *= part
+    grid = find_lenslets(truth.frame())
+    found = grid.centres[:, 0] + 1j * grid.centres[:, 1]
+    taken = np.count_nonzero(np.abs(truth.nodes[dim, None] - found).min(axis=1) < 0.3 * truth.pitch_px)
+    count = np.count_nonzero(dim)
+    assert taken <= 0.1 * count or taken >= 0.9 * count or grid.doubt
+    assert taken >= 0.9 * count or part < 0.4
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ghosts_are_left_out(seed: int) -> None:
+    """Four as bright as spots far from the pupil, off the lattice or on it, and four dim ones anywhere."""
+    truth = Sensor(seed, lenslets=12)
+    rng = np.random.default_rng(100 + seed)
+    edge = np.abs(truth.nodes[:, None] - truth.nodes[truth.illuminated]).min(axis=1) / truth.pitch_px
+    far = rng.choice(np.flatnonzero(edge > 1.6), 4, replace=False)
+    dim = rng.choice(np.flatnonzero(~truth.illuminated), 4, replace=False)
+    truth.flux_e[far] = 2000.0
+    truth.flux_e[dim] += 200.0
+    truth.nodes[far[:2]] += 5.0
+    grid = find_lenslets(truth.frame())
+    missing, false = truth.wrong(grid)
+    assert missing <= 1
+    assert false == 0
+
+
+def test_faint_spots_are_doubtful_and_bright_ones_are_not() -> None:
+    assert find_lenslets(Sensor(1).frame()).doubt == ""
+    faint = Sensor(1, lenslets=16, flux_e=100.0)
+    grid = find_lenslets(faint.frame())
+    assert grid.doubt
+    # 100 e- in a spot of 1.4 px over 5.4 e- of noise: 3.7 standard deviations.
+    missing, false = faint.wrong(grid)
+    assert missing < 0.2 * np.count_nonzero(faint.illuminated)
+    assert false < 0.05 * np.count_nonzero(faint.illuminated)
+
+
+def test_two_brightnesses_are_doubtful() -> None:
+    grid = find_lenslets(Sensor(2, outside=0.45).frame())
+    assert grid.doubt
+    assert "\n" not in grid.doubt
+
+
+def test_illuminated_fraction_is_strict_and_of_the_median() -> None:
+    truth = Sensor(3, lenslets=14, scatter=0.4)
+    frame = truth.frame()
+    flux = find_lenslets(frame).flux
+    for part in (0.5, 1.0):
+        chosen = find_lenslets(frame, illuminated_fraction=part).flux
+        # The lattice is fitted to the lenslets that are lit, so that the flux differs a little.
+        np.testing.assert_allclose(np.sort(chosen), np.sort(flux[flux >= part * np.median(flux)]), rtol=0.01)
+    dim = Sensor(3, lenslets=14, outside=0.1)
+    assert len(find_lenslets(dim.frame(), illuminated_fraction=0.03).flux) > 0.95 * len(dim.nodes)
+
+
+def test_pupil_is_taken_as_given() -> None:
+    """Lit or not, within the disk or annulus in pixels."""
+    truth = Sensor(4, lenslets=12, inner=0.4)
+    middle = (truth.size - 1) / 2
+    grid = find_lenslets(truth.frame(), pupil=(middle + 10, middle, 100.0, 30.0))
+    distance = np.hypot(truth.nodes.real - middle - 10, truth.nodes.imag - middle)
+    assert abs(len(grid.cells) - np.count_nonzero((distance <= 100) & (distance >= 30))) <= 3
+    radius = np.hypot(grid.centres[:, 0] - middle - 10, grid.centres[:, 1] - middle)
+    assert radius.max() <= 100
+    assert radius.min() >= 30
+    assert grid.doubt == ""
+    with refused("0 of its lenslets lie in the pupil given"):
+        find_lenslets(truth.frame(), pupil=(-500, 0, 10))
+
+
+def test_region_of_interest() -> None:
+    """Another sensor's spots beside it, on another lattice, do not disturb."""
+    first, second = Sensor(5), Sensor(6, pitch_px=13.0, lenslets=18)
+    frame = np.zeros((max(first.size, second.size), first.size + second.size))
+    frame += np.median(first.frame())
+    frame[: second.size, : second.size] = second.frame()
+    frame[: first.size, second.size :] = first.frame()
+    grid = find_lenslets(frame, roi=(second.size, 0, frame.shape[1], first.size))
+    first.nodes += second.size
+    assert grid.pitch_px == pytest.approx(20.0, rel=0.01)
+    assert max(first.wrong(grid)) <= 1
+
+
+@pytest.mark.parametrize(
+    ("words", "options"),
+    [
+        ("illuminated_fraction = 2", {"illuminated_fraction": 2}),
+        ("pupil: expected x, y, radius", {"pupil": (1, 2)}),
+        ("pupil: expected radius > inner radius", {"pupil": (50, 50, 10, 20)}),
+        ("pupil", {"pupil": "round"}),
+        ("roi: expected x0, y0, x1, y1", {"roi": (1, 2, 3)}),
+        ("roi = 10, 0, 5, 20: expected x0 < x1", {"roi": (10, 0, 5, 20)}),
+        ("within the frame's 60 columns and 50 rows", {"roi": (0, 0, 61, 50)}),
+        ("roi = 0.5", {"roi": (0.5, 0, 10, 10)}),
+        ("pitch_px = 2: expected 4 to", {"pitch_px": 2}),
+        ("pitch_px = 40: expected at most 31.25", {"pitch_px": 40}),
+    ],
+)
+def test_bad_options(words: str, options: dict[str, Any]) -> None:
+    with refused(words):
+        find_lenslets(np.eye(50, 60), **options)

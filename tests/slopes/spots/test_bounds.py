@@ -1,0 +1,269 @@
+"""The Cramer-Rao bound: closed forms, limits, a fit that reaches it; photon efficiency."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from tests.refusals import refused
+
+from faintspot.base.errors import InputError
+from faintspot.slopes.simulate import Detector, spots, subapertures
+from faintspot.slopes.spots.bounds import MEAN_ABSOLUTE, cramer_rao, cramer_rao_covariance, photon_efficiency
+from faintspot.slopes.spots.psf import PSF
+
+PIXEL_VARIANCE = 1 / 12  # of a position within a pixel: widens a well-sampled spot
+GAUSSIAN_STD = 3 / math.sqrt(2 * math.log(2))  # of a "gaussian" spot of size 3
+WIDE: dict[str, Any] = {"profile": "gaussian", "size": 3.0, "shape": (36, 36)}
+
+
+def test_photon_noise_of_a_gaussian_spot() -> None:
+    bound = cramer_rao([50.0, 5000.0], detector=Detector(0.0), **WIDE)
+    std = math.sqrt(GAUSSIAN_STD**2 + PIXEL_VARIANCE)
+    expected = std / np.sqrt([[50.0], [5000.0]])
+    # Well sampled (2.5 px standard deviation): the next order in the pixel's size is below 1e-4.
+    np.testing.assert_allclose(bound, np.broadcast_to(expected, (2, 2)), rtol=1e-3)
+
+
+def test_read_noise_of_a_gaussian_spot() -> None:
+    read_noise, flux = 60.0, 100.0
+    variance = GAUSSIAN_STD**2 + PIXEL_VARIANCE
+    # Sum of squared derivatives: flux^2 / (8 pi std^4).
+    expected = read_noise * math.sqrt(8 * math.pi) * variance / flux
+    bound = cramer_rao(flux, detector=Detector(read_noise), **WIDE)
+    # The photons in the brightest pixel are 2.5 of a variance of 3600.
+    np.testing.assert_allclose(bound, expected, rtol=2e-3)
+
+
+def test_flux_and_background_cost_nothing_for_a_spot_in_the_middle() -> None:
+    free = cramer_rao(100.0, unknown_flux=False, positions=(0.3, -0.6))
+    flux = cramer_rao(100.0, positions=(0.3, -0.6))
+    background = cramer_rao(100.0, positions=(0.3, -0.6), unknown_background=True)
+    assert np.all(free < flux)
+    assert np.all(flux < background)
+    centred = [
+        cramer_rao(100.0, unknown_flux=unknown, unknown_background=unknown) for unknown in (False, True)
+    ]
+    np.testing.assert_allclose(centred[0], centred[1], rtol=1e-9)
+
+
+def test_derivatives_equal_the_differences_at_pixel_edges() -> None:
+    """Fisher information of a sinc^2 spot from the density at the edges of pixels."""
+    x, y, flux, size = 0.37, -0.81, 200.0, 1.3
+    width, edges = 2 * size, np.arange(17) - 8.0
+    image = spots([[x, y]], size=size)[0]
+    image *= flux / spots([[0.0, 0.0]], size=size)[0].sum()
+    along_x = image.sum(axis=0) / image.sum()
+    slope = -np.diff(np.sinc((edges - x) / width) ** 2) / width
+    fractions = spots([[x, y]], size=size, shape=(1001, 16))[0].sum(axis=0)
+    derivative = image * (slope / fractions)
+    information = np.sum(derivative**2 / image)
+    bound = cramer_rao(
+        flux, size=size, positions=(x, y), detector=Detector(0.0), unknown_flux=False, noise="gaussian"
+    )
+    along_y = -np.diff(np.sinc((edges - y) / width) ** 2) / width
+    fractions_y = spots([[x, y]], size=size, shape=(16, 1001))[0].sum(axis=1)
+    derivative_y = image * (along_y / fractions_y)[:, None]
+    cross = np.sum(derivative * derivative_y / image)
+    expected = math.sqrt(1 / (information - cross**2 / np.sum(derivative_y**2 / image)))
+    assert along_x.sum() == pytest.approx(1)
+    # The 1001 px stand for an infinite column: 1e-3 of the flux is beyond, the same in every column.
+    np.testing.assert_allclose(bound[0], expected, rtol=2e-3)
+
+
+def test_exact_and_gaussian_noise_agree_with_much_flux_only() -> None:
+    detector = Detector(1.0)
+    ratio = [
+        float((cramer_rao(f, detector=detector, noise="gaussian") / cramer_rao(f, detector=detector)).mean())
+        for f in (20.0, 1e5)
+    ]
+    assert ratio[0] > 1.03
+    # Dark wings hold a few thousandths of the information even then.
+    assert ratio[1] == pytest.approx(1, abs=5e-3)
+
+
+def fitted(images: NDArray[np.float64], size: float, read_noise: float) -> NDArray[np.float64]:
+    """Maximum likelihood fit of x, y and flux: Fisher scoring from the middle, Gaussian noise model."""
+    step = 0.01
+    where, flux = np.zeros((len(images), 2)), images.sum(axis=(1, 2))
+    for _ in range(8):
+        shape = spots(where, size=size)
+        derivatives = [
+            (spots(where + d, size=size) - spots(where - d, size=size)) / (2 * step) * flux[:, None, None]
+            for d in np.eye(2) * step
+        ]
+        stack = np.stack([*derivatives, shape], axis=1)
+        model = flux[:, None, None] * shape
+        weight = 1 / (model + read_noise**2)
+        information = np.einsum("naij,nbij,nij->nab", stack, stack, weight)
+        score = np.einsum("naij,nij,nij->na", stack, images - model, weight)
+        move = np.linalg.solve(information, score[:, :, None])[:, :, 0]
+        where = where + np.clip(move[:, :2], -0.5, 0.5)
+        flux = np.maximum(flux + move[:, 2], 1.0)
+    return where
+
+
+@pytest.mark.parametrize(("flux", "read_noise"), [(3000.0, 1.0), (2000.0, 8.0)])
+def test_a_maximum_likelihood_fit_reaches_the_bound(flux: float, read_noise: float) -> None:
+    detector = Detector(read_noise)
+    images, truth = subapertures(
+        1500, flux_e=flux, position_range_px=0.5, detector=detector, rng=np.random.default_rng(1)
+    )
+    error = fitted(images.astype(np.float64), 1.0, read_noise) - truth
+    bound = cramer_rao(flux, detector=detector, position_range_px=0.5)
+    # 3,000 errors: 1.3 % on their spread, times 3, and 1 % for what is left of the bias of a finite flux.
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(bound.mean(), rel=0.05)
+    efficiency = photon_efficiency(
+        np.abs(error).mean(), flux, detector=detector, position_range_px=0.5, noise="gaussian"
+    )
+    assert 0.9 < efficiency < 1.1
+
+
+def test_a_multiplication_register_costs_half_the_flux() -> None:
+    counting = cramer_rao(50.0, detector=Detector(0.0), noise="gaussian")
+    multiplied = cramer_rao(100.0, detector=Detector(0.0, em_gain=300.0))
+    np.testing.assert_allclose(multiplied, counting, rtol=1e-6)
+
+
+def test_background_and_read_noise_of_the_detector_count() -> None:
+    plain = cramer_rao(100.0, detector=Detector(1.0))
+    sky = cramer_rao(100.0, detector=Detector(1.0, background_e=2.0, dark_e=1.0))
+    same = cramer_rao(100.0, detector=Detector(2.0), noise="gaussian")
+    assert np.all(plain < sky)
+    # 3 e- of background and 1 e-^2 of read noise are a variance of 4.
+    gaussian = cramer_rao(100.0, detector=Detector(1.0, background_e=2.0, dark_e=1.0), noise="gaussian")
+    np.testing.assert_allclose(gaussian, same, rtol=1e-6)
+    # Converter steps of 1 e- at 1 e- of noise: one twelfth more variance.
+    steps = cramer_rao(100.0, detector=Detector(1.0, bits=16, offset_adu=100.0), noise="gaussian")
+    rounded = cramer_rao(100.0, detector=Detector(math.sqrt(13 / 12)), noise="gaussian")
+    np.testing.assert_allclose(steps, rounded, rtol=1e-6)
+    noisy = np.ones((16, 16))
+    noisy[7:9, 7:9] = 3.0
+    assert np.all(cramer_rao(100.0, detector=Detector(noisy)) > plain)
+
+
+def test_elongation_makes_one_axis_worse() -> None:
+    bound = cramer_rao(100.0, elongation=2.0)
+    assert bound[0] > 1.7 * bound[1]
+    turned = cramer_rao(100.0, elongation=2.0, angle_deg=90.0)
+    np.testing.assert_allclose(turned, bound[::-1], rtol=1e-6)
+    oblique = cramer_rao(100.0, elongation=2.0, angle_deg=45.0, size=1.5)
+    np.testing.assert_allclose(oblique[0], oblique[1], rtol=1e-3)
+
+
+def test_a_range_of_positions_is_the_mean_over_them() -> None:
+    bound = cramer_rao([10.0, 300.0], position_range_px=2.0)
+    random = np.random.default_rng(2).uniform(-2, 2, (400, 2))
+    # 400 positions: the bound varies by 1 % over a pixel.
+    np.testing.assert_allclose(bound, cramer_rao([10.0, 300.0], positions=random), rtol=3e-3)
+    np.testing.assert_allclose(cramer_rao(10.0, position_range_px=0.0), cramer_rao(10.0), rtol=1e-12)
+
+
+def test_a_prior_limits_the_error() -> None:
+    bound = cramer_rao([1e-6, 20.0, 1e6], prior_std_px=0.5)
+    np.testing.assert_allclose(bound[0], 0.5, rtol=1e-4)
+    without = cramer_rao([20.0, 1e6])
+    np.testing.assert_allclose(bound[1], 1 / np.sqrt(1 / without[0] ** 2 + 4), rtol=1e-9)
+    np.testing.assert_allclose(bound[2], without[1], rtol=1e-5)
+
+
+def test_a_spot_that_is_not_in_its_image() -> None:
+    far: dict[str, Any] = {"profile": "gaussian", "positions": (300.0, 0.0)}
+    assert np.all(np.isinf(cramer_rao(10.0, **far)))
+    np.testing.assert_array_equal(cramer_rao(10.0, prior_std_px=0.4, **far), [0.4, 0.4])
+
+
+class Lenslet:
+    """A spot given by its images."""
+
+    def images(self, positions: Any, shape: tuple[int, int], flux_e: Any = 1.0) -> NDArray[np.float64]:
+        return spots(positions, shape=shape, flux_e=7.0 * np.asarray(flux_e), size=1.2)
+
+
+def test_a_spot_given_by_its_images() -> None:
+    bound = cramer_rao([10.0, 500.0], psf=Lenslet(), position_range_px=1.0)
+    np.testing.assert_allclose(bound, cramer_rao([10.0, 500.0], size=1.2, position_range_px=1.0), rtol=1e-6)
+
+
+class Undershooting(Lenslet):
+    """A spot whose dark wings are negative, as learnt ones are."""
+
+    def images(self, positions: Any, shape: tuple[int, int], flux_e: Any = 1.0) -> NDArray[np.float64]:
+        image = super().images(positions, shape, flux_e)
+        lowered: NDArray[np.float64] = image - 2e-3 * image.max()
+        return lowered
+
+
+def test_negative_wings_tell_nothing() -> None:
+    bound = cramer_rao([10.0, 500.0], psf=Undershooting(), detector=Detector(0.0))
+    positive = cramer_rao([10.0, 500.0], psf=Lenslet(), detector=Detector(0.0))
+    # A part of the wings is lost, and its information with it.
+    np.testing.assert_allclose(bound, positive, rtol=0.2)
+
+
+@settings(max_examples=20, deadline=None)
+@given(flux=st.floats(1, 1e4), read_noise=st.sampled_from([0.0, 0.1, 1.0, 3.0]), share=st.floats(0.1, 1))
+def test_efficiency_is_the_share_of_flux_needed(flux: float, read_noise: float, share: float) -> None:
+    detector = Detector(read_noise)
+    error = MEAN_ABSOLUTE * cramer_rao(share * flux, detector=detector).mean()
+    assert photon_efficiency(error, flux, detector=detector) == pytest.approx(share, rel=2e-3)
+
+
+def test_efficiencies_of_many_estimators_at_once() -> None:
+    flux = np.array([20.0, 100.0, 3000.0])
+    error = MEAN_ABSOLUTE * cramer_rao(0.7 * flux).mean(axis=-1)
+    np.testing.assert_allclose(photon_efficiency(error, flux), 0.7, rtol=1e-3)
+    np.testing.assert_allclose(
+        photon_efficiency(error[:, None], [10.0, 20.0]), 0.7 * flux[:, None] / [10, 20], rtol=1e-3
+    )
+    # A prior of 0.1 px alone has R = 0.08.
+    assert photon_efficiency(0.09, 100.0, prior_std_px=0.1) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"flux_e": 0.0}, "flux_e = 0"),
+        ({"shape": (2, 9)}, "shape"),
+        ({"profile": "moffat"}, "profile"),
+        ({"size": 0.0}, "size"),
+        ({"noise": "none"}, "noise"),
+        ({"detector": 3.0}, "detector"),
+        ({"positions": [1.0, 2.0, 3.0]}, "positions"),
+        ({"position_range_px": -1.0}, "position_range_px"),
+        ({"prior_std_px": 0.0}, "prior_std_px"),
+    ],
+)
+def test_wrong_values_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        cramer_rao(**{"flux_e": 10.0, **options})
+
+
+def test_impossible_efficiencies_are_refused() -> None:
+    with pytest.raises(InputError, match="error_px"):
+        photon_efficiency(0.0, 10.0)
+    with pytest.raises(InputError, match="shapes"):
+        photon_efficiency([0.1, 0.2], [1.0, 2.0, 3.0])
+    with pytest.raises(InputError, match="1e-20"):
+        photon_efficiency(1e-20, 10.0)
+
+
+def test_the_covariance_of_elongated_spots_is_that_of_their_axes() -> None:
+    turned = [0.0, 30.0, 90.0]
+    psf = PSF.analytic("gaussian", elongation=[3.0] * 3, angle_deg=turned, radius_px=14, index=[0, 1, 2])
+    detector = Detector(read_noise_e=1.0)
+    found = cramer_rao_covariance([300.0, 300.0, 300.0], psf, (20, 20), detector=detector)
+    expected = cramer_rao(300.0, shape=(20, 20), elongation=3.0, profile="gaussian", detector=detector)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found[0])), expected, rtol=5e-3)
+    cosine, sine = np.cos(np.deg2rad(30.0)), np.sin(np.deg2rad(30.0))
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    # The pixels hardly matter at this width.
+    np.testing.assert_allclose(found[1], turn @ found[0] @ turn.T, rtol=0.02)
+    np.testing.assert_allclose(found[2], found[0][::-1, ::-1], rtol=1e-3, atol=1e-9)
+    with refused():
+        cramer_rao_covariance([1.0, 0.0, 1.0], psf)

@@ -1,0 +1,151 @@
+"""PSFs: analytic ones are those of the simulation, and what is saved comes back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from faintspot.base.errors import InputError
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.shapes import spots
+
+SHAPES: list[dict[str, Any]] = [
+    {"profile": "diffraction"},
+    {"profile": "diffraction", "size": 1.5},
+    {"profile": "gaussian"},
+    {"profile": "gaussian", "size": 1.3, "elongation": 2.0, "angle_deg": 30.0},
+]
+
+
+def analytic(options: dict[str, Any], **more: Any) -> PSF:
+    """Return the PSF of `spots` with these options."""
+    return PSF.analytic(options["profile"], **{k: v for k, v in options.items() if k != "profile"}, **more)
+
+
+@pytest.mark.parametrize("options", SHAPES)
+def test_images_are_those_of_the_simulation(options: dict[str, Any]) -> None:
+    positions = np.random.default_rng(1).uniform(-3, 3, (40, 2))
+    psf = analytic(options, radius_px=20)
+    images, expected = (
+        psf.images(positions, (16, 14), 1000.0),
+        1000 * spots(positions, shape=(16, 14), **options),
+    )
+    # The PSF has all its flux within 20 px; sinc^2 wings leave 2 to 4 % of theirs outside.
+    scale = images.sum() / expected.sum()
+    assert scale == pytest.approx(1.0, abs=0.05)
+    # Cubic splines on eight nodes per pixel.
+    assert np.abs(images / scale - expected).max() < 2e-3 * expected.max()
+
+
+@given(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.5, 1e4))
+@settings(max_examples=25, deadline=None)
+def test_flux_and_position(x: float, y: float, flux: float) -> None:
+    psf = PSF.analytic("gaussian", radius_px=8)
+    image = psf.images(np.array([[x, y]]), (24, 24), flux)[0]
+    u = np.arange(24) - 11.5
+    assert image.sum() == pytest.approx(flux, rel=1e-3)
+    assert (image.sum(axis=0) @ u) / flux == pytest.approx(x, abs=2e-3)
+    assert (image.sum(axis=1) @ u) / flux == pytest.approx(y, abs=2e-3)
+
+
+def test_samples_are_normalised_and_not_mine() -> None:
+    mine = np.ones((7, 9))
+    psf = PSF(mine, 2)
+    assert psf.samples.shape == (1, 7, 9)
+    assert psf.samples.sum() == pytest.approx(4.0)
+    assert mine.sum() == 63
+    with pytest.raises(ValueError, match="read-only"):
+        psf.samples[0, 0, 0] = 2.0
+
+
+def test_widths() -> None:
+    psf = PSF.analytic("gaussian", size=[1.0, 2.0], elongation=[1.0, 1.5], index=[1, 0, 1])
+    # FWHM 2 px x size along y; 1/12 px^2 of variance from the pixel.
+    pixel = 2.3548**2 / 12
+    assert psf.fwhm_px[:, 1] == pytest.approx(np.sqrt([4 + pixel, 16 + pixel]), rel=0.02)
+    assert psf.fwhm_px[1, 0] == pytest.approx(np.sqrt(36 + pixel), rel=0.02)
+    assert psf.index_of(3).tolist() == [1, 0, 1]
+    assert PSF.analytic().index_of(4).tolist() == [0] * 4
+    with pytest.raises(InputError, match="one per sub-aperture"):
+        psf.index_of(4)
+
+
+def test_blurred() -> None:
+    psf = PSF.analytic("gaussian", radius_px=12)
+    wider = psf.blurred(1.0)
+    before, after = (p.fwhm_px[0, 0] / 2.3548 for p in (psf, wider))
+    assert after**2 - before**2 == pytest.approx(1.0, rel=0.03)
+    assert np.allclose(psf.blurred(0.0).samples, psf.samples)
+    with pytest.raises(InputError, match="std_px"):
+        psf.blurred(-1.0)
+
+
+@pytest.mark.parametrize(("options", "rank"), [(SHAPES[0], 1), (SHAPES[2], 1), (SHAPES[3], 5)])
+def test_separable_terms(options: dict[str, Any], rank: int) -> None:
+    psf = analytic(options, radius_px=10)
+    along_x, along_y = psf.separable_terms
+    assert along_x.shape[1] == along_y.shape[1] <= rank
+    assert rank == 1 or along_x.shape[1] > 1
+    product = np.einsum("krc,krd->kcd", along_y, along_x)
+    assert np.abs(product - psf.samples).max() < 2.1e-3 * psf.samples.max()
+
+
+def test_saved_and_loaded(tmp_path: Path) -> None:
+    psf = PSF.analytic("gaussian", size=[1.0, 2.0], index=[1, 0, 1], radius_px=6)
+    psf.save(tmp_path / "psf.npz")
+    back = PSF.load(tmp_path / "psf.npz")
+    assert np.allclose(back.samples, psf.samples, rtol=1e-12)
+    assert back.oversampling == psf.oversampling
+    assert back.index.tolist() == [1, 0, 1]
+    PSF.analytic(radius_px=6).save(tmp_path / "one.npz")
+    assert PSF.load(tmp_path / "one.npz").index is None
+
+
+def test_files_that_are_no_psf(tmp_path: Path) -> None:
+    (tmp_path / "text.npz").write_text("no")
+    np.savez(tmp_path / "other.npz", a=1)
+    np.savez(tmp_path / "dark.npz", samples=np.zeros((7, 7)), oversampling=2)
+    for name in ("text.npz", "other.npz", "dark.npz", "absent.npz"):
+        with pytest.raises(InputError, match=name) as error:
+            PSF.load(tmp_path / name)
+        assert "\n" not in str(error.value)
+    with pytest.raises(InputError, match="cannot be written"):
+        PSF.analytic(radius_px=4).save(tmp_path / "no" / "psf.npz")
+
+
+@pytest.mark.parametrize(
+    ("samples", "oversampling", "index", "words"),
+    [
+        (np.ones((4, 7)), 2, None, "odd"),
+        (np.ones((3, 7)), 2, None, "at least 5"),
+        (np.ones(7), 2, None, "psf.samples"),
+        (-np.ones((7, 7)), 2, None, "positive"),
+        (np.full((7, 7), np.nan), 2, None, "finite"),
+        (np.full((7, 7), 1e300), 2, None, "psf.samples"),
+        (np.eye(7) - np.eye(7)[::-1] + 1e-12, 2, None, "flux in a pixel"),
+        (np.ones((7, 7)), 0, None, "oversampling"),
+        (np.ones((2, 7, 7)), 2, None, "psf.index"),
+        (np.ones((2, 7, 7)), 2, [0, 2], "psf.index"),
+        (np.ones((2, 7, 7)), 2, [[0, 1]], "psf.index"),
+    ],
+)
+def test_refused_in_one_line(samples: Any, oversampling: int, index: Any, words: str) -> None:
+    with pytest.raises(InputError, match=words) as error:
+        PSF(samples, oversampling, index)
+    assert "\n" not in str(error.value)
+
+
+def test_images_refuse_what_does_not_fit() -> None:
+    psf = PSF.analytic(radius_px=4)
+    for positions, options in (([[np.nan, 0]], {}), ([1.0, 2.0, 3.0], {}), ([[0, 0]], {"which": 1})):
+        with pytest.raises(InputError):
+            psf.images(positions, (8, 8), **options)
+
+
+def test_its_text_is_short() -> None:
+    assert repr(PSF.analytic(radius_px=10.0)) == "PSF(1 of 20.1 x 20.1 px, oversampling 8)"

@@ -1,0 +1,67 @@
+"""Centroid gains from spots that are moved."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import faintspot as fs
+from faintspot.slopes.estimators.built_in.window import Window
+from faintspot.slopes.spots.shapes import spots
+from faintspot.slopes.training import measure_centroid_gain
+
+FRAMES = 2000
+DITHER = 0.3 * np.sin(2 * np.pi * 0.137 * np.arange(FRAMES))
+
+
+def test_gain_and_its_error() -> None:
+    """Of 200 slopes with noise and a slow drift: true gain within the errors, which are the scatter."""
+    rng = np.random.default_rng(1)
+    true = rng.uniform(0.4, 1.2, 200)
+    drift = np.cumsum(rng.normal(0.0, 0.01, (FRAMES, 200)), axis=0)
+    slopes = true * DITHER[:, None] + drift + rng.normal(0.0, 0.5, (FRAMES, 200))
+    found = measure_centroid_gain(slopes, np.stack([DITHER, DITHER], axis=1))
+    away = (found.gain.T.ravel() - true) / found.standard_error.T.ravel()
+    assert abs(away.mean()) < 0.25  # 3.5 standard errors of a mean of 200
+    assert 0.85 < away.std() < 1.25  # 20 stretches each know their scatter to 16 %, 200 of them the mean
+
+
+def test_quad_cells() -> None:
+    """A quad cell's slope is that of its halves; spots 1.3 times as wide show by how much less it moves."""
+    pixels = 2
+    layout = fs.Layout.grid((2, 2), pixels=pixels)
+    moved = np.repeat(np.stack([DITHER, DITHER], axis=1)[:, None], 4, axis=1)
+    frames = np.zeros((FRAMES, *layout.frame_shape))
+    wide = spots(moved.reshape(-1, 2), shape=(pixels, pixels), profile="gaussian", size=1.3 * 0.6)
+    for s, (row, column) in enumerate(layout.corners):
+        frames[:, row : row + 2, column : column + 2] = 1e4 * wide.reshape(FRAMES, 4, 2, 2)[:, s]
+    settings = fs.Settings(Window(window_fwhm_px=1e3, normalisation="frame"), spot_fwhm_px=1.2)
+    pipeline = fs.SlopePipeline(layout, settings, fs.Calibration(read_noise_e=1.0))
+    found = measure_centroid_gain(pipeline(frames), np.stack([DITHER, DITHER], axis=1))
+    assert found.gain.max() < 0.95
+    gain = found.gain.mean(axis=1)
+    calibrated = pipeline.with_settings(settings.replace(centroid_gain=gain * prepared_gain(pipeline)))
+    again = measure_centroid_gain(calibrated(frames), np.stack([DITHER, DITHER], axis=1))
+    np.testing.assert_allclose(again.gain, 1.0, atol=1e-3)
+
+
+def prepared_gain(pipeline: fs.SlopePipeline) -> Any:
+    """The gain that the window takes for the spot's given width: what it divides differences by."""
+    prepared: Any = pipeline.plan.prepared
+    return 0.5 / np.abs(prepared.weights.x).max()
+
+
+@pytest.mark.parametrize(
+    ("slopes", "moved", "message"),
+    [
+        (np.zeros((10, 4)), np.zeros((10, 2)), "at least 40 frames"),
+        (np.zeros((50, 3)), np.zeros((50, 2)), "n_frames, 2 n"),
+        (np.zeros((50, 4)), np.zeros((50, 3)), "displacement_px: expected shape"),
+        (np.zeros((50, 4)), np.zeros((50, 2)), "expected all spots to move"),
+    ],
+)
+def test_what_is_refused(slopes: Any, moved: Any, message: str) -> None:
+    with pytest.raises(fs.InputError, match=message):
+        measure_centroid_gain(slopes, moved)
