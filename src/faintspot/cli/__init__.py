@@ -42,6 +42,11 @@ _MODULES = {
 """Modules of commands that are not named after them."""
 
 
+def module_of(name: str) -> str:
+    """Return the name of the module that defines a command."""
+    return f"{__name__}.{_MODULES.get(name, name)}"
+
+
 class _Interrupted(Exception):
     """Ctrl-C, under a name that click does not print anything for."""
 
@@ -57,7 +62,7 @@ class _LazyGroup(Group):
         """Import one command."""
         if name not in _COMMANDS:
             return None
-        command: click.Command = import_module(f"faintspot.cli.{_MODULES.get(name, name)}").command
+        command: click.Command = import_module(module_of(name)).command
         command.name = name  # in the modules all are called "command"
         return command
 
