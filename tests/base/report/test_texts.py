@@ -1,4 +1,4 @@
-"""The texts of pages: each is asked for by a module of its package, with the values that it names."""
+"""The texts of pages: each is asked for by a module that reads its file, with the values that it names."""
 
 from __future__ import annotations
 
@@ -41,8 +41,11 @@ def placeholders(text: object) -> set[str]:
 def asked_for(package: str) -> tuple[tuple[str, frozenset[str] | None], ...]:
     """Return the patterns of names that modules ask for, and the values given with each; None: not known."""
     found: list[tuple[str, frozenset[str] | None]] = []
-    for path in Path(str(files(package))).glob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for path in Path(str(files("faintspot"))).rglob("*.py"):
+        code = path.read_text(encoding="utf-8")
+        if f'Texts("{package}")' not in code:
+            continue
+        for node in ast.walk(ast.parse(code)):
             if isinstance(node, ast.Subscript) and re.match(r"_TEXT$|Texts\(", ast.unparse(node.value)):
                 found += [(name, None) for name in names(node.slice)]
             elif isinstance(node, ast.Call) and re.match(r"_TEXT(\.\w+)?$", ast.unparse(node.func)):

@@ -206,7 +206,10 @@ def _given(
             f"{first}: sensor {sensor.name!r}: expected its sub-apertures (subaperture_mask, mask_offsets, "
             f"subaperture_size), found none; give [layout] in {path}"
         )
-    layout = Layout(**sensor.layout)
+    try:
+        layout = Layout(**sensor.layout)
+    except InputError as error:
+        raise InputError(f"{first}: sensor {sensor.name!r}: {error}") from None
     words = ["sub-apertures", *(["reference slopes"] if sensor.reference is not None else [])]
     document = dict(sensor.tables)
     if not Path(path).exists() and not document:
