@@ -18,7 +18,7 @@ LAYOUT = Layout.grid((2, 2), pixels=8)
 SETTINGS = Settings("tv", noise_std=3.0, keep_brightest=20)
 _MEASURE = """
 import json
-from tests.kernels import test_target as here
+from tests.slopes.kernels.compilation import test_target as here
 from faintspot.slopes.kernels.compilation.host import lanes_for
 from faintspot.slopes.kernels.compilation.target import vector_registers
 target, width = here.compile_target(), lanes_for("float32").width
