@@ -28,7 +28,7 @@ _COMMANDS = {
     "slopes": "Measure slopes from recorded frames.",
     "sodium": "Learn the sodium profile of a laser guide star from frames.",
     "study": "Measure the slope error by Monte-Carlo simulation.",
-    "telemetry": "Report noise, turbulence, vibrations and control of a recorded loop.",
+    "telemetry": "Report noise, turbulence, vibrations and control of a recorded or running loop.",
     "tune": "Recommend an estimator and settings for a camera and a star.",
     "wavefront": "Fit Zernike modes to slopes, and draw the wavefront.",
 }
