@@ -55,8 +55,6 @@ def test_everything_imports_and_what_is_not_real_time_works(tmp_path: Path) -> N
     assert done.stderr.splitlines()[-1] == "faintspot: error: faintspot realtime run needs Linux"
     assert done.returncode == 2
     assert int(done.stdout.split()[0]) > 400  # modules
-    assert "no /dev/shm" in done.stdout
-    assert "no real-time scheduling" in done.stdout
     assert "cannot be found out" not in done.stdout
     assert_equal(tmp_path / "slopes.zarr", expected(frames))
     assert (tmp_path / "tuned.toml").exists()

@@ -17,7 +17,7 @@ from faintspot.cli.shared.commands import Group
 
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
-    "doctor": "Check the installation and this machine, and say how to add what is missing.",
+    "doctor": "Show versions, extras and processor, and how to add what is missing.",
     "estimators": "List the estimators, or the options of one.",
     "export": "Export settings as files for other controllers.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
