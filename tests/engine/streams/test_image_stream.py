@@ -27,7 +27,6 @@ from faintspot.engine.streams.stream_out import StreamOut
 pyshmem = pytest.importorskip("pyshmem")
 pytestmark = [
     pytest.mark.machine_time("clocks, threads and other processes"),
-    pytest.mark.portable,
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs shared memory as Linux has it"),
 ]
 
