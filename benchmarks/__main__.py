@@ -28,7 +28,6 @@ _ORDER = (
     "realtime",
     "realtime_loop",
     "realtime_guard",
-    "advice",
     "telemetry",
     "recorded_tip_tilt",
     "live_page",

@@ -72,7 +72,6 @@ class TestAgainstOracle:
         case = with_noise_map(random_case(seed, "map", n=2), seed)
         assert_equals_oracle(case, case.measure())
 
-    @pytest.mark.portable
     @given(seed=SEEDS)
     @settings(max_examples=4)
     def test_random_spots_with_a_prior(self, seed: int) -> None:
@@ -95,9 +94,8 @@ class TestAgainstOracle:
     @pytest.mark.parametrize(
         ("width", "estimator"),
         [
-            *(pytest.param(4, name, marks=pytest.mark.portable) for name in QUICK),
+            *product((4, 16), QUICK),
             *product((8,), ("tv", "window", "ml", "trained")),
-            *product((16,), QUICK),
         ],
     )
     def test_any_simd_width(self, estimator: str, width: int) -> None:
@@ -140,7 +138,6 @@ class TestAgainstOracle:
             assert abs(covariance - away_y @ weight @ away_x) < 1e-4 * expected[0] * expected[1]
 
 
-@pytest.mark.portable
 class TestIndependence:
     """Slopes are the same bit by bit."""
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -39,7 +39,7 @@ def test_help_lists_every_command(run: Commands) -> None:
 
 def test_every_option_says_what_it_is_for(run: Commands) -> None:
     for command in COMMANDS:
-        for parameter in importlib.import_module(module_of(command)).command.params:
+        for parameter in import_module(module_of(command)).command.params:
             assert parameter.param_type_name == "argument" or parameter.help, parameter.name
 
 
@@ -113,7 +113,7 @@ def test_errors_of_a_process_of_its_own(tmp_path: Path) -> None:
 def test_help_imports_nothing_heavy() -> None:
     """Help answers at once because nothing slow is imported, which is tested rather than its time."""
     code = (
-        "import sys; from faintspot.cli import module_of, main; main(['--help']);"
+        "import sys; from faintspot.cli import main; main(['--help']);"
         "print(sorted({'numba', 'scipy', 'astropy', 'zarr', 'matplotlib', 'jinja2'} & set(sys.modules)))"
     )
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

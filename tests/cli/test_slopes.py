@@ -19,7 +19,6 @@ zarr = pytest.importorskip("zarr")
 pytestmark = pytest.mark.machine_time("starts other processes")
 
 
-@pytest.mark.portable
 def test_frames_in(folder: Path, run: Commands) -> None:
     frames = simulated()
     fits.PrimaryHDU(frames).writeto(folder / "a.fits.gz")
@@ -29,7 +28,6 @@ def test_frames_in(folder: Path, run: Commands) -> None:
     assert result.out.splitlines()[-1] == "Next: faintspot report slopes.zarr"
 
 
-@pytest.mark.portable
 @pytest.mark.parametrize("name", ["s.zarr", "s.fits", "s.fits.gz", "s.npz", "s.csv", "with space.npz"])
 def test_formats_out(folder: Path, run: Commands, name: str) -> None:
     frames = simulated()

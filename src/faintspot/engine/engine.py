@@ -119,8 +119,6 @@ class Engine:
         self._lost = 0, IN_TIME  # since the last measured frame: their number, and the last one's cause
         self.refused: list[str] = []
         """Parts of the real-time scheduling that were not permitted."""
-        self.advice: list[str] = []
-        """Latest advice, shown in the status."""
         self.learning: dict[str, Any] | None = None
         """Result of the latest learning beside the engine, or the fault that ended it, for the status."""
         self.sodium: dict[str, Any] | None = None
@@ -195,7 +193,6 @@ class Engine:
             "loaded": {name: str(file.path) for name, file in self.estimators.loaded.items()},
             "estimator_fault": self.estimators.fault,
             "not_permitted": list(self.refused),
-            "advice": self.advice,
             "loop": self.loop_status(),
             "learning": self.learning,
             "sodium": self.sodium,

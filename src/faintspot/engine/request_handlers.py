@@ -21,7 +21,6 @@ from faintspot.slopes.training.known_sodium import SODIUM
 LENGTHY = ("set", "interleave", "load", "swap", "unload", "learnt", "spots")
 """Commands that prepare something new and may compile; other commands are answered meanwhile."""
 _USUAL_TURN = 50  # frames
-_MOST_LINES, _LONGEST_LINE = 40, 400  # of advice
 LOOP_ACTIONS = ("status", "open", "close", "gain", "flat")
 
 
@@ -34,7 +33,6 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
         "set": partial(_set, engine),
         "interleave": partial(_interleave, engine),
         "loop": partial(loop_command, engine),
-        "advice": partial(_advise, engine),
         "learnt": partial(_take_learnt, engine),
         "spots": partial(_take_spots, engine),
         "stop": partial(_stop, engine),
@@ -61,14 +59,6 @@ def _interleave(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
 
 def _stop(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     engine.stop()
-    return {}
-
-
-def _advise(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
-    lines = fields.get("lines")
-    if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
-        raise InputError(f"lines = {lines!r:.80}: expected a list of texts")
-    engine.advice = [line[:_LONGEST_LINE] for line in lines[:_MOST_LINES]]
     return {}
 
 

@@ -60,7 +60,7 @@ def is_png(path: Path) -> bool:
     return content.startswith(b"\x89PNG\r\n") and len(content) > 5000
 
 
-@pytest.mark.parametrize("geometry", [pytest.param("square", marks=pytest.mark.portable), "hexagonal"])
+@pytest.mark.parametrize("geometry", ["square", "hexagonal"])
 def test_simulated_frames(folder: Path, run: Commands, geometry: str) -> None:
     """Lattice points within 0.2 px: 3 frames of 49 spots leave 0.01 px, the fit of a common grid less."""
     np.save("a.npy", frames(geometry))
@@ -83,7 +83,6 @@ def test_simulated_frames(folder: Path, run: Commands, geometry: str) -> None:
     assert np.abs(stored.variables["x"]).mean() < 0.2
 
 
-@pytest.mark.portable
 @pytest.mark.usefixtures("no_picture")
 def test_slopes_do_not_depend_on_the_unit_of_the_frames(folder: Path, run: Commands) -> None:
     found, settings = [], []
@@ -107,7 +106,6 @@ def test_gain_goes_into_the_calibration(folder: Path, run: Commands) -> None:
     assert Calibration.load("new.toml") == Calibration(dark=100.0, gain_e_per_adu=2.0)
 
 
-@pytest.mark.portable
 @pytest.mark.usefixtures("no_picture")
 def test_dark_file(folder: Path, run: Commands) -> None:
     dark = np.random.default_rng(2).uniform(50, 150, SHAPE)

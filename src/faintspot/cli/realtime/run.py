@@ -23,7 +23,7 @@ from faintspot.engine.requests.private_socket import socket_path
 @click.command("run", short_help="Measure frames as they arrive and publish their slopes.")
 @configuration_option("Configuration.")
 @name_option("Name of the pixel ring, the streams and the engine.")
-@option("--stream", metavar="NAME", help="Take whole frames from a stream: pyshmem's, isio:NAME or dao:FILE.")
+@option("--stream", metavar="NAME", help="Take whole frames from a stream: pyshmem's, or isio:NAME.")
 @option("--threads", type=click.IntRange(1), default=1, help="Worker threads.")
 @option("--cpus", metavar="LIST", help="Processors to run on, such as 2,3 or 4-7.")
 @option(

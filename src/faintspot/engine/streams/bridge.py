@@ -53,7 +53,7 @@ class StreamBridge:
     Parameters
     ----------
     stream : str
-        Name of the stream, which need not exist yet: NAME (pyshmem), isio:NAME or dao:FILE.
+        Name of the stream, which need not exist yet: NAME (pyshmem) or isio:NAME.
     name : str
         Name of the pixel ring.
     say : function, optional

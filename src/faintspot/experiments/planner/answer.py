@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
-from faintspot.base.notebook import table
 from faintspot.base.statistics import Estimate, SlopeStatistics
 from faintspot.experiments.curves import Curve
 from faintspot.experiments.methods import Knowledge
@@ -134,15 +133,6 @@ class Answer:
             read_noise_e=base.read_noise_e if same_noise else question.read_noise_e,
             background_e=question.background_e,
         )
-
-    def _repr_html_(self) -> str:
-        rows = {"recommended": f"{self.best.method.label} ({settings_in_words(self.best.settings)})"}
-        for result in sorted(self.results, key=lambda each: each.statistics.ranking_rms):
-            rows[result.method.label] = (
-                f"rms {result.statistics.corrected_rms.value:.3g} px, corrected for the gain; "
-                f"R {result.error_px[self.at_star]:.3g} px"
-            )
-        return table(f"Estimators for a star of {self.question.star_flux_e:.4g} e-", rows)
 
     def __getitem__(self, name: str) -> MethodResult:
         """Return the result of an estimator.

@@ -140,11 +140,6 @@ class Layout:
             f"geometry={self.geometry!r}{pitch}>"
         )
 
-    def _repr_html_(self) -> str:
-        from faintspot.base.notebook import windows_picture
-
-        return windows_picture(self.corners, self.window, self.frame_shape)
-
     def __len__(self) -> int:
         """Return the number of sub-apertures."""
         return len(self.corners)

@@ -115,12 +115,6 @@ class PSF(NpzFile):
         of = "" if self.index is None else f" for {len(self.index)} sub-apertures"
         return f"PSF({n} of {size}{of}, oversampling {self.oversampling})"
 
-    def _repr_html_(self) -> str:
-        from faintspot.base.notebook import image_picture
-
-        side = min(max(self.samples.shape[1:]) // self.oversampling, 22) - 1 | 1  # odd
-        return image_picture(self.images([[0.0, 0.0]], (side, side), 1.0)[0], repr(self))
-
     @classmethod
     def analytic(
         cls,

@@ -17,8 +17,6 @@ from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 from faintspot.loop.control.kalman.slope_model import SlopeModel
 
-pytestmark = pytest.mark.portable
-
 M, COMMANDS = INTERACTION.shape
 USUAL_PX2, GAIN, FRAMES = 0.25, 0.4, telemetry(500)
 Both = list[tuple[Any, CommandDelayLine]]

@@ -43,7 +43,6 @@ def strengths_of(stack: Any, fraction: float) -> Any:
 
 
 class TestAgainstOracle:
-    @pytest.mark.portable
     @every_dtype
     @every_algorithm
     @given(images(), fractions, st.sampled_from([1, 2, 7, 40]))
@@ -171,7 +170,6 @@ class TestSolution:
             competitor = g + direction * radius / np.linalg.norm(direction)
             assert naive.total_variation(competitor) >= smallest * (1 - 1e-6)
 
-    @pytest.mark.portable
     @every_algorithm
     def test_reference_cases(self, algorithm: str) -> None:
         cases = np.load(shared_file("reference/tv_cases.npz"))

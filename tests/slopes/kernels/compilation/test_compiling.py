@@ -14,7 +14,6 @@ from faintspot.slopes.kernels.compilation import compiling
 from faintspot.slopes.kernels.compilation.compiling import Direct, allocating, compiled, inlined
 
 pytestmark = [
-    pytest.mark.portable,
     pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
 ]
 

@@ -25,8 +25,6 @@ from faintspot.slopes.kernels.compilation.simd import (
     width_of,
 )
 
-pytestmark = pytest.mark.portable
-
 
 @njit(error_model="numpy")
 def _apply_all(lanes: Any, a: Any, b: Any, results: Any) -> Any:

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 import faintspot as fs
 from faintspot.slopes.kernels.gravity import every_k
 
-pytestmark = pytest.mark.portable
-
 FLOOR = 1e-4
 RULES = {"subtract_next": every_k.SUBTRACT_NEXT, "threshold": every_k.THRESHOLD}
 

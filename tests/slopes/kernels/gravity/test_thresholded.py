@@ -15,8 +15,6 @@ import faintspot as fs
 from faintspot.slopes.kernels.gravity.gravity import gravity_of_groups
 from faintspot.slopes.kernels.gravity.thresholded import thresholded_in_rows
 
-pytestmark = pytest.mark.portable
-
 WINDOWS = [(8, 8), (16, 16), (6, 12), (5, 4)]
 ROUNDING = 2e-5
 """Sums of up to 256 float32 numbers in another order; positions are quotients of two of them, in px."""
