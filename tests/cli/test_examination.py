@@ -25,7 +25,6 @@ NAMES = [
     "processor",
     "cache",
     "threads",
-    "GPU",
     "shared memory",
     "real time",
 ]

@@ -16,8 +16,8 @@ from faintspot.cli.shared.commands import option
 def command(as_json: bool) -> None:
     """Check the installation and this machine, and say how to add what is missing.
 
-    Versions, extras, processor and vector width, folder of compiled kernels, threads, GPU, shared memory and
-    real-time permissions. Nothing of it is an error: most of faintspot needs no extra, GPU or permission. Put
+    Versions, extras, processor and vector width, folder of compiled kernels, threads, shared memory and
+    real-time permissions. Nothing of it is an error: most of faintspot needs no extra and no permission. Put
     its output into a report of a fault.
 
     \b

@@ -41,7 +41,7 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Look at versions, extras, processor, cache, threads, GPU, shared memory and real-time permissions.
+    """Look at versions, extras, processor, cache, threads, shared memory and real-time permissions.
 
     Nothing that it finds, or fails to find out, raises.
 
@@ -61,7 +61,6 @@ def examine() -> list[Finding]:
         ("processor", _processor),
         ("cache", _cache),
         ("threads", _threads),
-        ("GPU", _gpu),
         ("shared memory", _shared_memory),
         ("real time", _real_time),
     )
@@ -152,22 +151,6 @@ def _threads() -> Finding:
     if usable < there:
         advice = "the rest is kept from this process by its affinity (taskset, a scheduler of jobs)"
     return Finding("threads", f"{usable} of {there} processors", advice)
-
-
-def _gpu() -> Finding:
-    from faintspot.base.errors import InputError, MissingExtraError
-    from faintspot.slopes.kernels.cuda.availability import check_cuda, simulated
-
-    try:
-        check_cuda()
-    except (InputError, MissingExtraError) as error:
-        advice = str(error).removeprefix('device="cuda": ')
-        return Finding("GPU", "none that can be used", advice)
-    if simulated():
-        return Finding("GPU", "simulated", "NUMBA_ENABLE_CUDASIM is set: unset it to use a GPU")
-    from numba import cuda
-
-    return Finding("GPU", ", ".join(device.name.decode() for device in cuda.gpus))
 
 
 def _shared_memory() -> Finding:
