@@ -41,7 +41,6 @@ _ORDER = (
     "winds",
     "large_sensors",
     "startup",
-    "gpu",
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
 LONG = {"realtime_sustained", "telemetry", "recorded_tip_tilt", "winds", "large_sensors"}

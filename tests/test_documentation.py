@@ -31,8 +31,6 @@ PAGES = [
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 NOT_RUN = {
-    'device="cuda"': "needs a GPU",
-    "FrameStream": "needs a GPU",
     "import hcipy": "run by the adapter's own tests",
     "adapter.calibrating": "a sketch of what adapters share",
     "import oopao": "run by tests/adapters/test_manual.py",

@@ -70,11 +70,6 @@ def test_preset_goes_before_the_configuration(folder: Path, run: Commands) -> No
     assert_equal(folder / "t.npz", expected(frames))
 
 
-def test_device(folder: Path, run: Commands) -> None:
-    np.save("a.npy", simulated())
-    run.refused("slopes", "a.npy", "-o", "s.npz", "--device", "tpu", naming=("device", "tpu", "cuda"))
-
-
 def test_reference(folder: Path, run: Commands) -> None:
     frames = simulated()
     reference = np.random.default_rng(4).normal(0, 0.3, (16, 2))

@@ -213,14 +213,3 @@ def test_the_terminal_shows_the_status(bench: Bench, monkeypatch: pytest.MonkeyP
     assert f"{mean:.1f}" in next(line for line in text.splitlines() if "iterations a sub-aperture" in line)
     assert "latency p99.9, us" in text
     assert f"process {os.getpid()}, frame 0" in text
-
-
-def test_a_pipeline_on_a_gpu_is_refused_at_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    def on_gpu(settings: fs.Settings) -> fs.SlopePipeline:
-        pipeline = make(settings)
-        monkeypatch.setattr(pipeline, "device", "cuda")
-        monkeypatch.setattr(pipeline, "on_device", object())
-        return pipeline
-
-    with pytest.raises(fs.InputError, match="real-time engine measures on the CPU"):
-        Engine(uuid4().hex, on_gpu, SETTINGS)

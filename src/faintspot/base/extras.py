@@ -15,7 +15,6 @@ EXTRAS = {
     "realtime": ("pyshmem", "aotpy"),
     "live": ("tornado",),
     "loop": ("hcipy",),
-    "gpu": ("numba_cuda",),
     "oopao": ("OOPAO",),
     "specula": ("specula",),
     "soapy": ("soapy",),

@@ -42,7 +42,6 @@ from faintspot.slopes.recorded import Summary, measure_recorded
     help="How much work to do.",
     show_default="as the configuration says",
 )
-@option("--device", default="cpu", help="cpu, or cuda: an NVIDIA GPU (the extra `gpu`).")
 @option(
     "--unit",
     type=click.Choice(UNITS),

@@ -356,12 +356,7 @@ class FramePath:
 
 
 def check_real_time(pipeline: SlopePipeline) -> None:
-    """Refuse a GPU, and settings that need the frame's own flux, which is not known before its last row."""
-    if pipeline.on_device is not None:
-        raise InputError(
-            f"pipeline: device = {pipeline.device!r}, but the real-time engine measures on the CPU; leave "
-            "device out, or measure frames on the GPU with slopes.pipeline.device_stream.FrameStream"
-        )
+    """Refuse settings that need the frame's own flux, which is not known before its last row."""
     if pipeline.needs_flux:
         raise InputError(
             "settings.flux_e: expected the flux (electrons) that a spot has in a frame, got none: in "

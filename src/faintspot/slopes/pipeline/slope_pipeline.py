@@ -8,12 +8,12 @@ import math
 import threading
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from faintspot.base.checks import number_between, numbers_between, one_of, real_array
+from faintspot.base.checks import number_between, numbers_between, real_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator
@@ -31,9 +31,6 @@ from faintspot.slopes.pipeline.small_frames import NO_STAGES, SmallFrames
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.score import Score
-
-if TYPE_CHECKING:
-    from faintspot.slopes.pipeline.device import DevicePipeline
 
 _KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
 _SMALL_TYPES = (np.dtype(np.uint8), *_KERNEL_TYPES)
@@ -62,16 +59,11 @@ class SlopePipeline:
         SIMD width in float32 numbers: 4, 8 or 16. Default: the width of the machine.
     threads : int, optional
         Maximum number of threads. Default: all available processors. Slopes do not depend on it.
-    device : {"cpu", "cuda"}, optional
-        Device on which frames are measured. "cuda" uses an NVIDIA GPU (see `kernels.cuda`), for the
-        estimators that support it; `explain` and real time always use the CPU.
 
     Raises
     ------
     InputError
-        If the parts are inconsistent, or for "cuda" without a GPU.
-    MissingExtraError
-        For "cuda" without the extra `gpu`.
+        If the parts are inconsistent.
 
     Examples
     --------
@@ -99,7 +91,6 @@ class SlopePipeline:
         score: Score | None = None,
         width: int | None = None,
         threads: int | None = None,
-        device: str = "cpu",
     ) -> None:
         self.layout = layout
         self.settings = Settings(settings) if isinstance(settings, Estimator) else settings
@@ -113,8 +104,6 @@ class SlopePipeline:
         self.plan = self._prepared()
         """Settings and tables computed before the first frame."""
         self._identity = _identity(*self._parts)
-        self.device = one_of("device", device, ("cpu", "cuda"))
-        self.on_device = self._device_pipeline() if self.device == "cuda" else None
 
     @classmethod
     def from_file(cls, path: str | Path, **options: Any) -> SlopePipeline:
@@ -126,15 +115,6 @@ class SlopePipeline:
         """Compute the tables for the current SIMD width; forget what was prepared for small frames."""
         self._small = threading.local()
         return Plan(self.layout, self.settings, self.calibration, *self._parts, self._lanes.width)
-
-    def _device_pipeline(self) -> DevicePipeline:
-        """Transfer the tables to the GPU."""
-        from faintspot.slopes.kernels.cuda.availability import check_cuda
-
-        check_cuda()
-        from faintspot.slopes.pipeline.device import DevicePipeline
-
-        return DevicePipeline(self.layout, self.calibration, self.plan)
 
     @property
     def width(self) -> int:
@@ -153,7 +133,6 @@ class SlopePipeline:
         other._lanes = lanes_for(np.float32, width)
         other._calibration = packed_calibration(self.layout, self.calibration, width)
         other.plan = other._prepared()
-        other.on_device = None if self.on_device is None else other._device_pipeline()
         return other
 
     @property
@@ -179,7 +158,6 @@ class SlopePipeline:
             score=score,
             width=self.width,
             threads=self.threads,
-            device=self.device,
         )
 
     def with_flux(self, mean_flux: MeanFlux | ArrayLike) -> SlopePipeline:
@@ -229,7 +207,6 @@ class SlopePipeline:
         )
         other._calibration = packed_calibration(other.layout, other.calibration, self.width)
         other.plan = other._prepared()
-        other.device, other.on_device = "cpu", None
         return other
 
     def _noise_of_images(self) -> Any:
@@ -290,8 +267,7 @@ class SlopePipeline:
         """Return the calling thread's own way to measure frames of a small sensor; None if it is not one."""
         plan, lanes, window = self.plan, self._lanes, self.layout.window
         groups = -(-len(self.layout) // lanes.width)
-        simple = dtype in _SMALL_TYPES and self.on_device is None
-        simple = simple and not (plan.needs_flux or plan.prepared.in_python)
+        simple = dtype in _SMALL_TYPES and not (plan.needs_flux or plan.prepared.in_python)
         if not simple or most_threads(groups, lanes, window, plan.estimator.cost) > 1:
             return None
         frames = np.empty((1, *self.layout.frame_shape), np.float32 if dtype.kind == "f" else np.uint16)
@@ -334,10 +310,6 @@ class SlopePipeline:
             stages = np.empty((STAGE_ROWS, n_frames, n, self.layout.pixels), np.float32)
         source = self.source(frames, dtype)
         variants = self._variants(source)
-        if self.on_device is not None and not explain:
-            measured = self.on_device.measure_from_host(frames, dtype, variants)
-            self.flag_doubtful(SlopeArrays(*measured))
-            return Slopes(*(result.reshape(*array.shape[:-2], n) for result in measured)), stages
         predicted = None if prior is None else _prior_slopes(prior, n_frames, self.layout)
         task = self.plan.task(variants, predicted)
         kernel = self.plan.kernel(frames)

@@ -76,7 +76,6 @@ def measure_recorded(
     denoise: bool = True,
     preset: str | None = None,
     changes: Mapping[str, Any] | None = None,
-    device: str = "cpu",
     unit: str = "px",
     mean_flux: bool = False,
     reference: NDArray[Any] | str | Path | None = None,
@@ -106,8 +105,6 @@ def measure_recorded(
         New values of settings by name, instead of those in the configuration; "estimator" is one.
     preset : str, optional
         "accurate" or "fast", instead of that in the configuration.
-    device : str
-        "cpu" or "cuda", see `SlopePipeline`.
     unit : {"px", "arcsec"}
         Of positions and standard errors in the output; arcsec needs the layout's `pixel_scale_arcsec`.
     mean_flux : bool
@@ -145,11 +142,9 @@ def measure_recorded(
         positions = in_file
     try:
         pipeline = SlopePipeline(
-            layout, settings, calibration, positions, psf=psf, score=score, threads=threads, device=device
+            layout, settings, calibration, positions, psf=psf, score=score, threads=threads
         )
     except InputError as error:
-        if str(error).startswith("device"):
-            raise
         about_reference = positions is not None and str(error).startswith("reference")
         where = reference if about_reference and isinstance(reference, str | Path) else configuration_file
         raise InputError(f"{where}: {error}") from None

@@ -46,9 +46,6 @@ NOT_CONVERGED = int(SubapertureFlag.NOT_CONVERGED)
 STRENGTH, TOLERANCE, LIMIT, RANK, SUBTRACT, FLOOR, LEVEL = range(COMMON_ROWS, COMMON_ROWS + 7)
 SETTING_ROWS = COMMON_ROWS + 7
 
-NOTHING, SMOOTH, DENOISE = range(3)
-"""Steps before the background subtraction."""
-
 
 class GravityTables(NamedTuple):
     """Tables of the kernel; None, a separate type, for a step that is not compiled."""
