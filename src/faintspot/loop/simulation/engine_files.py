@@ -82,8 +82,8 @@ def write_engine_files(
     configuration_file.save(path, psf)
     if not configuration_file.has(path, "settings"):
         configuration_file.save(path, fixed_window(configuration))
-    known = configuration_file.load_all(path)
-    method = _method(known.settings, psf, known.score, control)
+    stored = configuration_file.load_all(path)
+    method = _method(stored.settings, psf, stored.score, control)
     reference = reference_slopes(configuration, optics.sensor, method)
     write_atomically(folder / INTERACTION, lambda stream: np.save(stream, optics.interaction))
     write_atomically(folder / REFERENCE, lambda stream: np.save(stream, reference))

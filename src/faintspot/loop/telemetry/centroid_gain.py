@@ -62,10 +62,10 @@ def shifted_gain(
         ends = []
         for step in (_STEP_PX, -_STEP_PX):
             slopes = pipeline(np.roll(frames_e, step, axis=image))
-            found = slopes.vector.astype(np.float64)
+            vector = slopes.vector.astype(np.float64)
             error = np.hstack([slopes.standard_error_x, slopes.standard_error_y]).astype(np.float64)
             error[~np.tile(slopes.valid, 2)] = np.inf
-            ends.append(without_prior(found, error, np.zeros_like(found), prior_px))
+            ends.append(without_prior(vector, error, np.zeros_like(vector), prior_px))
         along = slice(axis * n, (axis + 1) * n)
         weight = np.minimum(ends[0][2], ends[1][2])[:, along]
         moved += (weight * (ends[0][0] - ends[1][0])[:, along]).sum(axis=1) / (2 * _STEP_PX)

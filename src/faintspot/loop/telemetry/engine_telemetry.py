@@ -89,12 +89,12 @@ def seen_in_telemetry(
     rows = _usable(telemetry, control.options.delay_frames)
     if len(rows) < FEWEST_FRAMES:
         raise InputError(f"telemetry: expected {FEWEST_FRAMES} frames of a closed loop, got {len(rows)}")
-    slopes, error, held, expected = recorded_slopes(telemetry, control, rows, predicted, "telemetry")
-    alone, _, trust = without_prior(slopes, error, expected, prior_px)
+    slopes, error, mirror, expected = recorded_slopes(telemetry, control, rows, predicted, "telemetry")
+    measured, _, trust = without_prior(slopes, error, expected, prior_px)
     frame, times = telemetry.frame[rows], telemetry.last_row_time_ns[rows]
     rate = (frame[-1] - frame[0]) / max(float(times[-1] - times[0]) / 1e9, 1e-9)
     segment = np.concatenate([[0], np.cumsum(np.diff(frame) != 1)])
-    return LoopTelemetry(segment, alone, trust, held, float(rate))
+    return LoopTelemetry(segment, measured, trust, mirror, float(rate))
 
 
 def _usable(telemetry: Telemetry, delay: int) -> NDArray[np.int64]:
@@ -102,5 +102,5 @@ def _usable(telemetry: Telemetry, delay: int) -> NDArray[np.int64]:
     frame, closed = np.asarray(telemetry.frame), np.asarray(telemetry.loop) == CLOSED
     if len(frame) <= delay:
         return np.empty(0, np.int64)
-    whole = (frame[delay:] - frame[:-delay] == delay) & closed[delay:] & closed[:-delay]
-    return np.flatnonzero(whole) + delay
+    usable = (frame[delay:] - frame[:-delay] == delay) & closed[delay:] & closed[:-delay]
+    return np.flatnonzero(usable) + delay

@@ -86,7 +86,7 @@ def of_images(frames_e: NDArray[np.float32], layout: Layout, calibration: Calibr
     noise, width = ("read noise", "e-"), ("width of the spots", "px, with the pixel and the mean speckles")
     if len(frames_e) < _FEWEST_IMAGES:
         why = f"{len(frames_e)} images in telemetry, expected {_FEWEST_IMAGES}: images-every"
-        return [Measured(*each, remark=why) for each in (flux, noise, width)]
+        return [Measured(*quantity, remark=why) for quantity in (flux, noise, width)]
     images = layout.images(frames_e)
     pixels = images.shape[-2] * images.shape[-1]
     background = calibration.background_e * pixels
@@ -96,7 +96,7 @@ def of_images(frames_e: NDArray[np.float32], layout: Layout, calibration: Calibr
         remark = "pixels above the windows' edges: wings are missing"
     sums = images.sum(axis=(-2, -1)).mean(axis=-1) - background
     halves = [pixel_noise(half) for half in np.array_split(images, 2)]
-    found = [
+    measured = [
         Measured(*flux, float(sums.mean()), float(sums.std(ddof=1) / math.sqrt(len(sums))), remark),
         Measured(*noise, float(np.mean(halves)), abs(halves[0] - halves[1]) / 2),
     ]
@@ -105,80 +105,80 @@ def of_images(frames_e: NDArray[np.float32], layout: Layout, calibration: Calibr
         spots = images.reshape(-1, *images.shape[-2:])
         psf = learn_psf_from_images(spots, calibration=plain, rng=np.random.default_rng(1)).psf
     except InputError as error:
-        return [*found, Measured(*width, remark=str(error))]
-    return [*found, Measured(*width, float(psf.fwhm_px.mean()))]
+        return [*measured, Measured(*width, remark=str(error))]
+    return [*measured, Measured(*width, float(psf.fwhm_px.mean()))]
 
 
-def of_atmosphere(seen: LoopTelemetry, layout: Layout, gain: float = 1.0) -> list[Measured]:
+def of_atmosphere(telemetry: LoopTelemetry, layout: Layout, gain: float = 1.0) -> list[Measured]:
     """Return r0, the wind and vibrations, from slopes without the mirror's contribution."""
-    residual, atmosphere = seen.weighted(gain)
+    residual, atmosphere = telemetry.weighted(gain)
     r0, wind = ("r0 at 500 nm", "m"), ("wind", "m/s")
     side = side_m(layout.cells, layout.subaperture_m, layout.diameter_m)
     if side is None or layout.pixel_scale_arcsec is None:
         why = "the layout lacks subaperture_m or pixel_scale_arcsec"
-        found = [Measured(*r0, remark=why), Measured(*wind, remark=why)]
+        measured = [Measured(*r0, remark=why), Measured(*wind, remark=why)]
     else:
         site = site_of(layout)
-        found = [
-            *outer_scale_and_r0(turbulence_strength(atmosphere, residual, seen.segment, site)),
-            _wind(Measured(*wind), seen, atmosphere, site),
+        measured = [
+            *outer_scale_and_r0(turbulence_strength(atmosphere, residual, telemetry.segment, site)),
+            _wind(Measured(*wind), telemetry, atmosphere, site),
         ]
-    return [*found, *_vibrations(seen, atmosphere)]
+    return [*measured, *_vibrations(telemetry, atmosphere)]
 
 
-def _stretches(seen: LoopTelemetry) -> list[NDArray[np.int64]]:
-    return list(np.array_split(np.arange(len(seen)), _STRETCHES))
+def _stretches(telemetry: LoopTelemetry) -> list[NDArray[np.int64]]:
+    return list(np.array_split(np.arange(len(telemetry)), _STRETCHES))
 
 
-def _of_stretches(kind: Measured, whole: float, parts: list[float], remark: str) -> Measured:
+def _of_stretches(kind: Measured, value: float, parts: list[float], remark: str) -> Measured:
     """Return a value with an error from the scatter between parts of the telemetry."""
-    known = [part for part in parts if math.isfinite(part)]
-    error = float(np.std(known, ddof=1)) / math.sqrt(len(known)) if len(known) > 1 else math.nan
-    if not math.isfinite(whole):
+    values = [part for part in parts if math.isfinite(part)]
+    error = float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+    if not math.isfinite(value):
         return Measured(kind.name, kind.unit, remark="the slopes vary no more than their noise")
-    return Measured(kind.name, kind.unit, whole, error, remark)
+    return Measured(kind.name, kind.unit, value, error, remark)
 
 
-def outer_scale_and_r0(found: Strength, known_scale_m: float | None = None) -> list[Measured]:
+def outer_scale_and_r0(strength: Strength, known_scale_m: float | None = None) -> list[Measured]:
     """Return the outer scale, where it is known with this value, and r0."""
     remark = f"{OUTER_SCALE_M:g} m within a factor of two was expected" if known_scale_m is None else "given"
     name, unit = "r0 at 500 nm", "m"
-    if not math.isfinite(found.r0_m):
+    if not math.isfinite(strength.r0_m):
         outer = Measured("outer scale", "m", remark="unknown without r0")
         return [outer, Measured(name, unit, remark="the slopes vary no more than their noise")]
-    outer = Measured("outer scale", "m", found.outer_scale_m, found.outer_scale_error_m, remark, True)
-    return [outer, Measured(name, unit, found.r0_m, found.r0_error_m, is_positive=True)]
+    outer = Measured("outer scale", "m", strength.outer_scale_m, strength.outer_scale_error_m, remark, True)
+    return [outer, Measured(name, unit, strength.r0_m, strength.r0_error_m, is_positive=True)]
 
 
-def _wind(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, site: SlopeTurbulence) -> Measured:
+def _wind(kind: Measured, telemetry: LoopTelemetry, atmosphere: Floats, site: SlopeTurbulence) -> Measured:
     """Return the wind speed of a layer that changes the slopes as fast as observed, from any direction."""
     far = _WIND_LAG
-    if seen.rate_hz <= 0 or len(seen) < 10 * far:
-        return Measured(kind.name, kind.unit, remark=f"{len(seen)} frames are too few")
+    if telemetry.rate_hz <= 0 or len(telemetry) < 10 * far:
+        return Measured(kind.name, kind.unit, remark=f"{len(telemetry)} frames are too few")
     anywhere = replace(site, wind_m_per_s=np.array([[1.0, 0.0]])).from_anywhere()
     still = _without_tilt(anywhere.covariance_px2(0.0))
-    metres = np.concatenate([[0.0], _WINDS_M_PER_S * far / seen.rate_hz])
-    theory = np.array([_without_tilt(anywhere.covariance_px2(each)) for each in metres]) / still
+    metres = np.concatenate([[0.0], _WINDS_M_PER_S * far / telemetry.rate_hz])
+    theory = np.array([_without_tilt(anywhere.covariance_px2(metre)) for metre in metres]) / still
 
     def speed(rows: NDArray[np.int64]) -> float:
-        slopes, turn = _without_mean(atmosphere[rows] - atmosphere.mean(axis=0)), seen.segment[rows]
+        slopes, turn = _without_mean(atmosphere[rows] - atmosphere.mean(axis=0)), telemetry.segment[rows]
 
         def lagged(lag: int) -> float:
-            together = turn[lag:] == turn[:-lag]
-            products = (slopes[lag:] * slopes[:-lag])[together]
+            same_run = turn[lag:] == turn[:-lag]
+            products = (slopes[lag:] * slopes[:-lag])[same_run]
             return float(products.mean()) if len(products) else math.nan
 
         share = 3 * lagged(far) / max(4 * lagged(1) - lagged(2), 1e-12)
         falling = np.minimum.accumulate(theory)
         moved = np.interp(-share, -falling, metres) if falling[-1] <= share <= 1 else math.nan
-        return float(moved * seen.rate_hz / far)
+        return float(moved * telemetry.rate_hz / far)
 
-    whole = speed(np.arange(len(seen)))
+    mean_speed = speed(np.arange(len(telemetry)))
     remark = "of a single layer that would change the slopes as fast"
-    found = _of_stretches(kind, whole, [speed(part) for part in _stretches(seen)], remark)
-    if not math.isfinite(whole):
+    wind = _of_stretches(kind, mean_speed, [speed(part) for part in _stretches(telemetry)], remark)
+    if not math.isfinite(mean_speed):
         return Measured(kind.name, kind.unit, remark=f"beyond {_WINDS_M_PER_S[-1]:g} m/s, or hidden by noise")
-    return found
+    return wind
 
 
 def _without_mean(slopes: Floats) -> Floats:
@@ -195,39 +195,39 @@ def _without_tilt(covariance: Floats) -> float:
     return total
 
 
-def _vibrations(seen: LoopTelemetry, atmosphere: Floats) -> list[Measured]:
+def _vibrations(telemetry: LoopTelemetry, atmosphere: Floats) -> list[Measured]:
     """Return lines in the spectra of tip and tilt that exceed the turbulence at neighbouring frequencies."""
     from scipy.signal import welch
     from scipy.stats import chi2
 
     name, unit = "vibrations", "Hz"
-    starts = np.flatnonzero(np.concatenate([[True], np.diff(seen.segment) != 0, [True]]))
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(telemetry.segment) != 0, [True]]))
     longest = int(np.argmax(np.diff(starts)))
     rows = slice(starts[longest], starts[longest + 1])
     length = rows.stop - rows.start
     if length < 4 * _BINS:
         return [Measured(name, unit, remark=f"{length} frames without a gap, expected {4 * _BINS}")]
-    found, hidden = [], 0.0
+    lines, hidden = [], 0.0
     for axis, letter in enumerate("xy"):
         mean = atmosphere[rows].reshape(length, 2, -1)[:, axis].mean(axis=1)
-        frequency, power = welch(mean, seen.rate_hz, nperseg=2 * _BINS, detrend="linear")
-        beside = np.array([_median_beside(power, place) for place in range(len(power))])
+        frequency, power = welch(mean, telemetry.rate_hz, nperseg=2 * _BINS, detrend="linear")
+        beside = np.array([_median_beside(power, bin_) for bin_ in range(len(power))])
         freedom = 2 * length / (2 * _BINS)
         limit = chi2.isf(_FALSE_ALARM / len(power), freedom) / freedom
         hidden = max(hidden, float((limit * beside[_FIRST_BIN:]).max() * frequency[1]))
-        for place in np.flatnonzero(power > limit * beside):
-            if place < _FIRST_BIN or power[place] < power[max(place - 2, 0) : place + 3].max():
+        for index in np.flatnonzero(power > limit * beside):
+            if index < _FIRST_BIN or power[index] < power[max(index - 2, 0) : index + 3].max():
                 continue
-            near = slice(max(place - 2, 0), place + 3)
-            square = float((power[near] - beside[near]).sum() * frequency[1])
+            peak = slice(max(index - 2, 0), index + 3)
+            square = float((power[peak] - beside[peak]).sum() * frequency[1])
             remark = f"along {letter}, rms {math.sqrt(max(square, 0.0)):.2g} px"
-            found.append(
-                Measured("vibration", unit, float(frequency[place]), float(frequency[1] / 2), remark)
+            lines.append(
+                Measured("vibration", unit, float(frequency[index]), float(frequency[1] / 2), remark)
             )
-    return found or [Measured(name, "px", 0.0, remark=f"none with an rms above {math.sqrt(hidden):.2g} px")]
+    return lines or [Measured(name, "px", 0.0, remark=f"none with an rms above {math.sqrt(hidden):.2g} px")]
 
 
-def _median_beside(power: Floats, place: int) -> float:
+def _median_beside(power: Floats, index: int) -> float:
     """Return the median of the bins beside a bin, except its direct neighbours."""
-    low, high = power[max(place - _NEIGHBOURS, 0) : max(place - 2, 0)], power[place + 3 : place + _NEIGHBOURS]
+    low, high = power[max(index - _NEIGHBOURS, 0) : max(index - 2, 0)], power[index + 3 : index + _NEIGHBOURS]
     return float(np.median(np.concatenate([low, high])))

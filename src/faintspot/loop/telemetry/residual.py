@@ -35,11 +35,11 @@ def wavefront_modes(layout: Layout) -> tuple[Floats, str]:
     names = Slopes.__dataclass_fields__
     fields = {name: np.zeros((2 * n, n), kind) for name, kind in zip(names, RESULT_TYPES, strict=True)}
     fields["x"][:n], fields["y"][n:] = np.eye(n), np.eye(n)
-    found = fit_wavefront(Slopes(**fields), layout)
-    return np.ascontiguousarray(found.coefficients.T), found.unit
+    fit = fit_wavefront(Slopes(**fields), layout)
+    return np.ascontiguousarray(fit.coefficients.T), fit.unit
 
 
-def residual_wavefront(seen: LoopTelemetry, modes: Floats, gain: float = 1.0) -> Floats:
+def residual_wavefront(telemetry: LoopTelemetry, modes: Floats, gain: float = 1.0) -> Floats:
     """Return the mean square of each frame's residual wavefront without the noise, (frames,).
 
     In the square of the modes' unit; it may be negative for single frames. NaN near the ends of segments and
@@ -47,19 +47,19 @@ def residual_wavefront(seen: LoopTelemetry, modes: Floats, gain: float = 1.0) ->
 
     Parameters
     ----------
-    seen : LoopTelemetry
+    telemetry : LoopTelemetry
     modes : (k, m) array
         See `wavefront_modes`.
     gain : float
         Centroid gain; see `faintspot.loop.telemetry.centroid_gain`.
     """
-    residual, atmosphere = (each @ modes.T for each in seen.weighted(gain))
-    around = np.full_like(atmosphere, np.nan)
+    residual, atmosphere = (slopes @ modes.T for slopes in telemetry.weighted(gain))
+    neighbours = np.full_like(atmosphere, np.nan)
     near, far = atmosphere[3:-1] + atmosphere[1:-3], atmosphere[4:] + atmosphere[:-4]
-    around[2:-2] = (4 * near - far) / 6
-    noise = (atmosphere * (atmosphere - around)).sum(axis=1)
-    left: Floats = np.square(residual).sum(axis=1) - noise
-    apart = np.full(len(seen), True)
-    apart[2:-2] = seen.segment[4:] != seen.segment[:-4]
-    left[apart | (seen.since < SETTLE_FRAMES)] = np.nan
-    return left
+    neighbours[2:-2] = (4 * near - far) / 6
+    noise = (atmosphere * (atmosphere - neighbours)).sum(axis=1)
+    squares: Floats = np.square(residual).sum(axis=1) - noise
+    unusable = np.full(len(telemetry), True)
+    unusable[2:-2] = telemetry.segment[4:] != telemetry.segment[:-4]
+    squares[unusable | (telemetry.since < SETTLE_FRAMES)] = np.nan
+    return squares
