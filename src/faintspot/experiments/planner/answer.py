@@ -91,10 +91,10 @@ class Answer:
     @property
     def best_without_psf(self) -> MethodResult:
         """The best method of those that need not know the spot."""
-        free = [result for result in self.results if Knowledge.of(result.method.estimator) < Knowledge.SPOT]
-        if self.best in free:
+        blind = [result for result in self.results if Knowledge.of(result.method.estimator) < Knowledge.SPOT]
+        if self.best in blind:
             return self.best
-        return min(free, key=lambda result: result.statistics.ranking_rms)
+        return min(blind, key=lambda result: result.statistics.ranking_rms)
 
     @property
     def prior_rms_px(self) -> float:
@@ -137,7 +137,7 @@ class Answer:
 
     def _repr_html_(self) -> str:
         rows = {"recommended": f"{self.best.method.label} ({settings_in_words(self.best.settings)})"}
-        for result in sorted(self.results, key=lambda each: each.statistics.ranking_rms):
+        for result in sorted(self.results, key=lambda result: result.statistics.ranking_rms):
             rows[result.method.label] = (
                 f"rms {result.statistics.corrected_rms.value:.3g} px, corrected for the gain; "
                 f"R {result.error_px[self.at_star]:.3g} px"
@@ -153,10 +153,10 @@ class Answer:
             For one that was not tried.
         """
         results = {result.method.name: result for result in self.results}
-        found = results.get(name)
-        if found is None:
+        result = results.get(name)
+        if result is None:
             raise InputError(f"estimator {name!r}: expected one that was tried: {', '.join(results)}")
-        return found
+        return result
 
     @property
     def _psf(self) -> PSF | None:
