@@ -74,8 +74,8 @@ def save_picture(path: str | Path, calibration: MirrorCalibration, reference: Fl
         figure.colorbar(shown, ax=matrix, label=f"px for {calibration.amplitude:g}")
         matrix.set(title="Interaction matrix", xlabel="command", ylabel="slope: all x, then all y")
         size, error = (
-            np.sqrt(np.square(each).mean(axis=0)) * calibration.amplitude
-            for each in (calibration.interaction, calibration.interaction_error)
+            np.sqrt(np.square(slopes).mean(axis=0)) * calibration.amplitude
+            for slopes in (calibration.interaction, calibration.interaction_error)
         )
         actuators = np.arange(len(size))
         answers.plot(actuators, size, "o", ms=4, color=METHOD_COLOURS[1], label="slopes")

@@ -35,7 +35,7 @@ from faintspot.loop.simulation.telescope.model import (
 )
 from faintspot.loop.simulation.telescope.natural_star import LowOrders
 from faintspot.loop.simulation.telescope.sodium import FollowedSodium, learn_sodium, with_spots
-from faintspot.slopes.pipeline import configuration as configuration_file
+from faintspot.slopes.pipeline.configuration import to_text
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
@@ -351,7 +351,7 @@ class _Loop:
             self.gains,
             np.array([method.correct_gain for method in self.methods]),
             tuple(method.label for method in self.methods),
-            tuple(configuration_file.to_text(method.settings) for method in self.methods),
+            tuple(to_text(method.settings) for method in self.methods),
             sensor.layout.cells,
             sensor.illumination,
             configuration.control.frame_rate_hz,

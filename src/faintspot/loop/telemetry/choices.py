@@ -137,7 +137,7 @@ def _expected_left(identified: Identified, plant: LoopPlant, variance: Floats, p
     """Return the phase variance that the predictive filter leaves in the turbulence that was identified."""
     model = identified.slope_model()
     after = model.spread(steady_covariance(model, variance), plant.delay_frames - 1)
-    return float(np.einsum("pi,ij,pj->", phase, model.seen @ after @ model.seen.T, phase))
+    return float(np.einsum("pi,ij,pj->", phase, model.observation @ after @ model.observation.T, phase))
 
 
 @dataclass(frozen=True, eq=False)

@@ -211,7 +211,7 @@ def _vibrations(telemetry: LoopTelemetry, atmosphere: Floats) -> list[Measured]:
     for axis, letter in enumerate("xy"):
         mean = atmosphere[rows].reshape(length, 2, -1)[:, axis].mean(axis=1)
         frequency, power = welch(mean, telemetry.rate_hz, nperseg=2 * _BINS, detrend="linear")
-        beside = np.array([_median_beside(power, bin_) for bin_ in range(len(power))])
+        beside = np.array([_median_beside(power, index) for index in range(len(power))])
         freedom = 2 * length / (2 * _BINS)
         limit = chi2.isf(_FALSE_ALARM / len(power), freedom) / freedom
         hidden = max(hidden, float((limit * beside[_FIRST_BIN:]).max() * frequency[1]))

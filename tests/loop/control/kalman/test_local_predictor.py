@@ -152,7 +152,7 @@ def test_errors_die_away() -> None:
 def test_the_error_is_nearly_that_of_the_riccati_equation(arrays: dict[str, Any]) -> None:
     """Steps of eight frames are coarse: within a third of the variance."""
     covariance = dense_covariance(LAYERS, NOISE_PX2)
-    expected = np.diag(LAYERS.seen @ covariance @ LAYERS.seen.T)
+    expected = np.diag(LAYERS.observation @ covariance @ LAYERS.observation.T)
     np.testing.assert_allclose(arrays["predicted_px2"], expected, rtol=0.35)
 
 

@@ -180,11 +180,11 @@ def _interpolate(
     out : (lags, k + 2 derived, distinct) array
     """
     side, spacing, origin = scale
-    count, places = tables.shape[0], tables.shape[1]
+    count, nodes = tables.shape[0], tables.shape[1]
     for lag in range(shift_m.shape[0]):
         for s in range(apart_m.shape[0]):
-            row = _spline(apart_m[s, 0] - shift_m[lag, 0], side, spacing, origin, places, weights[0])
-            column = _spline(apart_m[s, 1] - shift_m[lag, 1], side, spacing, origin, places, weights[1])
+            row = _spline(apart_m[s, 0] - shift_m[lag, 0], side, spacing, origin, nodes, weights[0])
+            column = _spline(apart_m[s, 1] - shift_m[lag, 1], side, spacing, origin, nodes, weights[1])
             of_x, of_y = weights[0], weights[1]
             for k in range(count):
                 value, along, across = 0.0, 0.0, 0.0
@@ -203,12 +203,12 @@ def _interpolate(
 
 
 @_compiled
-def _spline(apart_m: Any, side: Any, spacing: Any, origin: Any, places: Any, weights: Any) -> int:
+def _spline(apart_m: Any, side: Any, spacing: Any, origin: Any, nodes: Any, weights: Any) -> int:
     """Write weights and derivatives (2, 4) of coefficients at a separation; return the first one's place."""
     ratio = apart_m / side
     root = math.sqrt(1.0 + ratio * ratio)
     position = math.copysign(math.log(abs(ratio) + root), ratio) / spacing + origin
-    position = min(max(position, 1.0), places - 2.001)
+    position = min(max(position, 1.0), nodes - 2.001)
     first = int(position)
     t, per_m = position - first, 1.0 / (root * side * spacing)
     complement = 1.0 - t

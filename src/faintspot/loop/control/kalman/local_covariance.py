@@ -145,9 +145,9 @@ def _corrections(gains: Floats, neighbours: Indices) -> sparse.csr_matrix:
     n, rows, _ = gains.shape
     columns = both_axes(neighbours, n)
     exists = np.broadcast_to((columns < 2 * n)[:, None], gains.shape)
-    own, row, index = np.nonzero(exists)
+    cell, row, index = np.nonzero(exists)
     return sparse.csr_matrix(
-        (gains.astype(np.float32)[exists], (row * n + own, columns[own, index])), shape=(rows * n, 2 * n)
+        (gains.astype(np.float32)[exists], (row * n + cell, columns[cell, index])), shape=(rows * n, 2 * n)
     )
 
 

@@ -49,9 +49,9 @@ class SlopePredictor:
             covariance = steady_covariance(model, variance_px2, covariance_xy_px2)
         self.covariance = covariance
         """(states, states): covariance of the state's error before a measurement."""
-        self.with_slopes = self.covariance @ model.seen.T
+        self.with_slopes = self.covariance @ model.observation.T
         """(states, m): covariance of the errors of state and slopes."""
-        self.predicted_px2 = model.seen @ self.with_slopes
+        self.predicted_px2 = model.observation @ self.with_slopes
         """(m, m): covariance of the predicted slopes' error."""
         self.usual_px2 = self.predicted_px2.copy()
         add_noise(self.usual_px2, np.minimum(variance_px2, LARGEST_VARIANCE_PX2), covariance_xy_px2)
@@ -128,7 +128,7 @@ def steady_covariance(
     twice as many frames with each step.
     """
     n, m = model.states, model.slopes
-    observation, variance = model.seen, np.minimum(variance_px2, LARGEST_VARIANCE_PX2)
+    observation, variance = model.observation, np.minimum(variance_px2, LARGEST_VARIANCE_PX2)
     step = model.onward.T  # transposed: of the dual problem
     informed = observation.T @ weighted_slopes(observation, variance, covariance_xy_px2)
     error = np.zeros((n, n))

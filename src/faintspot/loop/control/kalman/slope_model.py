@@ -76,13 +76,13 @@ class SlopeModel:
         return np.asarray(block_diag(*blocks))
 
     @cached_property
-    def seen(self) -> Floats:
+    def observation(self) -> Floats:
         """(m, states): matrix from the state to z[k]."""
         return np.tile(np.eye(self.slopes, 2 * self.slopes), self.layers)
 
     def ahead(self, frames: int) -> Floats:
         """Return (m, states): matrix from the state to z a number of frames later."""
-        matrix = self.seen
+        matrix = self.observation
         for _ in range(frames):
             matrix = matrix @ self.onward
         return matrix

@@ -82,7 +82,7 @@ class FollowedSodium:
         Known before the run.
     """
 
-    def __init__(self, configuration: LoopConfiguration, layout: Layout, known: KnownSodium) -> None:
+    def __init__(self, configuration: LoopConfiguration, layout: Layout, sodium: KnownSodium) -> None:
         assert configuration.laser is not None
         self._laser, self._layout = configuration.laser, layout
         camera = configuration.camera
@@ -91,7 +91,7 @@ class FollowedSodium:
         self._dark_adu = camera.offset_adu + background / self._scale
         self._mean: MeanImages | None = None
         self._frames = 0
-        self.sodium = known
+        self.sodium = sodium
 
     def take(self, frame_adu: NDArray[np.generic], slopes_px: Floats) -> bool:
         """Take a frame and its slopes (2 n,) from the window centres; return whether the profile is new."""
