@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.slope_prior import Prior
 from faintspot.engine.streams.prediction_stream import PredictionStream
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.simulation import Method, simulate_loop

@@ -13,7 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.engine.loop.control_loop import CLOSED, OPEN, STATES, ControlLoop
 from faintspot.engine.path.frame_path import FramePath
 from faintspot.engine.path.lateness import CAUSES, IN_TIME, INCOMPLETE, WORKER, Lateness
-from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.slope_prior import Prior
 from faintspot.engine.path.timing import Counters, Latencies
 from faintspot.engine.path.workers import Workers
 from faintspot.engine.pixels.pixel_ring import PixelRing

@@ -13,7 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.engine.engine import Engine
 from faintspot.engine.path.pipeline_maker import PipelineMaker
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
-from faintspot.loop.control.identification.model import Model
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.score import load_score
 from faintspot.slopes.training.known_sodium import SODIUM
@@ -71,7 +71,7 @@ def _take_learnt(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     if engine.loop is None:
         raise InputError("learnt: this engine makes no commands; add [control] to its configuration")
     try:
-        engine.loop.renew(Model.load(_text(fields, "model"), engine.loop.control.plant))
+        engine.loop.renew(ControlModel.load(_text(fields, "model"), engine.loop.control.plant))
     except InputError as error:
         engine.learning = {**known, "fault": f"{error}"}
         raise

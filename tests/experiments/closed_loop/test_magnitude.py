@@ -26,7 +26,7 @@ PHOTONS = (400.0, 40.0)
 
 
 def run(folder: Path, place: WorkerPool, methods: tuple[str, ...] = METHODS) -> MagnitudeResult:
-    return run_magnitude(small(), folder, methods, PHOTONS, search=SEARCH, place=place)
+    return run_magnitude(small(), folder, methods, PHOTONS, search=SEARCH, pool=place)
 
 
 TOLD: list[tuple[int, int]] = []
@@ -80,13 +80,13 @@ def test_methods_can_be_added(tmp_path: Path, whole: Path) -> None:
 
 def test_bad_input(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^method = 'kog': expected one of 'brightest'"):
-        run_magnitude(small(), tmp_path, ("kog",), PHOTONS, place=HERE)
+        run_magnitude(small(), tmp_path, ("kog",), PHOTONS, pool=HERE)
     with pytest.raises(InputError, match="methods: expected at least one"):
-        run_magnitude(small(), tmp_path, (), PHOTONS, place=HERE)
+        run_magnitude(small(), tmp_path, (), PHOTONS, pool=HERE)
     with pytest.raises(InputError, match="photons: expected at least one"):
-        run_magnitude(small(), tmp_path, METHODS, place=HERE)
+        run_magnitude(small(), tmp_path, METHODS, pool=HERE)
     with pytest.raises(InputError, match="photons"):
-        run_magnitude(small(), tmp_path, METHODS, (0.0,), place=HERE)
+        run_magnitude(small(), tmp_path, METHODS, (0.0,), pool=HERE)
 
 
 def test_quick_is_never_longer() -> None:

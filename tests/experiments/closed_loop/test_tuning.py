@@ -31,7 +31,7 @@ def question(**asked: Any) -> LoopQuestion:
 
 
 def tuned(folder: Path, place: WorkerPool = HERE, **asked: Any) -> LoopAnswer:
-    return tune_loop(question(**asked), folder, plan=PLAN, place=place)
+    return tune_loop(question(**asked), folder, plan=PLAN, pool=place)
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +68,8 @@ def test_another_loop_in_the_folder_is_refused_or_replaced(tmp_path: Path) -> No
     tuned(tmp_path, methods=())
     other = LoopQuestion(small().replace("camera", read_noise_e=5.0), magnitudes=(9.0, 11.0), methods=())
     with pytest.raises(InputError, match=r"magnitude-tuning\.zarr"):
-        tune_loop(other, tmp_path, plan=PLAN, place=HERE)
-    answer = tune_loop(other, tmp_path, plan=PLAN, place=HERE, overwrite=True)
+        tune_loop(other, tmp_path, plan=PLAN, pool=HERE)
+    answer = tune_loop(other, tmp_path, plan=PLAN, pool=HERE, overwrite=True)
     assert answer.question is other
 
 

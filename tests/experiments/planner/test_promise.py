@@ -13,7 +13,7 @@ from tests.experiments.planner_cases import QUICK
 
 from faintspot.base.statistics import Estimate
 from faintspot.experiments import Answer, Promise, Question, question_from_frames, tune
-from faintspot.experiments.planner.promise import _places, _with_unshared
+from faintspot.experiments.planner.promise import _spot_positions, _with_unshared
 from faintspot.experiments.planner.text import CONTRADICTED, promise_lines
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
@@ -148,6 +148,6 @@ def test_spots_are_predicted_without_the_noise_of_their_positions() -> None:
     def scatter(error_px: float) -> float:
         error, psf = np.full((360, 2), error_px), PSF.analytic(radius_px=8)
         fitted = LearntPSF(psf, np.zeros(1), positions, np.full(360, 100.0), error)
-        return float(_places(question, fitted).std(axis=0).max())
+        return float(_spot_positions(question, fitted).std(axis=0).max())
 
     assert scatter(0.5) < 0.5 * scatter(0.01)

@@ -22,7 +22,7 @@ from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
 from faintspot.io.telemetry.recording import Telemetry, stored_names
 from faintspot.loop.control.configuration import Control, load_control, prior_std_px
 from faintspot.loop.control.identification.model import KALMAN
-from faintspot.loop.control.identification.relearning import FEWEST_FRAMES, Relearnt, relearn
+from faintspot.loop.control.identification.relearning import FEWEST_FRAMES, RelearntControl, relearn
 from faintspot.loop.telemetry.recording import CLOSED, site_of, telemetry_of_recording
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
@@ -62,7 +62,7 @@ class LearningBeside(BesideEngine):
         super().__init__(name)
         self._every_s = every_s
         self._cursor, self._records = self._reader.records.written, list[NDArray[Any]]()
-        self._last: Relearnt | None = None
+        self._last: RelearntControl | None = None
         self._count = 0
 
     def take(self) -> bool:
@@ -95,7 +95,7 @@ class LearningBeside(BesideEngine):
         found, taken = self.learn()
         return f"{found.summary()}; {'taken' if taken else 'not taken'}"
 
-    def learn(self) -> tuple[Relearnt, bool]:
+    def learn(self) -> tuple[RelearntControl, bool]:
         """Learn from the records since the last time; return the result and whether the engine took it.
 
         Raises
@@ -111,7 +111,7 @@ class LearningBeside(BesideEngine):
         recording = Telemetry(**arrays, **images, changes=[], attributes=dict(self._reader.description))
         telemetry, rate_hz = telemetry_of_recording(recording, self._control, self._prior_std_px())
         anew = self._last is None or self._count % _FROM_NOTHING_EVERY == 0
-        start = None if anew or self._last is None else self._last.learnt.found
+        start = None if anew or self._last is None else self._last.learnt.identified
         self._last = found = relearn(
             self._control.plant, self._control.model, telemetry, self._site, rate_hz, start
         )
@@ -127,7 +127,7 @@ class LearningBeside(BesideEngine):
         given = {name: value for name, value in values.items() if value is not None}
         return prior_std_px(Settings(given.pop("estimator"), **given), self._layout)
 
-    def _report(self, found: Relearnt) -> None:
+    def _report(self, found: RelearntControl) -> None:
         """Tell the engine what was found, and hand the new filter to it if it is better."""
         with tempfile.TemporaryDirectory(prefix="faintspot-learn-") as folder:
             path = Path(folder) / "model.npz"

@@ -13,13 +13,13 @@ from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.engine.loop.guard import Guard
 from faintspot.engine.loop.successor import Ready, Successor
-from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.slope_prior import Prior
 from faintspot.engine.path.timing import Latencies
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import CompiledIntegrator, true_slopes
 from faintspot.loop.control.configuration import Control
-from faintspot.loop.control.identification.model import Model
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.guarded import Guarded
 from faintspot.slopes.kernels.compilation.compiling import Direct
@@ -261,7 +261,7 @@ class ControlLoop:
             return
         self._ready[kind] = _prepared(self.control.with_controller(kind))
 
-    def renew(self, model: Model) -> None:
+    def renew(self, model: ControlModel) -> None:
         """Replace the model of a learnt controller.
 
         While the loop is closed, a new filter first follows it, see `Successor`.

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.slope_prior import Prior
 from faintspot.engine.path.workers import Workers
 from faintspot.loop.control.configuration import prior_std_px
 from faintspot.slopes.kernels.compilation.compiling import Direct

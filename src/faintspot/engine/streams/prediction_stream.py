@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.slope_prior import Prior
 from faintspot.engine.streams.stream import Follower
 
 _READ_S = 2e-4  # to wait for a writer in the middle of a publication

@@ -90,10 +90,10 @@ class Answer:
     @property
     def best_without_psf(self) -> MethodResult:
         """The best method of those that need not know the spot."""
-        free = [result for result in self.results if Knowledge.of(result.method.estimator) < Knowledge.SPOT]
-        if self.best in free:
+        blind = [result for result in self.results if Knowledge.of(result.method.estimator) < Knowledge.SPOT]
+        if self.best in blind:
             return self.best
-        return min(free, key=lambda result: result.statistics.ranking_rms)
+        return min(blind, key=lambda result: result.statistics.ranking_rms)
 
     @property
     def prior_rms_px(self) -> float:
@@ -143,10 +143,10 @@ class Answer:
             For one that was not tried.
         """
         results = {result.method.name: result for result in self.results}
-        found = results.get(name)
-        if found is None:
+        result = results.get(name)
+        if result is None:
             raise InputError(f"estimator {name!r}: expected one that was tried: {', '.join(results)}")
-        return found
+        return result
 
     @property
     def _psf(self) -> PSF | None:

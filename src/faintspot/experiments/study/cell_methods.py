@@ -100,8 +100,8 @@ class CellMethods:
     def measure(self, method: str, candidate: Candidate, images: Images) -> Slopes:
         """Return the slopes of images (n, side, side) in photo-electrons."""
         output = images * np.float32(self.cell.em_gain)  # as the camera gives it
-        made = self._method(self.estimator(method, candidate))
-        return measure_images(output, made.settings, calibration=self._calibration, **made.parts)
+        prepared = self._method(self.estimator(method, candidate))
+        return measure_images(output, prepared.settings, calibration=self._calibration, **prepared.parts)
 
     def parts(self, method: str, blocks: Sequence[Block]) -> Sequence[Block]:
         """Return what a method measures at a time: blocks, or all of them where it has no table."""
@@ -122,12 +122,12 @@ class CellMethods:
 
     def _method(self, estimator: Estimator) -> Method:
         """Tell an estimator what it has to know."""
-        told: dict[str, Any] = {}
+        widths: dict[str, Any] = {}
         if Need.WIDTH in estimator.needs:
-            told["spot_fwhm_px"], told["spot_fwhm_y_px"] = self._spot_fwhm_px
+            widths["spot_fwhm_px"], widths["spot_fwhm_y_px"] = self._spot_fwhm_px
         return Method(
             estimator.label,
-            Settings(estimator, search_range_px=self._within_px, flux_e=self.flux_e, **told),
+            Settings(estimator, search_range_px=self._within_px, flux_e=self.flux_e, **widths),
             psf=self._psf if Need.PSF in estimator.needs else None,
             score=self._score if Need.SCORE in estimator.needs else None,
         )
@@ -138,13 +138,13 @@ class CellMethods:
             name: list(self._listed(name)) for name in kind.declared() if name in self._specification.LISTED
         }
         found_by_table = {_KEPT} if keeps_every_k(kind) else set()
-        made = kind(**{name: values[0] * self._unit(name) for name, values in listed.items()})
-        own = {
+        estimator = kind(**{name: values[0] * self._unit(name) for name, values in listed.items()})
+        automatic = {
             name: list(values)
-            for name, values in made.tuned(self.scene).items()
+            for name, values in estimator.tuned(self.scene).items()
             if name not in self._specification.LISTED.keys() | found_by_table
         }
-        return {**listed, **own}
+        return {**listed, **automatic}
 
     def _listed(self, option: str) -> tuple[float, ...]:
         key, only_speckled = self._specification.LISTED[option]
@@ -241,11 +241,11 @@ def _prepared(estimator: KeepingBrightest, images: Images) -> Images:
 def moments_of(positions: Floats, truth: Floats) -> Floats:
     """Sums that a regression of (n, K, 2) positions on the truth needs, (8, K)."""
     x, y = positions[..., 0], positions[..., 1]
-    whole = [len(truth), *truth.sum(axis=0), np.square(truth).sum()]
-    own = [x.sum(axis=0), y.sum(axis=0), np.square(positions).sum(axis=(0, 2))]
+    of_truth = [len(truth), *truth.sum(axis=0), np.square(truth).sum()]
+    of_positions = [x.sum(axis=0), y.sum(axis=0), np.square(positions).sum(axis=(0, 2))]
     across = (x * truth[:, :1]).sum(axis=0) + (y * truth[:, 1:]).sum(axis=0)
-    same = np.repeat(np.array(whole)[:, None], positions.shape[1], axis=1)
-    return np.concatenate([same, np.stack([*own, across])])
+    same = np.repeat(np.array(of_truth)[:, None], positions.shape[1], axis=1)
+    return np.concatenate([same, np.stack([*of_positions, across])])
 
 
 def errors_of(positions: Floats, truth: Floats) -> Floats:

@@ -40,12 +40,12 @@ class Measured:
         return {"name": self.name, "unit": self.unit, **plain, "remark": self.remark}
 
 
-def outer_scale_and_r0(found: Strength, known_scale_m: float | None = None) -> list[Measured]:
+def outer_scale_and_r0(strength: Strength, known_scale_m: float | None = None) -> list[Measured]:
     """Return the outer scale, where it is known with this value, and r0."""
     remark = f"{OUTER_SCALE_M:g} m within a factor of two was expected" if known_scale_m is None else "given"
     name, unit = "r0 at 500 nm", "m"
-    if not math.isfinite(found.r0_m):
+    if not math.isfinite(strength.r0_m):
         outer = Measured("outer scale", "m", remark="unknown without r0")
         return [outer, Measured(name, unit, remark="the slopes vary no more than their noise")]
-    outer = Measured("outer scale", "m", found.outer_scale_m, found.outer_scale_error_m, remark, True)
-    return [outer, Measured(name, unit, found.r0_m, found.r0_error_m, is_positive=True)]
+    outer = Measured("outer scale", "m", strength.outer_scale_m, strength.outer_scale_error_m, remark, True)
+    return [outer, Measured(name, unit, strength.r0_m, strength.r0_error_m, is_positive=True)]

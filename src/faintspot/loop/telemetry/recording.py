@@ -77,11 +77,11 @@ def telemetry_of_recording(
             f"{stop - start}"
         )
     rows = np.arange(start + delay, stop)
-    slopes, error, held, expected = _recorded_slopes(recording, control, rows, predicted)
+    slopes, error, mirror, expected = _recorded_slopes(recording, control, rows, predicted)
     times = recording.last_row_time_ns[start:stop]
     rate = (stop - start - 1) / max(float(times[-1] - times[0]) / 1e9, 1e-9)
     covariance = recording.covariance_xy[rows].astype(np.float64) / control.options.centroid_gain**2
-    return make_telemetry(slopes, error, held, expected, prior_std_px, covariance), rate
+    return make_telemetry(slopes, error, mirror, expected, prior_std_px, covariance), rate
 
 
 def _recorded_slopes(
@@ -101,7 +101,7 @@ def _recorded_slopes(
 
     Returns
     -------
-    slopes, errors, held, expected : (frames, m) arrays
+    slopes, errors, mirror, expected : (frames, m) arrays
         In true pixels; infinite error: not measured.
 
     Raises
@@ -116,11 +116,11 @@ def _recorded_slopes(
     if not np.isfinite(error).any():
         raise InputError("recording: expected standard errors of slopes; give the calibration a read noise")
     slopes = recording.slopes[rows].astype(np.float64) / gain
-    held, latest = (
+    mirror, latest = (
         recording.commands[rows - lag].astype(np.float64) @ control.interaction.T for lag in (delay, 1)
     )
-    expected = held - latest if predicted else np.zeros_like(held)  # what acts less the latest command
-    return slopes, error / gain, held, expected
+    expected = mirror - latest if predicted else np.zeros_like(mirror)  # what acts less the latest command
+    return slopes, error / gain, mirror, expected
 
 
 def site_of(layout: Layout, layers: Sequence[tuple[float, float, float]] = ()) -> SlopeTurbulence:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.slope_prior import Prior
 
 
 def test_what_is_expected_and_how_surely() -> None:
