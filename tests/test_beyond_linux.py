@@ -28,6 +28,7 @@ flux_e = [30, 100]
 OF_RECORDINGS = {"learn", "export"}
 
 
+@pytest.mark.slow
 def test_everything_imports_and_what_is_not_real_time_works(tmp_path: Path) -> None:
     for package in ("hcipy", "pyshmem", "specula", "tornado", "xarray"):
         pytest.importorskip(package)

@@ -62,6 +62,7 @@ def test_public_names_have_examples() -> None:
     assert without == set(WITHOUT_EXAMPLE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(NAMES.keys() - WITHOUT_EXAMPLE.keys()))
 def test_examples(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     home, _, short = name.rpartition(".")

@@ -52,6 +52,7 @@ class TestAgainstOracle:
         case = random_case(seed, estimator)
         assert_equals_oracle(case, case.measure())
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("estimator", QUICK)
     @given(seed=SEEDS)
     @settings(max_examples=10)
@@ -90,6 +91,7 @@ class TestAgainstOracle:
         case = on_unknown_background(random_case(seed, "map", n=2, window=(10, 11)), seed)
         assert_equals_oracle(case, case.measure())
 
+    @pytest.mark.slow
     # Each is compiled anew: at 8 lanes the families, at the ends all.
     @pytest.mark.parametrize(
         ("width", "estimator"),
@@ -213,6 +215,7 @@ class TestNoiseMap:
             values = getattr(expected, name)
             np.testing.assert_allclose(getattr(found, name), values, rtol=1e-5, atol=1e-5, err_msg=name)
 
+    @pytest.mark.slow
     @EVERY
     def test_images_and_widths(self, estimator: str) -> None:
         """Calibrated images and other SIMD widths give what the frames give."""

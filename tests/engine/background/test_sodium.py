@@ -113,6 +113,7 @@ def test_a_layer_that_changes_is_handed_over(name: str, config: Path) -> None:
     assert np.abs((weights.x * (spot - weights.mean_spot)).sum(axis=(1, 2))).max() < 0.02
 
 
+@pytest.mark.slow
 def test_an_engine_measures_with_new_spots_from_the_next_frame(name: str, tmp_path: Path) -> None:
     """Slopes are those of a pipeline that has known them from the start."""
     pytest.importorskip("pyshmem")

@@ -128,6 +128,7 @@ def any_control(data: st.DataObject) -> None:
     assert "\n" not in said
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_never_reaches_the_mirror() -> None:
     settings(max_examples=100, deadline=None)(given(st.data())(any_control))()
 

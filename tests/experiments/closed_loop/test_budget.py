@@ -53,6 +53,7 @@ def test_unknown_term() -> None:
         strehl("noise")
 
 
+@pytest.mark.slow
 def test_experiment_and_resume(tmp_path: Path) -> None:
     def run(folder: Path, place: WorkerPool) -> BudgetResult:
         return run_budget(small(), folder, ["brightest"], search=SEARCH, pool=place)

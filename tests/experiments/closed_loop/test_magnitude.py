@@ -40,6 +40,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_one_progress_of_all_stages(whole: Path) -> None:
     done, total = np.transpose(TOLD)
     assert (np.diff(done) >= 0).all()
@@ -58,6 +59,7 @@ def test_result(whole: Path) -> None:
     assert "keep_brightest" in result.settings[1, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("calls", [2, 120])
 def test_interrupted_and_started_again(tmp_path: Path, whole: Path, calls: int) -> None:
     with pytest.raises(KeyboardInterrupt):
@@ -67,6 +69,7 @@ def test_interrupted_and_started_again(tmp_path: Path, whole: Path, calls: int) 
     assert_same_units(tmp_path, whole)
 
 
+@pytest.mark.slow
 def test_methods_can_be_added(tmp_path: Path, whole: Path) -> None:
     folder = shutil.copytree(whole, tmp_path / "copy")
     one = run(folder, WorkerPool(0, progress=StopsAfter(0)), ("centroid",))  # nothing is left to do

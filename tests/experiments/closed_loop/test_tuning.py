@@ -40,6 +40,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LoopAnswer]:
     return folder, tuned(folder)
 
 
+@pytest.mark.slow
 def test_answer(whole: tuple[Path, LoopAnswer]) -> None:
     _, answer = whole
     assert list(answer.kinds) == ["brightest", "window", "window+kalman"]
@@ -55,6 +56,7 @@ def test_answer(whole: tuple[Path, LoopAnswer]) -> None:
         assert all(learning[name] == plain[name] for name in plain if name != LOOP_GAIN)
 
 
+@pytest.mark.slow
 def test_interrupted_it_goes_on_to_the_same_answer(tmp_path: Path, whole: tuple[Path, LoopAnswer]) -> None:
     folder, answer = whole
     with pytest.raises(KeyboardInterrupt):
@@ -64,6 +66,7 @@ def test_interrupted_it_goes_on_to_the_same_answer(tmp_path: Path, whole: tuple[
     np.testing.assert_array_equal(again.runs("window+kalman"), answer.runs("window+kalman"))
 
 
+@pytest.mark.slow
 def test_another_loop_in_the_folder_is_refused_or_replaced(tmp_path: Path) -> None:
     tuned(tmp_path, methods=())
     other = LoopQuestion(small().replace("camera", read_noise_e=5.0), magnitudes=(9.0, 11.0), methods=())

@@ -29,6 +29,7 @@ def of(specification: StudySpecification, **options: Any) -> Any:
 
 
 class TestPage:
+    @pytest.mark.slow
     def test_is_complete_and_in_order(self) -> None:
         html = study_report(of(paper_study(quick=True)))
         sections = re.findall(r'<section id="([^"]+)"', html)

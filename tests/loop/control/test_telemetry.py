@@ -47,6 +47,7 @@ def test_usual_noise_gives_the_mean_information() -> None:
     np.testing.assert_allclose(shared, usual[0, 1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in CONTROLS if kind != INTEGRATOR])
 def test_what_has_learnt_leaves_less(kind: str) -> None:
     """On other frames of the same air, than the integrator with the gain that is best there."""

@@ -37,6 +37,7 @@ def value(report: LoopReport, part: str, name: str) -> Measured:
     return next(each for each in report.parts[part].values if each.name == name)
 
 
+@pytest.mark.slow
 def test_loop_and_frames(report: LoopReport) -> None:
     assert value(report, "frames", "lost frames").value == 20
     delay = value(report, "loop", "delay")
@@ -166,6 +167,7 @@ def test_constant_slopes() -> None:
         report_of_loop(replace(loop, slopes=np.full_like(loop.slopes, 0.1)))
 
 
+@pytest.mark.slow
 def test_a_single_sub_aperture() -> None:
     """Neither delay, winds nor r0 are known; vibrations and other choices are."""
     rng = np.random.default_rng(3)

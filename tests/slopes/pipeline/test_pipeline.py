@@ -25,6 +25,7 @@ class TestAgainstOracle:
         case = random_case(seed, dtype)
         assert_equals_oracle(case, case.pipeline()(case.frame))
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("width", [4, 8, 16])
     def test_any_simd_width(self, width: int) -> None:
         for seed in range(20):

@@ -34,6 +34,7 @@ def commands(controller: Any, line: CommandDelayLine, frames: int = 60) -> np.nd
     return np.array(sent)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, LearntControl], tmp_path: Path) -> None:
     path = tmp_path / "model.npz"

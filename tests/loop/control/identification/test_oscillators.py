@@ -37,6 +37,7 @@ def _seen(seed: int) -> NDArray[np.float64]:
     return np.array(moving).T + _NOISE * rng.standard_normal((_FRAMES, 2))
 
 
+@pytest.mark.slow
 def test_oscillators_and_noise_are_found() -> None:
     found, noise = fitted_oscillators(_seen(1), _RATE_HZ, 2)
     assert noise == pytest.approx(np.full(2, _NOISE**2), rel=0.1)
@@ -48,6 +49,7 @@ def test_oscillators_and_noise_are_found() -> None:
         assert narrow.rms_px == pytest.approx(_VIBRATION.rms_px, rel=0.4)
 
 
+@pytest.mark.slow
 def test_the_learnt_filter_beats_the_best_integrator() -> None:
     plant = LoopPlant(np.eye(2), make_reconstructor(np.eye(2)), 2, 0.01)
     learning, scoring = (

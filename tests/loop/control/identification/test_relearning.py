@@ -23,6 +23,7 @@ def now() -> LearntControl:
     return learn(KALMAN, PLANT, telemetry(800, 0.3, seed=9, model=LAYERS), TURBULENCE, RATE_HZ, ASSUMED)
 
 
+@pytest.mark.slow
 def test_a_filter_for_other_turbulence_is_replaced(now: LearntControl) -> None:
     """The running filter takes slopes for nearly constant."""
     arrays = now.model.arrays
@@ -34,6 +35,7 @@ def test_a_filter_for_other_turbulence_is_replaced(now: LearntControl) -> None:
     assert found.residual < found.by_integrator
 
 
+@pytest.mark.slow
 def test_a_filter_that_is_as_good_stays(now: LearntControl) -> None:
     found = relearn(PLANT, now.model, FRAMES, TURBULENCE, RATE_HZ, now.identified)
     assert not found.is_better

@@ -55,6 +55,7 @@ def shared(rng: np.random.Generator, error: np.ndarray) -> np.ndarray:
     return covariance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prior", [None, np.full(M, 0.5)])
 @pytest.mark.parametrize(("steps", "tolerance"), [(STEPS, 3e-3), (30, 1e-7)])
 @pytest.mark.parametrize("model", [MODEL, LAYERS], ids=["one layer", "two layers"])

@@ -130,6 +130,7 @@ def test_a_step_of_the_covariance_is_the_textbooks(reach: float, monkeypatch: py
     np.testing.assert_allclose(found, expected, atol=1e-5 * before.max())
 
 
+@pytest.mark.slow
 def test_errors_die_away() -> None:
     """Without measurements to follow, any error shrinks with all gains: no frame of noise stays.
 

@@ -105,6 +105,7 @@ METHODS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.label)
 def test_every_method_closes_the_loop(method: Method) -> None:
     record = simulate_loop(LOOP, [method])

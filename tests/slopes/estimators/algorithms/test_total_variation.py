@@ -43,6 +43,7 @@ def strengths_of(stack: Any, fraction: float) -> Any:
 
 
 class TestAgainstOracle:
+    @pytest.mark.slow
     @every_dtype
     @every_algorithm
     @given(images(), fractions, st.sampled_from([1, 2, 7, 40]))
@@ -87,6 +88,7 @@ class TestAgainstOracle:
         assert result.iterations.tolist() == [e.iterations for e in expected]
         assert result.converged.tolist() == [e.converged for e in expected]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("width", ["4", "8", "16"])
     def test_any_simd_width(self, width: str, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("FAINTSPOT_SIMD_WIDTH", width)

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from tests.shared_data import ROOT
 
 from faintspot import Layout, Settings, SlopePipeline
@@ -41,6 +42,7 @@ def test_target_of_this_process() -> None:
     assert all(name and name[0] not in "+-" for name in target.features)
 
 
+@pytest.mark.slow
 def test_generic_processor(tmp_path: Path) -> None:
     """As on clusters whose nodes differ; code for more than the target has would end the process."""
     environment = {
