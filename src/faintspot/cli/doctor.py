@@ -16,6 +16,8 @@ from faintspot.base.version import __version__
 from faintspot.cli.shared.commands import option
 
 _REQUIRED = ("numpy", "scipy", "numba", "llvmlite", "tomlkit", "click", "rich")
+_DISTRIBUTIONS = {"PIL": "pillow", "pyrtc": "pyrtcao"}
+"""Names in the package index that differ from those of imports."""
 _FORCING = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "FAINTSPOT_SIMD_WIDTH", "NUMBA_DISABLE_JIT")
 
 
@@ -55,7 +57,7 @@ def command(as_json: bool) -> None:
 def examine() -> list[Finding]:
     """Return versions, extras and the processor; a broken installation is a finding, not an error."""
     return [
-        Finding("faintspot", f"{__version__} in {Path(__file__).parent}"),
+        Finding("faintspot", f"{__version__} in {Path(__file__).parents[1]}"),
         Finding("Python", f"{platform.python_version()} ({platform.platform()}, {platform.machine()})"),
         Finding("packages", ", ".join(f"{name} {_version(name)}" for name in _REQUIRED)),
         *(_extra(name) for name in EXTRAS),
@@ -65,7 +67,7 @@ def examine() -> list[Finding]:
 
 def _version(package: str) -> str:
     try:
-        return version(package.replace("_", "-"))
+        return version(_DISTRIBUTIONS.get(package, package))
     except PackageNotFoundError:
         return "of unknown version" if present(package) else "missing"
 

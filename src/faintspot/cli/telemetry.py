@@ -19,7 +19,7 @@ from faintspot.cli.shared.needs import needs
 _SECONDS = 20.0
 
 
-@needs("web", "matplotlib", "jinja2")
+@needs("report", "matplotlib", "jinja2")
 @click.command(short_help="Report noise, turbulence, vibrations and control of a recorded or running loop.")
 @click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[FILE]")
 @option("--engine", metavar="NAME", help="Record this running engine first; FILE keeps the recording.")

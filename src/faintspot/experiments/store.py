@@ -265,7 +265,7 @@ def _zarr() -> Any:
     try:
         import zarr
     except ImportError:
-        raise MissingExtraError("zarr", "study", "Keeping finished work in files") from None
+        raise MissingExtraError("zarr", "io", "Keeping finished work in files") from None
     return zarr
 
 

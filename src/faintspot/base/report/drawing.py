@@ -19,7 +19,7 @@ try:
     from matplotlib.figure import Figure
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 except ImportError:
-    raise MissingExtraError("matplotlib", "web", "Drawing pictures") from None
+    raise MissingExtraError("matplotlib", "report", "Drawing pictures") from None
 
 COLOUR_MAP = "cividis"
 # Okabe & Ito (2008): readable with any colour vision.

@@ -30,7 +30,7 @@ try:
     from tornado.web import Application, HTTPError, RequestHandler
     from tornado.websocket import WebSocketClosedError, WebSocketHandler
 except ImportError:
-    raise MissingExtraError("tornado", "live", "The live page") from None
+    raise MissingExtraError("tornado", "realtime", "The live page") from None
 
 LARGEST_REQUEST = 16 * 1024
 MOST_CLIENTS = 32

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 try:
     import xarray
 except ImportError:
-    raise MissingExtraError("xarray", "study", "A study") from None
+    raise MissingExtraError("xarray", "loop", "A study") from None
 
 VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     name: (tuple(dimensions.split()), units, description.format(outlier=OUTLIER_PX))
