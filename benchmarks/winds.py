@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.measuring import Row, Table
 from benchmarks.prediction import SETTLE, VIBRATION_NM, Case, Floats, Run
 from faintspot.base.statistics import paired_mean
-from faintspot.engine.loop.successor import Ready, Successor
+from faintspot.engine.loop.successor import ControllerSuccessor, PreparedController
 from faintspot.loop.control.base import ASSUMED, WINDS
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.learning import KALMAN
@@ -112,8 +112,8 @@ def drifting(case: Case, learnt: LearntControl, realisation: int) -> Drifted:
             found = relearn(case.plant, running, telemetry, case.site, case.rate_hz, start)
         if run.frame % every == later and found is not None and found.is_better:
             running, line = found.learnt.model, CommandDelayLine(len(run.line.latest), run.line.delay_frames)
-            successor = Successor(
-                Ready(KALMAN, found.learnt.controller(line), line, False, True, True, False)
+            successor = ControllerSuccessor(
+                PreparedController(KALMAN, found.learnt.controller(line), line, False, True, True, False)
             )
     run.strehl[:SETTLE], change[:SETTLE] = np.nan, 0.0
     largest = float((at_handover * change).max()), float((change - at_handover * change).max())

@@ -64,8 +64,8 @@ def _stop(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
 
 def _take_learnt(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     """Note what was learnt beside the engine, and take the new model, if one is handed over."""
-    known: dict[str, Any] = {"found": _text(fields, "found"), "unix_time_s": time.time(), "taken": False}
-    engine.learning = known
+    learning: dict[str, Any] = {"found": _text(fields, "found"), "unix_time_s": time.time(), "taken": False}
+    engine.learning = learning
     if fields.get("model") is None:
         return {}
     if engine.loop is None:
@@ -73,24 +73,24 @@ def _take_learnt(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     try:
         engine.loop.renew(ControlModel.load(_text(fields, "model"), engine.loop.control.plant))
     except InputError as error:
-        engine.learning = {**known, "fault": f"{error}"}
+        engine.learning = {**learning, "fault": f"{error}"}
         raise
-    engine.learning = {**known, "taken": True}
+    engine.learning = {**learning, "taken": True}
     return {}
 
 
 def _take_spots(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     """Measure with the PSF and the fixed weights of a sodium profile from the next frame on."""
-    known = fields.get("sodium")
-    if not isinstance(known, Mapping):
-        raise InputError(f"sodium = {known!r:.80}: expected a profile")
+    sodium = fields.get("sodium")
+    if not isinstance(sodium, Mapping):
+        raise InputError(f"sodium = {sodium!r:.80}: expected a profile")
     if not isinstance(maker := engine.preparer.make_pipeline, PipelineMaker):
         raise InputError("spots: this engine does not know how its pipelines are made")
     changes: dict[str, Any] = {"psf": PSF.load(_text(fields, "psf"))}
     if fields.get("score") is not None:
         changes["score"] = load_score(_text(fields, "score"))
-    change = engine.renew_spots(replace(maker, **changes), {SODIUM: known})
-    engine.sodium = {**known, "unix_time_s": time.time()}
+    change = engine.renew_spots(replace(maker, **changes), {SODIUM: sodium})
+    engine.sodium = {**sodium, "unix_time_s": time.time()}
     return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,7 @@ from tests.loop.control.control_cases import FRAME_S, INTERACTION, LAYERS, PLANT
 from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
-from faintspot.engine.background.learning import LearningBeside, learning_beside
+from faintspot.engine.background.learning import BackgroundLearning, background_learning
 from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.requests.private_socket import socket_path
@@ -93,11 +94,7 @@ def test_a_new_filter_goes_on_from_the_mirror(name: str, model: ControlModel) ->
     assert np.abs(after[:SETTLE_FRAMES] - others[100:-100]).max() > 0.2 * largest
     np.testing.assert_allclose(after[-85:], others[-85:], atol=0.02 * largest)
     with pytest.raises(InputError, match="first"):
-        run.loop.renew(
-            ControlModel(
-                KALMAN, {**model.arrays, "first": np.eye(3)}, 0.4, 1.0, model.left, model.phase_of_commands
-            )
-        )
+        run.loop.renew(replace(model, arrays={**model.arrays, "first": np.eye(3)}))
     for each in (run, other):
         each.ring.close()
 
@@ -123,7 +120,7 @@ def test_a_better_filter_is_handed_to_the_engine(
     outdated(model).save(tmp_path / "model.npz")
     save_control(path, interaction_matrix="m.npy")
     with pytest.raises(InputError, match="expected controller"):
-        LearningBeside(name, path, 1.0)
+        BackgroundLearning(name, path, 1.0)
     save_control(path, controller=KALMAN, model="model.npz")
     run = Run(name, outdated(model))
     engine = engine_of(run)
@@ -132,7 +129,7 @@ def test_a_better_filter_is_handed_to_the_engine(
         "get": lambda _: {"settings": {"estimator": "window"}},
     }
     with ControlServer(socket_path(name), handlers, lengthy=("learnt",)):
-        learning = LearningBeside(name, path, 280 * FRAME_S)
+        learning = BackgroundLearning(name, path, 280 * FRAME_S)
         run.frames(100)
         assert not learning.take()
         run.frames(200)
@@ -157,7 +154,7 @@ def test_a_better_filter_is_handed_to_the_engine(
 def test_a_process_that_dies_is_one_line(name: str, tmp_path: Path) -> None:
     """It waits for an engine that is not there, or is killed; the status says so."""
     engine, lines = SimpleNamespace(name=name, learning=None), list[str]()
-    with learning_beside(engine, tmp_path / "none.toml", 1.0, lines.append):  # type: ignore[arg-type]
+    with background_learning(engine, tmp_path / "none.toml", 1.0, lines.append):  # type: ignore[arg-type]
         wait_for(lambda: bool(lines))
     assert len(lines) == 1
     assert "none.toml" in engine.learning["fault"]

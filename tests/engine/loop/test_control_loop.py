@@ -13,7 +13,7 @@ from tests.loop.control.control_cases import FRAME_S, INTERACTION, PLANT, TURBUL
 
 from faintspot.base.errors import InputError
 from faintspot.engine.loop.control_loop import ControlLoop
-from faintspot.engine.path.slope_prior import Prior
+from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.loop.control import slope_product
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
@@ -118,7 +118,7 @@ def any_control(data: st.DataObject) -> None:
     """Control that cannot be computed is refused in one line; else the loop opens and the mirror stays."""
     try:
         control = data.draw(controls())
-        loop = ControlLoop(control, LAYOUT, prior=Prior(N))
+        loop = ControlLoop(control, LAYOUT, prior=SlopePrior(N))
     except InputError as error:
         event("refused")
         said = str(error)

@@ -2,12 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from faintspot.engine.path.slope_prior import Prior
+from faintspot.engine.path.slope_prior import SlopePrior
 
 
 def test_what_is_expected_and_how_surely() -> None:
     """Widths are the rms of both axes; what no frame can hold is not expected, what says nothing is NaN."""
-    prior = Prior(3, 10.0)
+    prior = SlopePrior(3, 10.0)
     mean = np.array([1.0, 11.0, np.nan, -2.0, 3.0, -10.0])
     std = np.array([3.0, 1.0, np.inf, 4.0, 0.0, 1.0])
     prior.expect(mean, std)

@@ -13,7 +13,7 @@ SMALLEST_STD_PX, LARGEST_STD_PX = 1e-6, 1e4
 """Smallest and largest standard deviation of a prior [px]."""
 
 
-class Prior:
+class SlopePrior:
     """Predicted slopes and their uncertainty for each frame in turn, in fixed memory.
 
     Parameters
@@ -39,7 +39,7 @@ class Prior:
         self.changes = 0
         self.largest_px = largest_px
         self._mean = self.mean_px.reshape(-1)
-        self._given: Floats | None = None
+        self._std_px: Floats | None = None
 
     def forget(self) -> None:
         """Remove the prediction."""
@@ -62,13 +62,13 @@ class Prior:
         self._take_std(std_px)
 
     def _take_std(self, std_px: Floats | None) -> None:
-        if std_px is self._given:
+        if std_px is self._std_px:
             return
-        self._given = std_px
+        self._std_px = std_px
         self.changes += 1
         self.std_px[:] = np.nan
         if std_px is not None:
             x, y = std_px.reshape(2, -1)
-            known = np.minimum(x, y) >= SMALLEST_STD_PX
-            known &= np.maximum(x, y) <= LARGEST_STD_PX
-            self.std_px[known] = np.hypot(x[known], y[known]) / math.sqrt(2)
+            usable = np.minimum(x, y) >= SMALLEST_STD_PX
+            usable &= np.maximum(x, y) <= LARGEST_STD_PX
+            self.std_px[usable] = np.hypot(x[usable], y[usable]) / math.sqrt(2)

@@ -243,7 +243,7 @@ class Follower:
         self.using = threading.Lock()
         self.obstacle = "is not there"
         self.counters = StreamCounters() if counters is None else counters
-        self.seen, self._said, self._next_look_s = 0, "", -math.inf
+        self.seen, self._reported, self._next_look_s = 0, "", -math.inf
 
     def say(self, text: str) -> None:
         """Report a change of the stream."""
@@ -269,9 +269,9 @@ class Follower:
             self.close()
             self.say("was removed" if same is None else "was recreated")
         self.obstacle = self._opened()
-        if self.obstacle != self._said and self.obstacle:
+        if self.obstacle != self._reported and self.obstacle:
             self.say(f"{self.obstacle}; {self._meanwhile()}")
-        self._said = self.obstacle
+        self._reported = self.obstacle
         source = self.source
         if source is not None:
             self._prepare(source)

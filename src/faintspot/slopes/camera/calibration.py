@@ -120,11 +120,11 @@ class Calibration:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Calibration):
             return NotImplemented
-        mine, theirs = vars(self), vars(other)
+        own, theirs = vars(self), vars(other)
         return all(
-            (mine[name] is None) == (theirs[name] is None)
-            and (mine[name] is None or np.array_equal(mine[name], theirs[name], equal_nan=True))
-            for name in mine
+            (own[name] is None) == (theirs[name] is None)
+            and (own[name] is None or np.array_equal(own[name], theirs[name], equal_nan=True))
+            for name in own
         )
 
     __hash__ = None  # type: ignore[assignment]
@@ -168,12 +168,12 @@ class Calibration:
 
     def with_bad_pixels(self, rows_and_columns: NDArray[np.int64]) -> Calibration:
         """Return the same calibration with further bad pixels, (n, 2)."""
-        known = self.bad_pixels
-        if known is None:
-            known = np.empty((0, 2), np.int64)
-        elif known.dtype == np.bool_:
-            known = np.argwhere(known)
-        return replace(self, bad_pixels=np.unique(np.concatenate([known, rows_and_columns]), axis=0))
+        bad = self.bad_pixels
+        if bad is None:
+            bad = np.empty((0, 2), np.int64)
+        elif bad.dtype == np.bool_:
+            bad = np.argwhere(bad)
+        return replace(self, bad_pixels=np.unique(np.concatenate([bad, rows_and_columns]), axis=0))
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
@@ -255,8 +255,8 @@ class Calibration:
             return self.bad_pixels  # type: ignore[no-any-return]
         outside = np.any(self.bad_pixels >= np.array(frame_shape), axis=1)
         if outside.any():
-            place = tuple(int(i) for i in self.bad_pixels[np.argmax(outside)])
-            raise InputError(f"calibration.bad_pixels: (row, column) {place} is outside {frame_shape}")
+            pixel = tuple(int(i) for i in self.bad_pixels[np.argmax(outside)])
+            raise InputError(f"calibration.bad_pixels: (row, column) {pixel} is outside {frame_shape}")
         mask = np.zeros(frame_shape, bool)
         mask[self.bad_pixels[:, 0], self.bad_pixels[:, 1]] = True
         return mask
@@ -283,10 +283,10 @@ def _read_noise(value: Any) -> Any:
     if real_array(name, value).ndim == 0:
         return number_between(name, value, 0.0, _LARGEST_READ_NOISE_E)
     noise = _map(name, value)
-    known = noise[~np.isnan(noise)]
-    if known.size == 0:
+    finite = noise[~np.isnan(noise)]
+    if finite.size == 0:
         raise InputError(f"{name}: expected the noise of at least one pixel, every value is NaN")
-    numbers_between(name, known, 0.0, _LARGEST_READ_NOISE_E)
+    numbers_between(name, finite, 0.0, _LARGEST_READ_NOISE_E)
     return noise
 
 

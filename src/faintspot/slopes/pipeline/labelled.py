@@ -35,13 +35,13 @@ def dataset_of(slopes: Variables, layout: Layout | None, unit: str) -> xarray.Da
     except ImportError:
         raise MissingExtraError("xarray", "loop", "Slopes.to_xarray") from None
     variables, coordinates = _parts(slopes, layout, unit)
-    of = {"unit": unit}
+    attributes = {"unit": unit}
     return xarray.Dataset(
         {
             name: (
                 ("frame", "subaperture"),
                 values,
-                {"units": unit_of(name, of), "long_name": VARIABLES[name].long_name},
+                {"units": unit_of(name, attributes), "long_name": VARIABLES[name].long_name},
             )
             for name, values in variables.items()
         },
@@ -49,7 +49,7 @@ def dataset_of(slopes: Variables, layout: Layout | None, unit: str) -> xarray.Da
             name: ("subaperture", values, {"units": COORDINATE_UNITS.get(name, "1")})
             for name, values in coordinates.items()
         },
-        of,
+        attributes,
     )
 
 

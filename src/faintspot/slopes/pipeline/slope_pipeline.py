@@ -129,11 +129,11 @@ class SlopePipeline:
         InputError
             If the width is another one.
         """
-        other = copy.copy(self)
-        other._lanes = lanes_for(np.float32, width)
-        other._calibration = packed_calibration(self.layout, self.calibration, width)
-        other.plan = other._prepared()
-        return other
+        pipeline = copy.copy(self)
+        pipeline._lanes = lanes_for(np.float32, width)
+        pipeline._calibration = packed_calibration(self.layout, self.calibration, width)
+        pipeline.plan = pipeline._prepared()
+        return pipeline
 
     @property
     def spot(self) -> tuple[PSF | None, Score | None]:
@@ -184,20 +184,20 @@ class SlopePipeline:
                 f"mean_flux: expected one number or {len(self.layout)}, got shape {flux_e.shape}"
             )
         step = math.log(self.plan.prepared.flux_step)
-        known = self.plan.sensor.flux_e
+        planned_e = self.plan.sensor.flux_e
         with np.errstate(divide="ignore", invalid="ignore"):
-            steady = np.abs(np.log(flux_e / known)) <= step
+            steady = np.abs(np.log(flux_e / planned_e)) <= step
         if steady.all():
             return self
         rounded = np.exp(step * np.rint(np.log(flux_e) / step))
-        return self.with_settings(self.settings.replace(flux_e=np.broadcast_to(rounded, known.shape)))
+        return self.with_settings(self.settings.replace(flux_e=np.broadcast_to(rounded, planned_e.shape)))
 
     def for_images(self) -> SlopePipeline:
         """Return the same pipeline for calibrated images (n, ny, nx) [electrons], read as one tall frame."""
         layout, camera = self.layout, self.calibration
-        other = copy.copy(self)
-        other.layout = Layout.stacked(len(layout), layout.window, layout.offsets)
-        other.calibration = Calibration(
+        pipeline = copy.copy(self)
+        pipeline.layout = Layout.stacked(len(layout), layout.window, layout.offsets)
+        pipeline.calibration = Calibration(
             dark=None if camera.dark is None else 0.0,
             rough_dark=camera.rough_dark,
             gain_e_per_adu=camera.em_gain,
@@ -205,9 +205,9 @@ class SlopePipeline:
             read_noise_e=self._noise_of_images(),
             background_e=camera.background_e,
         )
-        other._calibration = packed_calibration(other.layout, other.calibration, self.width)
-        other.plan = other._prepared()
-        return other
+        pipeline._calibration = packed_calibration(pipeline.layout, pipeline.calibration, self.width)
+        pipeline.plan = pipeline._prepared()
+        return pipeline
 
     def _noise_of_images(self) -> Any:
         """Return the read noise of `for_images`."""
@@ -382,8 +382,8 @@ def _reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -
     n, side = len(layout), max(layout.frame_shape)
     if reference is None:
         return np.zeros((n, 2))
-    given = reference.vector if isinstance(reference, Slopes) else reference
-    array = numbers_between("reference", given, -side, side)
+    values = reference.vector if isinstance(reference, Slopes) else reference
+    array = numbers_between("reference", values, -side, side)
     if array.shape == (2 * n,):
         return np.stack([array[:n], array[n:]], axis=1)
     if array.shape != (n, 2):
@@ -420,6 +420,6 @@ def _identity(psf: PSF | None, score: Score | None, zero: NDArray[np.float64]) -
     for part in (psf, score):
         for field in fields(part) if part is not None else ():
             value = getattr(part, field.name)
-            whole = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
-            digest.update(f"{type(part).__name__}.{field.name}".encode() + whole)
+            content = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+            digest.update(f"{type(part).__name__}.{field.name}".encode() + content)
     return digest.digest()

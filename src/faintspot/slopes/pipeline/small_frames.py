@@ -47,4 +47,4 @@ class SmallFrames:
         np.copyto(self._frame, frame)
         self._kernel(*self._arguments)
         self._flag_doubtful(self._results)
-        return Slopes(*[each.copy() for each in self._slopes])
+        return Slopes(*[values.copy() for values in self._slopes])

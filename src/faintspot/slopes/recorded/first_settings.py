@@ -110,15 +110,15 @@ def _displacement(images: Floats, layout: Layout, spots: SeenSpots) -> float:
     mean = images.mean(axis=(0, 1))
     mean = mean - np.median(mean[[0, -1]])
     try:
-        seen = seen_spots(mean)
+        wide = seen_spots(mean)
     except InputError:
         return _WIDTH_OF_WINDOW * min(layout.window)
-    squares = np.square([seen.fwhm_x_px, seen.fwhm_y_px]) - np.square([spots.fwhm_x_px, spots.fwhm_y_px])
+    squares = np.square([wide.fwhm_x_px, wide.fwhm_y_px]) - np.square([spots.fwhm_x_px, spots.fwhm_y_px])
     v, u = (np.arange(side) - 0.5 * (side - 1) for side in layout.window)
     spot = np.maximum(mean - 0.5 * mean.max(), 0.0)
     middle = np.array([u @ spot.sum(axis=0), v @ spot.sum(axis=1)]) / spot.sum()
-    away = np.square(middle - layout.offsets.mean(axis=0)) - layout.offsets.var(axis=0)
-    return math.sqrt(max(float((squares * FWHM_TO_STD**2 + away).mean()), 0.0))
+    squares_away = np.square(middle - layout.offsets.mean(axis=0)) - layout.offsets.var(axis=0)
+    return math.sqrt(max(float((squares * FWHM_TO_STD**2 + squares_away).mean()), 0.0))
 
 
 def _photon_noise(images: Floats, noise: float, flux: float) -> float:

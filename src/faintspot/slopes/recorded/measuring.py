@@ -129,8 +129,8 @@ def measure_recorded(
     InputError
         When a file cannot be read or written, or frames and configuration do not fit together.
     """
-    given, origin, in_file = _given(configuration_file, frames, key)
-    layout, settings, calibration, psf, score = given
+    parts, origin, stored_reference = _configured(configuration_file, frames, key)
+    layout, settings, calibration, psf, score = parts
     if changes:
         settings = settings.replace(**changes)
     if not denoise:
@@ -139,15 +139,15 @@ def measure_recorded(
         settings = with_preset(settings, preset)
     positions = read_reference(reference) if isinstance(reference, str | Path) else reference
     if positions is None:
-        positions = in_file
+        positions = stored_reference
     try:
         pipeline = SlopePipeline(
             layout, settings, calibration, positions, psf=psf, score=score, threads=threads
         )
     except InputError as error:
         about_reference = positions is not None and str(error).startswith("reference")
-        where = reference if about_reference and isinstance(reference, str | Path) else configuration_file
-        raise InputError(f"{where}: {error}") from None
+        file = reference if about_reference and isinstance(reference, str | Path) else configuration_file
+        raise InputError(f"{file}: {error}") from None
     with open_frames(frames, key=key) as source:
         _check_output(output, frames)
         if source.shape != layout.frame_shape:
@@ -156,7 +156,7 @@ def measure_recorded(
                 f"{layout.frame_shape[0]} x {layout.frame_shape[1]} as in {configuration_file}"
             )
         if mean_flux:
-            pipeline = _told_mean_flux(pipeline, source)
+            pipeline = _with_mean_flux(pipeline, source)
         attributes = _attributes(pipeline, source, frames, configuration_file, key, unit)
         factor = pixels_in(one_of("unit", unit, UNITS), attributes)
         if positions is not None:
@@ -183,19 +183,19 @@ def measure_recorded(
     return summary
 
 
-def _given(
+def _configured(
     path: str | Path, frames: Sequence[str | Path], key: str | None
 ) -> tuple[configuration.Configuration, str, NDArray[Any] | None]:
     """Return the configuration, what of it is that of an AOT file, in words, and that file's references."""
     if isinstance(frames, str | Path) or not frames or configuration.has(path, "layout"):
         return configuration.load_all(path), "", None
     try:
-        first, own = split_location(frames[0])
+        first, key_in_name = split_location(frames[0])
     except InputError:  # whoever opens it says so, after what is wrong with the configuration
         return configuration.load_all(path), "", None
     if not is_aot(first):
         return configuration.load_all(path), "", None
-    sensor = read_aot(first, own or key)
+    sensor = read_aot(first, key_in_name or key)
     if sensor.layout is None:
         raise InputError(
             f"{first}: sensor {sensor.name!r}: expected its sub-apertures (subaperture_mask, mask_offsets, "
@@ -214,12 +214,12 @@ def _given(
         document = read_tables(path)
     else:
         words.append("settings")
-    where = Path(path)
+    file_path = Path(path)
     if "settings" in words and sensor.parts is not None:
-        settings = Settings.from_tables(where, document)
+        settings = Settings.from_tables(file_path, document)
         measuring = configuration.Parts(settings, *configuration.unpacked(sensor.parts))
     else:
-        measuring = configuration.Parts.from_tables(where, document)
+        measuring = configuration.Parts.from_tables(file_path, document)
     parts = configuration.Configuration(layout, *measuring)
     listed = " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
     return parts, f"{listed} of {first}", sensor.reference
@@ -229,13 +229,13 @@ def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str
     """Return the command that writes a configuration for a layout whose cells are on a grid."""
     rows, columns = np.ptp(layout.cells, axis=0) + 1
     (top, left), (bottom, right) = layout.corners.min(axis=0), layout.corners.max(axis=0) + layout.window
-    whole = (top, left, bottom, right) == (0, 0, *layout.frame_shape)
-    roi = [] if whole else ["--roi", f"{left},{top},{right},{bottom}"]
+    is_whole = (top, left, bottom, right) == (0, 0, *layout.frame_shape)
+    roi = [] if is_whole else ["--roi", f"{left},{top},{right},{bottom}"]
     words = ["faintspot", "layout", str(frames), "--grid", f"{rows}x{columns}", *roi, "-o", str(path)]
     return shlex.join(words)
 
 
-def _told_mean_flux(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeline:
+def _with_mean_flux(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeline:
     """Return the pipeline for the mean flux of frames from all over the recording."""
     estimator = pipeline.settings.estimator
     if not estimator.uses_flux:

@@ -52,8 +52,8 @@ class StoredRun:
     @property
     def sources(self) -> list[str]:
         """The files that the frames came from."""
-        found = self.stored.attributes.get("sources", [])
-        return [found] if isinstance(found, str) else [str(item) for item in found]
+        sources = self.stored.attributes.get("sources", [])
+        return [sources] if isinstance(sources, str) else [str(item) for item in sources]
 
     @property
     def text(self) -> str:

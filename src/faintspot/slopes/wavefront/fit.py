@@ -162,15 +162,15 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
         [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
     )
     used = np.tile(valid, 2)
-    known = bool(np.isfinite(errors[used]).all())
+    has_errors = bool(np.isfinite(errors[used]).all())
     noise = np.square(errors, dtype=np.float64), np.atleast_2d(slopes.covariance_xy).astype(np.float64)
     measured = np.concatenate([x, y], axis=1).astype(np.float64)
-    coefficients, standard_errors, residual = _fit(measured, used, gradients, noise if known else None)
+    coefficients, standard_errors, residual = _fit(measured, used, gradients, noise if has_errors else None)
     return Wavefront(
         np.arange(2, 2 + gradients.shape[1]),
         scale * coefficients,
         scale * standard_errors,
-        "slopes" if known else "residuals",
+        "slopes" if has_errors else "residuals",
         residual,
         unit,
         pupil,
@@ -229,26 +229,26 @@ def _fit(
     residual = np.full(frames, np.nan)
     patterns, of_frame = np.unique(np.packbits(valid, axis=1), axis=0, return_inverse=True)
     for number in range(len(patterns)):
-        which = np.flatnonzero(of_frame.ravel() == number)
-        used = valid[which[0]]
+        rows = np.flatnonzero(of_frame.ravel() == number)
+        used = valid[rows[0]]
         if not _condition(gradients[used]) <= LARGEST_CONDITION:
             continue
         inverse = np.linalg.pinv(gradients[used])
-        measured = slopes[np.ix_(which, used)]
+        measured = slopes[np.ix_(rows, used)]
         fitted = measured @ inverse.T
-        left = measured - fitted @ gradients[used].T
-        coefficients[which] = fitted
-        residual[which] = np.sqrt(np.mean(left**2, axis=1))
+        residuals = measured - fitted @ gradients[used].T
+        coefficients[rows] = fitted
+        residual[rows] = np.sqrt(np.mean(residuals**2, axis=1))
         freedom = measured.shape[1] - k
         if noise is not None:
             along, across = np.split(inverse, 2, axis=1)
-            variance = noise[0][np.ix_(which, used)] @ (inverse**2).T
-            both = noise[1][np.ix_(which, used[: len(used) // 2])]
-            variance = variance + 2 * both @ (along * across).T
+            variance = noise[0][np.ix_(rows, used)] @ (inverse**2).T
+            covariance = noise[1][np.ix_(rows, used[: len(used) // 2])]
+            variance = variance + 2 * covariance @ (along * across).T
         elif freedom > 0:
-            of_slopes = np.sum(left**2, axis=1, keepdims=True) / freedom
+            of_slopes = np.sum(residuals**2, axis=1, keepdims=True) / freedom
             variance = of_slopes * np.sum(inverse**2, axis=1)
         else:
             continue
-        standard_errors[which] = np.sqrt(variance)
+        standard_errors[rows] = np.sqrt(variance)
     return coefficients, standard_errors, residual
