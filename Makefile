@@ -11,7 +11,7 @@ export OPENBLAS_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types unit fuzz docs release bench bench-compare pins clean
+.PHONY: help demo test test-all lint types unit slow fuzz docs release bench bench-compare pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -19,7 +19,9 @@ help:  ## this list
 demo: $(VENV)/installed-demo  ## simulate a faint star, measure it with and without denoising, write a report
 	$(BIN)/faintspot demo
 
-test: lint types unit  ## lint, types, tests
+test: lint types unit  ## lint, types, and the tests that take no processes and no more than seconds
+
+test-all: test slow  ## all tests
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .
@@ -30,7 +32,10 @@ types: $(VENV)/installed
 	$(BIN)/mypy
 
 unit: $(VENV)/installed
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+
+slow: $(VENV)/installed  ## tests that start processes or a browser, or take longer
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
 fuzz: $(VENV)/installed  ## hostile values at every entry point for MINUTES=60; a finding names its seed
 	$(BIN)/python -m tests.fuzz --minutes $(MINUTES)
