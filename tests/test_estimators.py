@@ -289,7 +289,7 @@ class TestLocalBackground:
 
         for each, changes in ((off, {"dark": 0.0}), (on, {"dark": None})):
             assert_same(with_dark(case, **changes).measure(), with_dark(each, dark=0.0).measure())
-        rough = {"dark": 1.0, "rough_dark": True}
+        rough = {"dark": 1.0, "estimated": ("dark",)}
         assert_same(with_dark(case, **rough).measure(), with_dark(on, dark=1.0).measure())
 
     def test_images_keep_what_is_known_of_the_dark(self) -> None:

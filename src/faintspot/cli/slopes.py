@@ -148,7 +148,9 @@ def describe(summary: Summary, output: str) -> list[str]:
         count = summary.flag_counts.get(flag, 0)
         if count:
             lines.append(f"  {_count(count, 'slope')} {text} ({100 * count / summary.measured:.3g} %)")
-    if not any(summary.flag_counts.values()):
+    if summary.reference:
+        lines.append(f"  {summary.reference}")
+    if not any(summary.flag_counts.values()) and not summary.doubtful:
         lines.append("  every slope is valid, without any flag")
     if summary.failed_frames:
         lines.append(f"  {_count(summary.failed_frames, 'frame')} without slopes: {summary.failure}")

@@ -168,7 +168,7 @@ def _calibration(
         em_gain=em_gain,
         read_noise_e=read_noise,
         background_e=background,
-        rough_dark=darks is None,
+        estimated=("dark",) if darks is None else (),
     )
 
 

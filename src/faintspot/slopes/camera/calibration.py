@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import number_between, numbers_between, real_array
+from faintspot.base.checks import number_between, numbers_between, one_of, real_array, strings_of
 from faintspot.base.config.tables import (
     check_fields,
     chosen_fields,
@@ -27,6 +27,7 @@ from faintspot.base.npz import save_arrays
 from faintspot.io.frames import open_frames, read_array
 
 _BLOCK_PIXELS = 1 << 22  # processed at a time
+_ESTIMATED = ("dark", "gain_e_per_adu", "saturation_adu", "bad_pixels")
 _MAPS = ("dark", "flat", "bad_pixels", "read_noise_e")
 # Limit of values that the kernels square in float32, with a wide margin; no camera reaches it.
 _GAINS = 1e-9, 1e9
@@ -47,8 +48,9 @@ class Calibration:
     dark : float or (h, w) array, optional, ADU
         Frame without flux: bias and dark current. NaN marks a bad pixel. Default: unknown, and treated as
         0. A value of 0 states that there is none.
-    rough_dark : bool
-        Whether `dark` is only approximate, such as the background of frames with light in them.
+    estimated : tuple of str
+        Names of fields that were estimated from frames with light in them, such as a `dark` that is their
+        background. `faintspot layout` estimates them again; estimators may fit an estimated dark level.
     flat : (h, w) array, optional
         Relative response of each pixel, 1 on average. NaN, zero or negative marks a bad pixel.
     gain_e_per_adu : float
@@ -89,14 +91,15 @@ class Calibration:
     saturation_adu: float | None = None
     read_noise_e: Any = None
     background_e: float = 0.0
-    rough_dark: bool = False
+    estimated: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         put = object.__setattr__
         if self.dark is not None:
             put(self, "dark", _scalar_or_map("calibration.dark", self.dark))
-        if not isinstance(self.rough_dark, bool):
-            raise InputError(f"calibration.rough_dark = {self.rough_dark!r}: expected true or false")
+        put(self, "estimated", strings_of("calibration.estimated", self.estimated))
+        for name in self.estimated:
+            one_of("calibration.estimated", name, _ESTIMATED)
         if self.flat is not None:
             put(self, "flat", _map("calibration.flat", self.flat))
         for name in ("gain_e_per_adu", "em_gain"):
@@ -137,7 +140,7 @@ class Calibration:
     @property
     def vouches_for_dark(self) -> bool:
         """Whether the dark level is known accurately; otherwise estimators may fit it."""
-        return self.dark is not None and not self.rough_dark
+        return self.dark is not None and "dark" not in self.estimated
 
     @property
     def typical_read_noise_e(self) -> float | None:

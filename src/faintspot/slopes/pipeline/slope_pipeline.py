@@ -199,7 +199,7 @@ class SlopePipeline:
         pipeline.layout = Layout.stacked(len(layout), layout.window, layout.offsets)
         pipeline.calibration = Calibration(
             dark=None if camera.dark is None else 0.0,
-            rough_dark=camera.rough_dark,
+            estimated=camera.estimated,
             gain_e_per_adu=camera.em_gain,
             em_gain=camera.em_gain,
             read_noise_e=self._noise_of_images(),

@@ -30,6 +30,7 @@ from faintspot.slopes.pipeline.settings import Settings, with_preset, without_de
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.sensor.stated import reference_in_words
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
 
@@ -58,6 +59,10 @@ class Summary:
     """Error of the last of them."""
     origin: str = ""
     """Description of the values taken from a file of telemetry."""
+    reference: str = ""
+    """Description of the reference where it was fitted to a frame."""
+    doubtful: bool = False
+    """Whether the layout has doubts that nobody has settled."""
 
     def add(self, slopes: Slopes) -> None:
         """Count the flags of a block."""
@@ -161,7 +166,11 @@ def measure_recorded(
         factor = pixels_in(one_of("unit", unit, UNITS), attributes)
         if positions is not None:
             attributes["reference"] = np.asarray(positions).tolist()
-        summary = Summary(source.n_frames, len(layout), origin=origin)
+            if isinstance(reference, str | Path):
+                attributes["reference_file"] = str(reference)
+        summary = Summary(source.n_frames, len(layout), origin=origin, doubtful=bool(layout.doubts))
+        if positions is None:
+            summary.reference = reference_in_words(layout.fitted)
         size = block_frames or max(1, _BLOCK_BYTES // (4 * source.shape[0] * source.shape[1]))
         with create_writer(
             output,
