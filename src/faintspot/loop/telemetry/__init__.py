@@ -1,6 +1,6 @@
 """Measurements from the telemetry of loops. Read in this order.
 
-Of any system: `recorded_loop` (its file), `open_loop` (slopes without the mirror), `choices` (other
-controllers by replay), `report` and `page`. Of this engine: `recording` and `engine_telemetry` (its
-slopes), `measured` (star, camera and turbulence), `residual`, `centroid_gain`.
+`recorded_loop` (a loop of any system from its file), `open_loop` (slopes without the mirror), `spectra`,
+`slope_discrepancy`, `measured` (values with errors), `choices` (other controllers by replay),
+`report`, `page`. `recording` prepares telemetry of this engine for learning.
 """
