@@ -1,1 +1,1 @@
-"""Measurements from the telemetry of running or recorded loops."""
+"""Measurements from recorded loops."""
