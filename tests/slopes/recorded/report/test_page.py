@@ -173,5 +173,5 @@ def test_parts_that_do_not_fit_are_refused_in_one_line() -> None:
 def test_missing_jinja2_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "jinja2", None)
     layout = sensor((1, 1))
-    with pytest.raises(MissingExtraError, match=r"faintspot\[web\]"):
+    with pytest.raises(MissingExtraError, match=r"faintspot\[report\]"):
         page_of(layout, simulated(layout, 1)[0])
