@@ -35,7 +35,10 @@ def load_zarr() -> Any:
 
 def has_zarr() -> bool:
     """Return whether zarr is installed."""
-    return importlib.util.find_spec("zarr") is not None
+    try:
+        return importlib.util.find_spec("zarr") is not None
+    except ImportError:  # an import hook that refuses it
+        return False
 
 
 def _load(module: str, package: str, purpose: str) -> Any:
