@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import warnings
 from dataclasses import replace
@@ -282,7 +283,7 @@ def _found(description: str, mean: NDArray[np.float64], options: dict[str, Any])
     except InputError as error:
         text = str(error)
         for name, option in _OPTIONS.items():
-            text = text.replace(name, option)
+            text = re.sub(rf"\b{name}\b", option, text)
         if "found no" in text:
             text += "; --grid is for an array that is known, such as quad cells"
         raise InputError(f"{description}: {text}") from None
