@@ -159,6 +159,11 @@ def describe(summary: Summary, output: str) -> list[str]:
         count = summary.flag_counts.get(flag, 0)
         if count:
             lines.append(f"  {_count(count, 'slope')} {text} ({100 * count / summary.measured:.3g} %)")
+    if summary.saturation_adu is not None:
+        lines.append(
+            f"  values pile up at {summary.saturation_adu:g} ADU, taken as saturation; saturation_adu in "
+            "[calibration] states it"
+        )
     if summary.reference:
         lines.append(f"  {summary.reference}")
     if not any(summary.flag_counts.values()) and not summary.doubtful:

@@ -275,7 +275,7 @@ def test_numbers_are_plain_and_doubt_is_said(folder: Path, run: Commands) -> Non
 
 def test_pure_noise(folder: Path, run: Commands) -> None:
     np.save("a.npy", np.random.default_rng(3).normal(100, 5, (3, 128, 128)))
-    run.refused("layout", "a.npy", "-o", "new.toml", naming=("a.npy", "no square or hexagonal", "--pitch-px"))
+    run.refused("layout", "a.npy", "-o", "new.toml", naming=("a.npy", "--pitch-px"))
     np.save("b.npy", np.full((3, 128, 128), np.nan))
     run.refused("layout", "b.npy", "-o", "new.toml", naming=("b.npy", "every pixel is NaN"))
     np.save("c.npy", np.ones((128, 128)))

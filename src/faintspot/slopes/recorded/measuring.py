@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from faintspot.io.references import read_reference
 from faintspot.io.slopes import create_writer
 from faintspot.io.stored.slopes_format import UNITS, pixels_in, scaled_positions
 from faintspot.io.telemetry.aot_reading import is_aot, read_aot
+from faintspot.slopes.camera.saturation import LargestValues
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.labelled import layout_coordinates
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
@@ -34,6 +36,7 @@ from faintspot.slopes.sensor.stated import reference_in_words
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
 
+_FRAMES_FOR_SATURATION, _LOOK_BYTES = 200, 1 << 21
 _LOOKS_FOR_FLUX, _FRAMES_FOR_FLUX = 20, 50  # stretches of frames over the whole recording
 
 Progress = Callable[[int, int], None]
@@ -61,6 +64,8 @@ class Summary:
     """Description of the values taken from a file of telemetry."""
     reference: str = ""
     """Description of the reference where it was fitted to a frame."""
+    saturation_adu: float | None = None
+    """Saturation level found in the frames, where the configuration states none."""
     doubtful: bool = False
     """Whether the layout has doubts that nobody has settled."""
 
@@ -146,10 +151,9 @@ def measure_recorded(
     positions = read_reference(reference) if isinstance(reference, str | Path) else reference
     if positions is None:
         positions = stored_reference
+    options: dict[str, Any] = {"psf": psf, "score": score, "threads": threads}
     try:
-        pipeline = SlopePipeline(
-            layout, settings, calibration, positions, psf=psf, score=score, threads=threads
-        )
+        pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
     except InputError as error:
         about_reference = positions is not None and str(error).startswith("reference")
         file = reference if about_reference and isinstance(reference, str | Path) else configuration_file
@@ -161,6 +165,10 @@ def measure_recorded(
                 f"{source.description}: frames of {source.shape[0]} x {source.shape[1]} pixels, expected "
                 f"{layout.frame_shape[0]} x {layout.frame_shape[1]} as in {configuration_file}"
             )
+        saturation_adu = _saturation(source) if calibration.saturation_adu is None else None
+        if saturation_adu is not None:
+            calibration = replace(calibration, saturation_adu=saturation_adu)
+            pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
         if mean_flux:
             pipeline = _with_mean_flux(pipeline, source)
         attributes = _attributes(pipeline, source, frames, configuration_file, key, unit)
@@ -170,6 +178,7 @@ def measure_recorded(
             if isinstance(reference, str | Path):
                 attributes["reference_file"] = str(reference)
         summary = Summary(source.n_frames, len(layout), origin=origin, doubtful=bool(layout.doubts))
+        summary.saturation_adu = saturation_adu
         if positions is None:
             summary.reference = reference_in_words(layout.fitted)
         size = block_frames or max(1, _BLOCK_BYTES // (4 * source.shape[0] * source.shape[1]))
@@ -257,6 +266,16 @@ def _with_mean_flux(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeli
         for _, block in source.blocks(start, min(start + _FRAMES_FOR_FLUX, source.n_frames), _FRAMES_FOR_FLUX)
     ]
     return pipeline.with_flux(MeanFlux(np.concatenate(flux)))
+
+
+def _saturation(source: FrameSource) -> float | None:
+    """Return the level at which values of the first frames pile up; None if they do not."""
+    values = LargestValues()
+    size = max(1, _LOOK_BYTES // (source.shape[0] * source.shape[1]))
+    with suppress(InputError):  # of a damaged frame; it is said when it is measured
+        for _, block in source.blocks(0, min(_FRAMES_FOR_SATURATION, source.n_frames), size):
+            values.add(block)
+    return values.saturation_adu
 
 
 def _check_output(output: str | Path, frames: Sequence[str | Path]) -> None:
