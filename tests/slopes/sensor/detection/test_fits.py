@@ -1,0 +1,77 @@
+"""The lattice chosen is that of the spots, not one that is coarser, finer or of another geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from benchmarks.layouts import verdict
+from benchmarks.simulated_arrays import plain_small, random_array
+from numpy.typing import NDArray
+from tests.slopes.sensor.sensor_cases import spot_frame
+
+from faintspot.base.errors import InputError
+from faintspot.slopes.sensor.detection.lenslets import find_lenslets
+
+RATIOS = {"square": 1j, "hexagonal": np.exp(1j * np.pi / 3)}
+PLAIN = plain_small()
+
+
+@pytest.mark.parametrize(
+    "index",
+    [1, 31, 52, 75, 83, 112, 155],
+    ids=["5 x 5", "round", "annulus", "7 x 7", "jitter", "12 spots", "even 7 x 7"],
+)
+def test_plain_small_arrays_are_found(index: int) -> None:
+    """They came out with 2 or 1.4 times the pitch, with a spot missing, or were refused."""
+    assert verdict(PLAIN[index]) == ("right", "")
+
+
+def nodes(geometry: str, across: int, pitch_px: float, angle_deg: float = 4.0) -> NDArray[np.complex128]:
+    """Return a disk of nodes about 0."""
+    count = np.arange(-across, across + 1)
+    cells = (count + count[:, None] * RATIOS[geometry]).ravel() + 0.2 + 0.1j
+    return pitch_px * np.exp(1j * np.radians(angle_deg)) * cells[np.abs(cells) < across / 2]
+
+
+@pytest.mark.parametrize("geometry", ["square", "hexagonal"])
+@pytest.mark.parametrize(
+    ("across", "pitch_px", "width"),
+    [(30, 5.2, 0.15), (12, 8.0, 0.2), (4, 100.0, 0.02), (4, 100.0, 0.2), (5, 33.0, 0.05)],
+    ids=["dense", "wide", "far and sharp", "far and wide", "few"],
+)
+def test_pitch_and_width_of_spots_of_any_ratio(
+    geometry: str, across: int, pitch_px: float, width: float
+) -> None:
+    at = nodes(geometry, across, pitch_px)
+    size = int((across + 2) * pitch_px)
+    width_px = max(width * pitch_px, 0.7)
+    frame = spot_frame(at + size / 2 * (1 + 1j), (size, size), flux_e=3000.0 * width_px, width_px=width_px)
+    grid = find_lenslets(frame)
+    assert grid.geometry == geometry
+    assert grid.pitch_px == pytest.approx(pitch_px, rel=0.01)
+    assert abs(len(grid.cells) - len(at)) <= 0.01 * len(at)
+    assert grid.doubt == ""
+
+
+@pytest.mark.parametrize("part", [0.3, 0.5])
+def test_spots_between_the_lenslets_make_a_lattice_doubtful(part: float) -> None:
+    """As many fill a part of the lattice that is finer by 1.4."""
+    rng = np.random.default_rng(1)
+    at = nodes("square", 12, 20.0) + 150 * (1 + 1j)
+    between = at[rng.random(len(at)) < part] + 10 * (1 + 1j) * np.exp(1j * np.radians(4.0))
+    frame = spot_frame(np.concatenate([at, between]), (300, 300), flux_e=4000.0, width_px=1.4)
+    assert "only a part of the flux" in find_lenslets(frame).doubt
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_few_spots_anywhere_are_no_lattice(seed: int) -> None:
+    """One pair of spots in each direction may be a coincidence."""
+    at = np.random.default_rng(seed).uniform(10, 120, (6, 2)) @ np.array([1, 1j])
+    frame = spot_frame(at, (130, 130), flux_e=5000.0, width_px=2.0)
+    with pytest.raises(InputError, match="^frame: (found no|.* expected at least two rows)"):
+        find_lenslets(frame)
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_random_arrays_are_right_or_doubtful(index: int) -> None:
+    assert verdict(random_array(99, index))[0] != "WRONG"
