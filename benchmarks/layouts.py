@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from benchmarks.measuring import Row, Table
-from benchmarks.simulated_arrays import DARK, Array, Points, plain_small, random_array
+from benchmarks.simulated_arrays import DARK, LIT, Array, Points, plain_small, random_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.found_layout import FoundLayout, find_layout
 
@@ -94,9 +94,10 @@ def _faults(array: Array, found: FoundLayout) -> str:
 
 
 def _true_lattice(array: Array) -> tuple[float, Points]:
-    """Return pitch and nodes of the regular lattice that fits the lit spots best."""
+    """Return pitch and nodes of the regular lattice that fits the spots of all open lenslets best."""
+    used = array.flux >= LIT
     columns = np.column_stack([np.ones(len(array.nodes)), array.nodes])
-    fit = np.linalg.lstsq(columns[array.lit], array.spots[array.lit], rcond=None)[0]
+    fit = np.linalg.lstsq(columns[used], array.spots[used], rcond=None)[0]
     distance = np.abs(array.nodes[:, None] - array.nodes[:50])
     return float(np.abs(fit[1]) * distance[distance > 0].min()), np.asarray(columns @ fit)
 

@@ -30,7 +30,7 @@ def nodes(geometry: str, across: int, pitch_px: float, angle_deg: float = 4.0) -
     """Return a disk of nodes about 0."""
     count = np.arange(-across, across + 1)
     cells = (count + count[:, None] * RATIOS[geometry]).ravel() + 0.2 + 0.1j
-    return pitch_px * np.exp(1j * np.radians(angle_deg)) * cells[np.abs(cells) < across / 2]
+    return np.asarray(pitch_px * np.exp(1j * np.radians(angle_deg)) * cells[np.abs(cells) < across / 2])
 
 
 @pytest.mark.parametrize("geometry", ["square", "hexagonal"])
@@ -68,7 +68,7 @@ def test_a_few_spots_anywhere_are_no_lattice(seed: int) -> None:
     """One pair of spots in each direction may be a coincidence."""
     at = np.random.default_rng(seed).uniform(10, 120, (6, 2)) @ np.array([1, 1j])
     frame = spot_frame(at, (130, 130), flux_e=5000.0, width_px=2.0)
-    with pytest.raises(InputError, match="^frame: (found no|.* expected at least two rows)"):
+    with pytest.raises(InputError, match=r"^frame: (found no|.* expected at least two rows)"):
         find_lenslets(frame)
 
 

@@ -90,7 +90,10 @@ def find_illumination(spots: NodeFlux, lattice: Lattice, illuminated_fraction: f
     choose = _Chooser(spots, detected, lattice)
     # Dim spots outside the pupil may be as many as those in it: start from the bright ones.
     bright = float(np.quantile(spots.flux[certain], 0.8))
-    fraction = _emptiest(spots.flux[detected > 0] / bright)
+    noise = float(np.median(spots.flux_noise[certain]))
+    fraction = float(
+        np.clip(_DETECTED * noise / bright, _emptiest(spots.flux[detected > 0] / bright), _FRACTIONS[1])
+    )
     illuminated, reference, scatter = choose.settled(bright, fraction)
     if not _spans(spots.cells[illuminated]):
         # In one or two rows at the pupil's edge, the dimmer row must be illuminated: one row makes no sensor.
