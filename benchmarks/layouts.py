@@ -1,4 +1,4 @@
-"""How often `faintspot layout` is right, refuses or doubts, or is wrong without a word.
+"""Rates at which `faintspot layout` is right, refuses, doubts, or is wrong without a doubt.
 
 2,000 random arrays (benchmarks/simulated_arrays.py), 160 plain small ones, and real frames where they are
 at hand. Each gets one verdict:

@@ -98,8 +98,8 @@ def _binned(image: NDArray[Any]) -> NDArray[Any]:
 def _spot_map(image: NDArray[np.float64]) -> NDArray[np.float32] | None:
     """Return a map of features about a pixel wide, or None if there are none.
 
-    The difference of two Gaussians removes the background. Noise is kept as it is, so that many spots below
-    it add up; bright values are compressed, so that dim spots contribute.
+    The difference of two Gaussians removes the background. Noise is not cut off, so that many spots below it
+    add up; bright values are compressed, so that dim spots contribute.
     """
     band = scipy.ndimage.gaussian_filter(image, 1.0) - scipy.ndimage.gaussian_filter(image, 4.0)
     noise = max(robust_std(band), _NOISE_FLOOR * float(np.quantile(band, 0.999)))
