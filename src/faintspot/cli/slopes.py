@@ -17,6 +17,7 @@ from faintspot.cli.shared.options import KEY, REFERENCE, configuration_option
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.io.formats.registry import slope_format
 from faintspot.io.locations import split_location
+from faintspot.io.optional_packages import has_zarr
 from faintspot.io.stored.slopes_format import UNITS
 from faintspot.slopes.recorded import Summary, measure_recorded
 
@@ -81,9 +82,10 @@ def command(
 
     FRAMES are FITS (plain, .gz, .fz), TIFF, PNG, HDF5, MATLAB, .npy, .npz or Zarr, in the order given.
     They are read block by block, so that their size does not matter. Interrupted and started again, the
-    command goes on where it stopped. Of telemetry in the AOT standard the frames of its Shack-Hartmann
-    sensor are measured (--key names one of several); where the configuration has no [layout], with the
-    file's sub-apertures and reference slopes.
+    command resumes (this needs the extra io): until a file other than a .zarr store is complete, its slopes
+    are in OUTPUT.partial.zarr. Of telemetry in the AOT standard the frames of its Shack-Hartmann sensor are
+    measured (--key names one of several); where the configuration has no [layout], with the file's
+    sub-apertures and reference slopes.
 
     The output holds x, y (px, or arcsec, from the sub-aperture's centre, 0 where not valid), flux (e-),
     valid, flags, iterations and bad_pixels of every frame and sub-aperture. A .zarr store opens with
@@ -112,11 +114,20 @@ def command(
 
 
 def _check_format(output: str) -> None:
-    """Refuse a format whose package is missing, before the work, and say which one needs none."""
+    """Refuse a format whose package is missing, before the work, and say which one needs none.
+
+    Without zarr, warn that the run cannot be resumed.
+    """
     try:
         slope_format(Path(output)).require()
     except MissingExtraError as error:
         raise InputError(f"{error}, or write NumPy's own format: -o {Path(output).stem}.npz") from None
+    if not has_zarr():
+        click.echo(
+            f"{output}: without zarr an interrupted run starts again; "
+            "to resume it, install zarr with pip install 'faintspot[io]'",
+            err=True,
+        )
 
 
 def describe(summary: Summary, output: str) -> list[str]:

@@ -88,7 +88,8 @@ def measure_recorded(
 ) -> Summary:
     """Measure the slopes of all frames in some files and write them to a file.
 
-    Interrupted and called again with the same arguments, it goes on where it stopped.
+    Interrupted and called again with the same arguments, it resumes where it stopped; without zarr, only a
+    complete output is kept.
 
     Parameters
     ----------

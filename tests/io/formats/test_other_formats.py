@@ -1,22 +1,18 @@
-"""What is particular to HDF5, MATLAB, PNG and compressed TIFF files."""
+"""HDF5, MATLAB and PNG files: tests beyond those of every format."""
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import scipy.io
 from PIL import Image
-from tests.io.frame_files import cube, save
+from tests.io.frame_files import cube, h5py, save
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.io import open_frames, read_array
-
-h5py: Any = pytest.importorskip("h5py")
 
 
 class TestHdf5:
@@ -39,6 +35,19 @@ class TestHdf5:
                 file[f"set{number}"] = cube(1)
         with pytest.raises(InputError, match="and 30 more"):
             open_frames([tmp_path / "a.h5"])
+
+    def test_numbers_in_other_files_are_not_read(self, tmp_path: Path) -> None:
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            layout = h5py.VirtualLayout((2, 4, 4), "u1")
+            layout[0] = h5py.VirtualSource("/dev/zero", "x", (4, 4))
+            file.create_virtual_dataset("virtual", layout)
+            file.create_dataset("external", (2, 4, 4), "u1", external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)])
+            file["link"] = h5py.ExternalLink("other.h5", "frames")
+        for name in ("virtual", "external"):
+            with refused("stored in other files"):
+                open_frames([f"{tmp_path}/a.h5:{name}"])
+        with refused("no array 'link'"):
+            open_frames([f"{tmp_path}/a.h5:link"])
 
     def test_only_numbers(self, tmp_path: Path) -> None:
         with h5py.File(tmp_path / "a.h5", "w") as file:
@@ -92,21 +101,3 @@ class TestPng:
         path.write_bytes(path.read_bytes()[:200])
         with pytest.raises(InputError, match=r"a\.png: .*damaged"), open_frames([path]) as source:
             source.block(0, 1)
-
-
-@pytest.mark.parametrize("compression", ["tiff_lzw", "packbits"])
-@pytest.mark.parametrize("kind", ["u1", "u2", "i4", "f4"])
-def test_tiff_that_pillow_decodes(
-    tmp_path: Path, compression: str, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == "imagecodecs" else found(name)
-    )
-    frames = cube().astype(kind)
-    first, *others = (Image.fromarray(frame) for frame in frames)
-    first.save(tmp_path / "a.tif", compression=compression, save_all=True, append_images=others)
-    with open_frames([tmp_path / "a.tif"]) as source:
-        assert source.dtype == kind
-        np.testing.assert_array_equal(source.block(0, 11), frames)
-        np.testing.assert_array_equal(source.block(7, 8), frames[7:8])
