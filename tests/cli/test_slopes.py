@@ -169,3 +169,14 @@ def test_arcsec_need_a_scale(folder: Path, run: Commands) -> None:
     np.save("frames.npy", simulated(3))
     run.refused("slopes", "frames.npy", "--unit", "arcsec", naming=("unit", "pixel_scale_arcsec"))
     assert not Path("slopes.zarr").exists()
+
+
+def test_without_zarr_the_command_says_that_it_cannot_resume(
+    folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    np.save("a.npy", simulated())
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    result = run.ok("slopes", "a.npy", "-o", "s.npz")
+    assert result.err.splitlines()[0].startswith("s.npz: without zarr an interrupted run starts again")
+    assert_equal(folder / "s.npz", expected(simulated()))
+    run.refused("slopes", "a.npy", naming=("zarr", "faintspot[io]", "-o slopes.npz"))

@@ -27,7 +27,7 @@ BAD_FRAMES: list[tuple[str, Callable[[Path], Any], tuple[str, ...]]] = [
     ("missing.fits", lambda path: None, ("no such file",)),
     ("*.fits", lambda path: None, ("no such file",)),
     ("text.fits", lambda path: path.write_text("x, y\n1, 2\n"), ("FITS",)),
-    ("half.fits.gz", half_of_a_compressed_file, ("frame", "damaged or incomplete")),
+    ("half.fits.gz", half_of_a_compressed_file, ("frames", "damaged or incomplete")),
     ("large.npy", lambda path: np.save(path, np.ones((3, 33, 32))), ("33 x 32", "32 x 32", "faintspot.toml")),
 ]
 

@@ -86,8 +86,8 @@ def _read_configuration(path: Path) -> None:
     fs.SlopePipeline(**_parts(configuration.load_all(path)))
 
 
-def _parts(found: configuration.Configuration) -> dict[str, Any]:
-    return found._asdict()
+def _parts(parts: configuration.Configuration) -> dict[str, Any]:
+    return parts._asdict()
 
 
 def _read_telemetry(path: Path) -> None:
@@ -210,8 +210,8 @@ def _damaged(rng: np.random.Generator, content: bytes) -> bytes:
         kind = rng.integers(8)
         if kind == 0:
             some = bytearray(content)
-            for place in rng.integers(0, len(some), 1 + int(rng.integers(4))):
-                some[place] ^= 1 << int(rng.integers(8))
+            for position in rng.integers(0, len(some), 1 + int(rng.integers(4))):
+                some[position] ^= 1 << int(rng.integers(8))
             content = bytes(some)
         elif kind == 1:
             content = content[:first]
@@ -233,13 +233,13 @@ def _other_number(rng: np.random.Generator, content: bytes, same_length: bool) -
     numbers = list(_NUMBER.finditer(content[:20_000]))
     if not numbers:
         return content
-    found = numbers[rng.integers(len(numbers))]
-    size = found.end() - found.start()
+    number = numbers[rng.integers(len(numbers))]
+    size = number.end() - number.start()
     if same_length:
         new = bytes([int(rng.choice(list(b"0123456789")))]) * size
     else:
         new = _WORDS[rng.integers(len(_WORDS))]
-    return content[: found.start()] + new + content[found.end() :]
+    return content[: number.start()] + new + content[number.end() :]
 
 
 def _other_array(rng: np.random.Generator, array: Any) -> Any:

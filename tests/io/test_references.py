@@ -27,10 +27,10 @@ def means() -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("shape", [(7, 2), (14,)])
 def test_on_top_of_their_own_reference(tmp_path: Path, shape: tuple[int, ...]) -> None:
-    own = np.arange(14.0).reshape(7, 2) / 10
-    stored = own if shape == (7, 2) else own.T.reshape(14)
+    reference = np.arange(14.0).reshape(7, 2) / 10
+    stored = reference if shape == (7, 2) else reference.T.reshape(14)
     write(tmp_path / "a.npz", result(), attributes={**ATTRIBUTES, "reference": stored.tolist()})
-    np.testing.assert_allclose(read_reference(tmp_path / "a.npz"), means() + own, rtol=1e-12)
+    np.testing.assert_allclose(read_reference(tmp_path / "a.npz"), means() + reference, rtol=1e-12)
 
 
 def test_where_nothing_is_valid(tmp_path: Path) -> None:

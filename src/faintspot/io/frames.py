@@ -72,7 +72,7 @@ class FrameSource(Closing):
         ------
         InputError
             When the range is not within the sequence, or the file is damaged there; the message names the
-            frame.
+            frames.
         """
         if not 0 <= start < stop <= self.n_frames:
             raise InputError(f"frames {start} to {stop} of {self.description}: expected 0 to {self.n_frames}")

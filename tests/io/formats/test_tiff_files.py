@@ -70,9 +70,9 @@ def test_damaged_page(tmp_path: Path) -> None:
 def test_tiff_that_pillow_decodes(
     tmp_path: Path, compression: str, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = importlib.util.find_spec
+    find_spec = importlib.util.find_spec
     monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == "imagecodecs" else found(name)
+        importlib.util, "find_spec", lambda name: None if name == "imagecodecs" else find_spec(name)
     )
     frames = cube().astype(kind)
     first, *others = (Image.fromarray(frame) for frame in frames)
@@ -81,3 +81,16 @@ def test_tiff_that_pillow_decodes(
         assert source.dtype == kind
         np.testing.assert_array_equal(source.block(0, 11), frames)
         np.testing.assert_array_equal(source.block(7, 8), frames[7:8])
+
+
+def test_pages_in_a_circle_are_refused(tmp_path: Path) -> None:
+    """The last page states that the first is next."""
+    path = save(tmp_path / "pages.tif", cube(3))
+    with tifffile.TiffFile(path) as file:
+        first, last = file.pages[0].offset, file.pages[2].offset
+        link = last + 2 + 12 * len(file.pages[2].tags)
+    content = bytearray(path.read_bytes())
+    content[link : link + 4] = first.to_bytes(4, "little")
+    path.write_bytes(content)
+    with refused("pages.tif", "circular"):
+        open_frames([path])

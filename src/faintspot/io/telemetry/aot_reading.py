@@ -123,12 +123,13 @@ def frames_of_aot(path: Path, sensor: str | None) -> str:
     InputError
         When the sensor has no pixels, and as `read_aot`.
     """
-    found = read_aot(path, sensor)
-    if found.pixels is None:
+    aot_sensor = read_aot(path, sensor)
+    if aot_sensor.pixels is None:
         raise InputError(
-            f"{path}: sensor {found.name!r}: expected frames (pixel_intensities of its detector), found none"
+            f"{path}: sensor {aot_sensor.name!r}: expected frames (pixel_intensities of its detector), "
+            "found none"
         )
-    return found.pixels
+    return aot_sensor.pixels
 
 
 def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
@@ -174,26 +175,26 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
             noise = _noise(path)
         except Exception as error:  # aotpy raises many kinds of errors on damaged files
             raise InputError(f"{path}: the AOT file is not valid ({one_line(error)})") from None
-    sensors = [each for each in system.wavefront_sensors if isinstance(each, aotpy.ShackHartmann)]
-    found = _chosen(path, sensors, sensor)
+    sensors = [item for item in system.wavefront_sensors if isinstance(item, aotpy.ShackHartmann)]
+    chosen = _chosen(path, sensors, sensor)
     loops = [
-        each for each in system.loops if isinstance(each, aotpy.ControlLoop) and each.input_sensor is found
+        loop for loop in system.loops if isinstance(loop, aotpy.ControlLoop) and loop.input_sensor is chosen
     ]
     try:
-        return _sensor(path, found, system, loops, noise)
+        return _sensor(path, chosen, system, loops, noise)
     except InputError as error:
-        raise InputError(f"{path}: sensor {found.uid!r}: {error}") from None
+        raise InputError(f"{path}: sensor {chosen.uid!r}: {error}") from None
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
-        raise InputError(f"{path}: sensor {found.uid!r}: not valid AOT ({one_line(error)})") from None
+        raise InputError(f"{path}: sensor {chosen.uid!r}: not valid AOT ({one_line(error)})") from None
 
 
 def _chosen(path: Path, sensors: list[Any], name: str | None) -> Any:
     """Return the selected sensor."""
-    listed = ", ".join(str(each.uid) for each in sensors) or "none"
+    listed = ", ".join(str(item.uid) for item in sensors) or "none"
     if name is not None:
-        sensors = [each for each in sensors if name in (each.uid, _pixels_of(each))]
+        sensors = [item for item in sensors if name in (item.uid, _pixels_of(item))]
     elif len(sensors) > 1:
-        sensors = [each for each in sensors if _pixels_of(each) is not None]
+        sensors = [item for item in sensors if _pixels_of(item) is not None]
     if len(sensors) != 1:
         wanted = f"a Shack-Hartmann sensor {name!r}" if name else "one Shack-Hartmann sensor with pixels"
         hint = "; name one" if len(sensors) > 1 else ""
@@ -207,47 +208,47 @@ def _pixels_of(sensor: Any) -> str | None:
     return None if image is None or image.data is None else str(image.name)
 
 
-def _sensor(path: Path, found: Any, system: Any, loops: list[Any], noise: Any) -> AotSensor:
-    n = int(found.n_valid_subapertures)
-    name, size = _pixels_of(found), None
-    pixels = None if name is None else found.detector.pixel_intensities
+def _sensor(path: Path, sensor: Any, system: Any, loops: list[Any], noise: Any) -> AotSensor:
+    n = int(sensor.n_valid_subapertures)
+    name, size = _pixels_of(sensor), None
+    pixels = None if name is None else sensor.detector.pixel_intensities
     if pixels is not None:
         if pixels.data.ndim not in (2, 3):
             shape = pixels.data.shape
             raise InputError(f"pixel_intensities: expected (frames, height, width), got shape {shape}")
         size = int(pixels.data.shape[-2]), int(pixels.data.shape[-1])
-    own = _own(found.ref_measurements)
-    layout = own["LAYOUT"] if "LAYOUT" in own else _layout(found, n, size)
-    if "SUBTRACT" in own:
-        reference = None if own["SUBTRACT"] is None else np.asarray(own["SUBTRACT"], np.float64)
+    details = _details(sensor.ref_measurements)
+    layout = details["LAYOUT"] if "LAYOUT" in details else _layout(sensor, n, size)
+    if "SUBTRACT" in details:
+        reference = None if details["SUBTRACT"] is None else np.asarray(details["SUBTRACT"], np.float64)
     else:
-        reference = _reference(found, n)
-    slopes, flux = _data_of(found, "measurements"), _data_of(found, "subaperture_intensities")
+        reference = _reference(sensor, n)
+    slopes, flux = _data_of(sensor, "measurements"), _data_of(sensor, "subaperture_intensities")
     if slopes is not None and slopes.shape[1:] != (2, n):
         raise InputError(f"measurements: expected shape (t, 2, {n}), got {slopes.shape}")
     if noise is not None and (slopes is None or noise.shape != (len(slopes), 3, n)):
         raise InputError(f"{NOISE}: expected as many variances and covariances as slopes, got {noise.shape}")
-    numbers, times = _time_of(found.measurements)
-    scale = _number(found.detector, "pixel_scale")
+    numbers, times = _time_of(sensor.measurements)
+    scale = _number(sensor.detector, "pixel_scale")
     return AotSensor(
         path,
-        str(found.uid),
+        str(sensor.uid),
         n,
         layout,
         _tables(system),
-        own.get("PARTS"),
+        details.get("PARTS"),
         reference,
         name,
         _time_of(pixels)[0],
         slopes,
-        "" if slopes is None else str(found.measurements.unit or ""),
+        "" if slopes is None else str(sensor.measurements.unit or ""),
         noise,
         numbers,
         times,
         flux,
-        _interaction([each for each in loops if each.interaction_matrix], n),
+        _interaction([loop for loop in loops if loop.interaction_matrix], n),
         _loop(loops, n),
-        _cells(found, n),
+        _cells(sensor, n),
         _number(system.main_telescope, "enclosing_diameter"),
         None if scale is None else scale * 180 / np.pi * 3600,
     )
@@ -257,18 +258,18 @@ def _loop(loops: list[Any], n: int) -> AotLoop | None:
     """Return the first loop with commands, else the first one."""
     if not loops:
         return None
-    found = next((each for each in loops if _data_of(each, "commands") is not None), loops[0])
-    commands, control = (_data_of(found, name) for name in ("commands", "control_matrix"))
+    loop = next((loop for loop in loops if _data_of(loop, "commands") is not None), loops[0])
+    commands, control = (_data_of(loop, name) for name in ("commands", "control_matrix"))
     if commands is not None and commands.ndim != 2:
         raise InputError(f"commands: expected shape (t, commands), got {commands.shape}")
     if control is not None and control.shape[1:] != (2, n):
         raise InputError(f"control_matrix: expected shape (commands, 2, {n}), got {control.shape}")
     return AotLoop(
-        bool(found.closed),
+        bool(loop.closed),
         None if commands is None else commands.astype(np.float64),
         None if control is None else control.reshape(len(control), -1).astype(np.float64),
-        _number(found, "framerate"),
-        _number(found, "delay"),
+        _number(loop, "framerate"),
+        _number(loop, "delay"),
     )
 
 
@@ -278,14 +279,14 @@ def _number(owner: Any, name: str) -> float | None:
     return float(value) if value is not None and np.isfinite(value) and value > 0 else None
 
 
-def _layout(found: Any, n: int, size: tuple[int, int] | None) -> dict[str, Any] | None:
+def _layout(sensor: Any, n: int, size: tuple[int, int] | None) -> dict[str, Any] | None:
     """Return arguments of a layout, in AOT a grid of squares of pixels; None if data for it are missing."""
-    cells = _cells(found, n)
-    if cells is None or not found.mask_offsets or found.subaperture_size is None:
+    cells = _cells(sensor, n)
+    if cells is None or not sensor.mask_offsets or sensor.subaperture_size is None:
         return None
-    if len(found.mask_offsets) != 1:
-        raise InputError(f"mask_offsets: expected one, got {len(found.mask_offsets)}")
-    side, offset = float(found.subaperture_size), found.mask_offsets[0]
+    if len(sensor.mask_offsets) != 1:
+        raise InputError(f"mask_offsets: expected one, got {len(sensor.mask_offsets)}")
+    side, offset = float(sensor.subaperture_size), sensor.mask_offsets[0]
     first = np.array([float(offset.y), float(offset.x)])
     corners = np.rint(finite_array("mask_offsets", first) + cells * side).astype(np.int64)
     window = int(side)
@@ -295,9 +296,9 @@ def _layout(found: Any, n: int, size: tuple[int, int] | None) -> dict[str, Any] 
     return {"frame_shape": size, "window": (window, window), "corners": corners, "cells": cells}
 
 
-def _cells(found: Any, n: int) -> NDArray[np.int64] | None:
+def _cells(sensor: Any, n: int) -> NDArray[np.int64] | None:
     """Return row and column of the sub-apertures, (n, 2); None without a mask."""
-    mask = _data_of(found, "subaperture_mask")
+    mask = _data_of(sensor, "subaperture_mask")
     if mask is None:
         return None
     numbers = mask[mask >= 0]
@@ -306,10 +307,10 @@ def _cells(found: Any, n: int) -> NDArray[np.int64] | None:
     return np.argwhere(mask >= 0)[np.argsort(numbers)]
 
 
-def _reference(found: Any, n: int) -> NDArray[np.float64] | None:
+def _reference(sensor: Any, n: int) -> NDArray[np.float64] | None:
     """Return the reference slopes if they are in pixels."""
-    values = _data_of(found, "ref_measurements")
-    if values is None or str(found.ref_measurements.unit).lower() not in _PIXELS:
+    values = _data_of(sensor, "ref_measurements")
+    if values is None or str(sensor.ref_measurements.unit).lower() not in _PIXELS:
         return None
     if values.shape != (2, n):
         raise InputError(f"ref_measurements: expected shape (2, {n}), got {values.shape}")
@@ -351,11 +352,11 @@ def _time_of(image: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return frame numbers and times of an image; empty if it has none."""
     time = None if image is None else image.time
     values = ([], []) if time is None else (time.frame_numbers, time.timestamps)
-    numbers, stamps = (np.asarray([] if each is None else each, np.float64) for each in values)
+    numbers, stamps = (np.asarray([] if data is None else data, np.float64) for data in values)
     return numbers, stamps
 
 
-def _own(image: Any) -> dict[str, Any]:
+def _details(image: Any) -> dict[str, Any]:
     """Return the data that faintspot has written with the references."""
     if image is None:
         return {}

@@ -121,7 +121,7 @@ def _metadata(telemetry: Telemetry) -> list[Any]:
         Metadatum("ORIGIN", "faintspot"),
         Metadatum("DROPPED", dropped, "frames measured, lost by the recorder"),
         Metadatum("METHODS", ", ".join(telemetry.attributes["methods"]), "interleaved settings"),
-        *(Metadatum(f"CHG{i}", json.dumps(each)) for i, each in enumerate(telemetry.changes, 1)),
+        *(Metadatum(f"CHG{i}", json.dumps(change)) for i, change in enumerate(telemetry.changes, 1)),
     ]
 
 
@@ -169,10 +169,10 @@ def _sensor(telemetry: Telemetry, source: Any, estimator: str | None) -> Any:
 
 def _mask(cells: NDArray[np.int64]) -> NDArray[np.int32] | None:
     """Return a square grid with the number of each sub-aperture, -1 elsewhere; None if two share a cell."""
-    places = cells - cells.min(axis=0)
-    mask = np.full((int(places.max()) + 1,) * 2, -1, np.int32)
-    mask[places[:, 0], places[:, 1]] = np.arange(len(places))
-    return mask if np.count_nonzero(mask >= 0) == len(places) else None
+    indices = cells - cells.min(axis=0)
+    mask = np.full((int(indices.max()) + 1,) * 2, -1, np.int32)
+    mask[indices[:, 0], indices[:, 1]] = np.arange(len(indices))
+    return mask if np.count_nonzero(mask >= 0) == len(indices) else None
 
 
 def _detector(telemetry: Telemetry) -> Any:
@@ -181,10 +181,10 @@ def _detector(telemetry: Telemetry) -> Any:
 
     detector = aotpy.Detector(uid="DETECTOR")
     if len(telemetry.image_frame):
-        numbers, places = np.unique(telemetry.frame, return_index=True)
-        found = np.minimum(np.searchsorted(numbers, telemetry.image_frame), len(numbers) - 1)
-        known = bool(np.all(numbers[found] == telemetry.image_frame))
-        times = telemetry.unix_time_s[places[found]].tolist() if known else []  # for all or none
+        numbers, rows = np.unique(telemetry.frame, return_index=True)
+        nearest = np.minimum(np.searchsorted(numbers, telemetry.image_frame), len(numbers) - 1)
+        all_recorded = bool(np.all(numbers[nearest] == telemetry.image_frame))
+        times = telemetry.unix_time_s[rows[nearest]].tolist() if all_recorded else []  # for all or none
         when = aotpy.Time("IMAGES", timestamps=times, frame_numbers=telemetry.image_frame.tolist())
         detector.pixel_intensities = aotpy.Image("PIXELS", telemetry.raw, "adu", when)
     return detector

@@ -285,12 +285,12 @@ def attributes_of(store: Path) -> dict[str, Any]:
         raise InputError(f"{store}: no such file or directory")
     try:
         attributes = stored_attributes(store)
-        known = attributes["format"] == FORMAT and attributes["version"] == 1
+        is_telemetry = attributes["format"] == FORMAT and attributes["version"] == 1
         if (store / _PARTS).is_dir():
             attributes[_PARTS] = stored_attributes(store / _PARTS)[_PARTS]
     except (OSError, ValueError, KeyError, TypeError):
-        known = False
-    if not (known and is_store(store)):
+        is_telemetry = False
+    if not (is_telemetry and is_store(store)):
         raise InputError(f"{store}: expected a Zarr store of telemetry from `faintspot realtime record`")
     return attributes
 
