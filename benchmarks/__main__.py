@@ -29,6 +29,7 @@ _ORDER = (
     "realtime_loop",
     "realtime_guard",
     "advice",
+    "validity",
     "telemetry",
     "recorded_tip_tilt",
     "live_page",

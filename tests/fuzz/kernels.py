@@ -183,7 +183,7 @@ def _measured(
     rows = STAGE_ROWS * int(rng.integers(2))
     stages = guard(np.empty((rows, n_frames, n, pipeline.layout.pixels), np.float32))
     plan.kernel(frames)(source, task, 0, groups, scratch, results, stages)
-    pipeline.flag_doubtful(results)
+    pipeline.flag_doubtful(results, guard(kernel_frames(frames)))
     return Slopes(*results)
 
 

@@ -16,11 +16,9 @@ MODES, UNIT = wavefront_modes(LAYOUT)
 def test_modes_are_those_of_the_wavefront_fit() -> None:
     slopes = np.random.default_rng(2).standard_normal(2 * len(LAYOUT))
     n = len(LAYOUT)
-    names = fs.Slopes.__dataclass_fields__
-    fields = {name: np.zeros(n, kind) for name, kind in zip(names, RESULT_TYPES, strict=True)}
-    found = fs.slopes.wavefront.fit_wavefront(
-        fs.Slopes(**{**fields, "x": slopes[:n], "y": slopes[n:]}), LAYOUT
-    )
+    measured = fs.Slopes(*(np.zeros(n, kind) for kind in RESULT_TYPES))
+    measured.x[:], measured.y[:] = slopes[:n], slopes[n:]
+    found = fs.slopes.wavefront.fit_wavefront(measured, LAYOUT)
     np.testing.assert_allclose(MODES @ slopes, found.coefficients[0], rtol=1e-4, atol=1e-5)
     assert found.unit == UNIT
 

@@ -24,6 +24,7 @@ from faintspot.cli.shared.output import picture_file
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.hot_pixels import find_hot_pixels
+from faintspot.slopes.camera.saturation import LargestValues
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, FirstSettings, first_settings
@@ -181,7 +182,7 @@ def command(
     drawing = picture_file(target, picture, ".png")
     with open_frames(frames, key=key) as source:
         calibration = layout_options.calibration(target, of_camera)
-        mean = _mean_frame(source, calibration)
+        mean, values = _mean_frame(source, calibration)
         hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
         mean[tuple(hot.T)] = np.nan
         found: FoundLayout | KnownGrid
@@ -193,6 +194,9 @@ def command(
         layout = replace(found.layout[kept], **optics)
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
     calibration, notes = _completed(calibration, found, layout, mean, hot)
+    if calibration.saturation_adu is None and values.saturation_adu is not None:
+        calibration = replace(calibration, saturation_adu=values.saturation_adu)
+        notes.append(f"  saturation {values.saturation_adu:g} ADU, at which values pile up")
     unit = "ADU" if of_camera["gain_e_per_adu"] is None and calibration.gain_e_per_adu == 1.0 else "e-"
     seen = first_settings(layout, calibration, first)
     if unit == "ADU" and 0 < seen.flux < _FEWEST_E:
@@ -327,10 +331,12 @@ def _sides(found: FoundLayout) -> str:
     return ", ".join(f"{count} {name}" for count, name in zip(counts, names, strict=True) if count)
 
 
-def _mean_frame(source: FrameSource, calibration: Calibration) -> NDArray[np.float64]:
-    """Mean of the first frames in electrons, of what is finite; NaN where nothing is."""
+def _mean_frame(source: FrameSource, calibration: Calibration) -> tuple[NDArray[np.float64], LargestValues]:
+    """Return the mean of the first frames in electrons, NaN where none is finite, and the largest values."""
+    values = LargestValues()
     total, count = np.zeros(source.shape), np.zeros(source.shape, int)
     for _, block in source.blocks(0, min(_MOST_FRAMES, source.n_frames), _FIRST_FRAMES):
+        values.add(block)
         finite = np.isfinite(block)
         total += np.where(finite, block, 0).sum(axis=0, dtype=np.float64)
         count += finite.sum(axis=0)
@@ -339,7 +345,7 @@ def _mean_frame(source: FrameSource, calibration: Calibration) -> NDArray[np.flo
     dark, electrons_per_adu = calibration.maps(source.shape)
     mean = np.divide(total, count, where=count > 0, out=np.full(source.shape, np.nan))
     electrons: NDArray[np.float64] = (mean - dark) * electrons_per_adu
-    return electrons
+    return electrons, values
 
 
 def _completed(

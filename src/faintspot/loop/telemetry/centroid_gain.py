@@ -64,7 +64,7 @@ def shifted_gain(
             slopes = pipeline(np.roll(frames_e, step, axis=image))
             found = slopes.vector.astype(np.float64)
             error = np.hstack([slopes.standard_error_x, slopes.standard_error_y]).astype(np.float64)
-            error[~np.tile(slopes.valid, 2)] = np.inf
+            error[~np.tile(slopes.measured, 2)] = np.inf
             ends.append(without_prior(found, error, np.zeros_like(found), prior_px))
         along = slice(axis * n, (axis + 1) * n)
         weight = np.minimum(ends[0][2], ends[1][2])[:, along]

@@ -32,10 +32,9 @@ def wavefront_modes(layout: Layout) -> tuple[Floats, str]:
         When the layout's sub-apertures cannot separate the modes.
     """
     n = len(layout)
-    names = Slopes.__dataclass_fields__
-    fields = {name: np.zeros((2 * n, n), kind) for name, kind in zip(names, RESULT_TYPES, strict=True)}
-    fields["x"][:n], fields["y"][n:] = np.eye(n), np.eye(n)
-    found = fit_wavefront(Slopes(**fields), layout)
+    slopes = Slopes(*(np.zeros((2 * n, n), kind) for kind in RESULT_TYPES))
+    slopes.x[:n], slopes.y[n:] = np.eye(n), np.eye(n)
+    found = fit_wavefront(slopes, layout)
     return np.ascontiguousarray(found.coefficients.T), found.unit
 
 

@@ -95,7 +95,7 @@ class FrameStream:
         The slopes are views of memory that the next `submit` overwrites.
         """
         self.stream.synchronize()
-        self._flag_doubtful(self._arrays)
+        self._flag_doubtful(self._arrays, self.frame[None])
         return self._slopes
 
     def _start_steps(self) -> None:

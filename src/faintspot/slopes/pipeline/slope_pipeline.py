@@ -19,10 +19,12 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.kernels.compilation.host import lanes_for
+from faintspot.slopes.kernels.driver.dark import flag_dark, scratch_size
 from faintspot.slopes.kernels.driver.doubtful import flag_doubtful
 from faintspot.slopes.kernels.driver.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
 from faintspot.slopes.kernels.parallel import most_threads, run_groups, thread_scratch
 from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.pipeline.light import MeanLight, light_test
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
 from faintspot.slopes.pipeline.plan import Plan, packed_calibration
 from faintspot.slopes.pipeline.settings import Settings
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 
 _KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
 _SMALL_TYPES = (np.dtype(np.uint8), *_KERNEL_TYPES)
+_flag_dark = {dtype: Direct(flag_dark) for dtype in _KERNEL_TYPES}
 _flag_doubtful = Direct(flag_doubtful)
 _FLUX_COST = 0.1  # of summing the pixels of a sub-aperture, in units of `Estimator.cost`
 
@@ -108,10 +111,8 @@ class SlopePipeline:
             None if threads is None else int(number_between("threads", threads, 1, 4096, integer=True))
         )
         self._lanes = lanes_for(np.float32, width)
-        self._calibration = packed_calibration(layout, self.calibration, self._lanes.width)
         self._parts = psf, score, layout.offsets + _reference_positions(reference, layout)
-        self.plan = self._prepared()
-        """Settings and tables computed before the first frame."""
+        self._prepare()
         self._identity = _identity(*self._parts)
         self.device = one_of("device", device, ("cpu", "cuda"))
         self.on_device = self._device_pipeline() if self.device == "cuda" else None
@@ -122,10 +123,15 @@ class SlopePipeline:
         layout, settings, calibration, psf, score = configuration.load_all(path)
         return cls(layout, settings, calibration, psf=psf, score=score, **options)
 
-    def _prepared(self) -> Plan:
+    def _prepare(self) -> None:
         """Compute the tables for the current SIMD width; forget what was prepared for small frames."""
         self._small = threading.local()
-        return Plan(self.layout, self.settings, self.calibration, *self._parts, self._lanes.width)
+        width, maps = self._lanes.width, self.calibration.maps(self.layout.frame_shape)
+        self._calibration = packed_calibration(self.layout, maps, width)
+        self.plan = Plan(self.layout, self.settings, self.calibration, *self._parts, width)
+        """Settings and tables computed before the first frame."""
+        self.light_test = light_test(self.layout, maps, self.plan.typical_fwhm_px)
+        """Test for sub-apertures without flux."""
 
     def _device_pipeline(self) -> DevicePipeline:
         """Transfer the tables to the GPU."""
@@ -151,8 +157,7 @@ class SlopePipeline:
         """
         other = copy.copy(self)
         other._lanes = lanes_for(np.float32, width)
-        other._calibration = packed_calibration(self.layout, self.calibration, width)
-        other.plan = other._prepared()
+        other._prepare()
         other.on_device = None if self.on_device is None else other._device_pipeline()
         return other
 
@@ -214,6 +219,23 @@ class SlopePipeline:
         rounded = np.exp(step * np.rint(np.log(flux_e) / step))
         return self.with_settings(self.settings.replace(flux_e=np.broadcast_to(rounded, known.shape)))
 
+    def with_dark(self, mean: NDArray[Any]) -> SlopePipeline:
+        """Return the same pipeline for frames of this mean: what has no flux in it is dark in all of them.
+
+        A single frame shows which sub-apertures are dark only if its spots are bright. The mean of all frames
+        shows it for faint stars, and for none at all.
+
+        Parameters
+        ----------
+        mean : (h, w) array
+            Mean of the frames [ADU]; NaN in pixels without any value.
+        """
+        light = MeanLight(self.layout, self.light_test.maps, self.plan.typical_fwhm_px)
+        dark = np.flatnonzero(light.significances(mean) < 1.0)
+        other = copy.copy(self)
+        other._small, other.light_test = threading.local(), self.light_test._replace(dark=dark)
+        return other
+
     def for_images(self) -> SlopePipeline:
         """Return the same pipeline for calibrated images (n, ny, nx) [electrons], read as one tall frame."""
         layout, camera = self.layout, self.calibration
@@ -227,8 +249,7 @@ class SlopePipeline:
             read_noise_e=self._noise_of_images(),
             background_e=camera.background_e,
         )
-        other._calibration = packed_calibration(other.layout, other.calibration, self.width)
-        other.plan = other._prepared()
+        other._prepare()
         other.device, other.on_device = "cpu", None
         return other
 
@@ -336,7 +357,7 @@ class SlopePipeline:
         variants = self._variants(source)
         if self.on_device is not None and not explain:
             measured = self.on_device.measure_from_host(frames, dtype, variants)
-            self.flag_doubtful(SlopeArrays(*measured))
+            self.flag_doubtful(SlopeArrays(*measured), frames)
             return Slopes(*(result.reshape(*array.shape[:-2], n) for result in measured)), stages
         predicted = None if prior is None else _prior_slopes(prior, n_frames, self.layout)
         task = self.plan.task(variants, predicted)
@@ -354,16 +375,25 @@ class SlopePipeline:
             for f in range(n_frames):
                 predicted_f = task.prior[min(f, len(task.prior) - 1)]
                 prepared.locate_frame(images[f], predicted_f, task.settings[0], f, results)
-        self.flag_doubtful(results)
+        self.flag_doubtful(results, frames)
         return Slopes(*(results if array.ndim == 3 else [result[0] for result in results])), stages
 
-    def flag_doubtful(self, results: SlopeArrays) -> None:
-        """Set the flags of spots that are cut by the edge of their window or differ from all neighbours.
+    def flag_doubtful(self, results: SlopeArrays, frames: NDArray[Any]) -> None:
+        """Flag dark sub-apertures of bright frames, and spots cut by their window or unlike all neighbours.
 
-        The flags need the slopes of whole frames; slopes can be used before they are set.
+        The flags need the slopes of whole frames; slopes can be used before they are set. Those of dark
+        sub-apertures become 0.
+
+        Parameters
+        ----------
+        results : SlopeArrays
+            Slopes of the frames; changed.
+        frames : (n, h, w) array, uint16 or float32, contiguous
         """
-        scratch = np.empty(len(self.layout), np.float32)
-        _flag_doubtful(results.x, results.y, results.flags, self.plan.expected, scratch)
+        scratch = np.empty(scratch_size(len(self.layout), *self.layout.window), np.float32)
+        _flag_dark[frames.dtype](self.light_test, frames, results, scratch)
+        n = len(self.layout)
+        _flag_doubtful(results.x, results.y, results.flags, self.plan.expected, scratch[:n])
 
     def source(self, frames: NDArray[Any], dtype: DTypeLike) -> Source:
         """Return the frames in the form that kernels read.

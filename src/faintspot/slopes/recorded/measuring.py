@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import one_of
 from faintspot.base.config.tables import read_tables
 from faintspot.base.errors import InputError
-from faintspot.base.flags import SubapertureFlag
+from faintspot.base.flags import SubapertureFlag, kept_flags
 from faintspot.base.version import __version__
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.io.locations import split_location
@@ -29,6 +29,7 @@ from faintspot.slopes.pipeline.mean_flux import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings, with_preset, without_denoising
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.recorded.survey import survey
 from faintspot.slopes.sensor.layout import Layout
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
@@ -58,6 +59,8 @@ class Summary:
     """Error of the last of them."""
     origin: str = ""
     """Description of the values taken from a file of telemetry."""
+    saturation_adu: float | None = None
+    """Saturation level found in the frames, where the configuration states none."""
 
     def add(self, slopes: Slopes) -> None:
         """Count the flags of a block."""
@@ -79,6 +82,7 @@ def measure_recorded(
     device: str = "cpu",
     unit: str = "px",
     mean_flux: bool = False,
+    keep: Sequence[str] = (),
     reference: NDArray[Any] | str | Path | None = None,
     key: str | None = None,
     threads: int | None = None,
@@ -113,6 +117,9 @@ def measure_recorded(
     mean_flux : bool
         Tell the estimator the mean flux of every sub-aperture over the recording, instead of letting it take
         that of each frame: better where the star is faint and steady; see `faintspot.MeanFlux`.
+    keep : sequence of {"limited", "unlike"}
+        Doubtful slopes that stay valid: those at their search limit or cut by their window, and those unlike
+        all neighbours.
     reference : array or path, optional
         Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key", or
         slopes of which they are the mean; see `faintspot.io.references.read_reference`.
@@ -132,6 +139,7 @@ def measure_recorded(
     InputError
         When a file cannot be read or written, or frames and configuration do not fit together.
     """
+    kept = kept_flags(keep)
     given, origin, in_file = _given(configuration_file, frames, key)
     layout, settings, calibration, psf, score = given
     if changes:
@@ -143,10 +151,9 @@ def measure_recorded(
     positions = read_reference(reference) if isinstance(reference, str | Path) else reference
     if positions is None:
         positions = in_file
+    options: dict[str, Any] = {"psf": psf, "score": score, "threads": threads, "device": device}
     try:
-        pipeline = SlopePipeline(
-            layout, settings, calibration, positions, psf=psf, score=score, threads=threads, device=device
-        )
+        pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
     except InputError as error:
         if str(error).startswith("device"):
             raise
@@ -160,13 +167,20 @@ def measure_recorded(
                 f"{source.description}: frames of {source.shape[0]} x {source.shape[1]} pixels, expected "
                 f"{layout.frame_shape[0]} x {layout.frame_shape[1]} as in {configuration_file}"
             )
+        seen = survey(source)
+        if calibration.saturation_adu is None and seen.saturation_adu is not None:
+            calibration = replace(calibration, saturation_adu=seen.saturation_adu)
+            pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
         if mean_flux:
             pipeline = _told_mean_flux(pipeline, source)
-        attributes = _attributes(pipeline, source, frames, configuration_file, key, unit)
+        attributes = _attributes(pipeline, source, frames, configuration_file, key, unit, keep)
         factor = pixels_in(one_of("unit", unit, UNITS), attributes)
         if positions is not None:
             attributes["reference"] = np.asarray(positions).tolist()
+        pipeline = pipeline.with_dark(seen.mean)
         summary = Summary(source.n_frames, len(layout), origin=origin)
+        if given.calibration.saturation_adu is None:
+            summary.saturation_adu = calibration.saturation_adu
         size = block_frames or max(1, _BLOCK_BYTES // (4 * source.shape[0] * source.shape[1]))
         with create_writer(
             output,
@@ -178,7 +192,7 @@ def measure_recorded(
         ) as writer:
             summary.resumed_at = writer.finished()
             for start, block in source.blocks(summary.resumed_at, source.n_frames, size):
-                slopes = pipeline(block)
+                slopes = replace(pipeline(block), keep=kept)
                 writer.append(start, scaled_positions(slopes.variables, factor))
                 summary.add(slopes)
                 if progress is not None:
@@ -273,6 +287,7 @@ def _attributes(
     configuration_file: str | Path,
     key: str | None,
     unit: str,
+    keep: Sequence[str],
 ) -> dict[str, Any]:
     """Return the attributes of the output; the fingerprint decides whether a run may be continued."""
     text = configuration.to_text(pipeline.layout, pipeline.settings, pipeline.calibration)
@@ -283,6 +298,7 @@ def _attributes(
         text,
         str(key),
         *([] if unit == "px" else [unit]),
+        *sorted(keep),
         *paths,
         *(_version(split_location(path)[0]) for path in frames),
         str((source.n_frames, source.shape, source.dtype)),
@@ -299,6 +315,7 @@ def _attributes(
         **_files_of_the_spot(configuration_file),
         "sources": paths,
         "source_key": key or "",
+        "keep": sorted(keep),
         "faintspot_version": __version__,
         "fingerprint": state.hexdigest(),
     }
