@@ -361,7 +361,7 @@ def doubtful(
             if measured.measured[a] and measured.measured[b]
         ]
         if away:
-            usual[s] = np.sqrt(len(away) * min((x**2 + y**2) / variance for (x, y), variance in away))
+            usual[s] = np.sqrt(min((x**2 + y**2) / variance for (x, y), variance in away))
             least[s] = min(np.hypot(*each) for each, _ in away)
     several = np.sort(usual[~np.isnan(usual)])
     typical = float(several[(len(several) - 1) // 2]) if several.size else 0.0
@@ -370,7 +370,7 @@ def doubtful(
         whole = half - np.broadcast_to(fwhm, (n, 2))[s] / 2
         if np.any((np.abs(places[s]) > whole) & (whole > half / 2)):
             flags[s] |= int(Flag.AT_SEARCH_LIMIT)
-        if pitch and least[s] > min(0.1 * pitch, 0.3) and usual[s] > 3.65 * typical:
+        if pitch and least[s] > min(0.1 * pitch, 0.3) and usual[s] > 4.5 * typical:
             flags[s] |= int(Flag.UNLIKE_NEIGHBOURS)
     return flags
 

@@ -152,7 +152,7 @@ def describe(summary: Summary, output: str) -> list[str]:
             f"  went on at frame {summary.resumed_at} (counted from 0); the counts are from there on"
         )
     texts = {
-        SubapertureFlag.NO_FLUX: "without flux",
+        SubapertureFlag.NO_FLUX: "without flux above zero",
         SubapertureFlag.TOO_MANY_BAD_PIXELS: "with too many bad pixels",
         SubapertureFlag.UNLIKE_NEIGHBOURS: "unlike those of all neighbours (probably a wrong spot)",
         SubapertureFlag.SATURATED: "with saturated pixels",

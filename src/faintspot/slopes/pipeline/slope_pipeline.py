@@ -7,6 +7,7 @@ import hashlib
 import math
 import threading
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.kernels.compilation.host import lanes_for
+from faintspot.slopes.kernels.compilation.simd import Lanes
 from faintspot.slopes.kernels.driver.dark import flag_dark, scratch_size
 from faintspot.slopes.kernels.driver.doubtful import flag_doubtful
 from faintspot.slopes.kernels.driver.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
@@ -39,7 +41,6 @@ if TYPE_CHECKING:
 
 _KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
 _SMALL_TYPES = (np.dtype(np.uint8), *_KERNEL_TYPES)
-_flag_dark = {dtype: Direct(flag_dark) for dtype in _KERNEL_TYPES}
 _flag_doubtful = Direct(flag_doubtful)
 _FLUX_COST = 0.1  # of summing the pixels of a sub-aperture, in units of `Estimator.cost`
 
@@ -391,7 +392,8 @@ class SlopePipeline:
         frames : (n, h, w) array, uint16 or float32, contiguous
         """
         scratch = np.empty(scratch_size(len(self.layout), *self.layout.window), np.float32)
-        _flag_dark[frames.dtype](self.light_test, frames, results, scratch)
+        flag_dark_in = _flag_dark(frames.dtype, self.light_test.lanes)
+        flag_dark_in(self.light_test, frames, results, scratch)
         n = len(self.layout)
         _flag_doubtful(results.x, results.y, results.flags, self.plan.expected, scratch[:n])
 
@@ -423,6 +425,12 @@ class SlopePipeline:
         n_groups = n_frames * -(-n // self._lanes.width)
         run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, cost=_FLUX_COST)
         return self.plan.variants(flux.mean(axis=1, dtype=np.float64))
+
+
+@cache
+def _flag_dark(dtype: np.dtype[Any], lanes: Lanes) -> Direct:
+    """Return `flag_dark` for frames of a type, and windows whose pixels are in so many lanes."""
+    return Direct(flag_dark)
 
 
 def kernel_frames(array: NDArray[Any]) -> NDArray[Any]:

@@ -14,9 +14,9 @@ _UNMEASURED = int(UNMEASURED)
 UNLIKE_NEIGHBOURS = int(SubapertureFlag.UNLIKE_NEIGHBOURS)
 AT_SEARCH_LIMIT = int(SubapertureFlag.AT_SEARCH_LIMIT)
 
-TYPICAL = 3.65
-"""Times the median over the sub-apertures that a spot is off what its neighbours say: by chance, where
-displacements are normally distributed, 1 in 10000."""
+TYPICAL = 4.5
+"""Times the median over the sub-apertures that a spot is off what its neighbours say: by chance, of normally
+distributed displacements, 1 in 1000 of 7 x 7 sub-apertures, 1 in 2000 of 40 x 40."""
 
 
 class Expected(NamedTuple):
@@ -82,11 +82,10 @@ def _median(values: Any) -> Any:
 def _difference(f: Any, s: Any, x: Any, y: Any, flags: Any, expected: Any) -> Any:
     """Return how much a slope differs from the most similar of its lines, for comparison and in px.
 
-    For comparison, it is divided by its error for slopes of error 1, and multiplied by the root of the number
-    of lines, of which it is the least: it is then distributed alike in all sub-apertures. -1 without a line.
+    For comparison, it is divided by its error for slopes of error 1; -1 without a line.
     """
     lines, n = expected.lines, x.shape[1]
-    square, least, count = np.float32(math.inf), np.float32(math.inf), 0
+    square = least = np.float32(math.inf)
     for k in range(lines.shape[1]):
         a, b = lines[s, k, 0], lines[s, k, 1]
         if a == n:
@@ -100,7 +99,6 @@ def _difference(f: Any, s: Any, x: Any, y: Any, flags: Any, expected: Any) -> An
         away_y = y[f, s] - near * y[f, a] - far * y[f, b]
         away = away_x * away_x + away_y * away_y
         square, least = min(square, away / variance), min(least, away)
-        count += 1
-    if count == 0:
+    if square == math.inf:
         return np.float32(-1.0), np.float32(0.0)
-    return np.float32(math.sqrt(square * np.float32(count))), np.float32(math.sqrt(least))
+    return np.float32(math.sqrt(square)), np.float32(math.sqrt(least))
