@@ -23,7 +23,7 @@ from benchmarks.prediction import TELEMETRY_GAIN, Case
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import CompiledIntegrator
-from faintspot.loop.control.identification.learning import KALMAN, Plant, learn
+from faintspot.loop.control.identification.learning import KALMAN, LoopPlant, learn
 from faintspot.loop.control.identification.relearning import relearn
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.guarded import Guarded
@@ -54,7 +54,7 @@ def small_table() -> Table:
     turbulence = slope_turbulence(configuration, optics.sensor.layout.cells)
     covariances = turbulence.lagged_px2(frame_s)
     layered = SlopeModel.of_covariances(np.array([each.lagged_px2(frame_s) for each in turbulence.layers()]))
-    plant = Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
+    plant = LoopPlant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
     slopes = np.random.default_rng(1).standard_normal(len(optics.interaction))
     errors = np.full(len(slopes), _NOISE_PX)
     model, clean = SlopeModel.of_covariances(covariances), optics.reconstructor.clean
@@ -208,7 +208,7 @@ def learning_table() -> Table:
     begun = time.process_time()
     learnt = learn(KALMAN, plant, first, site, rate_hz)
     cold = time.process_time()
-    found = relearn(plant, learnt.model, rest, site, rate_hz, learnt.found)
+    found = relearn(plant, learnt.model, rest, site, rate_hz, learnt.identified)
     warm = time.process_time()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     rows = [

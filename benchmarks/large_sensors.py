@@ -124,7 +124,7 @@ def _rival(case: Large, learnt_from: OpenLoopTelemetry, tuning: OpenLoopTelemetr
     plant, phase = case.plant, case.phase
 
     def left(make: Make) -> float:
-        return plant.left(make, tuning, phase)
+        return plant.residual(make, tuning, phase)
 
     offered = rivals("least_squares", plant, learnt_from, _RIVAL_OPTIONS, _RIVAL_GAINS[:1])
     best = min(offered, key=left)

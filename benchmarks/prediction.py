@@ -23,8 +23,8 @@ from benchmarks.measuring import Row, Table
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.base import LEARNT, Controller, Expected
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.learning import GAINS, KALMAN, Plant, learn
-from faintspot.loop.control.identification.model import Learnt
+from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn
+from faintspot.loop.control.identification.model import LearntControl
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.phase import residual_phase
 from faintspot.loop.control.telemetry import OpenLoopTelemetry, make_telemetry
@@ -94,7 +94,9 @@ class Rival:
 
     undoes_prior = True
 
-    def __init__(self, line: CommandDelayLine, plant: Plant, to_modes: Floats, predictor: Any, gain: float):
+    def __init__(
+        self, line: CommandDelayLine, plant: LoopPlant, to_modes: Floats, predictor: Any, gain: float
+    ):
         self._line, self._plant, self._to_modes, self._gain = line, plant, to_modes, gain
         self._predictor = predictor
         self.begin()
@@ -133,10 +135,10 @@ class Case:
         return load_loop(self.name).replace("camera", photons_per_subaperture=self.photons)
 
     @property
-    def plant(self) -> Plant:
+    def plant(self) -> LoopPlant:
         """What a controller needs to know of the loop."""
         optics, control = prepare(self.configuration), self.configuration.control
-        return Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
+        return LoopPlant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
 
     @property
     def rate_hz(self) -> float:
@@ -156,7 +158,7 @@ class Case:
             run.step(controller)
         return float(run.strehl[SETTLE:].mean()), run.telemetry(SETTLE, frames)
 
-    def learnt(self, telemetry: OpenLoopTelemetry, winds: str = LEARNT) -> Learnt:
+    def learnt(self, telemetry: OpenLoopTelemetry, winds: str = LEARNT) -> LearntControl:
         """Return our filter."""
         return learn(KALMAN, self.plant, telemetry, self.site, self.rate_hz, winds)
 
@@ -179,7 +181,7 @@ class Case:
         """Return controllers that have learnt: the rivals, tuned, and the integrator and ours."""
         plant, phase, (learning, tuning) = self.plant, self.phase, self.telemetry()
         found: dict[str, Make] = {
-            name: min(rivals(name, plant, learning), key=lambda make: plant.left(make, tuning, phase))
+            name: min(rivals(name, plant, learning), key=lambda make: plant.residual(make, tuning, phase))
             for name in _GRIDS
         }
         if ours:
@@ -247,7 +249,7 @@ class Run:
 
 def rivals(
     name: str,
-    plant: Plant,
+    plant: LoopPlant,
     telemetry: OpenLoopTelemetry,
     options: Mapping[str, Sequence[Any]] | None = None,
     gains: Sequence[float] = _GAINS,

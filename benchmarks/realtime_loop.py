@@ -27,7 +27,7 @@ from faintspot import Calibration, Layout, Settings, SlopePipeline
 from faintspot.engine.engine import Engine
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.loop.control.configuration import Control, ControlOptions, load_control
-from faintspot.loop.control.identification.model import CONTROLS, KALMAN, POLC, Model
+from faintspot.loop.control.identification.model import CONTROLS, KALMAN, POLC, ControlModel
 from faintspot.loop.control.kalman.slope_model import SlopeModel
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.control import slope_turbulence
@@ -63,7 +63,7 @@ def _latency() -> Table:
         },
     }
     for kind, arrays in learnt.items():
-        known = Model(kind, arrays, 0.3, 1.0, (1.0, 2.0), np.zeros_like(interaction.T))
+        known = ControlModel(kind, arrays, 0.3, 1.0, (1.0, 2.0), np.zeros_like(interaction.T))
         control = Control(interaction, None, ControlOptions(controller=kind), known)
         rows.append(_row(CONTROLS[kind], layout, control, TARGETS_US[1]))
     return Table("realtime-commands", "From slopes to commands, us", rows)

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.measuring import Row, Table
 from benchmarks.prediction import Make, rivals
 from faintspot.base.statistics import mean_by_blocks
-from faintspot.loop.control.identification.learning import GAINS, KALMAN, Plant, learn
+from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.replay import replayed_frames
 from faintspot.loop.control.reconstructor import make_reconstructor
@@ -55,10 +55,10 @@ def _replayed(delay: int) -> Table:
     half = len(seen.telemetry) // 2
     first, second = seen.telemetry.part(0, half), seen.telemetry.part(half, len(seen.telemetry))
     tuning = first.part(half - TUNED_FRAMES, half)
-    plant, phase = Plant(np.eye(2), make_reconstructor(np.eye(2)), delay, LEAK), np.eye(2)
+    plant, phase = LoopPlant(np.eye(2), make_reconstructor(np.eye(2)), delay, LEAK), np.eye(2)
 
     def best(candidates: list[Make]) -> Make:
-        return min(candidates, key=lambda each: plant.left(each, tuning, phase))
+        return min(candidates, key=lambda each: plant.residual(each, tuning, phase))
 
     makes: dict[str, Make] = {"integrator": best([partial(plant.integrator, gain) for gain in GAINS])}
     if importlib.util.find_spec("pyrtc"):

@@ -120,7 +120,7 @@ def _intervals(values: list[tuple[Measured, float]]) -> Iterable[tuple[float, fl
 
 def compared(report: LoopReport, truth: Truth) -> Pairs:
     """Return the values of a report that are known, with the truth."""
-    known = {each.name: each for part in report.parts.values() for each in part.known}
+    known = {each.name: each for part in report.parts.values() for each in part.values}
     true = {
         "delay": truth.delay_frames,
         "noise of a slope": truth.noise_px,
@@ -156,7 +156,7 @@ def _layers(known: dict[str, Measured], truth: Truth) -> Pairs:
 
 def _vibrations(report: LoopReport, truth: Truth) -> Pairs:
     """Return the frequency and rms of the vibration, if it was found, and those that are not there."""
-    known, true, pairs = report.parts["vibrations"].known, truth.vibration, Pairs()
+    known, true, pairs = report.parts["vibrations"].values, truth.vibration, Pairs()
     for frequency, rms in zip(known[::2], known[1::2], strict=True):
         is_true = true is not None and frequency.name.endswith(f" {true.mode}")
         if true is not None and is_true and abs(frequency.value - true.frequency_hz) < _SAME_LINE_HZ:

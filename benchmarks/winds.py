@@ -13,12 +13,12 @@ import numpy as np
 from benchmarks.measuring import Row, Table
 from benchmarks.prediction import SETTLE, VIBRATION_NM, Case, Floats, Run
 from faintspot.base.statistics import paired_mean
-from faintspot.engine.loop.successor import Ready, Successor
+from faintspot.engine.loop.successor import ControllerSuccessor, PreparedController
 from faintspot.loop.control.base import ASSUMED, WINDS
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.learning import KALMAN
-from faintspot.loop.control.identification.model import Learnt
-from faintspot.loop.control.identification.relearning import Relearnt, relearn
+from faintspot.loop.control.identification.model import LearntControl
+from faintspot.loop.control.identification.relearning import RelearntControl, relearn
 from faintspot.loop.control.kalman.guarded import HANDOVER_FRAMES
 
 CASES = {
@@ -85,14 +85,14 @@ class Drifted(NamedTuple):
     """Largest rms change of commands from frame to frame: at a handover, and otherwise."""
 
 
-def drifting(case: Case, learnt: Learnt, realisation: int) -> Drifted:
+def drifting(case: Case, learnt: LearntControl, realisation: int) -> Drifted:
     """Simulate a run; filters are learnt and handed over as beside an engine."""
     every, later = (round(each * case.rate_hz) for each in (LEARN_EVERY_S, LEARNING_TAKES_S))
     run = Run(case, realisation, round(DRIFT_S * case.rate_hz))
     controller, running = learnt.controller(run.line), learnt.model
     change, at_handover = np.zeros((2, len(run.strehl)))
     wind, successor = run.model.atmosphere.velocity, None
-    found: Relearnt | None = None
+    found: RelearntControl | None = None
     while run.frame < len(run.strehl):
         part = run.frame / len(run.strehl)
         now = (1 + DRIFT * part) * wind @ _rotation(DRIFT_DEG * part)
@@ -108,12 +108,12 @@ def drifting(case: Case, learnt: Learnt, realisation: int) -> Drifted:
             successor, at_handover[run.frame : run.frame + HANDOVER_FRAMES] = None, 1.0
         if run.frame % every == 0 and run.frame < len(run.strehl):
             telemetry = run.telemetry(run.frame - every, run.frame)
-            start = None if found is None else found.learnt.found
+            start = None if found is None else found.learnt.identified
             found = relearn(case.plant, running, telemetry, case.site, case.rate_hz, start)
         if run.frame % every == later and found is not None and found.is_better:
             running, line = found.learnt.model, CommandDelayLine(len(run.line.latest), run.line.delay_frames)
-            successor = Successor(
-                Ready(KALMAN, found.learnt.controller(line), line, False, True, True, False)
+            successor = ControllerSuccessor(
+                PreparedController(KALMAN, found.learnt.controller(line), line, False, True, True, False)
             )
     run.strehl[:SETTLE], change[:SETTLE] = np.nan, 0.0
     largest = float((at_handover * change).max()), float((change - at_handover * change).max())

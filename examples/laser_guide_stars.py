@@ -2,7 +2,8 @@
 
 Prints Markdown tables for an 8 m telescope with 20 x 20 sub-apertures and a laser launched from its side:
 flux needed for equal wavefront errors, and the photon efficiency of every sub-aperture. Errors: jackknife
-over frames. `laser_guide_star_change.py` prints the modes that a changing layer leaves.
+over frames. Then, also for the size of an ELT, what windows that cut off spots do to slopes; there all
+methods know the profile.
 
     python examples/laser_guide_stars.py
 """
@@ -58,16 +59,16 @@ CASES = (
 )
 
 
-def subapertures_m() -> Floats:
+def subapertures_m(diameter_m: float, lenslets: int, obstruction_m: float) -> Floats:
     """Return the centres of the sub-apertures in the pupil."""
-    place = (np.arange(LENSLETS) - (LENSLETS - 1) / 2) * DIAMETER_M / LENSLETS
+    place = (np.arange(lenslets) - (lenslets - 1) / 2) * diameter_m / lenslets
     x, y = np.meshgrid(place, place)
     distance = np.hypot(x, y)
-    lit = (distance < DIAMETER_M / 2) & (distance > OBSTRUCTION_M / 2)
+    lit = (distance < diameter_m / 2) & (distance >= obstruction_m / 2)
     return np.column_stack([x[lit], y[lit]])
 
 
-PLACES = subapertures_m()
+PLACES = subapertures_m(DIAMETER_M, LENSLETS, OBSTRUCTION_M)
 N = len(PLACES)
 DETECTOR = fs.slopes.simulate.Detector(READ_NOISE_E)
 CALIBRATION = fs.Calibration(read_noise_e=READ_NOISE_E)
@@ -280,13 +281,93 @@ def _of(psf: fs.PSF, kept: NDArray[np.int64]) -> fs.PSF:
     return fs.PSF(psf.samples[kept], psf.oversampling, range(len(kept)))
 
 
+# Windows that cut off spots --------------------------------------------------------------------------
+
+EDGES = (0.0, 0.01, 0.05, 0.15, 0.3, 1.0)  # parts of the flux that are cut off
+CUT_FLUX_E, CUT_FRAMES, STEP_PX = 300.0, 200, 0.3
+
+
+class Cutting(NamedTuple):
+    """Telescope and sensor."""
+
+    name: str
+    diameter_m: float
+    lenslets: int
+    launch_m: float
+    pixel_arcsec: float
+    side: int
+    every: int
+    """Of this number of sub-apertures one is measured."""
+    width_px: float
+    """Width of the Gaussian window."""
+
+
+CUTTING = (
+    Cutting("8 m, 20 x 20, launched 5 m off-axis", 8.0, 20, -5.0, 0.5, 6, 2, 5.0),
+    Cutting("39 m, 80 x 80, launched 40 m off-axis", 39.0, 80, -40.0, 1.0, 16, 31, 16.0),
+    Cutting("39 m, 80 x 80, launched 40 m off-axis", 39.0, 80, -40.0, 1.0, 10, 31, 16.0),
+)
+
+
+def cutting_pipelines(layout: fs.Layout, psf: fs.PSF, width_px: float) -> dict[str, fs.SlopePipeline]:
+    """Return the methods; spots are within 2 px of the reference."""
+    weights = fs.FixedWeights.matched(psf, layout.window, flux_e=CUT_FLUX_E, read_noise_e=READ_NOISE_E)
+    window = fs.Settings("window", window_fwhm_px=width_px, spot_fwhm_px=width_px, normalisation="frame")
+    correlation = fs.Settings(Correlation(step_px=0.5), search_range_px=2.0)
+    ml = fs.Settings("ml", search_range_px=2.0)
+    return {
+        "weighted centre of gravity": fs.SlopePipeline(layout, window, CALIBRATION),
+        "correlation": fs.SlopePipeline(layout, correlation, CALIBRATION, psf=psf),
+        "linear matched filter": fs.SlopePipeline(layout, window, CALIBRATION, score=weights),
+        "ml": fs.SlopePipeline(layout, ml, CALIBRATION, psf=psf),
+    }
+
+
+def cutting_table(case: Cutting) -> None:
+    """Print offset, gain along the elongation and error over the bound, by the part that is cut off."""
+    places = subapertures_m(case.diameter_m, case.lenslets, 0.0)[:: case.every]
+    spot = fs.PSF.analytic("gaussian", size=1.2 / case.pixel_arcsec / 2, radius_px=8)
+    star = fs.LaserGuideStar(places, (case.launch_m, 0.0), case.pixel_arcsec, spot, ZENITH_DEG, SITE_M)
+    profile, side = star.focused(DOUBLE), case.side
+    along = star.elongation_px(profile)
+    along = along / np.hypot(*along.T)[:, None]
+    layout, psf = fs.Layout.grid((1, len(star)), pixels=side), star.psf(profile, radius_px=side / 2 + 3)
+
+    def frame(step: float) -> Floats:
+        images = np.maximum(star.images(profile, (side, side), step * along), 0.0)
+        return images.swapaxes(0, 1).reshape(side, -1)
+
+    groups = np.digitize(1.0 - layout.images(frame(0.0)).sum(axis=(1, 2)), EDGES[1:-1])
+    drawn = np.random.default_rng(1).poisson(CUT_FLUX_E * frame(0.0), (CUT_FRAMES, side, side * len(star)))
+    noisy = drawn + np.random.default_rng(2).normal(0.0, READ_NOISE_E, drawn.shape)
+    bound = fs.cramer_rao_covariance(CUT_FLUX_E, psf, (side, side), detector=DETECTOR)
+    least = np.sqrt(np.trace(bound, axis1=1, axis2=2))
+    shown = [groups == group for group in np.unique(groups)]
+    parts = [f"{100 * EDGES[k]:g} to {100 * EDGES[k + 1]:g} % cut off" for k in np.unique(groups)]
+    print(f"\n### {case.name}, {side} px of {case.pixel_arcsec:g} arcsec\n")
+    print("| slope at the reference [px rms]; gain; error / bound | " + " | ".join(parts) + " |")
+    print("|---" * (1 + len(shown)) + "|")
+    for name, pipeline in cutting_pipelines(layout, psf, case.width_px).items():
+        ends = (pipeline(1e4 * frame(step)) for step in (STEP_PX, -STEP_PX))
+        ahead, behind = ((np.stack([each.x, each.y], axis=1) * along).sum(axis=1) for each in ends)
+        offset, gain = 0.5 * (ahead + behind), (ahead - behind) / (2 * STEP_PX)
+        found = pipeline(noisy)
+        error = np.sqrt(found.x.var(axis=0) + found.y.var(axis=0)) / np.maximum(gain, 0.1) / least
+        rms = [np.sqrt(np.square(offset[own]).mean()) for own in shown]
+        cells = [
+            f"{r:.3f}; {gain[own].mean():.2f}; {np.median(error[own]):.2f}"
+            for r, own in zip(rms, shown, strict=True)
+        ]
+        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description="Measure what a followed sodium profile gains.")
     parser.add_argument("--frames", type=int, default=200, help="Frames that are scored. [default: 200]")
-    parser.add_argument("--parts", nargs="*", default=["efficiency", "flux"], help="Tables.")
+    parser.add_argument("--parts", nargs="*", default=["efficiency", "flux", "cutting"], help="Tables.")
     chosen = parser.parse_args()
-    steps = {"efficiency": 3 * len(CASES[:-1]), "flux": len(CASES) * len(FLUXES)}
+    steps = {"efficiency": 3 * len(CASES[:-1]), "flux": len(CASES) * len(FLUXES), "cutting": 3}
     total, done = sum(steps[part] for part in chosen.parts), 0
     with progress_bar("Laser guide stars", "steps") as show:
 
@@ -303,6 +384,11 @@ def main() -> None:
             print("\n## Wavefront error [nm rms] of a frame, Zernike modes 4 to 136")
             for case in CASES:
                 flux_table(case, chosen.frames, advance)
+        if "cutting" in chosen.parts:
+            print("\n## Windows that cut off spots")
+            for cutting in CUTTING:
+                cutting_table(cutting)
+                advance(1)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-NOT_TRIED = ("develop", "benchmarks", "docs", "gpu", "oopao", "specula", "soapy", "pyrtc")
-"""Extras that are for developers, need a GPU, or bring another tool with pins of its own."""
+NOT_TRIED = ("oopao", "specula", "soapy", "pyrtc")
+"""Extras that bring another tool, with pins of its own."""
 FRAME = "import numpy as np; from faintspot.data import mmt_frame; np.save('frame.npy', mmt_frame())"
 COMMANDS = (
     "doctor",

@@ -6,8 +6,10 @@ Hypothesis has no deadline, because the first call of a kernel compiles it;
 
 from __future__ import annotations
 
+import multiprocessing.process
 import os
 import signal
+import subprocess
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -24,11 +26,26 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(tryfirst=True)  # before -m "not slow" selects
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Repeat tests that depend on clocks or other processes, and no others, up to twice."""
+    """Tests that depend on clocks or other processes are slow ones, and alone are repeated, up to twice."""
     for item in items:
         if item.get_closest_marker("machine_time"):
+            item.add_marker(pytest.mark.slow)
             item.add_marker(pytest.mark.flaky(reruns=2))
+
+
+@pytest.fixture(autouse=True)
+def no_processes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let only slow tests start processes."""
+    if request.node.get_closest_marker("slow"):
+        return
+
+    def refuse(*arguments: object, **options: object) -> None:
+        pytest.fail("a test that starts a process carries the marker `slow`")
+
+    monkeypatch.setattr(multiprocessing.process.BaseProcess, "start", refuse)
+    monkeypatch.setattr(subprocess.Popen, "__init__", refuse)
 
 
 @pytest.fixture

@@ -1,18 +1,12 @@
-"""What tests do otherwise in an emulator, which sets FAINTSPOT_PATIENCE: how many times longer they wait."""
+"""How long tests wait for other processes and threads."""
 
 from __future__ import annotations
 
-import os
 import time
 from typing import Any
 
-import pytest
-
-LIMIT_S = 60.0 * float(os.environ.get("FAINTSPOT_PATIENCE", "1"))
+LIMIT_S = 60.0
 """How long to wait for what must come."""
-not_emulated = pytest.mark.skipif(
-    "FAINTSPOT_PATIENCE" in os.environ, reason="qemu-user 7.2 fails in processes that fork beside threads"
-)
 
 
 def wait_for(condition: Any, what: object = "") -> None:

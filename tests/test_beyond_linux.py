@@ -25,9 +25,10 @@ realisations = 200
 [sweeps.flux]
 flux_e = [30, 100]
 """
-OF_RECORDINGS = {"learn", "advise", "export"}
+OF_RECORDINGS = {"learn", "export"}
 
 
+@pytest.mark.slow
 def test_everything_imports_and_what_is_not_real_time_works(tmp_path: Path) -> None:
     for package in ("hcipy", "pyshmem", "specula", "tornado", "xarray"):
         pytest.importorskip(package)
@@ -55,8 +56,6 @@ def test_everything_imports_and_what_is_not_real_time_works(tmp_path: Path) -> N
     assert done.stderr.splitlines()[-1] == "faintspot: error: faintspot realtime run needs Linux"
     assert done.returncode == 2
     assert int(done.stdout.split()[0]) > 400  # modules
-    assert "no /dev/shm" in done.stdout
-    assert "no real-time scheduling" in done.stdout
     assert "cannot be found out" not in done.stdout
     assert_equal(tmp_path / "slopes.zarr", expected(frames))
     assert (tmp_path / "tuned.toml").exists()
@@ -88,5 +87,5 @@ def test_the_other_ways_into_real_time_say_so_too(
 ) -> None:
     run = Commands(capsys)
     monkeypatch.setattr(extras, "SHARED_MEMORY", tmp_path / "none")
-    for line in ("live", "realtime demo", "realtime advise"):
+    for line in ("live", "realtime demo", "telemetry --engine faintspot"):
         run.refused(*line.split(), naming=("needs shared memory", "which Linux has"))

@@ -62,9 +62,8 @@ def test_public_names_have_examples() -> None:
     assert without == set(WITHOUT_EXAMPLE)
 
 
-@pytest.mark.parametrize(
-    "name", [*sorted(NAMES.keys() - WITHOUT_EXAMPLE.keys()), "faintspot.cli.examination.examine"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(NAMES.keys() - WITHOUT_EXAMPLE.keys()))
 def test_examples(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     home, _, short = name.rpartition(".")
     for package in NEEDED.get(short, ()):

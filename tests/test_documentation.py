@@ -31,8 +31,6 @@ PAGES = [
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 NOT_RUN = {
-    'device="cuda"': "needs a GPU",
-    "FrameStream": "needs a GPU",
     "import hcipy": "run by the adapter's own tests",
     "adapter.calibrating": "a sketch of what adapters share",
     "import oopao": "run by tests/adapters/test_manual.py",
@@ -139,6 +137,7 @@ def write_night(path: Path, layout: fs.Layout) -> None:
     write_aot(path.with_suffix(".fits"), read_telemetry(store.path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", blocks())
 def test_blocks_run(page: Path, names: dict[str, Any]) -> None:
     for number, code in enumerate(BLOCK.findall(page.read_text(encoding="utf-8"))):
@@ -169,6 +168,7 @@ def variables(table: symtable.SymbolTable) -> tuple[set[str], set[str]]:
     return read, made
 
 
+@pytest.mark.slow
 def test_names_are_there_after_the_import() -> None:
     """Blocks share a process with others that import more than they do."""
     text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)

@@ -124,6 +124,7 @@ def run(words: list[str]) -> None:
     assert said.exit_code == 0, said.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("called", pages_to_run())
 def test_commands_run(
     called: list[list[str]],

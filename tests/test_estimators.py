@@ -52,6 +52,7 @@ class TestAgainstOracle:
         case = random_case(seed, estimator)
         assert_equals_oracle(case, case.measure())
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("estimator", QUICK)
     @given(seed=SEEDS)
     @settings(max_examples=10)
@@ -72,7 +73,6 @@ class TestAgainstOracle:
         case = with_noise_map(random_case(seed, "map", n=2), seed)
         assert_equals_oracle(case, case.measure())
 
-    @pytest.mark.portable
     @given(seed=SEEDS)
     @settings(max_examples=4)
     def test_random_spots_with_a_prior(self, seed: int) -> None:
@@ -91,13 +91,13 @@ class TestAgainstOracle:
         case = on_unknown_background(random_case(seed, "map", n=2, window=(10, 11)), seed)
         assert_equals_oracle(case, case.measure())
 
+    @pytest.mark.slow
     # Each is compiled anew: at 8 lanes the families, at the ends all.
     @pytest.mark.parametrize(
         ("width", "estimator"),
         [
-            *(pytest.param(4, name, marks=pytest.mark.portable) for name in QUICK),
+            *product((4, 16), QUICK),
             *product((8,), ("tv", "window", "ml", "trained")),
-            *product((16,), QUICK),
         ],
     )
     def test_any_simd_width(self, estimator: str, width: int) -> None:
@@ -140,7 +140,6 @@ class TestAgainstOracle:
             assert abs(covariance - away_y @ weight @ away_x) < 1e-4 * expected[0] * expected[1]
 
 
-@pytest.mark.portable
 class TestIndependence:
     """Slopes are the same bit by bit."""
 
@@ -216,6 +215,7 @@ class TestNoiseMap:
             values = getattr(expected, name)
             np.testing.assert_allclose(getattr(found, name), values, rtol=1e-5, atol=1e-5, err_msg=name)
 
+    @pytest.mark.slow
     @EVERY
     def test_images_and_widths(self, estimator: str) -> None:
         """Calibrated images and other SIMD widths give what the frames give."""
@@ -289,7 +289,7 @@ class TestLocalBackground:
 
         for each, changes in ((off, {"dark": 0.0}), (on, {"dark": None})):
             assert_same(with_dark(case, **changes).measure(), with_dark(each, dark=0.0).measure())
-        rough = {"dark": 1.0, "rough_dark": True}
+        rough = {"dark": 1.0, "estimated": ("dark",)}
         assert_same(with_dark(case, **rough).measure(), with_dark(on, dark=1.0).measure())
 
     def test_images_keep_what_is_known_of_the_dark(self) -> None:

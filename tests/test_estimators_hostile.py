@@ -80,6 +80,7 @@ def flat_case(estimator: str, images: NDArray[Any], **changes: Any) -> Case:
 
 
 class TestImages:
+    @pytest.mark.slow
     @EVERY
     @given(seed=SEEDS)
     @settings(max_examples=25)
@@ -130,6 +131,7 @@ class TestImages:
         assert_sane(slopes)
         assert np.mean(slopes.flags == 0) < 0.04
 
+    @pytest.mark.slow
     @EVERY
     def test_bad_pixels_and_saturation_are_counted(self, estimator: str) -> None:
         images = np.round(one_psf().images(np.zeros((6, 2)), (9, 9), 3000.0)).astype(np.uint16)

@@ -46,6 +46,7 @@ def test_fast_is_as_good_as_converged(case: Cell, keep: int) -> None:
     assert excess(case, keep, 1.0, preset="fast") < TOLERANCE
 
 
+@pytest.mark.slow
 def test_accurate_is_as_good_as_converged_with_many_pixels_kept_and_fewer_iterations_are_not() -> None:
     """Where a wide, shallow residue is left: a large Gaussian spot, 100 of 256 pixels."""
     case = cell(0.1, 80, "gaussian", 2.0)

@@ -58,10 +58,12 @@ def imported_by(statement: str) -> set[str]:
     return set(result.stdout.split())
 
 
+@pytest.mark.slow
 def test_import_is_light() -> None:
     assert imported_by("import faintspot") == set()
 
 
+@pytest.mark.slow
 def test_sensor_needs_no_kernels() -> None:
     """Neither the sensor nor the declaration of options; settings have an estimator, which has a kernel."""
     statement = (
@@ -71,6 +73,7 @@ def test_sensor_needs_no_kernels() -> None:
     assert imported_by(statement) <= {"scipy"}
 
 
+@pytest.mark.slow
 def test_settings_load_no_more_than_numba_and_scipy() -> None:
     statement = "import faintspot\nfaintspot.Settings(noise_std=1.0)"
     assert imported_by(statement) <= {"numba", "llvmlite", "scipy"}

@@ -45,11 +45,11 @@ figure.colorbar(shown, label="ADU", shrink=0.8)
 # Measure
 # -------
 # A `Calibration` describes the detector, `Settings` the estimator. There is no dark frame here, so the
-# background of the frame replaces it; `rough_dark` says that it is approximate. The strength of the denoising
+# background of the frame replaces it; `estimated` says that it is approximate. The strength of the denoising
 # is a noise level in electrons.
 
 dark = float(np.median(frame))
-calibration = fs.Calibration(dark=dark, rough_dark=True, bad_pixels=hot)
+calibration = fs.Calibration(dark=dark, estimated=("dark",), bad_pixels=hot)
 denoised = fs.SlopePipeline(layout, fs.Settings("tv", noise_std=15.0, keep_brightest=30), calibration)
 plain = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30), calibration)
 

@@ -13,6 +13,7 @@ from tests.shared_data import ROOT
 MANUAL = ROOT / "docs" / "adapters"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("page", "module", "result", "low", "high"),
     [

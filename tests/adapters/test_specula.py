@@ -161,6 +161,7 @@ class TestRealTool:
             self.made(subapertures, filtmat=np.full((2, 2, 2 * N), np.nan))
 
 
+@pytest.mark.slow
 @needs("specula", "specula")
 def test_a_parameter_file_finds_the_class() -> None:
     code = (

@@ -14,7 +14,6 @@ import faintspot as fs
 from faintspot.base.sizes import MOST_NUMBERS, check_size
 from faintspot.experiments.study.specification import StudySpecification, Sweep
 from faintspot.io import open_frames
-from faintspot.io.frames import read_array
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.slopes.estimators import spot_tables
 from faintspot.slopes.spots.psf import PSF
@@ -141,17 +140,6 @@ def test_sizes_up_to_the_limit_pass() -> None:
 
 
 class TestFilesThatClaimMore:
-    def test_a_store_whose_chunks_were_never_written(self, tmp_path: Path) -> None:
-        zarr = pytest.importorskip("zarr")
-        path = tmp_path / "frames.zarr"
-        zarr.create_array(str(path), shape=(1 << 40, 64, 64), chunks=(1, 64, 64), dtype="f4")
-        for read in (lambda path: open_frames([path]), read_array):
-            with pytest.raises(fs.InputError, match="1,099,511,627,776 chunks that it states, found 0"):
-                read(path)
-        zarr.create_array(str(path), shape=(500, 64, 64), chunks=(1, 64, 64), dtype="f4", overwrite=True)
-        with open_frames([path]) as frames:  # frames that are absent are the fill value, by Zarr's definition
-            assert frames.block(499, 500).shape == (1, 64, 64)
-
     def test_frames_beyond_any_camera(self, tmp_path: Path) -> None:
         zarr = pytest.importorskip("zarr")
         path = tmp_path / "frames.zarr"

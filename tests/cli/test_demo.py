@@ -20,6 +20,7 @@ pytest.importorskip("jinja2")
 FILES = {"frames.npy", "truth.npy", "tv.toml", "tv.npz", "no-tv.toml", "no-tv.npz", "report.html"}
 
 
+@pytest.mark.slow
 def test_demo_twice(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     first = run.ok("demo", "--frames", 40, "-o", "new/demo", "--seed", 7)
     made = folder / "new" / "demo"

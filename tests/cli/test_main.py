@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 from tests.cli.cli_cases import Commands, command_line
 
 import faintspot
+from faintspot.cli import module_of
 
 pytestmark = pytest.mark.machine_time("starts other processes")
 
@@ -37,8 +39,7 @@ def test_help_lists_every_command(run: Commands) -> None:
 
 def test_every_option_says_what_it_is_for(run: Commands) -> None:
     for command in COMMANDS:
-        module = __import__(f"faintspot.cli.{command}", fromlist=["command"])
-        for parameter in module.command.params:
+        for parameter in import_module(module_of(command)).command.params:
             assert parameter.param_type_name == "argument" or parameter.help, parameter.name
 
 

@@ -26,6 +26,7 @@ def is_page(path: Path) -> bool:
     return text.lstrip().lower().startswith("<!doctype html>") and text.rstrip().endswith("</html>")
 
 
+@pytest.mark.slow
 def test_one_and_two_methods(measured: Path, run: Commands) -> None:
     result = run.ok("report", "slopes.zarr/")  # as a shell completes it
     assert result.out == "slopes.html: open it in a browser\n"
@@ -36,6 +37,7 @@ def test_one_and_two_methods(measured: Path, run: Commands) -> None:
     assert "plain.npz" in (measured / "both.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_frames_that_have_moved(measured: Path, run: Commands) -> None:
     (measured / "a.npy").rename(measured / "b.npy")
     run.ok("report", "slopes.zarr", "-o", "with.html", "--recording", "b.npy")

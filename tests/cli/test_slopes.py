@@ -19,7 +19,6 @@ zarr = pytest.importorskip("zarr")
 pytestmark = pytest.mark.machine_time("starts other processes")
 
 
-@pytest.mark.portable
 def test_frames_in(folder: Path, run: Commands) -> None:
     frames = simulated()
     fits.PrimaryHDU(frames).writeto(folder / "a.fits.gz")
@@ -29,7 +28,6 @@ def test_frames_in(folder: Path, run: Commands) -> None:
     assert result.out.splitlines()[-1] == "Next: faintspot report slopes.zarr"
 
 
-@pytest.mark.portable
 @pytest.mark.parametrize("name", ["s.zarr", "s.fits", "s.fits.gz", "s.npz", "s.csv", "with space.npz"])
 def test_formats_out(folder: Path, run: Commands, name: str) -> None:
     frames = simulated()
@@ -70,11 +68,6 @@ def test_preset_goes_before_the_configuration(folder: Path, run: Commands) -> No
     assert_equal(folder / "s.npz", SlopePipeline(LAYOUT, SETTINGS.replace(preset="fast"))(frames))
     run.ok("slopes", "a.npy", "-o", "t.npz", "--preset", "accurate")
     assert_equal(folder / "t.npz", expected(frames))
-
-
-def test_device(folder: Path, run: Commands) -> None:
-    np.save("a.npy", simulated())
-    run.refused("slopes", "a.npy", "-o", "s.npz", "--device", "tpu", naming=("device", "tpu", "cuda"))
 
 
 def test_reference(folder: Path, run: Commands) -> None:

@@ -39,11 +39,9 @@ def uninterrupted(frames: np.ndarray) -> Slopes:
 
 def finished(output: Path) -> int:
     """Return how many frames the unfinished output says it has."""
+    store = output if output.suffix == ".zarr" else output.with_name(f"{output.name}.partial.zarr")
     try:
-        if output.suffix == ".zarr":
-            return int(json.loads((output / "zarr.json").read_text())["attributes"]["finished_frames"])
-        mark = (output.with_name(f".{output.name}.partial") / "finished").read_text()
-        return int(mark.split("\n")[0] or 0)  # empty while it is written
+        return int(json.loads((store / "zarr.json").read_text())["attributes"]["finished_frames"])
     except FileNotFoundError:
         return 0
 

@@ -37,6 +37,7 @@ def test_answer_configuration_and_picture(
     assert "faintspot slopes" in result.out
 
 
+@pytest.mark.slow
 def test_camera_file_and_options_that_count_more(
     run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -52,6 +53,7 @@ def test_camera_file_and_options_that_count_more(
     assert len(SlopePipeline.from_file("out.toml").layout) == 16
 
 
+@pytest.mark.slow
 def test_without_a_layout_it_says_what_to_do(
     run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -77,6 +79,7 @@ def test_calibration_of_an_existing_configuration_counts_and_stays(
     )
 
 
+@pytest.mark.slow
 def test_from_frames(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import numpy as np
 

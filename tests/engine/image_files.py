@@ -1,4 +1,4 @@
-"""Streams of ImageStreamIO and dao put together byte by byte, from the offsets of their public headers."""
+"""Streams of ImageStreamIO put together byte by byte, from the offsets of its public header."""
 
 from __future__ import annotations
 
@@ -15,23 +15,7 @@ LIBC = ctypes.CDLL(None)
 SEMAPHORES, KEYWORDS, TRACES = 10, 2, 10
 
 
-class Memory:
-    """A file in memory."""
-
-    memory: mmap.mmap
-
-    def mapped(self, path: Path) -> None:
-        with path.open("r+b") as file:
-            self.memory = mmap.mmap(file.fileno(), 0)
-
-    def put(self, place: int, form: str, *values: Any) -> None:
-        struct.pack_into("<" + form, self.memory, place, *values)
-
-    def get(self, place: int, form: str) -> Any:
-        return struct.unpack_from("<" + form, self.memory, place)[0]
-
-
-class IsioFile(Memory):
+class IsioFile:
     """A file of ImageStreamIO, version 2.00, as milk makes one; sizes are (x, y, z)."""
 
     def __init__(self, path: Path, sizes: tuple[int, ...], dtype: str, **changes: Any) -> None:
@@ -58,7 +42,8 @@ class IsioFile(Memory):
             end += (16 + 16 + 8) * sizes[2]
         end += self._up(48 * values["buffered"]) + self._up(data * values["buffered"])
         path.write_bytes(bytes(end))
-        self.mapped(path)
+        with path.open("r+b") as file:
+            self.memory = mmap.mmap(file.fileno(), 0)
         put = self.put
         put(0, "32s", values["version"])
         put(32, "80s", path.name.removesuffix(".im.shm").encode())
@@ -76,6 +61,12 @@ class IsioFile(Memory):
         for number in range(SEMAPHORES):
             LIBC.sem_init(ctypes.c_void_p(self.address(number)), 1, 0)
             put(self.readers + 4 * number, "i", -1)
+
+    def put(self, place: int, form: str, *values: Any) -> None:
+        struct.pack_into("<" + form, self.memory, place, *values)
+
+    def get(self, place: int, form: str) -> Any:
+        return struct.unpack_from("<" + form, self.memory, place)[0]
 
     def address(self, number: int) -> int:
         start: int = np.frombuffer(self.memory, np.uint8).ctypes.data
@@ -101,30 +92,3 @@ class IsioFile(Memory):
     @staticmethod
     def _up(size: int) -> int:
         return -(-size // 8) * 8
-
-
-class DaoFile(Memory):
-    """A file of dao's, as its library makes one."""
-
-    def __init__(self, path: Path, sizes: tuple[int, ...], dtype: str, keywords: int = 0) -> None:
-        self.path, self.dtype = path, np.dtype(dtype)
-        path.write_bytes(bytes(4296 + int(np.prod(sizes)) * self.dtype.itemsize + 120 * keywords))
-        self.mapped(path)
-        self.put(0, "80s", str(path).encode())
-        self.put(80, "B", len(sizes))
-        self.put(84, f"{len(sizes)}I", *sizes)
-        self.put(96, "Q", int(np.prod(sizes)))
-        self.put(104, "B", CODES[dtype])
-        self.put(144, "B", 1)
-        self.put(148, "H", 10)
-        self.put(178, "H", keywords)
-
-    def write(self, values: Any) -> None:
-        raw = np.asarray(values, self.dtype).tobytes()
-        self.put(176, "B", 1)
-        self.memory[4296 : 4296 + len(raw)] = raw
-        self.put(176, "B", 0)
-        self.put(152, "Q", self.get(152, "Q") + 1)
-
-    def values(self) -> Any:
-        return np.frombuffer(self.memory, self.dtype, int(self.get(96, "Q")), 4296)

@@ -23,10 +23,10 @@ pytestmark = [
 @pytest.mark.parametrize(
     ("command", "number"),
     [
-        ("realtime_sources.bridge", signal.SIGINT),
-        ("realtime_sources.replay", signal.SIGTERM),
-        ("realtime_camera.camera", signal.SIGINT),
-        ("realtime_camera.camera", signal.SIGTERM),
+        ("sources.bridge", signal.SIGINT),
+        ("sources.replay", signal.SIGTERM),
+        ("camera.camera", signal.SIGINT),
+        ("camera.camera", signal.SIGTERM),
     ],
 )
 def test_ends_in_order(name: str, tmp_path: Path, command: str, number: signal.Signals) -> None:
@@ -39,7 +39,7 @@ def test_ends_in_order(name: str, tmp_path: Path, command: str, number: signal.S
         "camera": ["--config", str(tmp_path / "faintspot.toml"), "--frame-rate-hz", "200", "--distinct", "5"],
     }[function]
     stream = pyshmem.create(f"{name}_in", shape=(6, 5), dtype=np.uint16)
-    code = f"from faintspot.cli.{module} import {function}; {function}()"
+    code = f"from faintspot.cli.realtime.{module} import {function}; {function}()"
     process = start(code, *options, "--name", name)
     wait_for(lambda: (FOLDER / name).exists() or process.poll() is not None)
     ring = PixelRing.attach(name)

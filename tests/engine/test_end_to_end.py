@@ -84,7 +84,6 @@ def captured(name: str, count: int) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-@pytest.mark.portable
 def test_three_processes(name: str, processes: list[subprocess.Popen[bytes]], tmp_path: Path) -> None:
     wait_for(lambda: socket_path(name).exists(), "the engine")
     wait_for(lambda: json.loads(ask(name, "status", "--json"))["counters"]["processed"] > 10, "frames")

@@ -30,7 +30,6 @@ pyshmem = pytest.importorskip("pyshmem")
 pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 
 
-@pytest.mark.portable
 def test_every_frame_is_published_once_and_bit_for_bit(bench: Bench) -> None:
     data = simulated(6)
     expected = make(SETTINGS)(data).vector
@@ -42,7 +41,6 @@ def test_every_frame_is_published_once_and_bit_for_bit(bench: Bench) -> None:
     assert bench.engine.latencies.as_dict()["count"] == 6
 
 
-@pytest.mark.portable
 def test_what_is_published(bench: Bench) -> None:
     """Slopes, details and marks, stamped with the frame's number."""
     data = simulated(1)
@@ -77,7 +75,6 @@ def test_methods_take_turns() -> None:
         assert np.array_equal(np.concatenate([record["x"], record["y"]]), make(settings)(frame).vector)
 
 
-@pytest.mark.portable
 def test_settings_change_between_two_frames(bench: Bench) -> None:
     data = simulated(4)
     other = SETTINGS.replace(noise_std=2.5, keep_brightest=5)
@@ -95,7 +92,6 @@ def test_settings_change_between_two_frames(bench: Bench) -> None:
         assert np.array_equal(bench.slopes[number], make(settings)(frame).vector), number
 
 
-@pytest.mark.portable
 def test_source_restarts(bench: Bench) -> None:
     data = simulated(2)
     expected = make(SETTINGS)(data).vector
@@ -161,7 +157,6 @@ def test_a_living_publisher_is_not_replaced(bench: Bench) -> None:
         Engine(bench.name, make, SETTINGS)
 
 
-@pytest.mark.portable
 def test_frames_of_a_stream() -> None:
     """The engine follows a pyshmem stream itself, also when it comes back with another size."""
     data = simulated(4)
@@ -185,7 +180,6 @@ def test_frames_of_a_stream() -> None:
         assert np.array_equal(bench.slopes[3], expected[3])
 
 
-@pytest.mark.portable
 def test_recorded_frames_give_the_slopes_that_they_give_offline(bench: Bench, tmp_path: Path) -> None:
     """Replayed row by row, much faster than it measures: every frame, as the pipeline measures it."""
     data = simulated(20)
@@ -219,14 +213,3 @@ def test_the_terminal_shows_the_status(bench: Bench, monkeypatch: pytest.MonkeyP
     assert f"{mean:.1f}" in next(line for line in text.splitlines() if "iterations a sub-aperture" in line)
     assert "latency p99.9, us" in text
     assert f"process {os.getpid()}, frame 0" in text
-
-
-def test_a_pipeline_on_a_gpu_is_refused_at_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    def on_gpu(settings: fs.Settings) -> fs.SlopePipeline:
-        pipeline = make(settings)
-        monkeypatch.setattr(pipeline, "device", "cuda")
-        monkeypatch.setattr(pipeline, "on_device", object())
-        return pipeline
-
-    with pytest.raises(fs.InputError, match="real-time engine measures on the CPU"):
-        Engine(uuid4().hex, on_gpu, SETTINGS)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tests.engine.bench import Bench, simulated
 from tests.engine.estimator_files import write
 
-from faintspot.engine.settings.estimator_trial import Trial
+from faintspot.engine.settings.estimator_trial import EstimatorTrial
 
 pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 
@@ -118,7 +118,7 @@ def test_swaps_of_an_estimator(changing: Changing, tmp_path: Path, monkeypatch: 
     """Every one is another version of its file, in use; the trial in another process is left out."""
     # Its frame comes after the change.
     monkeypatch.setattr("faintspot.engine.settings.estimators.EFFECT_TIMEOUT_S", 0.0)
-    monkeypatch.setattr(Trial, "elsewhere", Trial.here)
+    monkeypatch.setattr(EstimatorTrial, "elsewhere", EstimatorTrial.here)
     estimators, live = changing.bench.engine.estimators, changing.bench.engine.live
     estimators.load(str(write(tmp_path, "return sensor.zero")))
     live.propose({"estimator": "mine"})

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.streams.prediction_stream import PredictionStream
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.simulation import Method, simulate_loop
@@ -106,7 +106,7 @@ def test_predictions_from_a_stream(sky: Sky, files: tuple[Path, Control]) -> Non
 def test_a_prediction_s_writer_may_die() -> None:
     """It looks for the stream again, and never raises."""
     name = f"fs_test_{uuid4().hex[:12]}"
-    prior = Prior(2, 10.0)
+    prior = SlopePrior(2, 10.0)
     reader = PredictionStream(name, prior)
     reader.fill(0)
     assert not prior.mean_px.any()
@@ -150,7 +150,7 @@ def test_a_stream_is_not_closed_while_it_is_read() -> None:
         def close(self) -> None:
             self.done.append("closed")
 
-    reader = PredictionStream(f"fs_test_{uuid4().hex[:12]}", Prior(2, 10.0))
+    reader = PredictionStream(f"fs_test_{uuid4().hex[:12]}", SlopePrior(2, 10.0))
     removed = Removed()
     reader._follower.source = removed  # type: ignore[assignment]
     engine = threading.Thread(target=reader.fill, args=(0,))
@@ -171,7 +171,7 @@ def test_a_stream_is_not_closed_while_it_is_read() -> None:
 def test_a_prediction_for_another_frame_is_not_taken() -> None:
     """Neither the last one again, nor an older one, nor one for a later frame."""
     name = f"fs_test_{uuid4().hex[:12]}"
-    prior = Prior(2, 10.0)
+    prior = SlopePrior(2, 10.0)
     stream = pyshmem.create(f"{name}_prediction", shape=(9,), dtype=np.float64)
     reader = PredictionStream(name, prior)
     for late, predicted in enumerate((8, 7, 0, -1, 10)):

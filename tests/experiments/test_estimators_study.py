@@ -21,7 +21,7 @@ from faintspot.experiments.report.efficiency import (
 )
 from faintspot.experiments.report.estimator_figures import estimator_figures
 from faintspot.experiments.report.page import write_study_report
-from faintspot.experiments.study import built_in as estimators
+from faintspot.experiments.study.built_in import estimators_study
 from faintspot.experiments.study.sweep import Cell
 
 METHODS = ("brightest", "tv", "ml", "map", "weighted")
@@ -51,11 +51,11 @@ def test_full_study_has_the_reference_cases() -> None:
         camera = (given["elong"], given["n"], given["rng_px"], 0.0, 1.0)
         wanted.add(Cell(float(given["flux"]), given["rn"], profile, given["size"], *camera))
     assert len(wanted) == 24
-    assert wanted <= set(estimators.estimators_study().cells())
+    assert wanted <= set(estimators_study().cells())
 
 
 def test_cost_is_bounded() -> None:
-    full, quick = estimators.estimators_study().cells(), estimators.estimators_study(quick=True).cells()
+    full, quick = estimators_study().cells(), estimators_study(quick=True).cells()
     assert len(full) <= 120
     assert sum(cell.d_over_r0 > 0 for cell in full) <= 40
     assert len(quick) <= 15
@@ -129,7 +129,7 @@ def test_other_studies_do_not_compare_estimators() -> None:
 def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drawing, "DOTS_PER_INCH", 20)
     monkeypatch.setattr(drawing, "svg", lambda figure: b"")  # another drawing, as slow
-    specification = estimators.estimators_study(quick=True)
+    specification = estimators_study(quick=True)
     quick = [asdict(cell) for cell in specification.cells()]
     few = [row for row in quick if row["d_over_r0"] > 0 or row["read_noise_e"] == 3]
     data = dataset(few, error, methods=METHODS)

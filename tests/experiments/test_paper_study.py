@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from faintspot.base.errors import InputError
-from faintspot.experiments.study import built_in as paper
+from faintspot.experiments.study.built_in import FIGURES, paper_study
 
 
 def test_full_study_has_every_figure_of_the_paper() -> None:
-    specification = paper.paper_study()
+    specification = paper_study()
     names = {sweep.name.split()[0] for sweep in specification.sweeps}
     assert names == {"fig2", "fig3", "fig4", "fig5", "fig6", "fig7"}
     cells = specification.cells()
@@ -24,22 +24,22 @@ def test_full_study_has_every_figure_of_the_paper() -> None:
 
 def test_cost_is_bounded() -> None:
     """In cells of 16 x 16 px, on which the time of a study depends."""
-    assert sum(cell.pixels**2 / 256 for cell in paper.paper_study().cells()) <= 350
-    assert len(paper.paper_study(quick=True).cells()) <= 40
+    assert sum(cell.pixels**2 / 256 for cell in paper_study().cells()) <= 350
+    assert len(paper_study(quick=True).cells()) <= 40
 
 
 @pytest.mark.parametrize("quick", [False, True])
 def test_figure_five_needs_cells_of_its_own_for_faint_spots_at_much_noise_only(quick: bool) -> None:
-    others = [name for name in paper.FIGURES if name != "fig5"]
-    with_it, without = paper.paper_study(quick), paper.paper_study(quick, others)
+    others = [name for name in FIGURES if name != "fig5"]
+    with_it, without = paper_study(quick), paper_study(quick, others)
     extra = set(with_it.cells()) - set(without.cells())
     assert {(cell.flux_e, cell.read_noise_e) for cell in extra} == (set() if quick else {(50, 16)})
 
 
-@pytest.mark.parametrize("name", paper.FIGURES)
+@pytest.mark.parametrize("name", FIGURES)
 @pytest.mark.parametrize("quick", [False, True])
 def test_one_figure(name: str, quick: bool) -> None:
-    sweeps = paper.paper_study(quick, [name]).sweeps
+    sweeps = paper_study(quick, [name]).sweeps
     assert sweeps
     assert all(sweep.name.startswith(name) for sweep in sweeps)
 
@@ -50,4 +50,4 @@ def test_one_figure(name: str, quick: bool) -> None:
 )
 def test_bad_figures_are_refused(figures: list[str], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        paper.paper_study(figures=figures)
+        paper_study(figures=figures)

@@ -1,4 +1,4 @@
-"""Slopes to be written and checked, for the tests of writing."""
+"""Slopes to be written and checked, and the formats that `SlopeFormatTests` runs through."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from tests.refusals import refused
 
 from faintspot.io import SlopeWriter, create_writer, read_slopes
 from faintspot.io.stored.slopes_format import VARIABLES
+
+pytest.importorskip("astropy")
+pytest.importorskip("zarr")
 
 NAMES = ["slopes.zarr", "slopes.npz", "slopes.fits", "slopes.fits.gz", "slopes.csv"]
 ATTRIBUTES = {
@@ -21,6 +25,7 @@ ATTRIBUTES = {
     "faintspot_version": "0.1.0",
     "number": np.float32(0.5),
 }
+OTHER_RUN = {**ATTRIBUTES, "fingerprint": "other"}
 
 
 def result(n_frames: int = 50, n_subapertures: int = 7) -> dict[str, NDArray[Any]]:
@@ -63,6 +68,17 @@ def write(path: Path, whole: Mapping[str, NDArray[Any]], step: int = 8, **change
             writer.append(start, part(whole, start, min(start + step, n_frames)))
 
 
+def begin(path: Path, n_frames: int, **changes: Any) -> None:
+    """Write the first frames of `result` and stop."""
+    with writer_for(path, **changes) as writer:
+        writer.append(0, part(result(), 0, n_frames))
+
+
+def store_of(path: Path) -> Path:
+    """Return the store with the slopes of an unfinished run."""
+    return path if path.suffix == ".zarr" else path.with_name(f"{path.name}.partial.zarr")
+
+
 def assert_stored(path: Path, whole: Mapping[str, NDArray[Any]]) -> None:
     stored = read_slopes(path)
     assert stored.complete
@@ -74,6 +90,12 @@ def assert_stored(path: Path, whole: Mapping[str, NDArray[Any]]) -> None:
     if path.suffix != ".csv":
         assert stored.attributes == {**ATTRIBUTES, "number": 0.5}
         np.testing.assert_array_equal(stored.coordinates["centre_x"], np.arange(whole["x"].shape[1]) + 0.5)
+
+
+def assert_alone(path: Path, whole: Mapping[str, NDArray[Any]]) -> None:
+    """Check the content of a file with nothing beside it."""
+    assert_stored(path, whole)
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
 
 
 def assert_refused(path: Path, *parts: str, **changes: Any) -> None:

@@ -5,11 +5,8 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-import pytest
 
 from faintspot.io.frame_numbers import LARGEST_GAP, all_left_out, left_out
-
-pytestmark = pytest.mark.portable
 
 NUMBERS = [0, 1, 4, 4, 2, 3, LARGEST_GAP + 4, 2 * LARGEST_GAP + 6, 2**63 - 1, 0, 1]
 EXPECTED = [0, 2, -1, -1, 0, LARGEST_GAP, -1, -1, -1, 0]

@@ -96,8 +96,8 @@ def camera() -> Any:
     Its configuration is that of a `WavefrontSensor`, with the function `expose`, and
 
     frames : str
-        Stream of the frames: NAME (pyshmem), e.g. NAME_frames of `faintspot realtime telescope`, isio:NAME or
-        dao:FILE. Frames are converted to uint16, the type of pyRTC's raw frames. The stream need not exist
+        Stream of the frames: NAME (pyshmem), e.g. NAME_frames of `faintspot realtime telescope`, or
+        isio:NAME. Frames are converted to uint16, the type of pyRTC's raw frames. The stream need not exist
         yet.
 
     Raises

@@ -1,1 +1,1 @@
-"""Errors, checks and files used by all other packages."""
+"""Errors, checks, files and statistics used by all other packages; begin with `errors` and `checks`."""

@@ -132,6 +132,23 @@ def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
     return value
 
 
+def strings_of(name: str, value: Any) -> tuple[str, ...]:
+    """Return a sequence of texts as a tuple.
+
+    Raises
+    ------
+    InputError
+        If it is something else.
+    """
+    if (
+        isinstance(value, str)
+        or not isinstance(value, Sequence)
+        or not all(isinstance(v, str) for v in value)
+    ):
+        raise InputError(f"{name} = {value!r}: expected a list of texts")
+    return tuple(value)
+
+
 def _range_text(low: float, high: float, low_open: bool) -> str:
     """Return a range in words: 'a number from 0 to 1', 'a number above 0'."""
     start = f"above {low:g}" if low_open else f"from {low:g}"

@@ -36,3 +36,7 @@ class MissingExtraError(ImportError):
 
 class CacheWarning(RuntimeWarning):
     """Compiled kernels cannot be cached on disk; the message states what to set."""
+
+
+class DoubtWarning(UserWarning):
+    """A layout is used about which `faintspot layout` had doubts that nobody has settled."""

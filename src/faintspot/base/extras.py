@@ -10,12 +10,9 @@ from faintspot.base.errors import InputError, MissingExtraError
 
 EXTRAS = {
     "io": ("astropy", "h5py", "PIL", "tifffile", "zarr"),
-    "web": ("matplotlib", "jinja2"),
-    "study": ("xarray",),
-    "realtime": ("pyshmem", "aotpy"),
-    "live": ("tornado",),
-    "loop": ("hcipy",),
-    "gpu": ("numba_cuda",),
+    "report": ("matplotlib", "jinja2"),
+    "loop": ("hcipy", "xarray"),
+    "realtime": ("pyshmem", "aotpy", "tornado"),
     "oopao": ("OOPAO",),
     "specula": ("specula",),
     "soapy": ("soapy",),

@@ -50,13 +50,13 @@ def check_regular(path: str | Path) -> int:
     OSError
         If the file does not exist, or is a folder.
     """
-    found = os.stat(path)
-    if stat.S_ISDIR(found.st_mode):
+    status = os.stat(path)
+    if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-    if not stat.S_ISREG(found.st_mode):
-        kind = "a named pipe" if stat.S_ISFIFO(found.st_mode) else "a device or a socket"
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a named pipe" if stat.S_ISFIFO(status.st_mode) else "a device or a socket"
         raise InputError(f"{path}: expected a regular file, got {kind}")
-    return found.st_size
+    return status.st_size
 
 
 def read_bytes(path: str | Path, what: str, most: int) -> bytes:
@@ -84,8 +84,8 @@ def check_file_size(path: str | Path, what: str, most: int) -> int:
 def derived(path: str | Path, ending: str) -> Path:
     """Return a path beside `path` in which `ending` replaces its known extension."""
     path = Path(path)
-    own = next((each for each in _ENDINGS if path.name.lower().endswith(each)), "")
-    return path.with_name(f"{path.name[: len(path.name) - len(own)]}{ending}")
+    known_ending = next((ending for ending in _ENDINGS if path.name.lower().endswith(ending)), "")
+    return path.with_name(f"{path.name[: len(path.name) - len(known_ending)]}{ending}")
 
 
 def write_atomically(path: str | Path, content: Content) -> None:

@@ -87,8 +87,8 @@ def open_archive(path: str | Path) -> tuple[zipfile.ZipFile, dict[str, zipfile.Z
     """
     check_regular(path)
     archive = zipfile.ZipFile(path)
-    found = [item for item in archive.infolist() if item.filename.endswith(".npy")]
-    return archive, {item.filename.removesuffix(".npy"): item for item in found}
+    items = [item for item in archive.infolist() if item.filename.endswith(".npy")]
+    return archive, {item.filename.removesuffix(".npy"): item for item in items}
 
 
 def headers_of(path: str | Path, names: Iterable[str] | None = None) -> dict[str, Header]:

@@ -258,12 +258,12 @@ def of_draws(value: float, drawn: Floats, pieces: int, comparisons: int = 1) -> 
     """
     tail = 50 * (1 - _LEVEL)
     low, high = np.percentile(drawn, [tail, 100 - tail], method="nearest")
-    known = drawn[np.isfinite(drawn)]
+    finite = drawn[np.isfinite(drawn)]
     widened = math.sqrt(pieces / (pieces - 1))
     factor = widened * student(pieces - 1, comparisons) / 1.96
     return Estimate(
         value,
-        widened * float(known.std()) if len(known) > 1 else math.nan,
+        widened * float(finite.std()) if len(finite) > 1 else math.nan,
         float(value + factor * (low - value)),
         float(value + factor * (high - value)),
         pieces,

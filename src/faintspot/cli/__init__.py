@@ -17,9 +17,9 @@ from faintspot.cli.shared.commands import Group
 
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
-    "doctor": "Check the installation and this machine, and say how to add what is missing.",
+    "doctor": "Show versions, extras and processor, and how to add what is missing.",
     "estimators": "List the estimators, or the options of one.",
-    "export": "Export settings as files for other controllers.",
+    "export": "Write weights and matrices as FITS for other controllers.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
     "live": "Show a running engine, or a recording, as a web page.",
     "loop": "Compare methods in a simulated closed loop, and recommend one.",
@@ -28,7 +28,7 @@ _COMMANDS = {
     "slopes": "Measure slopes from recorded frames.",
     "sodium": "Learn the sodium profile of a laser guide star from frames.",
     "study": "Measure the slope error by Monte-Carlo simulation.",
-    "telemetry": "Report noise, turbulence, vibrations and control of a recorded loop.",
+    "telemetry": "Report noise, turbulence, vibrations and control of a recorded or running loop.",
     "tune": "Recommend an estimator and settings for a camera and a star.",
     "wavefront": "Fit Zernike modes to slopes, and draw the wavefront.",
 }

@@ -43,15 +43,15 @@ def command(output: str, frames: int, seed: int) -> None:
     one half of the frames and scored on the other.
 
     The folder then holds the frames of one flux, their configuration, both sets of slopes and the report
-    page, made by the same commands that you would use on frames of your own. The page needs the extra `web`.
-    `faintspot realtime demo` shows the closed loop in real time.
+    page, made by the same commands that you would use on frames of your own. The page needs the extra
+    `report`. `faintspot realtime demo` shows the closed loop in real time.
 
     \b
     Example:
       faintspot demo -o /tmp/demo --frames 2000
     """
     folder = Path(output)
-    with_report = can_make("report page", "web", "matplotlib", "jinja2")
+    with_report = can_make("report page", "report", "matplotlib", "jinja2")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

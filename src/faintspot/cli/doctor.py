@@ -1,24 +1,43 @@
-"""faintspot doctor: what is installed and what the machine allows."""
+"""faintspot doctor: versions, extras and processor, for reports of faults."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+import os
+import platform
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 import click
 
-from faintspot.cli.examination import examine
+from faintspot.base.extras import EXTRAS, present
+from faintspot.base.version import __version__
 from faintspot.cli.shared.commands import option
 
+_REQUIRED = ("numpy", "scipy", "numba", "llvmlite", "tomlkit", "click", "rich")
+_DISTRIBUTIONS = {"PIL": "pillow", "pyrtc": "pyrtcao"}
+"""Names in the package index that differ from those of imports."""
+_FORCING = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "FAINTSPOT_SIMD_WIDTH", "NUMBA_DISABLE_JIT")
 
-@click.command(short_help="Say what is installed, what this machine allows, and what to do.")
+
+@dataclass(frozen=True)
+class Finding:
+    """A version, an extra or the processor."""
+
+    name: str
+    value: str
+    """Finding, in one line."""
+    advice: str | None = None
+    """Advice, in one line; None where nothing is missing."""
+
+
+@click.command(short_help="Show versions, extras and processor, and how to add what is missing.")
 @option("--json", "as_json", is_flag=True, help="As JSON: name, value and advice of each finding.")
 def command(as_json: bool) -> None:
-    """Check the installation and this machine, and say how to add what is missing.
+    """Show versions, extras and processor, and how to add what is missing.
 
-    Versions, extras, processor and vector width, folder of compiled kernels, threads, GPU, shared memory and
-    real-time permissions. Nothing of it is an error: most of faintspot needs no extra, GPU or permission. Put
-    its output into a report of a fault.
+    A missing extra is no error: most of faintspot needs none. Put the output into a report of a fault.
 
     \b
     Examples:
@@ -33,3 +52,47 @@ def command(as_json: bool) -> None:
         click.echo(f"{finding.name:14s} {finding.value}")
         if finding.advice is not None:
             click.echo(f"{'':14s} -> {finding.advice}")
+
+
+def examine() -> list[Finding]:
+    """Return versions, extras and the processor; a broken installation is a finding, not an error."""
+    return [
+        Finding("faintspot", f"{__version__} in {Path(__file__).parents[1]}"),
+        Finding("Python", f"{platform.python_version()} ({platform.platform()}, {platform.machine()})"),
+        Finding("packages", ", ".join(f"{name} {_version(name)}" for name in _REQUIRED)),
+        *(_extra(name) for name in EXTRAS),
+        _processor(),
+    ]
+
+
+def _version(package: str) -> str:
+    try:
+        return version(_DISTRIBUTIONS.get(package, package))
+    except PackageNotFoundError:
+        return "of unknown version" if present(package) else "missing"
+
+
+def _extra(name: str) -> Finding:
+    packages = EXTRAS[name]
+    missing = [package for package in packages if not present(package)]
+    words = ", ".join(f"{package} {_version(package)}" for package in packages)
+    return Finding(f"extra {name}", words, f"pip install 'faintspot[{name}]'" if missing else None)
+
+
+def _processor() -> Finding:
+    """Return the processor that kernels are compiled for."""
+    try:
+        from llvmlite import binding
+
+        from faintspot.slopes.kernels.compilation.host import lanes_for
+        from faintspot.slopes.kernels.compilation.target import compile_target
+
+        target, host = compile_target(), binding.get_host_cpu_name()
+        lanes = lanes_for("float32").width
+    except Exception as error:
+        words = " ".join(f"{type(error).__name__}: {error}".split())
+        return Finding("processor", f"cannot be found out ({words})", "report this line")
+    words = f"{host}; kernels for {target.cpu} ({target.triple}), {lanes} lanes of float32"
+    forced = ", ".join(f"{name}={os.environ[name]}" for name in _FORCING if name in os.environ)
+    advice = f"{forced}: unset for the fastest kernels on this machine" if forced else None
+    return Finding("processor", words, advice)

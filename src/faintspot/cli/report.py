@@ -16,7 +16,7 @@ from faintspot.io.locations import split_location
 from faintspot.loop.simulation.files import holds_loop_results
 
 
-@needs("web", "matplotlib", "jinja2")
+@needs("report", "matplotlib", "jinja2")
 @click.command(short_help="Make a web page of pictures and tables from slopes, a study, a loop or telemetry.")
 @click.argument("slopes", nargs=-1, required=True, metavar="SLOPES [OTHER]")
 @option(

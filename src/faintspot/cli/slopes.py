@@ -17,6 +17,7 @@ from faintspot.cli.shared.options import KEY, REFERENCE, configuration_option
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.io.formats.registry import slope_format
 from faintspot.io.locations import split_location
+from faintspot.io.optional_packages import has_zarr
 from faintspot.io.stored.slopes_format import UNITS
 from faintspot.slopes.recorded import Summary, measure_recorded
 
@@ -42,7 +43,6 @@ from faintspot.slopes.recorded import Summary, measure_recorded
     help="How much work to do.",
     show_default="as the configuration says",
 )
-@option("--device", default="cpu", help="cpu, or cuda: an NVIDIA GPU (the extra `gpu`).")
 @option(
     "--unit",
     type=click.Choice(UNITS),
@@ -90,9 +90,10 @@ def command(
 
     FRAMES are FITS (plain, .gz, .fz), TIFF, PNG, HDF5, MATLAB, .npy, .npz or Zarr, in the order given.
     They are read block by block, so that their size does not matter. Interrupted and started again, the
-    command goes on where it stopped. Of telemetry in the AOT standard the frames of its Shack-Hartmann
-    sensor are measured (--key names one of several); where the configuration has no [layout], with the
-    file's sub-apertures and reference slopes.
+    command resumes (this needs the extra io): until a file other than a .zarr store is complete, its slopes
+    are in OUTPUT.partial.zarr. Of telemetry in the AOT standard the frames of its Shack-Hartmann sensor are
+    measured (--key names one of several); where the configuration has no [layout], with the file's
+    sub-apertures and reference slopes.
 
     The output holds x, y (px, or arcsec, from the sub-aperture's centre), flux (e-), valid, flags,
     iterations and bad_pixels of every frame and sub-aperture. Slopes are not valid without flux (x and y are
@@ -123,11 +124,20 @@ def command(
 
 
 def _check_format(output: str) -> None:
-    """Refuse a format whose package is missing, before the work, and say which one needs none."""
+    """Refuse a format whose package is missing, before the work, and say which one needs none.
+
+    Without zarr, warn that the run cannot be resumed.
+    """
     try:
         slope_format(Path(output)).require()
     except MissingExtraError as error:
         raise InputError(f"{error}, or write NumPy's own format: -o {Path(output).stem}.npz") from None
+    if not has_zarr():
+        click.echo(
+            f"{output}: without zarr an interrupted run starts again; "
+            "to resume it, install zarr with pip install 'faintspot[io]'",
+            err=True,
+        )
 
 
 def describe(summary: Summary, output: str) -> list[str]:
@@ -142,11 +152,6 @@ def describe(summary: Summary, output: str) -> list[str]:
     ]
     if summary.origin:
         lines.append(f"  {summary.origin}")
-    if summary.saturation_adu is not None:
-        lines.append(
-            f"  values pile up at {summary.saturation_adu:g} ADU, taken as saturation; "
-            "calibration.saturation_adu states another level"
-        )
     if summary.resumed_at:
         lines.append(
             f"  went on at frame {summary.resumed_at} (counted from 0); the counts are from there on"
@@ -165,7 +170,14 @@ def describe(summary: Summary, output: str) -> list[str]:
         count = summary.flag_counts.get(flag, 0)
         if count:
             lines.append(f"  {_count(count, 'slope')} {text} ({100 * count / summary.measured:.3g} %)")
-    if not any(summary.flag_counts.values()):
+    if summary.saturation_adu is not None:
+        lines.append(
+            f"  values pile up at {summary.saturation_adu:g} ADU, taken as saturation; saturation_adu in "
+            "[calibration] states it"
+        )
+    if summary.reference:
+        lines.append(f"  {summary.reference}")
+    if not any(summary.flag_counts.values()) and not summary.doubtful:
         lines.append("  every slope is valid, without any flag")
     if summary.failed_frames:
         lines.append(f"  {_count(summary.failed_frames, 'frame')} without slopes: {summary.failure}")

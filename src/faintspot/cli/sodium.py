@@ -71,7 +71,7 @@ def command(
     drawing = picture_file(Path(config), picture, ".sodium.png")
     with open_frames(frames, key=key) as source, progress_bar("sodium", "steps") as show:
         found = sodium_of_frames(source, layout, calibration, laser, most_frames=most, progress=show)
-    known, path = found.known, derived(config, ".sodium.npz")
+    known, path = found.sodium, derived(config, ".sodium.npz")
     profile = known.fit.profile
     profile.save(path)
     learnt = {"profile": path.name, "spot_fwhm_arcsec": float(f"{known.spot_fwhm_arcsec:.4g}")}

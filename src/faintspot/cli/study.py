@@ -46,7 +46,7 @@ def command() -> None:
     """
 
 
-@needs("study", "xarray", "zarr")
+@needs("loop", "xarray", "zarr")
 @command.command(short_help="Run a study of your own.")
 @click.argument("specification", metavar="TOML")
 @option(
@@ -74,7 +74,7 @@ def run(specification: str, output: str | None, **where: Any) -> None:
     click.echo(f"Next: faintspot report {shlex.quote(target)}")
 
 
-@needs("study", "xarray", "zarr", "matplotlib", "jinja2")
+@needs("loop", "xarray", "zarr", "matplotlib", "jinja2")
 @command.command(short_help="Repeat the study of Basden et al. 2015.")
 @option("--quick", is_flag=True, help="Fewer cells and realisations: about a minute.")
 @option(
@@ -106,7 +106,7 @@ def paper(quick: bool, figures: tuple[str, ...], output: str | None, **where: An
     _measure_and_report(paper_study(quick, figures or None), target, where)
 
 
-@needs("study", "xarray", "zarr", "matplotlib", "jinja2")
+@needs("loop", "xarray", "zarr", "matplotlib", "jinja2")
 @command.command(short_help="Compare all estimators with each other and with the limit.")
 @option("--quick", is_flag=True, help="A few cells of fewer realisations: less than a minute.")
 @option(

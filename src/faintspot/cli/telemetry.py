@@ -1,24 +1,51 @@
-"""faintspot telemetry: report of a recorded loop of any system."""
+"""faintspot telemetry: report of a recorded loop of any system, or of the running engine."""
 
 from __future__ import annotations
 
 import json
+import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
 import click
 
+from faintspot.base.errors import InputError
+from faintspot.base.extras import require, require_linux
 from faintspot.base.files import derived, write_atomically
+from faintspot.cli.realtime.record import record_engine, summary
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import needs
 
+_SECONDS = 20.0
 
-@needs("web", "matplotlib", "jinja2")
-@click.command(short_help="Report noise, turbulence, vibrations and control of a recorded loop.")
-@click.argument("recording", type=click.Path(path_type=Path), metavar="FILE")
+
+@needs("report", "matplotlib", "jinja2")
+@click.command(short_help="Report noise, turbulence, vibrations and control of a recorded or running loop.")
+@click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[FILE]")
+@option("--engine", metavar="NAME", help="Record this running engine first; FILE keeps the recording.")
+@option(
+    "--seconds",
+    type=click.FloatRange(0, min_open=True),
+    help="Time to record with --engine.",
+    show_default=f"{_SECONDS:g}",
+)
 @option("--system", metavar="TOML", help="Values that FILE lacks, such as rate, unit, matrix and geometry.")
-@option("-c", "--config", metavar="TOML", help="Configuration with [control], for recordings of the engine.")
-@option("--output", "-o", metavar="HTML", help="Page to write.", show_default="FILE's name with .html")
-def command(recording: Path, system: str | None, config: str | None, output: str | None) -> None:
+@option(
+    "-c",
+    "--config",
+    metavar="TOML",
+    help="Configuration with [control], for recordings of the engine.",
+    show_default="with --engine: faintspot.toml",
+)
+@option("--output", "-o", metavar="HTML", help="Page to write.", show_default="FILE's or NAME's, with .html")
+def command(
+    recording: Path | None,
+    engine: str | None,
+    seconds: float | None,
+    system: str | None,
+    config: str | None,
+    output: str | None,
+) -> None:
     """Report noise, turbulence, vibrations and control of a recorded loop, of any system.
 
     FILE is a store of `faintspot realtime record`, an AOT file (FITS), a TOML file that names arrays, or a
@@ -27,18 +54,45 @@ def command(recording: Path, system: str | None, config: str | None, output: str
 
     \b
     Examples:
+      faintspot telemetry --engine faintspot --seconds 20
       faintspot telemetry night.zarr --config faintspot.toml
       faintspot telemetry night_aot.fits --system rate_and_unit.toml
       faintspot telemetry loop.toml -o loop.html
     """
+    from faintspot.loop.control.configuration import load_control
     from faintspot.loop.telemetry.page import page_of_loop
     from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
     from faintspot.loop.telemetry.report import report_of_loop
 
-    loop = read_recorded_loop(recording, system, config)
+    if engine is None and recording is None:
+        raise click.UsageError("expected FILE or --engine")
+    if engine is None and seconds is not None:
+        raise click.UsageError("--seconds: expected --engine as well")
+    if engine is not None:
+        require_linux("telemetry --engine")
+        require("realtime", "zarr", purpose="telemetry --engine")
+    page = Path(output) if output is not None else derived(recording or f"{engine}", ".html")
+    with ExitStack() as temporary:
+        if engine is not None:
+            if recording is None:
+                recording = Path(temporary.enter_context(tempfile.TemporaryDirectory()), f"{engine}.zarr")
+            config = config or "faintspot.toml"
+            load_control(config)  # faults of the file are found before the recording
+            _record(engine, recording, _SECONDS if seconds is None else seconds)
+        assert recording is not None
+        loop = read_recorded_loop(recording, system, config)
     report = report_of_loop(loop, lambda step: click.echo(f"{step} ...", err=True))
-    page = Path(output) if output is not None else derived(recording, ".html")
     numbers = derived(page, ".json")
     write_atomically(numbers, json.dumps(report.as_values(), indent=1))
     write_atomically(page, page_of_loop(report))
     click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
+
+
+def _record(engine: str, store: Path, seconds: float) -> None:
+    """Record a running engine to a new store."""
+    if store.suffix != ".zarr":
+        raise InputError(f"{store}: expected a name that ends in .zarr, for the recording of --engine")
+    report = record_engine(engine, store, None, seconds)
+    click.echo(f"{engine}: {summary(report)}", err=True)
+    if not report.frames:
+        raise InputError(f"{engine}: no frames in {report.seconds:.1f} s; start its source of frames")

@@ -13,7 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.engine.loop.control_loop import CLOSED, OPEN, STATES, ControlLoop
 from faintspot.engine.path.frame_path import FramePath
 from faintspot.engine.path.lateness import CAUSES, IN_TIME, INCOMPLETE, WORKER, Lateness
-from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.timing import Counters, Latencies
 from faintspot.engine.path.workers import Workers
 from faintspot.engine.pixels.pixel_ring import PixelRing
@@ -22,7 +22,7 @@ from faintspot.engine.settings.estimators import EngineEstimators
 from faintspot.engine.settings.flux_following import FluxFollower
 from faintspot.engine.settings.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
 from faintspot.engine.settings.plan import EnginePlan, SettingsPreparer
-from faintspot.engine.settings.running_settings import Change, LiveSettings
+from faintspot.engine.settings.running_settings import Change, RunningSettings
 from faintspot.engine.streams.prediction_stream import PredictionStream
 from faintspot.engine.streams.slope_streams import SlopeStreams
 from faintspot.engine.telemetry.ring import TelemetryRing
@@ -121,8 +121,6 @@ class Engine:
         self._lost = 0, IN_TIME  # since the last measured frame: their number, and the last one's cause
         self.refused: list[str] = []
         """Parts of the real-time scheduling that were not permitted."""
-        self.advice: list[str] = []
-        """Latest advice, shown in the status."""
         self.learning: dict[str, Any] | None = None
         """Result of the latest learning beside the engine, or the fault that ended it, for the status."""
         self.sodium: dict[str, Any] | None = None
@@ -136,9 +134,9 @@ class Engine:
         self._measured: dict[int, int] = {}  # frames, by configuration
         self._stopping = threading.Event()
         self._workers = Workers(threads - 1, cpus) if threads > 1 else None
-        prior = None if control is None else Prior(len(control.interaction) // 2)
+        prior = None if control is None else SlopePrior(len(control.interaction) // 2)
         self.preparer = SettingsPreparer(make_pipeline, interleaving, self._workers, deadline_s, prior)
-        self.live: LiveSettings[EnginePlan] = LiveSettings(self.preparer.prepare, settings)
+        self.live: RunningSettings[EnginePlan] = RunningSettings(self.preparer.prepare, settings)
         self.estimators = EngineEstimators(self.live, self.preparer)
         self._flux = None if mean_flux is None else FluxFollower(self.live, mean_flux)
         self._dark = DarkFollower(self.live.running.pipelines[0])
@@ -154,8 +152,8 @@ class Engine:
         try:
             self.loop, self._prediction = None, None
             if control is not None:
-                own = None if control.prediction == STREAM else prior
-                self.loop = ControlLoop(control, layout, self._streams.held_commands, own, threads)
+                loop_prior = None if control.prediction == STREAM else prior
+                self.loop = ControlLoop(control, layout, self._streams.held_commands, loop_prior, threads)
                 if control.prediction == STREAM and prior is not None:
                     self._prediction = PredictionStream(name, prior)
             self._make_ready(interleaving)
@@ -199,7 +197,6 @@ class Engine:
             "loaded": {name: str(file.path) for name, file in self.estimators.loaded.items()},
             "estimator_fault": self.estimators.fault,
             "not_permitted": list(self.refused),
-            "advice": self.advice,
             "loop": self.loop_status(),
             "learning": self.learning,
             "sodium": self.sodium,
@@ -321,13 +318,13 @@ class Engine:
             return None
         if ring.stale or ring.closed:
             return None
-        shape, wanted = ring.shape, self.live.running.layout.frame_shape
-        fits = shape == wanted and ring.dtype in (np.uint16, np.float32)
+        shape, expected = ring.shape, self.live.running.layout.frame_shape
+        fits = shape == expected and ring.dtype in (np.uint16, np.float32)
         self._incompatible = ""
         if not fits:
             self._incompatible = (
                 f"frames of {shape[0]} x {shape[1]} pixels, {ring.dtype}; "
-                f"expected {wanted[0]} x {wanted[1]}, uint16 or float32"
+                f"expected {expected[0]} x {expected[1]}, uint16 or float32"
             )
         return ring if fits else None
 
@@ -368,16 +365,16 @@ class Engine:
         slot, last_row = (self._number + 1) % ring.slots, self._last_row_ns
         product = () if self.loop is None else self.loop.begin_product()
         rehearse = self._rehearse if last_row else None
-        whole = path.measure(
+        is_whole = path.measure(
             arrival, slot, explain=explain, after_ns=last_row, rehearse=rehearse, product=product
         )
         number = ring.number_of(arrival)
-        if whole and number >= 0 and number != self._number + 1:  # the frame is in another slot than expected
-            whole = path.measure(arrival, number % ring.slots, explain=explain, product=product)
+        if is_whole and number >= 0 and number != self._number + 1:  # it is in another slot than expected
+            is_whole = path.measure(arrival, number % ring.slots, explain=explain, product=product)
         self._waiting = False
-        if not whole and path.stopped:
+        if not is_whole and path.stopped:
             return False
-        self._end_frame(ring, path, method, arrival, number if whole else -1, explain)
+        self._end_frame(ring, path, method, arrival, number if is_whole else -1, explain)
         return True
 
     def _rehearse(self) -> None:
@@ -391,14 +388,14 @@ class Engine:
     def _take(self, ring: PixelRing) -> tuple[FramePath, int]:
         """Return the next frame's path and configuration; changes of settings take effect here."""
         prepared = self.live.take(self._number + 1)
-        place = prepared.interleaving.method_of(self.counters.processed)
-        path = prepared.paths(ring)[place]
+        index = prepared.interleaving.method_of(self.counters.processed)
+        path = prepared.paths(ring)[index]
         if path.fault is not None and prepared.fallback is not None:
             self.estimators.fall_back(prepared.fallback, path.fault)
             return self._take(ring)
         if self.loop is not None:
-            self.loop.take_turn(prepared.interleaving.methods[place].control)
-        return path, prepared.interleaving.first + place
+            self.loop.take_turn(prepared.interleaving.methods[index].control)
+        return path, prepared.interleaving.first + index
 
     def _end_frame(
         self, ring: PixelRing, path: FramePath, method: int, arrival: int, number: int, explained: bool
@@ -491,7 +488,7 @@ class Engine:
 
         Also do all that takes time: write changes to telemetry, replace dead workers, check streams.
         """
-        looks = told = 0
+        looks = last_change = 0
         loop_assumed: dict[str, Any] = {}
         while True:
             stopping = self._stopping.wait(_WATCH_S)
@@ -512,26 +509,26 @@ class Engine:
                 self._streams.look_after_commands()
             loop_assumed = self._tell_of_loop(loop_assumed)
             self.counters.settings_changes = self.live.change_number
-            for change in self.live.taken(after=told):
+            for change in self.live.taken(after=last_change):
                 self._telemetry.write_change(*change)
-                told = change[1]
+                last_change = change[1]
             if stopping and (ring is None or not self._waiting):
                 return
 
-    def _tell_of_loop(self, told: dict[str, Any]) -> dict[str, Any]:
+    def _tell_of_loop(self, last: dict[str, Any]) -> dict[str, Any]:
         """Write to telemetry when the loop was opened, and why, or closed, or its gain changed."""
         if self.loop is None:
-            return told
+            return last
         loop = self.loop
-        now = {
+        state = {
             "loop": loop.state,
             "gain": loop.gain,
             "opened_because": loop.opened_because,
             "closed_again_because": loop.closed_again_because,
         }
-        if now != told:
-            self._telemetry.write_change(self._number, self.live.change_number, now, None)
-        return now
+        if state != last:
+            self._telemetry.write_change(self._number, self.live.change_number, state, None)
+        return state
 
 
 def _count(causes: dict[str, int], cause: int, frames: int = 1) -> None:

@@ -13,7 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.engine.engine import Engine
 from faintspot.engine.path.pipeline_maker import PipelineMaker
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
-from faintspot.loop.control.identification.model import Model
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.score import load_score
 from faintspot.slopes.training.known_sodium import SODIUM
@@ -21,7 +21,6 @@ from faintspot.slopes.training.known_sodium import SODIUM
 LENGTHY = ("set", "interleave", "load", "swap", "unload", "learnt", "spots")
 """Commands that prepare something new and may compile; other commands are answered meanwhile."""
 _USUAL_TURN = 50  # frames
-_MOST_LINES, _LONGEST_LINE = 40, 400  # of advice
 LOOP_ACTIONS = ("status", "open", "close", "gain", "flat")
 
 
@@ -34,7 +33,6 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
         "set": partial(_set, engine),
         "interleave": partial(_interleave, engine),
         "loop": partial(loop_command, engine),
-        "advice": partial(_advise, engine),
         "learnt": partial(_take_learnt, engine),
         "spots": partial(_take_spots, engine),
         "stop": partial(_stop, engine),
@@ -64,43 +62,35 @@ def _stop(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     return {}
 
 
-def _advise(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
-    lines = fields.get("lines")
-    if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
-        raise InputError(f"lines = {lines!r:.80}: expected a list of texts")
-    engine.advice = [line[:_LONGEST_LINE] for line in lines[:_MOST_LINES]]
-    return {}
-
-
 def _take_learnt(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     """Note what was learnt beside the engine, and take the new model, if one is handed over."""
-    known: dict[str, Any] = {"found": _text(fields, "found"), "unix_time_s": time.time(), "taken": False}
-    engine.learning = known
+    learning: dict[str, Any] = {"found": _text(fields, "found"), "unix_time_s": time.time(), "taken": False}
+    engine.learning = learning
     if fields.get("model") is None:
         return {}
     if engine.loop is None:
         raise InputError("learnt: this engine makes no commands; add [control] to its configuration")
     try:
-        engine.loop.renew(Model.load(_text(fields, "model"), engine.loop.control.plant))
+        engine.loop.renew(ControlModel.load(_text(fields, "model"), engine.loop.control.plant))
     except InputError as error:
-        engine.learning = {**known, "fault": f"{error}"}
+        engine.learning = {**learning, "fault": f"{error}"}
         raise
-    engine.learning = {**known, "taken": True}
+    engine.learning = {**learning, "taken": True}
     return {}
 
 
 def _take_spots(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     """Measure with the PSF and the fixed weights of a sodium profile from the next frame on."""
-    known = fields.get("sodium")
-    if not isinstance(known, Mapping):
-        raise InputError(f"sodium = {known!r:.80}: expected a profile")
+    sodium = fields.get("sodium")
+    if not isinstance(sodium, Mapping):
+        raise InputError(f"sodium = {sodium!r:.80}: expected a profile")
     if not isinstance(maker := engine.preparer.make_pipeline, PipelineMaker):
         raise InputError("spots: this engine does not know how its pipelines are made")
     changes: dict[str, Any] = {"psf": PSF.load(_text(fields, "psf"))}
     if fields.get("score") is not None:
         changes["score"] = load_score(_text(fields, "score"))
-    change = engine.renew_spots(replace(maker, **changes), {SODIUM: known})
-    engine.sodium = {**known, "unix_time_s": time.time()}
+    change = engine.renew_spots(replace(maker, **changes), {SODIUM: sodium})
+    engine.sodium = {**sodium, "unix_time_s": time.time()}
     return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
 
 

@@ -82,10 +82,10 @@ class Curve:
 
     def at(self, flux_e: float, method: str) -> Estimate | None:
         """Return R at that flux; None when there is none."""
-        found = np.flatnonzero(np.isclose(self.flux_e, flux_e) & np.isfinite(self.of(method)))
+        index = np.flatnonzero(np.isclose(self.flux_e, flux_e) & np.isfinite(self.of(method)))
         return (
-            Estimate(float(self.of(method)[found[0]]), float(self.se_of(method)[found[0]]))
-            if found.size
+            Estimate(float(self.of(method)[index[0]]), float(self.se_of(method)[index[0]]))
+            if index.size
             else None
         )
 
@@ -110,7 +110,7 @@ class Gain:
     def in_magnitudes(self) -> Estimate:
         """The gain and its interval in magnitudes."""
         with np.errstate(divide="ignore"):
-            value, low, high = (magnitudes(each) for each in (self.factor, self.low, self.high))
+            value, low, high = (magnitudes(factor) for factor in (self.factor, self.low, self.high))
         error = magnitudes(math.e) * self.log_se if math.isfinite(value + self.log_se) else math.nan
         return Estimate(value, error, low, high)
 
@@ -154,9 +154,9 @@ def gain_at_flux(
     curves = _resampled(curve, reference, method, rng)
     if curves is None or not curves.log_flux[0] - 1e-9 <= np.log(flux_e) <= curves.log_flux[-1] + 1e-9:
         return None
-    place = np.clip(np.log(flux_e), curves.log_flux[0], curves.log_flux[-1])
-    wanted = _values_at(curves, curves.reference, place)
-    return _gain(place - _crossings(curves, curves.method, wanted))
+    log_flux = np.clip(np.log(flux_e), curves.log_flux[0], curves.log_flux[-1])
+    log_error = _values_at(curves, curves.reference, log_flux)
+    return _gain(log_flux - _crossings(curves, curves.method, log_error))
 
 
 def gain_at_error(
@@ -178,12 +178,12 @@ def gain_at_error(
     curves = _resampled(curve, reference, method, rng)
     if curves is None:
         return None
-    wanted = np.full(curves.reference.shape[1], np.log(error_px))
-    needed = _crossings(curves, curves.reference, wanted)
-    if not np.isfinite(needed[0]):
+    log_error = np.full(curves.reference.shape[1], np.log(error_px))
+    log_flux = _crossings(curves, curves.reference, log_error)
+    if not np.isfinite(log_flux[0]):
         return None
-    known = np.isfinite(needed)  # resamples in which the reference just misses that error
-    return _gain(needed[known] - _crossings(curves, curves.method, wanted)[known])
+    finite = np.isfinite(log_flux)  # resamples in which the reference just misses that error
+    return _gain(log_flux[finite] - _crossings(curves, curves.method, log_error)[finite])
 
 
 def magnitude_gain(
@@ -223,8 +223,8 @@ def limiting_flux(curve: Curve, method: str, budget_px: float, rng: np.random.Ge
         return Estimate(math.nan)
     flux = np.exp(_crossings(curves, curves.method, np.full(curves.method.shape[1], np.log(budget_px))))
     drawn = flux[1:][np.isfinite(flux[1:]) & (flux[1:] > 0)]
-    known = 0 < flux[0] < np.inf and len(drawn) > 1
-    return Estimate(float(flux[0]), float(drawn.std()) if known else math.nan)
+    is_known = 0 < flux[0] < np.inf and len(drawn) > 1
+    return Estimate(float(flux[0]), float(drawn.std()) if is_known else math.nan)
 
 
 @dataclass(frozen=True)
@@ -259,27 +259,27 @@ def _resampled(curve: Curve, reference: str, method: str, rng: np.random.Generat
     return _Resampled(grid, values[:, :, 0].T, values[:, :, 1].T)
 
 
-def _values_at(curves: _Resampled, values: Floats, place: float) -> Floats:
+def _values_at(curves: _Resampled, values: Floats, log_flux: float) -> Floats:
     """Return every curve's log R at a log flux."""
     step = curves.log_flux[1] - curves.log_flux[0]
-    position = (place - curves.log_flux[0]) / step
+    position = (log_flux - curves.log_flux[0]) / step
     below = min(int(position), len(curves.log_flux) - 2)
     weight = position - below
     result: Floats = (1 - weight) * values[below] + weight * values[below + 1]
     return result
 
 
-def _crossings(curves: _Resampled, values: Floats, wanted: Floats) -> Floats:
+def _crossings(curves: _Resampled, values: Floats, log_error: Floats) -> Floats:
     """Return the log flux where each falling curve has its wanted value: -inf below the curve, inf beyond."""
-    above = np.count_nonzero(values > wanted, axis=0)
+    above = np.count_nonzero(values > log_error, axis=0)
     index = np.clip(above, 1, len(values) - 1)
     columns = np.arange(values.shape[1])
     before, after = values[index - 1, columns], values[index, columns]
     step = curves.log_flux[1] - curves.log_flux[0]
-    place = curves.log_flux[index - 1] + step * (before - wanted) / (before - after)
+    log_flux = curves.log_flux[index - 1] + step * (before - log_error) / (before - after)
     tolerance = 1e-9
-    place = np.where((above == 0) & (wanted > values[0] + tolerance), -np.inf, place)
-    return np.where((above == len(values)) & (wanted < values[-1] - tolerance), np.inf, place)
+    log_flux = np.where((above == 0) & (log_error > values[0] + tolerance), -np.inf, log_flux)
+    return np.where((above == len(values)) & (log_error < values[-1] - tolerance), np.inf, log_flux)
 
 
 def _gain(log_factors: Floats) -> Gain:

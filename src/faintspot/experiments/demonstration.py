@@ -67,7 +67,7 @@ class Comparison:
         errors = {TV: self.denoised, NO_TV: self.without}
         curve = Curve.of_errors(
             FLUXES_E,
-            {method: np.stack([each.errors for each in scored]) for method, scored in errors.items()},
+            {method: np.stack([score.errors for score in scored]) for method, scored in errors.items()},
         )
         gain = gain_at_flux(curve, SHOWN_FLUX_E, rng, **TV_OVER_NO_TV)
         assert gain is not None  # the flux is one of the curve's

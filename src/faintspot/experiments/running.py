@@ -84,28 +84,28 @@ class WorkerPool:
             self.announce(text)
 
 
-def in_stages(place: WorkerPool, sizes: Sequence[int]) -> list[WorkerPool]:
-    """Return a place for each of several calls of `run_units`, with the progress of all of them together.
+def in_stages(pool: WorkerPool, sizes: Sequence[int]) -> list[WorkerPool]:
+    """Return a pool for each of several calls of `run_units`, with the progress of all of them together.
 
     Parameters
     ----------
-    place : WorkerPool
+    pool : WorkerPool
     sizes : sequence of int
         Expected amount of work of each call.
     """
 
     def part(before: int, size: int) -> WorkerPool:
         def progress(done: int, total: int) -> None:
-            if place.progress is not None:
-                place.progress(before + round(size * done / max(1, total)), sum(sizes))
+            if pool.progress is not None:
+                pool.progress(before + round(size * done / max(1, total)), sum(sizes))
 
-        return replace(place, progress=progress)
+        return replace(pool, progress=progress)
 
     return [part(sum(sizes[:number]), size) for number, size in enumerate(sizes)]
 
 
 def run_units(
-    function: Callable[..., Arrays], units: list[Unit], store: UnitStore, place: WorkerPool
+    function: Callable[..., Arrays], units: list[Unit], store: UnitStore, pool: WorkerPool
 ) -> Mapping[str, Arrays]:
     """Run the units whose results are not stored yet, store each as it finishes; return all results, by key.
 
@@ -119,7 +119,7 @@ def run_units(
     units : list of Unit
         Larger ones are begun first, so that no worker is left with one.
     store : UnitStore
-    place : WorkerPool
+    pool : WorkerPool
 
     Raises
     ------
@@ -128,8 +128,8 @@ def run_units(
     """
     missing = sorted((unit for unit in units if not store.done(unit.key)), key=lambda unit: -unit.size)
     if missing:
-        count = _Count(units, missing, place.progress)
-        for unit, result in _finished(function, missing, place, count):
+        count = _Count(units, missing, pool.progress)
+        for unit, result in _finished(function, missing, pool, count):
             store.write(unit.key, result)
             count.at(unit.key, unit.size)
     return _Stored(store, [unit.key for unit in units])
@@ -174,13 +174,13 @@ class _Count:
 
 
 def _finished(
-    function: Callable[..., Arrays], units: list[Unit], place: WorkerPool, count: _Count
+    function: Callable[..., Arrays], units: list[Unit], pool: WorkerPool, count: _Count
 ) -> Finished:
     """Yield every unit and its result as it finishes."""
-    if place.workers == 0:
+    if pool.workers == 0:
         return _here(function, units, count)
-    processes = min(available_cpus() if place.workers is None else place.workers, len(units))
-    place.say(f"{processes} {'process' if processes == 1 else 'processes'} on this machine")
+    processes = min(available_cpus() if pool.workers is None else pool.workers, len(units))
+    pool.say(f"{processes} {'process' if processes == 1 else 'processes'} on this machine")
     return _by_processes(function, units, processes, count)
 
 
@@ -193,11 +193,11 @@ def _by_processes(
     function: Callable[..., Arrays], units: list[Unit], processes: int, count: _Count
 ) -> Finished:
     """Let processes do the units; where one of them dies, new ones go on with what is left."""
-    left = {unit.key: unit for unit in units}
+    remaining = {unit.key: unit for unit in units}
     for deaths in range(1, _ALLOWED_DEATHS + 1):
         try:
-            for key, result in _by_one_pool(function, list(left.values()), processes, count):
-                yield left.pop(key), result
+            for key, result in _by_one_pool(function, list(remaining.values()), processes, count):
+                yield remaining.pop(key), result
         except BrokenProcessPool:
             if deaths == _ALLOWED_DEATHS:
                 raise InputError(
@@ -214,7 +214,7 @@ def _by_one_pool(
     # A process that was forked could not go on with the threads of this one.
     context = multiprocessing.get_context("spawn")
     news = context.SimpleQueue()
-    others = set(multiprocessing.active_children())
+    earlier = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(processes, context, _begin_worker, (news,))
     pending: dict[Future[Arrays], str] = {}
     try:
@@ -229,7 +229,7 @@ def _by_one_pool(
                     yield pending.pop(future), future.result()
     finally:
         if pending:  # an error, or the user has interrupted: nobody waits for these
-            for child in set(multiprocessing.active_children()) - others:
+            for child in set(multiprocessing.active_children()) - earlier:
                 child.terminate()
         pool.shutdown(cancel_futures=True)
 
@@ -274,12 +274,12 @@ def _in_process(function: Callable[..., Arrays], key: str, arguments: tuple[Any,
 
 def _seldom(tell: Advance) -> Advance:
     """Return a function that forwards progress at most a few times a second."""
-    told = time.monotonic()
+    last = time.monotonic()
 
     def advance(done: int) -> None:
-        nonlocal told
-        if time.monotonic() - told >= _TELLING_S:
-            told = time.monotonic()
+        nonlocal last
+        if time.monotonic() - last >= _TELLING_S:
+            last = time.monotonic()
             tell(done)
 
     return advance

@@ -112,14 +112,14 @@ class ZarrStore:
         overwrite: bool = False,
     ) -> None:
         self.path = Path(path)
-        known = {**(attributes or {}), _FORMAT: FORMAT, _KIND: kind, _FINGERPRINT: fingerprint}
-        _check_place(self.path, known, overwrite=overwrite)
+        own = {**(attributes or {}), _FORMAT: FORMAT, _KIND: kind, _FINGERPRINT: fingerprint}
+        _check_path(self.path, own, overwrite=overwrite)
         zarr = _zarr()
         with output_errors(self.path):
             if overwrite and self.path.exists():
                 shutil.rmtree(self.path)
             if not self.path.exists():
-                _create(zarr, self.path, {**known, _UNITS: list(units)}, template)
+                _create(zarr, self.path, {**own, _UNITS: list(units)}, template)
             for remains in self.path.rglob("*.partial"):  # of a program that was killed while it wrote
                 remains.unlink(missing_ok=True)
         try:
@@ -206,21 +206,21 @@ def _attributes(path: Path) -> dict[str, Any] | None:
     return attributes if isinstance(attributes, dict) and _FINGERPRINT in attributes else None
 
 
-def _check_place(path: Path, known: Mapping[str, Any], *, overwrite: bool) -> None:
+def _check_path(path: Path, attributes: Mapping[str, Any], *, overwrite: bool) -> None:
     """Refuse to write where there is anything but this experiment, or where `overwrite` another one."""
-    kind = known[_KIND]
+    kind = attributes[_KIND]
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} does not exist: create it or choose another")
     if not path.exists():
         return
-    found = _attributes(path)
-    if found is None or found.get(_KIND, kind) != kind:
+    stored = _attributes(path)
+    if stored is None or stored.get(_KIND, kind) != kind:
         raise InputError(f"{path}: already exists and is not the store of a {kind}; choose another name")
     if overwrite:
         return
-    if found[_FINGERPRINT] != known[_FINGERPRINT]:
+    if stored[_FINGERPRINT] != attributes[_FINGERPRINT]:
         raise InputError(
-            f"{path}: belongs to another {kind} ({found.get('name', 'without a name')!r}, or other "
+            f"{path}: belongs to another {kind} ({stored.get('name', 'without a name')!r}, or other "
             "settings or another version): choose another name, or --overwrite"
         )
 
@@ -265,7 +265,7 @@ def _zarr() -> Any:
     try:
         import zarr
     except ImportError:
-        raise MissingExtraError("zarr", "study", "Keeping finished work in files") from None
+        raise MissingExtraError("zarr", "io", "Keeping finished work in files") from None
     return zarr
 
 

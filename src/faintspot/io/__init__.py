@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 from faintspot.base.lazy import lazy_attributes
 from faintspot.io.frames import FrameSource, open_frames, read_array
 from faintspot.io.slopes import create_writer, read_slopes
-from faintspot.io.stored.slopes_format import SlopeWriter, StoredSlopes
+from faintspot.io.stored.slopes_format import StoredSlopes
+from faintspot.io.stored.slopes_writer import SlopeWriter
 
 if TYPE_CHECKING:
     from faintspot.io.telemetry.aot_reading import AotSensor as AotSensor

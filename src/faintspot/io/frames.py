@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
@@ -13,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.closing import Closing
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.sizes import check_bytes, check_size
-from faintspot.io.arrays.raw import MOST_WHOLE_BYTES
+from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
 from faintspot.io.formats.registry import frame_format
-from faintspot.io.locations import StoredArray, one_line, split_location
+from faintspot.io.locations import one_line, split_location
 
 _MOST_PIXELS = 1 << 26  # in a frame: 8192 x 8192
 
@@ -188,20 +189,25 @@ def read_array(location: str | Path) -> NDArray[Any]:
         raise InputError(f"{array.name}: expected at least one value, got shape {array.shape}")
     check_bytes(array.name, math.prod(array.shape) * array.dtype.itemsize, MOST_WHOLE_BYTES, "an array")
     check_size(array.name, array.shape)
-    try:
+    with array:
         return array.read(0, array.shape[0])
-    finally:
-        array.close()
 
 
 def _find_array(location: str | Path, key: str | None) -> StoredArray:
     """Find the array in a file of any format."""
     path, own_key = split_location(location)
-    key = own_key if own_key is not None else key
     try:
-        array = frame_format(path).find(path, key)
+        file_format = frame_format(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            array = file_format.find(path, own_key if own_key is not None else key)
+    except (InputError, MissingExtraError):
+        raise
+    except Exception as error:  # readers raise many kinds of errors on damaged files
+        raise InputError(f"{path}: expected a whole {file_format.name} file ({one_line(error)})") from None
     if not array.shape:
         raise InputError(f"{array.name}: expected an array, got a single number")
     return array

@@ -4,37 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 
 PREFERRED_NAME = "frames"
 _MOST_LISTED = 20
-
-
-class StoredArray(Protocol):
-    """An array in a file whose first axis can be read in parts; for one thread at a time."""
-
-    @property
-    def name(self) -> str:
-        """File and key, for messages."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the whole array."""
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Data type of the values that `read` returns."""
-
-    def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Return items `start` to `stop` of the first axis, in native byte order."""
-
-    def close(self) -> None:
-        """Close the file; a later `read` opens it again."""
 
 
 def split_location(location: str | Path) -> tuple[Path, str | None]:

@@ -1,4 +1,4 @@
-"""Output of slopes by a resumable writer whose format follows the file name, and reading them back."""
+"""Output of slopes, in a format that follows the file name, by a writer that resumes; and reading them."""
 
 from __future__ import annotations
 
@@ -14,25 +14,26 @@ from faintspot.base.checks import finite_array, number_between, one_of
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import check_regular, output_errors
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.formats.registry import slope_format
+from faintspot.io.formats.registry import slope_endings, slope_format
 from faintspot.io.formats.zarr_files import Zarr
 from faintspot.io.locations import one_line
+from faintspot.io.optional_packages import has_zarr
 from faintspot.io.stored.output_lock import OutputLock
-from faintspot.io.stored.slopes_folder import is_partial, partial_folder, read_partial
 from faintspot.io.stored.slopes_format import (
     RESERVED_ATTRIBUTES,
     UNITS,
     VARIABLES,
     RecordingHeader,
-    SlopeWriter,
     StoredSlopes,
+    check_memory,
     json_values,
     pixels_in,
     scaled_positions,
 )
-from faintspot.io.stored.slopes_writer import BlockWriter, FinishedWriter
+from faintspot.io.stored.slopes_writer import SlopeWriter, StoreWriter
+from faintspot.io.stored.slopes_zarr import SlopeStore, describe_store, remove_store
 
-_What = TypeVar("_What")
+_Result = TypeVar("_Result")
 
 
 def create_writer(
@@ -48,8 +49,9 @@ def create_writer(
     """Return a writer of slopes to `path`: .zarr, .fits, .fits.gz, .npz or .csv.
 
     A .zarr store is valid and readable from the start and states whether it is complete. Other files appear
-    only when complete; until then the slopes are in the hidden folder ".NAME.partial" beside them. After an
-    interruption, the same call continues where the output stopped.
+    only when complete; until then the slopes are in the store "NAME.partial.zarr" beside them, or in memory
+    if zarr is not installed. After an interruption, the same call continues where the store stopped; without
+    zarr, it starts again.
 
     Parameters
     ----------
@@ -72,7 +74,7 @@ def create_writer(
     ------
     InputError
         When the ending is unknown, the folder is missing or not writable, or the output is another run's and
-        `overwrite` is False.
+        `overwrite` is False; without zarr also when the slopes need too much memory.
     MissingExtraError
         When the package that writes the format is not installed.
 
@@ -92,29 +94,32 @@ def create_writer(
     with output_errors(path):
         if not path.parent.is_dir():
             raise InputError(f"{path}: the folder {path.parent} does not exist; create it or choose another")
-        form = slope_format(path)
-        form.require()
-        if not overwrite and _is_finished(path, form, run, resume=resume):
-            _remove_leftovers(path, form, run)
-            return FinishedWriter(run.n_frames)
+        file_format = slope_format(path)
+        file_format.require()
+        store_path = file_format.store(path)
+        export = None if store_path == path else file_format.write
+        if not overwrite and _is_finished(path, file_format, run, resume=resume):
+            if export is not None:
+                _remove_leftovers(path, store_path, run)
+            return SlopeWriter(path, run)
         lock = OutputLock(path)
         try:
-            storage = form.storage(path, run)
-            begun = storage.begun()
-            how = {"resume": resume, "overwrite": overwrite}
-            if begun is not None and not begun.may_be_continued(storage.place, run, **how):
-                storage.remove()
-                begun = None
-            if begun is None:
-                storage.create()
-            return BlockWriter(path, run, storage, lock)
+            if export is not None and not has_zarr() and not store_path.exists():
+                check_memory(path, *run.sizes)
+                return SlopeWriter(path, run, lock, export)
+            output = describe_store(store_path)
+            if output is not None:
+                output = replace(output, complete=output.complete and export is None)
+                if not output.may_be_continued(store_path, run, resume=resume, overwrite=overwrite):
+                    remove_store(store_path)
+            return StoreWriter(path, run, lock, export, SlopeStore(store_path, run))
         except BaseException:
             lock.release()
             raise
 
 
 def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
-    """Read slopes that `create_writer` wrote; from a .zarr store or a ".partial" folder the finished frames.
+    """Read slopes that `create_writer` wrote; from a .zarr store the finished frames.
 
     Parameters
     ----------
@@ -145,17 +150,16 @@ def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
     """
     path = Path(path)
     if not path.exists():
-        partial = partial_folder(path)
-        hint = f"; an unfinished run left {partial}" if is_partial(partial) else ""
+        hint = ""
+        if path.name.lower().endswith(tuple(slope_endings())):
+            store_path = slope_format(path).store(path)
+            hint = f"; an unfinished run left {store_path}" if store_path.exists() else ""
         raise InputError(f"{path}: no such file{hint}")
     if not path.is_dir():
         check_regular(path)
     one_of("unit", unit, UNITS)
-    if is_partial(path):
-        stored = _read(path, lambda folder: _consistent(read_partial(folder)))
-    else:
-        form = Zarr() if path.is_dir() else slope_format(path)
-        stored = _read(path, lambda file: _consistent(form.read(file)))
+    file_format = Zarr() if path.is_dir() else slope_format(path)
+    stored = _read(path, lambda file: _consistent(file_format.read(file)))
     before = str(stored.attributes.get("unit", "px"))
     if unit == before:
         return stored
@@ -184,7 +188,7 @@ def _consistent(slopes: StoredSlopes) -> StoredSlopes:
     return slopes
 
 
-def _read(path: Path, read: Callable[[Path], _What]) -> _What:
+def _read(path: Path, read: Callable[[Path], _Result]) -> _Result:
     """Read slopes or a part of them, with errors in one line."""
     try:
         return read(path)
@@ -215,20 +219,20 @@ def _checked_run(
     return RecordingHeader(frames, subapertures, json_values("attributes", attributes), values)
 
 
-def _is_finished(path: Path, form: FileFormat, run: RecordingHeader, *, resume: bool) -> bool:
+def _is_finished(path: Path, file_format: FileFormat, run: RecordingHeader, *, resume: bool) -> bool:
     """Return whether this run has completed the output before; refuse another run's output."""
-    begun = _read(path, form.finished)
-    return begun is not None and begun.may_be_continued(path, run, resume=resume, overwrite=False)
+    output = _read(path, file_format.finished)
+    return output is not None and output.may_be_continued(path, run, resume=resume, overwrite=False)
 
 
-def _remove_leftovers(path: Path, form: FileFormat, run: RecordingHeader) -> None:
-    """Remove what this run left if it ended between making the file and cleaning up."""
-    if form.leftovers(path):
-        lock = OutputLock(path)
-        try:
-            storage = form.storage(path, run)
-            begun = storage.begun()
-            if begun is not None and (begun.fingerprint, begun.sizes) == (run.fingerprint, run.sizes):
-                storage.remove()
-        finally:
-            lock.release()
+def _remove_leftovers(path: Path, store_path: Path, run: RecordingHeader) -> None:
+    """Remove the store that this run left if it ended between making the file and removing the store."""
+    if not store_path.exists():
+        return
+    lock = OutputLock(path)
+    try:
+        output = describe_store(store_path)
+        if output is not None and (output.fingerprint, output.sizes) == (run.fingerprint, run.sizes):
+            remove_store(store_path)
+    finally:
+        lock.release()

@@ -64,6 +64,7 @@ def test_any_text_is_parsed_or_refused_in_one_line(text: str) -> None:
         assert len(said.splitlines()) <= 1
 
 
+@pytest.mark.slow
 def test_commands_that_only_ask_import_nothing_that_takes_time() -> None:
     modules = "faintspot.cli.realtime.command, faintspot.base.config.written_changes"
     code = f"import {modules}, sys; print(*sys.modules)"

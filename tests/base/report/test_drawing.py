@@ -49,7 +49,7 @@ def test_missing_matplotlib_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> 
     ):
         for name in ("faintspot.base.report.drawing", f"faintspot.{module}"):
             monkeypatch.delitem(sys.modules, name, raising=False)
-        with pytest.raises(MissingExtraError, match=r"faintspot\[web\]"):
+        with pytest.raises(MissingExtraError, match=r"faintspot\[report\]"):
             __import__(f"faintspot.{module}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from tests.cli.cli_cases import Commands
 from tests.shared_data import shared_file
 
 from faintspot import Calibration, Layout, Settings
+from faintspot.base.errors import DoubtWarning
 from faintspot.io import read_slopes
 from faintspot.slopes.simulate import Detector, sensor_frames
 
@@ -47,6 +49,9 @@ def frames(geometry: str = "square", n_frames: int = 3) -> NDArray[Any]:
     return np.asarray(simulated)
 
 
+DOUBTS = pytest.mark.filterwarnings("ignore::faintspot.base.errors.DoubtWarning")
+
+
 @pytest.fixture
 def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw nothing, which takes most of a second, where the picture is not what is tested."""
@@ -60,7 +65,7 @@ def is_png(path: Path) -> bool:
     return content.startswith(b"\x89PNG\r\n") and len(content) > 5000
 
 
-@pytest.mark.parametrize("geometry", [pytest.param("square", marks=pytest.mark.portable), "hexagonal"])
+@pytest.mark.parametrize("geometry", ["square", "hexagonal"])
 def test_simulated_frames(folder: Path, run: Commands, geometry: str) -> None:
     """Lattice points within 0.2 px: 3 frames of 49 spots leave 0.01 px, the fit of a common grid less."""
     np.save("a.npy", frames(geometry))
@@ -83,7 +88,6 @@ def test_simulated_frames(folder: Path, run: Commands, geometry: str) -> None:
     assert np.abs(stored.variables["x"]).mean() < 0.2
 
 
-@pytest.mark.portable
 @pytest.mark.usefixtures("no_picture")
 def test_slopes_do_not_depend_on_the_unit_of_the_frames(folder: Path, run: Commands) -> None:
     found, settings = [], []
@@ -107,7 +111,6 @@ def test_gain_goes_into_the_calibration(folder: Path, run: Commands) -> None:
     assert Calibration.load("new.toml") == Calibration(dark=100.0, gain_e_per_adu=2.0)
 
 
-@pytest.mark.portable
 @pytest.mark.usefixtures("no_picture")
 def test_dark_file(folder: Path, run: Commands) -> None:
     dark = np.random.default_rng(2).uniform(50, 150, SHAPE)
@@ -222,6 +225,7 @@ def test_scales_on_the_sky_and_in_the_pupil(folder: Path, run: Commands) -> None
     assert not Path("o.toml").exists()
 
 
+@DOUBTS
 @pytest.mark.usefixtures("no_picture")
 def test_which_lenslets(folder: Path, run: Commands) -> None:
     np.save("a.npy", frames())
@@ -271,7 +275,7 @@ def test_numbers_are_plain_and_doubt_is_said(folder: Path, run: Commands) -> Non
 
 def test_pure_noise(folder: Path, run: Commands) -> None:
     np.save("a.npy", np.random.default_rng(3).normal(100, 5, (3, 128, 128)))
-    run.refused("layout", "a.npy", "-o", "new.toml", naming=("a.npy", "no square or hexagonal", "--pitch-px"))
+    run.refused("layout", "a.npy", "-o", "new.toml", naming=("a.npy", "--pitch-px"))
     np.save("b.npy", np.full((3, 128, 128), np.nan))
     run.refused("layout", "b.npy", "-o", "new.toml", naming=("b.npy", "every pixel is NaN"))
     np.save("c.npy", np.ones((128, 128)))
@@ -297,6 +301,7 @@ def test_places_that_cannot_be_written(folder: Path, run: Commands) -> None:
     run.refused("layout", "nix.fits", "-o", "new.toml", naming=("nix.fits", "no such file"))
 
 
+@DOUBTS
 @pytest.mark.parametrize(
     ("name", "geometry", "shape", "lowest", "highest"),
     [
@@ -365,3 +370,79 @@ def test_settings_without_a_layout_are_kept(
     assert "settings that tuned.toml has are kept" in run.ok("layout", "spots.npy", "-o", "tuned.toml").out
     assert Settings.load("tuned.toml") == settings
     assert "already exists" in run.refused("layout", "spots.npy", "-o", "tuned.toml").error
+
+
+def defocused(stretch: float = 1.02) -> NDArray[np.float32]:
+    """Return a frame of 11 x 11 sub-apertures, 24 px apart, whose spots lie on a wider lattice."""
+    y, x = np.mgrid[:320, :320]
+    frame = np.zeros((320, 320))
+    for row, column in np.argwhere(np.ones((11, 11))) - 5:
+        if np.hypot(row, column) <= 5.4:
+            dx, dy = stretch * 24 * column, stretch * 24 * row
+            frame += 5000 / (4 * np.pi) * np.exp(-((x - 159.5 - dx) ** 2 + (y - 159.5 - dy) ** 2) / 4)
+    rng = np.random.default_rng(1)
+    return (rng.poisson(frame + 20) + rng.normal(100, 3, frame.shape)).astype(np.float32)
+
+
+def shown(run: Commands) -> NDArray[np.float64]:
+    """Return the displacements x of the spots of `defocused` over the columns, measured with new.toml."""
+    run.ok("slopes", "a.npy", "-c", "new.toml", "-o", "a.npz", "--overwrite")
+    stored = read_slopes("a.npz")
+    x, column = stored.variables["x"][0], stored.coordinates["column"]
+    return np.array([x[column == number].mean() for number in range(11)])
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_a_stated_pitch_keeps_the_defocus_of_the_frame(folder: Path, run: Commands) -> None:
+    np.save("a.npy", defocused())
+    arguments = ("layout", "a.npy", "--overwrite", "-o", "new.toml")
+    wanted = 0.02 * 24 * (np.arange(11) - 5.0)
+    stated = run.ok(*arguments, "--pitch-px", "24")
+    assert Layout.load("new.toml").pitch_px == 24.0
+    assert Layout.load("new.toml").fitted == ("centre", "angle")
+    assert "tilt and rotation" in stated.out
+    np.testing.assert_allclose(shown(run), wanted, atol=0.05)
+    fitted = run.ok(*arguments, "--pitch-px", "24", "--fit", "pitch")
+    assert "tilt, defocus and rotation" in fitted.out
+    assert np.abs(shown(run)).max() < 0.05
+    known = run.ok(*arguments, "--pitch-px", "24", "--angle-deg", "0", "--centre", "158.5,159.5")
+    assert "reference is" not in known.out
+    np.testing.assert_allclose(shown(run), wanted + 1.0, atol=0.05)
+    run.refused(*arguments, "--fit", "colour", naming=("--fit", "colour", "centre"))
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_what_a_layout_estimated_is_estimated_again_and_what_is_stated_stays(
+    folder: Path, run: Commands
+) -> None:
+    arguments = ("layout", "a.npy", "--overwrite", "-o", "new.toml")
+    np.save("a.npy", defocused(1.0))
+    run.ok(*arguments, "--read-noise-e", "3")
+    first = Calibration.load("new.toml")
+    assert first.dark == pytest.approx(120, abs=1)
+    assert "dark" in first.estimated
+    np.save("a.npy", defocused(1.0) - 20)
+    result = run.ok(*arguments)
+    again = Calibration.load("new.toml")
+    assert again.dark == pytest.approx(100, abs=1)
+    assert again.read_noise_e == 3.0
+    assert "kept" in result.out
+    assert "read_noise_e 3" in result.out
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_doubts_are_repeated_until_they_are_accepted(folder: Path, run: Commands) -> None:
+    np.save("a.npy", defocused(1.0))
+    run.ok("layout", "a.npy", "-o", "new.toml")
+    layout = Layout.load("new.toml")
+    replace(layout, doubts=("8 lenslets may be dark",)).save("new.toml")
+    with pytest.warns(DoubtWarning, match="8 lenslets may be dark"):
+        result = run.ok("slopes", "a.npy", "-c", "new.toml", "-o", "a.npz")
+    assert "every slope" not in result.out
+    wavefront = run.ok("wavefront", "a.npz", "--picture", "")
+    assert "8 lenslets may be dark" in wavefront.out
+    assert "8 lenslets may be dark" in run.ok("layout", "--accept", "-o", "new.toml").out
+    assert Layout.load("new.toml") == layout
+    assert "every slope is valid" in run.ok("slopes", "a.npy", "-c", "new.toml", "-o", "b.npz").out
+    run.refused("layout", "a.npy", "--accept", "-o", "new.toml", naming=("--accept",))
+    run.refused("layout", "-o", "new.toml", naming=("FRAME", "--accept"))

@@ -20,10 +20,10 @@ pytestmark = pytest.mark.machine_time("starts other processes")
 
 OPTIONAL = sorted({package for packages in EXTRAS.values() for package in packages})
 NEEDING = {
-    "report slopes.npz": "web",
-    "study run study.toml": "study",
-    "study paper --quick": "study",
-    "study estimators --quick": "study",
+    "report slopes.npz": "report",
+    "study run study.toml": "loop",
+    "study paper --quick": "loop",
+    "study estimators --quick": "loop",
     "loop magnitude --quick": "loop",
     "loop budget --quick": "loop",
     "realtime run": "realtime",
@@ -32,9 +32,9 @@ NEEDING = {
     "realtime export night.zarr night.fits": "realtime",
     "slopes frames.npy": "io",
     "slopes frames.npy -o slopes.fits": "io",
-    "tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100 -o new.toml --picture tune.png": "web",
-    "layout frames.npy -o new.toml --picture layout.png": "web",
-    "wavefront slopes.npz --picture wavefront.png": "web",
+    "tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100 -o new.toml --picture tune.png": "report",
+    "layout frames.npy -o new.toml --picture layout.png": "report",
+    "wavefront slopes.npz --picture wavefront.png": "report",
     "wavefront slopes.npz -o wavefront.fits": "io",
 }
 # In a process where nothing has imported an optional package before, and nothing can.
@@ -108,7 +108,7 @@ def test_the_rest_is_done_and_what_is_left_out_is_said(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
     lines = [line for line in done.stderr.splitlines() if line.startswith("without ")]
     assert [line.partition(":")[0] for line in lines] == ["without report page", *["without picture"] * 3]
-    assert all("pip install 'faintspot[web]'" in line for line in lines)
+    assert all("pip install 'faintspot[report]'" in line for line in lines)
     assert done.stderr.index(lines[0]) == 0  # before any work
     assert "slopes.zarr" not in done.stdout  # what is suggested can be done
     made = {path.name for path in (tmp_path / "faintspot-demo").iterdir()}

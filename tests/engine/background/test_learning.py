@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,7 @@ from tests.loop.control.control_cases import FRAME_S, INTERACTION, LAYERS, PLANT
 from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
-from faintspot.engine.background.learning import LearningBeside, learning_beside
+from faintspot.engine.background.learning import BackgroundLearning, background_learning
 from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.requests.private_socket import socket_path
@@ -21,8 +22,8 @@ from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.loop.control.base import ASSUMED
 from faintspot.loop.control.configuration import Control, ControlOptions, save_control
 from faintspot.loop.control.identification.learning import KALMAN, learn
-from faintspot.loop.control.identification.model import SETTLE_FRAMES, Learnt, Model, Plant
-from faintspot.loop.control.identification.relearning import Relearnt
+from faintspot.loop.control.identification.model import SETTLE_FRAMES, ControlModel, LearntControl, LoopPlant
+from faintspot.loop.control.identification.relearning import RelearntControl
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.pipeline.settings import Settings
@@ -36,21 +37,21 @@ OPTIONS = ControlOptions(controller=KALMAN)
 
 
 @pytest.fixture(scope="module")
-def model() -> Model:
+def model() -> ControlModel:
     frames = telemetry(500, NOISE_PX, seed=9, model=LAYERS)
     return learn(KALMAN, PLANT, frames, TURBULENCE, 1 / FRAME_S, ASSUMED).model
 
 
-def outdated(model: Model) -> Model:
+def outdated(model: ControlModel) -> ControlModel:
     """Return the model of slopes that are forgotten from frame to frame."""
     arrays = {**model.arrays, "first": 0.1 * model.arrays["first"], "second": 0.0 * model.arrays["second"]}
-    return Model(KALMAN, arrays, 0.4, 1.0, model.left, model.phase_of_commands)
+    return ControlModel(KALMAN, arrays, 0.4, 1.0, model.left, model.phase_of_commands)
 
 
 class Run:
     """A loop on known open-loop slopes, whose records go into telemetry."""
 
-    def __init__(self, name: str, model: Model) -> None:
+    def __init__(self, name: str, model: ControlModel) -> None:
         self.loop = ControlLoop(Control(INTERACTION, None, OPTIONS, model), LAYOUT)
         self.ring = TelemetryRing.create(name, LAYOUT, commands=INTERACTION.shape[1])
         self._sent, self._number = [np.zeros(INTERACTION.shape[1])] * 2, 0
@@ -79,7 +80,7 @@ def engine_of(run: Run) -> Any:
     return SimpleNamespace(loop=run.loop, learning=None, estimators=None)
 
 
-def test_a_new_filter_goes_on_from_the_mirror(name: str, model: Model) -> None:
+def test_a_new_filter_goes_on_from_the_mirror(name: str, model: ControlModel) -> None:
     """No step is larger than those before; in the end commands are those of one that was always there."""
     run, other = Run(name, outdated(model)), Run(f"{name}_2", model)
     before, others = run.frames(100), other.frames(100 + SETTLE_FRAMES + 100)
@@ -93,22 +94,22 @@ def test_a_new_filter_goes_on_from_the_mirror(name: str, model: Model) -> None:
     assert np.abs(after[:SETTLE_FRAMES] - others[100:-100]).max() > 0.2 * largest
     np.testing.assert_allclose(after[-85:], others[-85:], atol=0.02 * largest)
     with pytest.raises(InputError, match="first"):
-        run.loop.renew(
-            Model(KALMAN, {**model.arrays, "first": np.eye(3)}, 0.4, 1.0, model.left, model.phase_of_commands)
-        )
+        run.loop.renew(replace(model, arrays={**model.arrays, "first": np.eye(3)}))
     for each in (run, other):
         each.ring.close()
 
 
 def test_a_better_filter_is_handed_to_the_engine(
-    name: str, model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, model: ControlModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same is found twice, which is better than what runs only the first time."""
 
-    def relearnt(plant: Plant, running: Model, frames: OpenLoopTelemetry, *_: Any) -> Relearnt:
+    def relearnt(
+        plant: LoopPlant, running: ControlModel, frames: OpenLoopTelemetry, *_: Any
+    ) -> RelearntControl:
         found = frames.open_loop_px
         assert any(np.allclose(found, OPEN_LOOP[first : first + 298], atol=1e-3) for first in (2, 302))
-        return Relearnt(Learnt(plant, model), 1.0, 1.0 if running is model else 2.0, 3.0, 0.1)
+        return RelearntControl(LearntControl(plant, model), 1.0, 1.0 if running is model else 2.0, 3.0, 0.1)
 
     monkeypatch.setattr("faintspot.engine.background.learning.relearn", relearnt)
     monkeypatch.setattr("faintspot.engine.background.learning.FEWEST_FRAMES", 90)
@@ -119,7 +120,7 @@ def test_a_better_filter_is_handed_to_the_engine(
     outdated(model).save(tmp_path / "model.npz")
     save_control(path, interaction_matrix="m.npy")
     with pytest.raises(InputError, match="expected controller"):
-        LearningBeside(name, path, 1.0)
+        BackgroundLearning(name, path, 1.0)
     save_control(path, controller=KALMAN, model="model.npz")
     run = Run(name, outdated(model))
     engine = engine_of(run)
@@ -128,7 +129,7 @@ def test_a_better_filter_is_handed_to_the_engine(
         "get": lambda _: {"settings": {"estimator": "window"}},
     }
     with ControlServer(socket_path(name), handlers, lengthy=("learnt",)):
-        learning = LearningBeside(name, path, 280 * FRAME_S)
+        learning = BackgroundLearning(name, path, 280 * FRAME_S)
         run.frames(100)
         assert not learning.take()
         run.frames(200)
@@ -153,7 +154,7 @@ def test_a_better_filter_is_handed_to_the_engine(
 def test_a_process_that_dies_is_one_line(name: str, tmp_path: Path) -> None:
     """It waits for an engine that is not there, or is killed; the status says so."""
     engine, lines = SimpleNamespace(name=name, learning=None), list[str]()
-    with learning_beside(engine, tmp_path / "none.toml", 1.0, lines.append):  # type: ignore[arg-type]
+    with background_learning(engine, tmp_path / "none.toml", 1.0, lines.append):  # type: ignore[arg-type]
         wait_for(lambda: bool(lines))
     assert len(lines) == 1
     assert "none.toml" in engine.learning["fault"]

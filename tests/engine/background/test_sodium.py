@@ -13,7 +13,7 @@ from tests.patience import wait_for
 
 import faintspot as fs
 from faintspot.base.errors import InputError
-from faintspot.engine.background.sodium import SodiumFollower, following_beside
+from faintspot.engine.background.sodium import SodiumFollower, background_sodium
 from faintspot.engine.engine import Engine
 from faintspot.engine.path.pipeline_maker import PipelineMaker
 from faintspot.engine.request_handlers import commands_of
@@ -113,6 +113,7 @@ def test_a_layer_that_changes_is_handed_over(name: str, config: Path) -> None:
     assert np.abs((weights.x * (spot - weights.mean_spot)).sum(axis=(1, 2))).max() < 0.02
 
 
+@pytest.mark.slow
 def test_an_engine_measures_with_new_spots_from_the_next_frame(name: str, tmp_path: Path) -> None:
     """Slopes are those of a pipeline that has known them from the start."""
     pytest.importorskip("pyshmem")
@@ -158,7 +159,7 @@ def test_a_laser_that_is_not_followed_is_refused(name: str, config: Path) -> Non
 @pytest.mark.machine_time("other processes")
 def test_a_process_that_dies_is_one_line(name: str, tmp_path: Path) -> None:
     engine, lines = SimpleNamespace(name=name, sodium=None), list[str]()
-    with following_beside(engine, tmp_path / "none.toml", lines.append):  # type: ignore[arg-type]
+    with background_sodium(engine, tmp_path / "none.toml", lines.append):  # type: ignore[arg-type]
         wait_for(lambda: bool(lines))
     assert len(lines) == 1
     assert "none.toml" in engine.sodium["fault"]

@@ -13,13 +13,13 @@ from tests.loop.control.control_cases import FRAME_S, INTERACTION, PLANT, TURBUL
 
 from faintspot.base.errors import InputError
 from faintspot.engine.loop.control_loop import ControlLoop
-from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.loop.control import slope_product
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.configuration import Control, ControlOptions
 from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, KALMAN, learn
-from faintspot.loop.control.identification.model import Model
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.guarded import Guarded
 from faintspot.slopes.kernels.driver.products import add_slopes
@@ -50,7 +50,7 @@ class PlainControl(Control):
 
 
 @cache
-def learnt(kind: str) -> Model:
+def learnt(kind: str) -> ControlModel:
     return learn(kind, PLANT, telemetry(200, 0.3), TURBULENCE, 1 / FRAME_S).model
 
 
@@ -80,7 +80,7 @@ def controls(draw: Any) -> Control:
         arrays = {name: scaled(draw, array) for name, array in own.arrays.items()}
         gain, factor = (draw(st.sampled_from([usual] * 20 + [*EXTREMES])) for usual in (0.4, 1.0))
         left = draw(st.sampled_from([(1.0, 2.0), (2.0, 1.0)]))
-        model = Model(kind, arrays, gain, factor, left, scaled(draw, own.phase_of_commands))
+        model = ControlModel(kind, arrays, gain, factor, left, scaled(draw, own.phase_of_commands))
     options = {
         "controller": kind,
         "gain": draw(st.sampled_from([0.4, 0.0, 2.0])),
@@ -118,7 +118,7 @@ def any_control(data: st.DataObject) -> None:
     """Control that cannot be computed is refused in one line; else the loop opens and the mirror stays."""
     try:
         control = data.draw(controls())
-        loop = ControlLoop(control, LAYOUT, prior=Prior(N))
+        loop = ControlLoop(control, LAYOUT, prior=SlopePrior(N))
     except InputError as error:
         event("refused")
         said = str(error)
@@ -128,6 +128,7 @@ def any_control(data: st.DataObject) -> None:
     assert "\n" not in said
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_never_reaches_the_mirror() -> None:
     settings(max_examples=100, deadline=None)(given(st.data())(any_control))()
 

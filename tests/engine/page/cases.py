@@ -55,7 +55,7 @@ class Played:
         self.frames += 1
         return Batch(made, picture=picture, anew=self.frames == 1)
 
-    def place(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
         return {"kind": "engine", "name": self.name, "there": True}
 
     def close(self) -> None:
@@ -68,7 +68,7 @@ class Noted:
     def __init__(self) -> None:
         self.asked: list[dict[str, Any]] = []
 
-    def known(self) -> Mapping[str, ClientRequest]:
+    def functions(self) -> Mapping[str, ClientRequest]:
         def note(asked: dict[str, Any]) -> Mapping[str, Any]:
             self.asked.append(asked)
             return {"text": "noted"}

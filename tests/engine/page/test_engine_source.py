@@ -24,7 +24,7 @@ def test_engine_that_comes_goes_and_comes_back(name: str, monkeypatch: pytest.Mo
     monkeypatch.setattr("faintspot.engine.page.engine_source._STALE_S", 0.0)
     source = EngineSource(name)
     assert source.read() is None
-    assert not source.place()["there"]
+    assert not source.state()["there"]
     for methods in ([], ["none", "tv"]):
         with TelemetryRing.create(name, LAYOUT, methods=methods) as ring:
             first = source.read()
@@ -50,7 +50,7 @@ def test_engine_that_comes_goes_and_comes_back(name: str, monkeypatch: pytest.Mo
             assert not len(again.records)
         source.read()
         assert source.read() is None
-        assert not source.place()["there"]
+        assert not source.state()["there"]
     source.close()
 
 

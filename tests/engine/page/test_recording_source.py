@@ -14,7 +14,7 @@ from tests.engine.page.cases import LAYOUT, N, records
 from faintspot.base.errors import InputError
 from faintspot.engine.page import recording_source
 from faintspot.engine.page.client_requests import answered
-from faintspot.engine.page.recording_source import RecordingSource, places_of
+from faintspot.engine.page.recording_source import RecordingSource, indices_of
 from faintspot.engine.telemetry.segment import image_type, layout_values
 from faintspot.io.telemetry.parts import StoredTelemetry
 from faintspot.io.telemetry.recording import TelemetryStore
@@ -102,16 +102,16 @@ def test_time_bar_speed_and_pause(night: Path, clock: Clock) -> None:
     ask(playing=False)
     clock.now += 5.0
     assert not len(read().records)
-    assert source.place()["playing"] is False
+    assert source.state()["playing"] is False
     ask(position_s=10.0)
     assert read().records["frame"].tolist() == [1000]
     ask(position_s=1e9, playing=True)
     clock.now += 1.0
     assert read().records["frame"].tolist() == [FRAMES - 1]
-    assert source.place()["playing"] is False  # it is over
+    assert source.state()["playing"] is False  # it is over
     ask(playing=True)
     read()
-    assert source.place()["position_s"] == 0.0
+    assert source.state()["position_s"] == 0.0
 
 
 def test_changes_are_told_when_they_come(night: Path, clock: Clock) -> None:
@@ -144,8 +144,8 @@ def test_what_cannot_be_played(night: Path, asked: dict[str, Any], error: str) -
 
 def test_pictures_of_a_camera_that_began_anew_are_found_behind_those_before() -> None:
     frames = np.array([0, 1, 2, 3, 0, 1, 2, 3])
-    assert places_of(np.array([1, 3, 1, 3]), frames).tolist() == [1, 3, 5, 7]
-    assert places_of(np.array([9, 2]), frames).tolist() == [0, 2]
+    assert indices_of(np.array([1, 3, 1, 3]), frames).tolist() == [1, 3, 5, 7]
+    assert indices_of(np.array([9, 2]), frames).tolist() == [0, 2]
 
 
 def test_what_is_no_recording_is_refused(tmp_path: Path, night: Path) -> None:

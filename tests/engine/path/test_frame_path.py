@@ -141,7 +141,6 @@ def test_a_product_with_the_slopes_is_begun_while_rows_arrive(
             np.testing.assert_allclose(product(vector), vector @ columns, atol=1e-5)  # of float32
 
 
-@pytest.mark.portable
 def test_frames_that_are_there_are_measured_before_any_product(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
     data, source = frames(1), Source()
@@ -156,7 +155,6 @@ def test_frames_that_are_there_are_measured_before_any_product(monkeypatch: pyte
     assert_same(path.slopes, pipeline("plain")(data), 0)
 
 
-@pytest.mark.portable
 def test_nothing_is_begun_of_a_frame_that_never_came(monkeypatch: pytest.MonkeyPatch) -> None:
     """The slopes of the frame before are still there."""
     monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
@@ -171,7 +169,6 @@ def test_nothing_is_begun_of_a_frame_that_never_came(monkeypatch: pytest.MonkeyP
     assert not product.memory.taken.any()
 
 
-@pytest.mark.portable
 def test_a_frame_that_has_passed_counts_as_there() -> None:
     data, source = frames(2), Source()
     source.write(0, data[0])
@@ -182,7 +179,6 @@ def test_a_frame_that_has_passed_counts_as_there() -> None:
     assert_same(path.slopes, pipeline("plain")(data), 0)
 
 
-@pytest.mark.portable
 def test_waiting_ends_when_told() -> None:
     """Half of a frame arrives, and no more: the path stops, keeps what it has, and can go on."""
     data, source = frames(1), Source()
@@ -247,7 +243,6 @@ def pace_of(last_row_ns: int, margin_ns: int) -> NDArray[np.int64]:
     return pace
 
 
-@pytest.mark.portable
 def test_a_pause_of_the_camera_delays_no_later_frame() -> None:
     """After a frame that came 2 s late a thread sleeps hardly longer than before."""
     cells, control, due = np.zeros(2, np.int64), np.zeros(1, np.int64), np.full(1, 3_000_000)
@@ -257,7 +252,6 @@ def test_a_pause_of_the_camera_delays_no_later_frame() -> None:
     assert 3_000_000 < due[0] < 4_000_000
 
 
-@pytest.mark.portable
 def test_a_thread_that_woke_up_late_wakes_up_earlier_next_time() -> None:
     cells, control, due = np.zeros(2, np.int64), np.zeros(1, np.int64), np.full(1, 200_000_000)
     pace = pace_of(0, SHORTEST_NS)
@@ -272,7 +266,6 @@ def test_a_thread_that_woke_up_late_wakes_up_earlier_next_time() -> None:
     assert wait_for_group(arrival, 0, 1, 0)
 
 
-@pytest.mark.portable
 def test_a_margin_above_the_time_between_frames_does_not_end_sleeping() -> None:
     cells, control, due = np.zeros(2, np.int64), np.zeros(1, np.int64), np.full(1, 50_000_000)
     pace = pace_of(time.monotonic_ns(), 80_000_000)

@@ -17,8 +17,8 @@ from tests.engine.bench import LAYOUT, SETTINGS, make, simulated
 import faintspot as fs
 from faintspot.base.flags import INVALID
 from faintspot.engine.path.frame_path import Progress
-from faintspot.engine.path.predicted_positions import Prior
 from faintspot.engine.path.python_path import PythonPath, tried
+from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.time_limit import call_within
 from faintspot.slopes.estimators import Estimator, Positions
 
@@ -51,7 +51,7 @@ class Source:
         self.slots = np.zeros((1, *LAYOUT.frame_shape), np.uint16)
         self.cells = np.array([-1, LAYOUT.frame_shape[0]], np.int64)
         self.pipeline = make(SETTINGS.replace(estimator=Odd(action=action)))
-        self.prior = Prior(len(LAYOUT))
+        self.prior = SlopePrior(len(LAYOUT))
         progress = Progress(self.cells, 0, 1)
         self.path = PythonPath(self.pipeline, self.slots, progress, prior=self.prior, budget_s=budget_s)
         self.path.warm_up()

@@ -11,7 +11,7 @@ from tests.patience import LIMIT_S
 
 from faintspot.engine.path.workers import Workers
 
-pytestmark = [pytest.mark.portable, pytest.mark.machine_time("clocks, threads and other processes")]
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 
 
 @pytest.fixture

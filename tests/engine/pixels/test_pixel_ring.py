@@ -22,7 +22,6 @@ from faintspot.engine.pixels.pixel_segment import FOLDER
 
 pytestmark = [
     pytest.mark.machine_time("clocks, threads and other processes"),
-    pytest.mark.portable,
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
 ]
 

@@ -13,7 +13,6 @@ from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.pixel_segment import FOLDER
 
 pytestmark = [
-    pytest.mark.portable,
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
 ]
 

@@ -10,7 +10,7 @@ import pytest
 
 from faintspot.engine.pixels.processes import process_age_s, process_lives, process_start
 
-pytestmark = [pytest.mark.portable, pytest.mark.machine_time("clocks, threads and other processes")]
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 
 
 def test_which_processes_live() -> None:

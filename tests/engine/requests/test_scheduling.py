@@ -32,6 +32,7 @@ def test_priority_holds_for_threads_that_were_there_before_and_is_given_back() -
         thread.join()
 
 
+@pytest.mark.slow
 def test_the_lowest_priority() -> None:
     code = (
         "import os; from faintspot.engine.requests.scheduling import lowest_priority; lowest_priority();"

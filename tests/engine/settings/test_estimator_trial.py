@@ -12,16 +12,16 @@ from tests.engine.estimator_files import PEAK, write
 
 import faintspot as fs
 from faintspot.engine.settings.estimator_file import load_estimators
-from faintspot.engine.settings.estimator_trial import Trial
+from faintspot.engine.settings.estimator_trial import EstimatorTrial
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.estimators.registry import restore
 
 pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 
 
-def trial(path: Path, limit_s: float = 60.0) -> Trial:
+def trial(path: Path, limit_s: float = 60.0) -> EstimatorTrial:
     # With a value that differs between sub-apertures, too.
-    return Trial(path, make, SETTINGS.replace(where=[0, 3], search_range_px=2.0), limit_s)
+    return EstimatorTrial(path, make, SETTINGS.replace(where=[0, 3], search_range_px=2.0), limit_s)
 
 
 def test_what_passes(tmp_path: Path) -> None:

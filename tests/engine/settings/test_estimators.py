@@ -18,7 +18,7 @@ from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import ControlServer
 from faintspot.engine.settings.estimator_file import load_estimators
-from faintspot.engine.settings.estimator_trial import Trial
+from faintspot.engine.settings.estimator_trial import EstimatorTrial
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.estimators.registry import restore
 
@@ -69,7 +69,7 @@ def camera() -> Iterator[Camera]:
 @pytest.fixture
 def tried_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Another process for the trial takes seconds to begin."""
-    monkeypatch.setattr(Trial, "elsewhere", Trial.here)
+    monkeypatch.setattr(EstimatorTrial, "elsewhere", EstimatorTrial.here)
 
 
 def mine(path: Path, **options: Any) -> fs.Settings:

@@ -12,7 +12,7 @@ from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.base.errors import InputError
-from faintspot.engine.settings.running_settings import LiveSettings
+from faintspot.engine.settings.running_settings import RunningSettings
 
 pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 
@@ -25,17 +25,17 @@ def made(settings: fs.Settings) -> fs.SlopePipeline:
     return fs.SlopePipeline(LAYOUT, settings)
 
 
-def history(live: LiveSettings[Any]) -> list[tuple[int, dict[str, Any], list[int] | None]]:
+def history(live: RunningSettings[Any]) -> list[tuple[int, dict[str, Any], list[int] | None]]:
     """Return frame, new values and sub-apertures of the changes that took effect."""
     return [(frame, values, where) for frame, _, values, where in live.taken()]
 
 
 @pytest.fixture
-def live() -> LiveSettings[fs.SlopePipeline]:
-    return LiveSettings(made, SETTINGS)
+def live() -> RunningSettings[fs.SlopePipeline]:
+    return RunningSettings(made, SETTINGS)
 
 
-def test_a_change_waits_for_the_next_frame_and_is_stamped(live: LiveSettings[fs.SlopePipeline]) -> None:
+def test_a_change_waits_for_the_next_frame_and_is_stamped(live: RunningSettings[fs.SlopePipeline]) -> None:
     before = live.take(6)
     change = live.propose({"noise_std": 2.5})
     assert (live.frame_of(change), live.running is before) == (None, True)
@@ -48,7 +48,7 @@ def test_a_change_waits_for_the_next_frame_and_is_stamped(live: LiveSettings[fs.
     assert history(live) == [(7, {"noise_std": 2.5}, None)]
 
 
-def test_changes_between_two_frames_build_on_each_other(live: LiveSettings[fs.SlopePipeline]) -> None:
+def test_changes_between_two_frames_build_on_each_other(live: RunningSettings[fs.SlopePipeline]) -> None:
     changes = [
         live.propose({"noise_std": 2.5}),
         live.propose({"keep_brightest": 20}, [1, 4]),
@@ -91,7 +91,7 @@ REFUSED: list[tuple[Any, Any, str]] = [
 
 
 @pytest.mark.parametrize(("changes", "where", "named"), REFUSED)
-def test_what_does_not_fit_is_refused_whole(live: LiveSettings, changes: Any, where: Any, named: str) -> None:
+def test_what_does_not_fit_is_refused(live: RunningSettings, changes: Any, where: Any, named: str) -> None:
     before = live.take(0)
     with refused(named):
         live.propose(changes, where)
@@ -105,7 +105,7 @@ def test_an_unforeseen_fault_while_building_leaves_the_running_one() -> None:
             raise RuntimeError("no memory")
         return made(settings)
 
-    live = LiveSettings(faulty, SETTINGS)
+    live = RunningSettings(faulty, SETTINGS)
     with pytest.raises(RuntimeError):
         live.propose({"noise_std": 7})
     live.propose({"tolerance": 0.1})
@@ -114,7 +114,7 @@ def test_an_unforeseen_fault_while_building_leaves_the_running_one() -> None:
 
 def test_history_is_bounded_and_keeps_the_latest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("faintspot.engine.settings.running_settings.HISTORY_LENGTH", 3)
-    live = LiveSettings(made, SETTINGS)
+    live = RunningSettings(made, SETTINGS)
     changes = []
     for frame_number in range(5):
         changes.append(live.propose({"noise_std": 1.0 + frame_number}))
@@ -124,7 +124,7 @@ def test_history_is_bounded_and_keeps_the_latest(monkeypatch: pytest.MonkeyPatch
 
 
 def test_pipelines_that_were_replaced_are_freed_without_the_collector(
-    live: LiveSettings[fs.SlopePipeline],
+    live: RunningSettings[fs.SlopePipeline],
 ) -> None:
     gc.disable()  # as it is while an engine runs
     try:
@@ -138,7 +138,7 @@ def test_pipelines_that_were_replaced_are_freed_without_the_collector(
         gc.enable()
 
 
-def test_history_is_not_changed_from_outside(live: LiveSettings[fs.SlopePipeline]) -> None:
+def test_history_is_not_changed_from_outside(live: RunningSettings[fs.SlopePipeline]) -> None:
     values, where = {"noise_std": [1.0, 2.0]}, [0, 1]
     live.propose(values, where)
     live.take(5)
@@ -150,7 +150,7 @@ def test_history_is_not_changed_from_outside(live: LiveSettings[fs.SlopePipeline
 
 def test_many_threads_propose_while_frames_are_taken() -> None:
     """No change is lost or taken out of order, and every frame's settings are those of its history."""
-    live = LiveSettings(lambda settings: fs.SlopePipeline(LAYOUT, settings, threads=1), SETTINGS)
+    live = RunningSettings(lambda settings: fs.SlopePipeline(LAYOUT, settings, threads=1), SETTINGS)
     each, done = 40, threading.Event()
 
     def propose(place: int) -> None:
@@ -199,7 +199,7 @@ def test_what_is_being_prepared_is_said_and_nobody_waits_for_it() -> None:
             go_on.wait(30)
         return made(settings)
 
-    live = LiveSettings(slow, SETTINGS)
+    live = RunningSettings(slow, SETTINGS)
     proposer = threading.Thread(target=live.propose, args=({"noise_std": 2.0},))
     proposer.start()
     begun.wait(30)
@@ -214,7 +214,7 @@ def test_what_is_being_prepared_is_said_and_nobody_waits_for_it() -> None:
     assert live.take(4).settings.noise_std == 2.0
 
 
-def test_waiting_for_a_change(live: LiveSettings[fs.SlopePipeline]) -> None:
+def test_waiting_for_a_change(live: RunningSettings[fs.SlopePipeline]) -> None:
     change = live.propose({"noise_std": 2.0})
     assert live.wait(change, timeout_s=0.01) is None
     live.propose({"noise_std": 3.0})
@@ -224,7 +224,7 @@ def test_waiting_for_a_change(live: LiveSettings[fs.SlopePipeline]) -> None:
     timer.join()
 
 
-def test_get_is_plain_and_complete(live: LiveSettings[fs.SlopePipeline]) -> None:
+def test_get_is_plain_and_complete(live: RunningSettings[fs.SlopePipeline]) -> None:
     live.propose({"spot_fwhm_px": 2.0}, [0])
     live.take(0)
     values = json.loads(json.dumps(live.get(), allow_nan=False))

@@ -1,4 +1,4 @@
-"""Streams of ImageStreamIO and dao: read and written as the offsets of their headers say, or refused."""
+"""Streams of ImageStreamIO: read and written as the offsets of its header say, or refused."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.engine.commands import start
-from tests.engine.image_files import DaoFile, IsioFile
+from tests.engine.image_files import IsioFile
 from tests.patience import LIMIT_S, wait_for
 
 from faintspot.base.errors import InputError
@@ -27,7 +27,6 @@ from faintspot.engine.streams.stream_out import StreamOut
 pyshmem = pytest.importorskip("pyshmem")
 pytestmark = [
     pytest.mark.machine_time("clocks, threads and other processes"),
-    pytest.mark.portable,
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs shared memory as Linux has it"),
 ]
 
@@ -35,7 +34,6 @@ pytestmark = [
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
-    monkeypatch.chdir(tmp_path)  # dao's names are paths of up to 79 characters
     return tmp_path
 
 
@@ -52,7 +50,7 @@ def values_of(stream: ImageStream) -> Any:
 @pytest.mark.parametrize("dtype", ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"])
 def test_isio_is_read(folder: Path, dtype: str) -> None:
     file = isio(folder, dtype=dtype)
-    stream = ImageStream("isio", "cam")
+    stream = ImageStream("cam")
     assert (stream.shape, stream.dtype, stream.count, stream.same()) == ((3, 5), np.dtype(dtype), 0, True)
     sent = np.arange(15).reshape(3, 5)  # x is the first axis, and the last of NumPy's
     file.write(sent)
@@ -70,7 +68,7 @@ def test_isio_is_read(folder: Path, dtype: str) -> None:
 
 def test_a_circular_buffer_gives_its_newest_slice(folder: Path) -> None:
     file = isio(folder, (5, 3, 4), "f4", imagetype=0x20001, buffered=2)
-    stream = ImageStream("isio", "cam")
+    stream = ImageStream("cam")
     assert stream.shape == (3, 5)
     for number in range(6):
         file.write(np.full((3, 5), number), slice_number=number % 4)
@@ -79,20 +77,10 @@ def test_a_circular_buffer_gives_its_newest_slice(folder: Path) -> None:
     assert values_of(stream).shape == (3, 5)
 
 
-def test_dao_is_read(folder: Path) -> None:
-    file = DaoFile(folder / "cam.im.shm", (4, 2), "f4", keywords=3)
-    stream = ImageStream("dao", "./cam.im.shm")
-    file.write(np.arange(8))
-    assert (stream.shape, stream.count, stream.number) == ((2, 4), 1, 0)
-    np.testing.assert_array_equal(values_of(stream), np.arange(8).reshape(2, 4))
-    assert stream.maker_lives() is None
-    assert stream.wait(1, 0.01) is False
-
-
 @pytest.mark.parametrize("posts", [True, False])
 def test_waiting_ends_with_a_post_or_the_counter(folder: Path, posts: bool) -> None:
     file = isio(folder)
-    stream = ImageStream("isio", "cam")
+    stream = ImageStream("cam")
     assert stream.wait(0, 0.01) is False
     timer = threading.Timer(0.05, lambda: file.write(np.ones((3, 5)), posts=posts))
     timer.daemon = True
@@ -106,7 +94,7 @@ def test_a_semaphore_is_taken_and_given_back(folder: Path) -> None:
     file = isio(folder)
     file.put(file.readers, "i", os.getppid())  # somebody living has the first
     file.put(file.readers + 4, "i", 2**22 - 1)  # and somebody dead the second
-    stream = ImageStream("isio", "cam")
+    stream = ImageStream("cam")
     assert file.get(file.readers + 4, "i") == os.getpid()
     file.write(np.ones((3, 5)))
     assert stream.wait(0, 1.0)
@@ -117,7 +105,7 @@ def test_a_semaphore_is_taken_and_given_back(folder: Path) -> None:
 
 def test_what_is_being_written_is_not_read(folder: Path) -> None:
     file = isio(folder)
-    stream = ImageStream("isio", "cam")
+    stream = ImageStream("cam")
     file.write(np.ones((3, 5)))
     file.put(288, "B", 1)
     assert stream.read(None, 0.02) is None
@@ -127,12 +115,12 @@ def test_what_is_being_written_is_not_read(folder: Path) -> None:
 
 def test_a_file_that_is_cut_or_replaced(folder: Path) -> None:
     file = isio(folder)
-    stream = ImageStream("isio", "cam")
+    stream = ImageStream("cam")
     file.path.unlink()
     assert stream.same() is None
     isio(folder)
     assert stream.same() is False
-    other = ImageStream("isio", "cam")
+    other = ImageStream("cam")
     os.truncate(folder / "cam.im.shm", 10)
     assert other.same() is False
     assert other.read(None, 0.01) is None
@@ -168,11 +156,10 @@ def test_what_is_no_stream_is_refused(folder: Path) -> None:
     (folder / "sub.im.shm").mkdir()
     with pytest.raises(IncompatibleStreamError, match="directory"):
         open_stream("isio:sub")
-    content = DaoFile(folder / "dao.im.shm", (4, 2), "f4").memory[:]
-    (folder / "dao.im.shm").write_bytes(content + b"more")
+    (folder / "long.im.shm").write_bytes(isio(folder).memory[:] + b"more")
     with pytest.raises(IncompatibleStreamError, match="it may have another version"):
-        open_stream("dao:./dao.im.shm")
-    for bad in ("isio:a/b", "isio:", "dao:x y", f"dao:/{'x' * 90}"):
+        open_stream("isio:long")
+    for bad in ("isio:a/b", "isio:", "isio:x y", f"isio:{'x' * 90}"):
         with pytest.raises(InputError, match="expected"):
             Follower(bad, print, lambda shape, dtype: "", lambda: "")
 
@@ -195,7 +182,7 @@ def test_random_metadata_never_end_the_process(folder: Path) -> None:
 
 
 def test_isio_is_written(folder: Path) -> None:
-    writer = ImageStreamWriter("isio", "slopes", (6,))
+    writer = ImageStreamWriter("slopes", (6,))
     path = folder / "slopes.im.shm"
     assert [each.name for each in folder.iterdir()] == ["slopes.im.shm"]
     writer.publish(np.arange(6, dtype=np.float32), 41)
@@ -224,7 +211,7 @@ def test_isio_is_written(folder: Path) -> None:
     assert struct.unpack_from("<10i", content, keyword + 128 + 352) == (-1,) * 10
     seconds = struct.unpack_from("<q", content, 184)[0]
     assert abs(seconds - time.clock_gettime(time.CLOCK_TAI)) < 60
-    reader = ImageStream("isio", "slopes")
+    reader = ImageStream("slopes")
     assert (reader.shape, reader.maker_lives()) == ((1, 6), True)
     assert reader.wait(2, 0.01) is False
     writer.publish(np.zeros(6, np.float32), 43)
@@ -234,7 +221,7 @@ def test_isio_is_written(folder: Path) -> None:
 
 
 def test_nobody_waits_and_nothing_overflows(folder: Path) -> None:
-    writer = ImageStreamWriter("isio", "slopes", (6,))
+    writer = ImageStreamWriter("slopes", (6,))
     for number in range(30):
         writer.publish(np.zeros(6, np.float32), number)
     content = (folder / "slopes.im.shm").read_bytes()
@@ -246,43 +233,19 @@ def test_nobody_waits_and_nothing_overflows(folder: Path) -> None:
 def test_who_may_take_a_name(folder: Path) -> None:
     isio(folder, pid=os.getppid())
     with pytest.raises(InputError, match="a living process made this stream"):
-        ImageStreamWriter("isio", "cam", (6,))
+        ImageStreamWriter("cam", (6,))
     (folder / "cam.im.shm").unlink()
     isio(folder, pid=2**22 - 1)
-    ImageStreamWriter("isio", "cam", (6,)).close()
+    ImageStreamWriter("cam", (6,)).close()
     (folder / "cam.im.shm").write_text("something else")
     with pytest.raises(InputError, match="is not a stream; remove it or choose another name"):
-        ImageStreamWriter("isio", "cam", (6,))
+        ImageStreamWriter("cam", (6,))
     os.mkfifo(folder / "pipe.im.shm")
     with pytest.raises(InputError, match="is not a stream"):
-        ImageStreamWriter("isio", "pipe", (6,))
-    with pytest.raises(InputError, match="cannot be made"):
-        ImageStreamWriter("dao", "no/cam.im.shm", (6,))
-
-
-def test_dao_is_written_where_it_is_or_made(folder: Path, name: str) -> None:
-    path = Path(f"{name}.im.shm")
-    file = DaoFile(path, (6, 1), "f4")
-    writer = ImageStreamWriter("dao", f"./{path}", (6,))
-    writer.publish(np.arange(6, dtype=np.float32), 7)
-    np.testing.assert_array_equal(file.values(), np.arange(6))
-    assert (file.get(152, "Q"), file.get(176, "B")) == (1, 0)
-    assert abs(file.get(136, "q") - time.time_ns()) < 60e9
-    assert (FOLDER / f"sem.{name}_sem09").exists()
-    writer.close()
-    assert not path.exists()
-    assert not (FOLDER / f"sem.{name}_sem09").exists()
-    writer = ImageStreamWriter("dao", f"./{path}", (6,))
-    writer.publish(np.ones(6, np.float32), 7)
-    content = path.read_bytes()
-    assert len(content) == 4296 + 24 + 120
-    assert content[: len(str(path))] == str(path).encode()
-    assert (content[80], struct.unpack_from("<2I", content, 84), content[104]) == (2, (6, 1), 9)
-    assert struct.unpack_from("<Q", content, 152) == (1,)
-    assert struct.unpack_from("<q", content, 4296 + 24 + 24) == (7,)
-    with pytest.raises(InputError, match=r"expected a stream of \[4, 1\] float32 values"):
-        ImageStreamWriter("dao", f"./{path}", (4,))
-    writer.close()
+        ImageStreamWriter("pipe", (6,))
+    (folder / "folder.im.shm").mkdir()
+    with pytest.raises(InputError, match="cannot be opened"):
+        ImageStreamWriter("folder", (6,))
 
 
 def test_frames_go_into_the_ring(folder: Path, name: str) -> None:
@@ -326,7 +289,7 @@ def test_slopes_come_out(folder: Path, name: str) -> None:
     stream = pyshmem.create(f"{name}_slopes", shape=(8,), dtype=np.float32)
     stream.write(np.arange(8, dtype=np.float32), frame_id=5)
     wait_for(out.step)
-    reader = ImageStream("isio", "wfs_slopes")
+    reader = ImageStream("wfs_slopes")
     np.testing.assert_array_equal(values_of(reader), [np.arange(8)])
     stream.write(np.ones(8, np.float32), frame_id=6)
     wait_for(out.step)
@@ -336,11 +299,11 @@ def test_slopes_come_out(folder: Path, name: str) -> None:
     another = pyshmem.create(f"{name}_slopes", shape=(4,), dtype=np.float32)
     another.write(np.ones(4, np.float32))
     wait_for(out.step)
-    assert ImageStream("isio", "wfs_slopes").shape == (1, 4)
+    assert ImageStream("wfs_slopes").shape == (1, 4)
     another.unlink()
     out.close()
     assert list(folder.glob("*.im.shm")) == []
-    with pytest.raises(InputError, match="expected isio:NAME or dao:FILE"):
+    with pytest.raises(InputError, match="expected isio:NAME"):
         StreamOut(f"{name}_slopes", "slopes")
 
 
@@ -352,7 +315,7 @@ def test_command_both_ways(folder: Path, name: str) -> None:
     try:
         wait_for(lambda: (FOLDER / name).exists() or process.poll() is not None)
         wait_for(lambda: (folder / "cam_slopes.im.shm").exists() or process.poll() is not None)
-        reader = ImageStream("isio", "cam_slopes")
+        reader = ImageStream("cam_slopes")
         slopes.write(np.arange(8, dtype=np.float32), frame_id=1)
         wait_for(lambda: reader.count == 1)
         ring = PixelRing.attach(name)
@@ -376,7 +339,7 @@ def test_command_both_ways(folder: Path, name: str) -> None:
     [
         ([], "expected a stream of frames, --to or --commands"),
         (["--to", "isio:b", "--frames", "3"], "--frames"),
-        (["--to", "b"], "expected isio:NAME or dao:FILE"),
+        (["--to", "b"], "expected isio:NAME"),
         (["isio:a/b"], "isio:a/b"),
     ],
 )

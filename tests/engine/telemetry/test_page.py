@@ -98,6 +98,7 @@ def test_methods_in_turn_differ_as_they_were_made(night: Telemetry) -> None:
     assert flux[1].difference.standard_error < 0.2 * flux[1].mean.standard_error  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_page(path: Path) -> None:
     page = Page(report_of_telemetry(path))
     assert page.ids[:4] == ["timing", "lost", "methods", "changes"]
@@ -112,6 +113,7 @@ def test_page(path: Path) -> None:
         assert words in page.text
 
 
+@pytest.mark.slow
 def test_key_numbers_are_those_of_each_method(path: Path) -> None:
     """The methods have 0.20 and 0.16 px of noise; together they would have 0.18."""
     text = Page(report_of_telemetry(path)).text

@@ -53,9 +53,10 @@ def test_unknown_term() -> None:
         strehl("noise")
 
 
+@pytest.mark.slow
 def test_experiment_and_resume(tmp_path: Path) -> None:
     def run(folder: Path, place: WorkerPool) -> BudgetResult:
-        return run_budget(small(), folder, ["brightest"], search=SEARCH, place=place)
+        return run_budget(small(), folder, ["brightest"], search=SEARCH, pool=place)
 
     whole, again = tmp_path / "whole", tmp_path / "again"
     result = run(whole, HERE)
@@ -70,6 +71,6 @@ def test_experiment_and_resume(tmp_path: Path) -> None:
 
 def test_bad_input(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="methods: expected at least one"):
-        run_budget(small(), tmp_path, [], place=HERE)
+        run_budget(small(), tmp_path, [], pool=HERE)
     with pytest.raises(InputError, match=r"control.mode = 'open'"):
-        run_budget(small().replace("control", mode="open"), tmp_path, place=HERE)
+        run_budget(small().replace("control", mode="open"), tmp_path, pool=HERE)

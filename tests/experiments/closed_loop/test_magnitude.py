@@ -26,7 +26,7 @@ PHOTONS = (400.0, 40.0)
 
 
 def run(folder: Path, place: WorkerPool, methods: tuple[str, ...] = METHODS) -> MagnitudeResult:
-    return run_magnitude(small(), folder, methods, PHOTONS, search=SEARCH, place=place)
+    return run_magnitude(small(), folder, methods, PHOTONS, search=SEARCH, pool=place)
 
 
 TOLD: list[tuple[int, int]] = []
@@ -40,6 +40,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_one_progress_of_all_stages(whole: Path) -> None:
     done, total = np.transpose(TOLD)
     assert (np.diff(done) >= 0).all()
@@ -58,6 +59,7 @@ def test_result(whole: Path) -> None:
     assert "keep_brightest" in result.settings[1, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("calls", [2, 120])
 def test_interrupted_and_started_again(tmp_path: Path, whole: Path, calls: int) -> None:
     with pytest.raises(KeyboardInterrupt):
@@ -67,6 +69,7 @@ def test_interrupted_and_started_again(tmp_path: Path, whole: Path, calls: int) 
     assert_same_units(tmp_path, whole)
 
 
+@pytest.mark.slow
 def test_methods_can_be_added(tmp_path: Path, whole: Path) -> None:
     folder = shutil.copytree(whole, tmp_path / "copy")
     one = run(folder, WorkerPool(0, progress=StopsAfter(0)), ("centroid",))  # nothing is left to do
@@ -80,13 +83,13 @@ def test_methods_can_be_added(tmp_path: Path, whole: Path) -> None:
 
 def test_bad_input(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^method = 'kog': expected one of 'brightest'"):
-        run_magnitude(small(), tmp_path, ("kog",), PHOTONS, place=HERE)
+        run_magnitude(small(), tmp_path, ("kog",), PHOTONS, pool=HERE)
     with pytest.raises(InputError, match="methods: expected at least one"):
-        run_magnitude(small(), tmp_path, (), PHOTONS, place=HERE)
+        run_magnitude(small(), tmp_path, (), PHOTONS, pool=HERE)
     with pytest.raises(InputError, match="photons: expected at least one"):
-        run_magnitude(small(), tmp_path, METHODS, place=HERE)
+        run_magnitude(small(), tmp_path, METHODS, pool=HERE)
     with pytest.raises(InputError, match="photons"):
-        run_magnitude(small(), tmp_path, METHODS, (0.0,), place=HERE)
+        run_magnitude(small(), tmp_path, METHODS, (0.0,), pool=HERE)
 
 
 def test_quick_is_never_longer() -> None:

@@ -16,6 +16,7 @@ from faintspot.loop.simulation.files import MAGNITUDE_FILE
 pytest.importorskip("hcipy")
 
 
+@pytest.mark.slow
 def test_the_page_holds_everything(tmp_path: Path) -> None:
     made_up_magnitude().save(tmp_path / MAGNITUDE_FILE)
     made_up_budget().save(tmp_path / "budget.npz")

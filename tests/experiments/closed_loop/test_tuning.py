@@ -31,7 +31,7 @@ def question(**asked: Any) -> LoopQuestion:
 
 
 def tuned(folder: Path, place: WorkerPool = HERE, **asked: Any) -> LoopAnswer:
-    return tune_loop(question(**asked), folder, plan=PLAN, place=place)
+    return tune_loop(question(**asked), folder, plan=PLAN, pool=place)
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +40,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LoopAnswer]:
     return folder, tuned(folder)
 
 
+@pytest.mark.slow
 def test_answer(whole: tuple[Path, LoopAnswer]) -> None:
     _, answer = whole
     assert list(answer.kinds) == ["brightest", "window", "window+kalman"]
@@ -55,6 +56,7 @@ def test_answer(whole: tuple[Path, LoopAnswer]) -> None:
         assert all(learning[name] == plain[name] for name in plain if name != LOOP_GAIN)
 
 
+@pytest.mark.slow
 def test_interrupted_it_goes_on_to_the_same_answer(tmp_path: Path, whole: tuple[Path, LoopAnswer]) -> None:
     folder, answer = whole
     with pytest.raises(KeyboardInterrupt):
@@ -64,12 +66,13 @@ def test_interrupted_it_goes_on_to_the_same_answer(tmp_path: Path, whole: tuple[
     np.testing.assert_array_equal(again.runs("window+kalman"), answer.runs("window+kalman"))
 
 
+@pytest.mark.slow
 def test_another_loop_in_the_folder_is_refused_or_replaced(tmp_path: Path) -> None:
     tuned(tmp_path, methods=())
     other = LoopQuestion(small().replace("camera", read_noise_e=5.0), magnitudes=(9.0, 11.0), methods=())
     with pytest.raises(InputError, match=r"magnitude-tuning\.zarr"):
-        tune_loop(other, tmp_path, plan=PLAN, place=HERE)
-    answer = tune_loop(other, tmp_path, plan=PLAN, place=HERE, overwrite=True)
+        tune_loop(other, tmp_path, plan=PLAN, pool=HERE)
+    answer = tune_loop(other, tmp_path, plan=PLAN, pool=HERE, overwrite=True)
     assert answer.question is other
 
 

@@ -11,7 +11,7 @@ import pytest
 from tests.experiments.study_cases import METHODS, Cell, cells, dataset, power_law
 
 from faintspot.experiments.paper.claims import fixed_mode, guidance, verdicts
-from faintspot.experiments.study import built_in as paper
+from faintspot.experiments.study.built_in import paper_study
 from faintspot.experiments.study.curves import Outcome, against_tv, combined
 
 HOLDS, IN_PART, FAILS = Outcome.HOLDS, Outcome.IN_PART, Outcome.FAILS
@@ -19,7 +19,7 @@ Gain = Callable[[Cell, str, str], float]
 
 
 def quick_cells() -> list[Cell]:
-    return [asdict(cell) for cell in paper.paper_study(quick=True).cells()]
+    return [asdict(cell) for cell in paper_study(quick=True).cells()]
 
 
 def study(gain: Callable[[Cell], float], every: list[Cell] | None = None, **options: Any) -> Any:

@@ -13,7 +13,7 @@ from tests.experiments.planner_cases import QUICK
 
 from faintspot.base.statistics import Estimate
 from faintspot.experiments import Answer, Promise, Question, question_from_frames, tune
-from faintspot.experiments.planner.promise import _places, _with_unshared
+from faintspot.experiments.planner.promise import _spot_positions, _with_unshared
 from faintspot.experiments.planner.text import CONTRADICTED, promise_lines
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
@@ -42,6 +42,7 @@ def answered(movement_px: float, gain: float, **given: float) -> Answer:
     return tune(question_from_frames(frames, layout=LAYOUT, **given), **QUICK)
 
 
+@pytest.mark.slow
 def test_without_darks_the_flux_is_right_and_the_promise_kept(tmp_path: Path) -> None:
     answer = answered(0.7, 0.5)
     question, promise = answer.question, answer.promise
@@ -60,6 +61,7 @@ def test_without_darks_the_flux_is_right_and_the_promise_kept(tmp_path: Path) ->
     assert len(promise_lines(answer)) == 1
 
 
+@pytest.mark.slow
 def test_a_promise_that_rests_on_a_wrong_gain_is_contradicted() -> None:
     answer = answered(0.7, 0.5, gain_e_per_adu=1.0)
     assert answer.promise is not None
@@ -103,6 +105,7 @@ def test_scatter_between_frames_that_one_method_alone_has_is_its_error() -> None
     assert checked({"window": math.nan})["window"].factor == 1.0
 
 
+@pytest.mark.slow
 def test_methods_are_chosen_by_the_recording() -> None:
     answer = answered(0.0, 0.5)
     assert set(answer.promises) == {result.method.name for result in answer.results}
@@ -111,6 +114,7 @@ def test_methods_are_chosen_by_the_recording() -> None:
     np.testing.assert_allclose(ratios, 1.0, atol=0.15)
 
 
+@pytest.mark.slow
 def test_spots_in_the_middle_of_the_search_range_have_larger_errors_than_spread_ones() -> None:
     """The range of 1 px cuts errors of spots near its edges: 0.25 px against 0.28 px at 0.36 px rms."""
     rng = np.random.default_rng(7)
@@ -148,6 +152,6 @@ def test_spots_are_predicted_without_the_noise_of_their_positions() -> None:
     def scatter(error_px: float) -> float:
         error, psf = np.full((360, 2), error_px), PSF.analytic(radius_px=8)
         fitted = LearntPSF(psf, np.zeros(1), positions, np.full(360, 100.0), error)
-        return float(_places(question, fitted).std(axis=0).max())
+        return float(_spot_positions(question, fitted).std(axis=0).max())
 
     assert scatter(0.5) < 0.5 * scatter(0.01)

@@ -36,6 +36,7 @@ def recorded(n_frames: int = 30) -> tuple[np.ndarray, np.ndarray]:
     return frames, CAMERA.expose(np.zeros((20, *LAYOUT.frame_shape)), rng)
 
 
+@pytest.mark.slow
 def test_camera_flux_and_spot_are_measured() -> None:
     frames, darks = recorded()
     question = question_from_frames(frames, darks, layout=LAYOUT)
@@ -46,6 +47,7 @@ def test_camera_flux_and_spot_are_measured() -> None:
     assert any("PSF learnt" in fact for fact in question.facts)
 
 
+@pytest.mark.slow
 def test_a_learnt_psf_is_used_and_the_trained_method_left_out() -> None:
     frames, darks = recorded()
     question = question_from_frames(frames, darks, layout=LAYOUT, flux_e=100.0)
@@ -128,6 +130,7 @@ def test_flux_that_differs_between_subapertures_is_simulated_so() -> None:
     np.testing.assert_allclose(question.relative_flux, flux / 1000.0, rtol=0.06)  # 6 frames, 2 % each
 
 
+@pytest.mark.slow
 def test_unreliable_gain_is_not_used() -> None:
     frames = read_array(f"{shared_file('data/ciao_bench_60x224x224.npz')}:frames")
     with pytest.raises(InputError, match=r"gain_e_per_adu.*disagree"):

@@ -16,7 +16,6 @@ from faintspot.experiments.planner.tuning import _ranked
 from faintspot.slopes.estimators import Estimator, Scene, estimators, option, registry
 
 
-@pytest.mark.portable
 def test_every_method_is_scored_on_the_same_spots() -> None:
     answer = answered()
     assert [result.method.name for result in answer.results] == list(estimators())
@@ -25,7 +24,6 @@ def test_every_method_is_scored_on_the_same_spots() -> None:
     assert all(result.settings.search_range_px == 1.0 for result in answer.results)
 
 
-@pytest.mark.portable
 def test_errors_are_near_the_bound_where_the_spot_is_known() -> None:
     """The bound is for unbiased estimators; 512 spots tell R to 3 %."""
     answer = answered()

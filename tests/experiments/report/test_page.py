@@ -13,7 +13,7 @@ from tests.experiments.study_cases import dataset, power_law
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.report.page import report_of_study, study_report
-from faintspot.experiments.study import built_in as paper
+from faintspot.experiments.study.built_in import paper_study
 from faintspot.experiments.study.specification import StudySpecification, Sweep
 
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")
@@ -29,8 +29,9 @@ def of(specification: StudySpecification, **options: Any) -> Any:
 
 
 class TestPage:
+    @pytest.mark.slow
     def test_is_complete_and_in_order(self) -> None:
-        html = study_report(of(paper.paper_study(quick=True)))
+        html = study_report(of(paper_study(quick=True)))
         sections = re.findall(r'<section id="([^"]+)"', html)
         assert sections[:4] == ["verdicts", "guidance", "baselines", "gains"]
         assert sections[4:11] == ["fig1", "fig2", "fig3", "fig4", "fig5", "fig6", "fig7"]
@@ -42,14 +43,14 @@ class TestPage:
         parser.close()
 
     def test_needs_nothing_else(self) -> None:
-        html = study_report(of(paper.paper_study(quick=True, figures=["fig3"])))
+        html = study_report(of(paper_study(quick=True, figures=["fig3"])))
         links = re.findall(r'(?:href|src)="([^"]*)"', html)
         assert links
         assert all(link.startswith(("data:", "#")) for link in links)
         assert "<script" not in html
 
     def test_of_an_unfinished_study_says_so(self) -> None:
-        data = of(paper.paper_study(quick=True), unfinished=tuple(range(1, 40)))
+        data = of(paper_study(quick=True), unfinished=tuple(range(1, 40)))
         html = study_report(data)
         assert "This study is not finished" in html
         assert "39 cells are still missing" in html
@@ -63,7 +64,7 @@ class TestPage:
         assert "my &lt;study&gt;" in html
 
     def test_of_methods_without_tv_has_no_verdict(self) -> None:
-        data = of(paper.paper_study(quick=True, figures=["fig3"]))
+        data = of(paper_study(quick=True, figures=["fig3"]))
         html = study_report(
             data.sel(estimator=["brightest", "smoothed"], estimator2=["brightest", "smoothed"])
         )
@@ -71,7 +72,7 @@ class TestPage:
 
 
 def test_study_without_a_finished_cell_is_refused() -> None:
-    data = of(paper.paper_study(quick=True, figures=["fig3"]))
+    data = of(paper_study(quick=True, figures=["fig3"]))
     data["done"][:] = False
     with pytest.raises(InputError, match="none of its 8 cells is finished"):
         study_report(data)

@@ -7,6 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
@@ -24,6 +26,8 @@ from faintspot.slopes.estimators import Estimator, Need, Scene, Sensor, option, 
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.estimators.registry import estimator_named
+
+FLOOR = 1e-4
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +65,41 @@ def test_methods_are_what_they_say(
         np.testing.assert_allclose(positions[found, k - 1], expected, rtol=0, atol=1e-5)  # of float32
 
 
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    side=st.sampled_from([4, 5, 8, 16]),
+    levels=st.sampled_from([0, 1, 3, 100]),
+    offset=st.sampled_from([0.0, -3.0, 5.0]),
+)
+def test_every_k_is_the_definition(seed: int, side: int, levels: int, offset: float) -> None:
+    rng = np.random.default_rng(seed)
+    images = rng.normal(size=(3, side, side)) * 10.0 ** rng.integers(-3, 4)
+    if levels:  # ties
+        images = np.rint(images / np.abs(images).max() * levels)
+    single = (images + offset).astype(np.float32)
+    positions, valid = position_table(BrightestPixels(flux_floor=FLOOR), single)
+    for k in range(1, side**2):
+        left = fs.brightest_pixels(single.astype(np.float64), keep=k)
+        total, largest = left.sum(axis=(1, 2)), np.abs(single).max(axis=(1, 2))
+        expected = np.where((total > FLOOR * largest)[:, None], fs.centre_of_gravity(left), 0.0)
+        # Round-off of double precision, magnified where low flux is left above the floor.
+        clear = np.abs(total - FLOOR * largest) > 1e-9 * largest
+        np.testing.assert_array_equal(valid[clear, k - 1], (total > FLOOR * largest)[clear])
+        np.testing.assert_allclose(positions[clear, k - 1], expected[clear], rtol=0, atol=1e-8)
+
+
+def test_flat_and_extreme_images() -> None:
+    tiny = np.zeros((1, 4, 4), np.float32)
+    tiny[0, 1, 2] = 1e-30
+    for image in (np.zeros((1, 4, 4), np.float32), np.full((1, 4, 4), 7.1, np.float32)):
+        positions, valid = position_table(BrightestPixels(), image)
+        assert not valid.any()
+        assert not positions.any()
+    positions, valid = position_table(BrightestPixels(), tiny)
+    assert valid.all()
+    np.testing.assert_allclose(positions[0], np.broadcast_to([0.5, -0.5], (15, 2)))
+
+
 def test_without_flux_the_position_is_the_centre() -> None:
     flat = np.full((1, 10, 10), 0.1, np.float32)
     positions, valid = position_table(TotalVariation(noise_std=1.4), flat)
@@ -76,8 +115,11 @@ def test_without_flux_the_position_is_the_centre() -> None:
 def test_positions_become_the_search_range(
     simulated: tuple[NDArray[np.float32], NDArray[np.float64]],
 ) -> None:
-    positions, _ = position_table(BrightestPixels(), simulated[0], 0.3)
-    assert np.abs(positions).max() == 0.3
+    free, valid = position_table(BrightestPixels(), simulated[0])
+    held, also_valid = position_table(BrightestPixels(), simulated[0], 0.3)
+    assert np.abs(free).max() > 1.0
+    np.testing.assert_array_equal(held, np.clip(free, -0.3, 0.3))
+    np.testing.assert_array_equal(valid, also_valid)
 
 
 def test_names() -> None:

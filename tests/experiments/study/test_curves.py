@@ -50,6 +50,7 @@ def test_gain_at_an_error_is_that_at_the_flux_where_it_is_reached() -> None:
     assert by_error.factor == pytest.approx(by_flux.factor, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_interval_covers_the_truth_as_often_as_it_says() -> None:
     """300 noisy studies: 95 % +- 3 standard deviations of the binomial count, 1.3 %."""
     rng = np.random.default_rng(3)

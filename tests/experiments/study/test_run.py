@@ -23,6 +23,7 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_in_memory(uninterrupted: Path) -> None:
     counts = []
     result = experiments.run(SPECIFICATION, workers=0, progress=lambda *count: counts.append(count))
@@ -31,6 +32,7 @@ def test_in_memory(uninterrupted: Path) -> None:
     assert_identical(result, experiments.open_study(uninterrupted))
 
 
+@pytest.mark.slow
 def test_interrupted_and_started_again(tmp_path: Path, uninterrupted: Path) -> None:
     path = tmp_path / "s.zarr"
 

@@ -1,81 +1,89 @@
+"""A format that somebody adds passes the tests of all formats."""
+
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 import pytest
-from tests.io.frame_files import cube
-from tests.io.slope_files import assert_refused, assert_stored, part, result, write, writer_for
+from numpy.typing import NDArray
+from tests.io.frame_files import FrameFile
+from tests.io.frame_format_tests import FrameFormatTests
+from tests.io.slope_files import assert_refused
+from tests.io.slope_format_tests import SlopeFormatTests
+from tests.refusals import refused
 
 from faintspot.io import open_frames
-from faintspot.io.arrays.raw import RawArray
-from faintspot.io.formats import registry as formats
+from faintspot.io.arrays.stored_array import StoredArray
+from faintspot.io.arrays.streams import StreamedArray
+from faintspot.io.formats import registry
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.locations import StoredArray
 from faintspot.io.stored.slopes_format import VARIABLES, StoredSlopes
 
 
 class Plain(FileFormat):
-    """A format of somebody's own: a line that says the shape, then int16; slopes as JSON."""
+    """A line with type and shape, then the frames; slopes as JSON."""
 
     name = "plain"
     signatures = (b"PLAIN",)
     endings = (".plain",)
 
     def find(self, path: Path, key: str | None) -> StoredArray:
+        if key is not None:
+            raise KeyError(key)
         line = path.read_bytes().split(b"\n", 1)[0]
-        shape = tuple(int(length) for length in line.split()[1:])
-        return RawArray(
+        dtype, shape = np.dtype(line.split()[1].decode()), tuple(int(side) for side in line.split()[2:])
+        return StoredArray(
             str(path),
-            lambda: path.open("rb"),
-            offset=len(line) + 1,
-            dtype=np.dtype("<i2"),
-            shape=shape,
-            forward_only=False,
+            shape,
+            dtype,
+            lambda files: StreamedArray(files.enter_context(path.open("rb")), len(line) + 1, dtype, shape),
         )
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
-        whole = {
-            name: values.tolist() for name, values in (*slopes.variables.items(), *slopes.coordinates.items())
-        }
-        stream.write(json.dumps({**whole, "attributes": slopes.attributes}).encode())
+        arrays = {**slopes.variables, **slopes.coordinates}
+        lists = {name: values[:].tolist() for name, values in arrays.items()}
+        stream.write(json.dumps({**lists, "attributes": slopes.attributes}).encode())
 
     def read(self, path: Path) -> StoredSlopes:
-        whole = json.loads(path.read_text())
-        attributes = whole.pop("attributes")
-        variables = {name: np.array(whole.pop(name), variable.dtype) for name, variable in VARIABLES.items()}
-        coordinates = {name: np.array(values) for name, values in whole.items()}
+        content = json.loads(path.read_text())
+        attributes = content.pop("attributes")
+        variables = {
+            name: np.array(content.pop(name), variable.dtype)
+            if name in content
+            else np.full(np.shape(content["flux"]), variable.if_absent, variable.dtype)
+            for name, variable in reversed(list(VARIABLES.items()))
+        }
+        coordinates = {name: np.array(values) for name, values in content.items()}
         return StoredSlopes(variables, coordinates, attributes, True, len(variables["x"]))
+
+
+def save(path: Path, frames: NDArray[Any]) -> None:
+    shape = " ".join(str(side) for side in frames.shape)
+    path.write_bytes(f"PLAIN {frames.dtype.str} {shape}\n".encode() + frames.tobytes())
 
 
 @pytest.fixture(autouse=True)
 def one_more_format(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(formats, "FORMATS", (*formats.FORMATS, Plain()))
+    monkeypatch.setattr(registry, "FORMATS", (*registry.FORMATS, Plain()))
 
 
-def test_frames(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(b"PLAIN 11 6 8\n" + cube().astype("<i2").tobytes())
-    with open_frames([tmp_path / "a"]) as source:
-        np.testing.assert_array_equal(source.block(2, 9), cube()[2:9])
+class TestFrames(FrameFormatTests):
+    @pytest.fixture
+    def kind(self) -> FrameFile:
+        return FrameFile("plain", save)
 
 
-def test_slopes_are_written_resumed_and_guarded(tmp_path: Path) -> None:
-    path = tmp_path / "a.plain"
-    with writer_for(path) as writer:
-        writer.append(0, part(result(), 0, 13))
-        assert_refused(path, "is being written")
-    assert writer_for(path).finished() == 13
-    write(path, result())
-    assert_stored(path, result())
-    with writer_for(path) as writer:
-        assert writer.finished() == 50
-    assert_refused(path, "another run", n_frames=51)
+class TestSlopes(SlopeFormatTests):
+    @pytest.fixture
+    def name(self) -> str:
+        return "slopes.plain"
 
 
 def test_it_is_listed(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("text")
     assert_refused(tmp_path / "b.txt", ".csv or .plain")
-    with pytest.raises(ValueError, match="MATLAB or plain file or a Zarr store"):
+    with refused("MATLAB or plain file or a Zarr store"):
         open_frames([tmp_path / "a.txt"])

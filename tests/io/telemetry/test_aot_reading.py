@@ -212,6 +212,7 @@ def test_subapertures_of_others(tmp_path: Path) -> None:
         assert np.array_equal(read_slopes(tmp_path / "s.npz").variables["y"], pipeline(frames.block(0, 10)).y)
 
 
+@pytest.mark.filterwarnings("ignore::faintspot.base.errors.DoubtWarning")
 def test_quad_cells_of_others_without_a_configuration(tmp_path: Path, run: Commands) -> None:
     def quad_cells(system: Any) -> None:
         sensor = system.wavefront_sensors[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from faintspot.loop.control.identification.learning import Plant
+from faintspot.loop.control.identification.learning import LoopPlant
 from faintspot.loop.control.kalman.slope_model import SlopeModel
 from faintspot.loop.control.phase import phase_of_commands
 from faintspot.loop.control.reconstructor import make_reconstructor
@@ -27,7 +27,7 @@ MODEL = SlopeModel.of_covariances(COVARIANCES)
 LAYERS = SlopeModel.of_covariances(np.array([layer.lagged_px2(FRAME_S) for layer in TURBULENCE.layers()]))
 INTERACTION = np.random.default_rng(1).standard_normal((18, 12))
 ERRORS = np.full(18, 0.3)
-PLANT = Plant(INTERACTION, make_reconstructor(INTERACTION), 2, 0.01)
+PLANT = LoopPlant(INTERACTION, make_reconstructor(INTERACTION), 2, 0.01)
 PHASE_OF_COMMANDS = phase_of_commands(INTERACTION, CELLS.astype(int))
 PHASE = PHASE_OF_COMMANDS @ PLANT.reconstructor.matrix
 

@@ -12,8 +12,6 @@ from faintspot.loop.control.compiled import INVALID_PART, MEAN_SQUARE, CompiledI
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.reconstructor import make_reconstructor
 
-pytestmark = pytest.mark.portable
-
 N = 9
 
 

@@ -141,7 +141,7 @@ def test_the_files_are_those_that_control_reads(tmp_path: Path) -> None:
     np.testing.assert_array_equal(control.interaction, found.interaction)
     np.testing.assert_array_equal(control.reference, found.reference)
     assert (control.options.gain, control.options.centroid_gain) == (0.3, 1.0)
-    assert store.name == "faintspot.loop.control.npz"
+    assert store.name == "faintspot.control.npz"
     pytest.importorskip("matplotlib")
     picture = tmp_path / "picture.png"
     save_picture(picture, found, found.reference, Layout.grid((3, 3), pixels=8))

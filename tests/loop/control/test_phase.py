@@ -7,7 +7,7 @@ from tests.loop.control.control_cases import TURBULENCE, telemetry
 
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.model import Plant
+from faintspot.loop.control.identification.model import LoopPlant
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 from faintspot.loop.control.kalman.slope_model import SlopeModel
@@ -29,7 +29,7 @@ def _slopes_of_corners() -> np.ndarray:
 
 
 INTERACTION = _slopes_of_corners()
-PLANT = Plant(INTERACTION, make_reconstructor(INTERACTION), 2, 0.01)
+PLANT = LoopPlant(INTERACTION, make_reconstructor(INTERACTION), 2, 0.01)
 PHASE = residual_phase(PLANT.reconstructor.matrix, INTERACTION, CELLS)
 
 

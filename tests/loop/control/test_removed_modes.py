@@ -18,8 +18,6 @@ from faintspot.loop.control.configuration import Control, ControlOptions, load_c
 from faintspot.loop.control.removed_modes import RemovedModes
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 
-pytestmark = pytest.mark.portable
-
 LAYOUT = fs.Layout.grid((4, 4), pixels=8)
 N = len(LAYOUT)
 PLACES = LAYOUT.centres

@@ -13,8 +13,6 @@ from faintspot.loop.control import slope_product
 from faintspot.loop.control.slope_product import SlopeProduct
 from faintspot.slopes.kernels.driver.products import add_slopes
 
-pytestmark = pytest.mark.portable
-
 N, COMMANDS, SCALE = 45, 31, 1.25
 MATRIX = np.random.default_rng(1).standard_normal((COMMANDS, 2 * N))
 TOLERANCE = 1e-5

@@ -42,6 +42,7 @@ def test_the_integrator_is_the_recursion() -> None:
         np.testing.assert_array_equal(record.commands[frame + 2], latest.astype(np.float32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("assumed", "kinds"), [(1.0, LEARNT), (3.0, ["kalman"])])
 def test_never_below_the_integrator(assumed: float, kinds: list[str]) -> None:
     """The same slopes on the same air, the integrator's gain the best of three; also with wrong winds.

@@ -1,4 +1,4 @@
-"""Fixtures for the tests of advice."""
+"""Fixtures for the tests of telemetry."""
 
 from __future__ import annotations
 

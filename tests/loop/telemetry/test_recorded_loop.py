@@ -130,6 +130,7 @@ def test_what_is_wrong(tmp_path: Path, change: dict[str, Any], message: str) -> 
         read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml")
 
 
+@pytest.mark.slow
 def test_command(tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     """A page and its numbers of 500 frames, from which other choices are not known."""
     pytest.importorskip("matplotlib")

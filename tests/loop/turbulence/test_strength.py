@@ -35,6 +35,7 @@ def found(slopes: np.ndarray, **options: float) -> Strength:
     return turbulence_strength(slopes, np.zeros_like(slopes), run, AIR, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_px", [0.0, 0.5])
 def test_known_turbulence(slopes: np.ndarray, noise_px: float) -> None:
     """Within three errors; the noise has as much variance as the turbulence of a slope."""

@@ -73,7 +73,7 @@ def test_who_vouches_for_the_dark() -> None:
     assert not fs.Calibration().vouches_for_dark
     assert fs.Calibration(dark=0.0).vouches_for_dark
     assert fs.Calibration(dark=np.zeros((3, 4))).vouches_for_dark
-    assert not fs.Calibration(dark=70.0, rough_dark=True).vouches_for_dark
+    assert not fs.Calibration(dark=70.0, estimated=("dark",)).vouches_for_dark
     assert fs.Calibration(dark=0.0) != fs.Calibration()
 
 
@@ -93,7 +93,8 @@ def test_equality() -> None:
         ("dark", {"dark": np.nan}),
         ("dark", {"dark": "dark.fits"}),
         ("dark", {"dark": np.zeros((2, 3, 4))}),
-        ("rough_dark = 'no'", {"rough_dark": "no"}),
+        ("estimated = 'dark'", {"estimated": "dark"}),
+        ("calibration.estimated", {"estimated": ["flat"]}),
         ("flat", {"flat": 1.0}),
         ("flat", {"flat": np.ones((3, 4), complex)}),
         ("gain_e_per_adu = 0", {"gain_e_per_adu": 0.0}),

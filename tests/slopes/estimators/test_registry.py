@@ -76,6 +76,7 @@ def test_built_in_ones_in_their_order() -> None:
         assert estimator_named(name) is kind
 
 
+@pytest.mark.slow
 def test_order_does_not_depend_on_what_was_imported_first() -> None:
     code = (
         "from faintspot.slopes.estimators.built_in.weighted import Weighted; "

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.patience import LIMIT_S, not_emulated
+from tests.patience import LIMIT_S
 
 from faintspot.slopes.kernels.compilation.host import lanes_for
 from faintspot.slopes.kernels.parallel import available_cpus, run_groups
 
-pytestmark = [pytest.mark.portable, pytest.mark.machine_time("threads and their clocks")]
+pytestmark = pytest.mark.machine_time("threads and their clocks")
 
 
 @pytest.mark.parametrize("threads", [None, 1, 2, 5])
@@ -113,7 +113,6 @@ assert np.array_equal(pipeline(frame).vector, before)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a system without fork")
-@not_emulated
 def test_a_process_that_forks_after_its_threads_have_worked() -> None:
     """The child has none of the threads, and makes its own."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}

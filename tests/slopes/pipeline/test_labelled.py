@@ -62,7 +62,7 @@ def test_refused(slopes: Slopes, monkeypatch: pytest.MonkeyPatch) -> None:
         slopes.to_pandas(LAYOUT, unit="mas")
     monkeypatch.setitem(sys.modules, "xarray", None)
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(MissingExtraError, match=r"faintspot\[study\]"):
+    with pytest.raises(MissingExtraError, match=r"faintspot\[loop\]"):
         slopes.to_xarray()
-    with pytest.raises(MissingExtraError, match=r"faintspot\[study\]"):
+    with pytest.raises(MissingExtraError, match=r"faintspot\[loop\]"):
         slopes.to_pandas()

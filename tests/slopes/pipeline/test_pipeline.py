@@ -25,7 +25,8 @@ class TestAgainstOracle:
         case = random_case(seed, dtype)
         assert_equals_oracle(case, case.pipeline()(case.frame))
 
-    @pytest.mark.parametrize("width", [pytest.param(4, marks=pytest.mark.portable), 8, 16])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("width", [4, 8, 16])
     def test_any_simd_width(self, width: int) -> None:
         for seed in range(20):
             case = random_case(seed, "float32")
@@ -39,7 +40,6 @@ class TestAgainstOracle:
             valid.extend(case.pipeline()(case.frame).valid)
         assert np.mean(valid) > 0.5
 
-    @pytest.mark.portable
     @given(seed=st.integers(0, 2**32 - 1))
     def test_steps_are_the_public_functions(self, seed: int) -> None:
         case = random_case(seed, "float32")
@@ -82,7 +82,6 @@ class TestAgainstOracle:
             assert np.all(np.abs(result - expected) <= bound[:, None, None])
 
 
-@pytest.mark.portable
 class TestFrames:
     def test_several_frames_equal_each_alone(self) -> None:
         case = random_case(1, "uint16")

@@ -20,7 +20,6 @@ import faintspot as fs
 Flag = fs.SubapertureFlag
 
 
-@pytest.mark.portable
 class TestBadFrames:
     """Whatever arrives: flags, no NaN, no warning, no exception."""
 
@@ -199,7 +198,6 @@ class TestWindows:
 
 
 class TestPhysics:
-    @pytest.mark.portable
     def test_slope_error_at_200_photons_and_3_electrons(self) -> None:
         """R with and without TV, against 10,000 independent realisations: 4 standard errors of the
         difference, and 1 % for what differs in the simulation.

@@ -59,6 +59,7 @@ def test_not_worse_than_a_fixed_window_or_the_reference(flux_e: float, read_nois
 
 @pytest.mark.parametrize("range_px", [0.0, 1.0, 3.0])
 def test_spots_that_move_more_get_a_larger_range(range_px: float) -> None:
+    """The whole window, where a smaller range does not help: frames to come may be aberrated more."""
     images, _ = fs.slopes.simulate.subapertures(
         20 * N,
         shape=(20, 20),
@@ -70,7 +71,8 @@ def test_spots_that_move_more_get_a_larger_range(range_px: float) -> None:
     )
     layout = fs.Layout.stacked(N, (20, 20))
     found = first_settings(layout, fs.Calibration(dark=0.0), images.reshape(20, N * 20, 20))
-    reach = float(found.settings.search_range_px)
+    limit = found.settings.search_range_px
+    reach = 10.0 if limit is None else float(limit)
     assert range_px < reach < 2 * range_px + 6.0
 
 

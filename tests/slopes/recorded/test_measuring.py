@@ -154,6 +154,7 @@ def test_summary_counts_flags() -> None:
     }
 
 
+@pytest.mark.slow
 def test_mean_flux_of_the_recording(files: tuple[Path, Path, Path]) -> None:
     """Told to the pipeline, and the same again after a stop."""
     frames, configuration, output = files

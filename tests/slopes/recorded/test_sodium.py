@@ -73,6 +73,7 @@ def test_profile_and_spot_are_found(recording: Path) -> None:
     assert np.abs(places).max() < 0.5
 
 
+@pytest.mark.slow
 def test_command_and_report(recording: Path, run: Commands) -> None:
     """What the command has learnt is what a pipeline of the configuration then knows."""
     path = recording / "faintspot.toml"

@@ -47,6 +47,7 @@ def learnt() -> fs.FixedWeights:
     return fs.FixedWeights.best_linear(clean, truth, flux_e=FLUX_E, read_noise_e=NOISE_E)
 
 
+@pytest.mark.slow
 def test_the_best_linear_weights_beat_every_gaussian_window(learnt: fs.FixedWeights) -> None:
     """Their mean square error is the least of all linear ones; 1 % for what the samples differ."""
     best, gain = errors(window(2.0), score=learnt)

@@ -36,6 +36,7 @@ spot_fwhm_arcsec = 1.2
 """
 
 
+@pytest.mark.slow
 def test_tuned_on_spots_of_the_sub_aperture(tmp_path: Path) -> None:
     """The layer's width at 90 km seen from 8.6 m: 2.2 arcsec, 4.4 px."""
     path = tmp_path / "camera.toml"

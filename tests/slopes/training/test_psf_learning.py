@@ -76,6 +76,7 @@ def test_a_background_does_not_enter_the_wings() -> None:
     assert learnt.flux_e.mean() == pytest.approx(300.0, rel=0.03)
 
 
+@pytest.mark.slow
 def test_each_subaperture_can_have_its_own_psf() -> None:
     rng = np.random.default_rng(8)
     psf = PSF.analytic("gaussian", elongation=[1.2, 2.5], angle_deg=[0.0, 120.0], radius_px=10, index=[0, 1])

@@ -29,7 +29,7 @@ def measured(flux_e: float, positions: np.ndarray, relative: np.ndarray | float 
 def test_noise_is_not_taken_for_motion(flux_e: float, true_px: float) -> None:
     positions = np.random.default_rng(8).uniform(-true_px, true_px, (SPOTS, 2))
     found = measured(flux_e, positions)
-    assert found.told
+    assert found.is_measured
     assert found.quantile_px == pytest.approx(true_px, abs=0.4 + 0.1 * true_px)  # squares grow by 0.25 px
     assert found.flux_scale == pytest.approx(0.5, rel=0.12)
 
@@ -47,4 +47,4 @@ def test_dim_subapertures_are_as_near_as_bright_ones() -> None:
 @pytest.mark.parametrize("true_px", [0.0, ANYWHERE])
 def test_too_little_flux_is_told(true_px: float) -> None:
     positions = np.random.default_rng(8).uniform(-true_px, true_px, (SPOTS, 2))
-    assert not measured(2.0, positions).told
+    assert not measured(2.0, positions).is_measured

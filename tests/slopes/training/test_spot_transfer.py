@@ -22,6 +22,7 @@ def images_of(movement_px: float, gain: float, flux_e: float, n: int = 800) -> n
     return images / gain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("movement_px", "gain", "flux_e"), [(0.15, 0.5, 2000.0), (0.3, 2.0, 500.0), (1.0, 1.0, 500.0)]
 )
@@ -36,6 +37,7 @@ def test_movement_does_not_bias_the_gain(movement_px: float, gain: float, flux_e
     assert found.background_adu * gain == pytest.approx(2.0, abs=0.25)  # the PSF's wings are in it
 
 
+@pytest.mark.slow
 def test_what_cannot_be_told_is_said() -> None:
     rng = np.random.default_rng(3)
     unit, _ = speckled_spots(600, d_over_r0=3.0, shape=(16, 16), size=1.0, rng=rng)

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintspot import InputError, Layout, Settings, SlopePipeline, Slopes, SubapertureFlag, fit_wavefront
-from faintspot.slopes.sensor.pupil import inside_pupil, lenslet_outlines, pupil_of
+from faintspot.slopes.sensor.pupil import inside_pupil, lenslet_outlines, lit_outlines, pupil_of
 from faintspot.slopes.wavefront.discrepancy import slope_discrepancy
 from faintspot.slopes.wavefront.zernike import mean_gradients, zernike
 
@@ -191,3 +191,43 @@ def test_corners_of_a_square_array_are_outside_of_the_disk() -> None:
     np.testing.assert_array_equal(
         fit_wavefront(wild, layout).coefficients, fit_wavefront(slopes, layout).coefficients
     )
+
+
+def test_subapertures_that_the_pupil_cuts_count_with_their_part_inside() -> None:
+    """A pupil of 8 sub-apertures with one on its axis: those at its edge are lit in part."""
+    whole = Layout.grid((9, 9), pixels=8, pixel_scale_arcsec=0.5, subaperture_m=0.5, diameter_m=4.0)
+    true = {4: 40.0, 5: 60.0, 7: 33.5}  # nm
+    offset = (np.arange(64) + 0.5) / 64 - 0.5
+    gradients, share = np.zeros((2, len(whole))), np.zeros(len(whole))
+    for number, (row, column) in enumerate(whole.cells - 4):
+        x, y = np.meshgrid((column + offset) / 4, (row + offset) / 4)
+        inside = np.hypot(x, y) <= 1
+        share[number] = inside.mean()
+        for axis, step in enumerate(((1e-4, 0.0), (0.0, 1e-4))):
+            for mode, value in true.items():
+                ahead = zernike(mode, x + step[0], y + step[1]) - zernike(mode, x - step[0], y - step[1])
+                gradients[axis, number] += value * (ahead[inside].mean() if inside.any() else 0.0) / 2e-4
+    lit = share > 0.2
+    layout = whole[lit]
+    slopes = slopes_of(gradients[:, lit] / (0.5 * 2.0 * 1e9 * RAD))
+    found = fit_wavefront(slopes, layout, modes=9)
+    assert found.unit == "nm"
+    for mode, value in zip(found.modes.tolist(), found.mean.tolist(), strict=True):
+        # Means over 64 x 64 points, and a disk of 256 corners.
+        assert value == pytest.approx(true.get(mode, 0.0), abs=0.1)
+    outlines, part = lit_outlines(layout, pupil_of(layout))
+    np.testing.assert_allclose(part, share[lit], atol=2e-3)
+    assert outlines.shape[::2] == (len(layout), 2)
+
+
+def test_slopes_count_by_their_standard_errors() -> None:
+    """A few noisy sub-apertures do not spoil a mode: errors are those of weighted least squares."""
+    rng = np.random.default_rng(4)
+    error = np.where(np.arange(len(LAYOUT)) % 3 == 0, 1.0, 0.02)
+    noise = rng.normal(size=(400, 2, len(LAYOUT))) * error
+    slopes = slopes_of(noise)
+    errors = np.broadcast_to(error, slopes.x.shape).astype(np.float32)
+    found = fit_wavefront(replace(slopes, standard_error_x=errors, standard_error_y=errors), LAYOUT, modes=5)
+    np.testing.assert_allclose(found.coefficients.std(axis=0), found.standard_errors[0], rtol=0.15)
+    plain = fit_wavefront(slopes, LAYOUT, modes=5)
+    assert (found.coefficients.std(axis=0) < 0.2 * plain.coefficients.std(axis=0)).all()

@@ -68,7 +68,7 @@ class Option:
             If the declaration does not allow it.
         """
         if isinstance(value, PerSubaperture) and self.per_subaperture:
-            return self._checked_places(name, value)
+            return self._checked_each(name, value)
         if value is None and self.optional:
             return None
         if self.automatic and isinstance(value, str) and value == AUTO:
@@ -83,7 +83,7 @@ class Option:
             raise InputError(f"{name}: expected a number{several}, got shape {array.shape}")
         return _locked(array.copy())
 
-    def _checked_places(self, name: str, value: PerSubaperture) -> PerSubaperture:
+    def _checked_each(self, name: str, value: PerSubaperture) -> PerSubaperture:
         if None in value.others.values():
             raise InputError(f"{name}: expected a value for each sub-aperture listed, got none")
         others = {int(index): self.checked(name, item) for index, item in value.others.items()}
@@ -251,8 +251,8 @@ class Options:
             result[selected] = new
             return result
         others = dict(old.others) if isinstance(old, PerSubaperture) else {}
-        each = new.tolist() if several else [new] * len(selected)
-        others.update({int(index): item for index, item in zip(selected, each, strict=True)})
+        values = new.tolist() if several else [new] * len(selected)
+        others.update({int(index): item for index, item in zip(selected, values, strict=True)})
         return PerSubaperture(old.default if isinstance(old, PerSubaperture) else old, others)
 
 

@@ -64,8 +64,8 @@ def errors_of_table(path: str | Path, name: str) -> Iterator[None]:
         yield
     except InputError as error:
         text = str(error)
-        known = text.startswith(tuple(f"{table}{mark}" for table in TABLES for mark in ".: "))
-        raise InputError(f"{path}: {'' if known else f'{name}.'}{text}") from None
+        names_table = text.startswith(tuple(f"{table}{mark}" for table in TABLES for mark in ".: "))
+        raise InputError(f"{path}: {'' if names_table else f'{name}.'}{text}") from None
 
 
 def check_fields(name: str, kind: type, values: Mapping[str, Any]) -> None:

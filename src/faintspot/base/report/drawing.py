@@ -19,7 +19,7 @@ try:
     from matplotlib.figure import Figure
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 except ImportError:
-    raise MissingExtraError("matplotlib", "web", "Drawing pictures") from None
+    raise MissingExtraError("matplotlib", "report", "Drawing pictures") from None
 
 COLOUR_MAP = "cividis"
 # Okabe & Ito (2008): readable with any colour vision.
@@ -89,18 +89,18 @@ def plain_ticks(axis: XAxis | YAxis, values: Iterable[float], form: str = "g") -
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:{form}}"))
 
 
-def axis_above(axes: Axes, places: Any, values: Iterable[float], label: str) -> Any:
+def axis_above(axes: Axes, positions: Any, values: Iterable[float], label: str) -> Any:
     """Put a second axis on top: numbers to three digits at places of the first one."""
     top = axes.secondary_xaxis("top")
-    top.set_xticks(places, [f"{float(f'{value:.3g}'):g}" for value in values])
+    top.set_xticks(positions, [f"{float(f'{value:.3g}'):g}" for value in values])
     top.set_xlabel(label)
     return top
 
 
-def note(axes: Axes, text: str, place: tuple[float, float], coordinates: str, **style: Any) -> None:
+def note(axes: Axes, text: str, position: tuple[float, float], coordinates: str, **style: Any) -> None:
     """Write a text beside a place, some points away; coordinates "data", "axes fraction" or one for each."""
     x, _, y = coordinates.partition(", ")
-    axes.annotate(text, place, xycoords=(x, y or x), textcoords="offset points", **style)
+    axes.annotate(text, position, xycoords=(x, y or x), textcoords="offset points", **style)
 
 
 def colour_bar(axes: Axes | list[Axes], mappable: Any, label: str, location: str = "right") -> None:

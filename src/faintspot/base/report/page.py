@@ -218,7 +218,7 @@ def _render(page: Page, drawn: Mapping[str, Sequence[DrawnFigure]]) -> str:
     try:
         import jinja2
     except ImportError:
-        raise MissingExtraError("jinja2", "web", "Making a report page") from None
+        raise MissingExtraError("jinja2", "report", "Making a report page") from None
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string(_template("page.html"))
     return template.render(page=page, drawn=drawn, style=style(), version=__version__)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shlex
+import warnings
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,10 +14,11 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError
+from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.cli.layout import grid as layout_grid
 from faintspot.cli.layout import options as layout_options
 from faintspot.cli.layout.darks import measured_darks, with_measured_pixels
+from faintspot.cli.layout.describing import describe, describe_settings, doubts_of
 from faintspot.cli.layout.options import plain
 from faintspot.cli.shared.commands import SectionedCommand, option
 from faintspot.cli.shared.needs import suggested_slopes
@@ -26,14 +29,12 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.hot_pixels import find_hot_pixels
 from faintspot.slopes.camera.saturation import LargestValues
 from faintspot.slopes.pipeline import configuration
-from faintspot.slopes.pipeline.settings import Settings
-from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, FirstSettings, first_settings
+from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, first_settings
 from faintspot.slopes.sensor.found_layout import FoundLayout, find_layout
 from faintspot.slopes.sensor.known_grid import KnownGrid
 from faintspot.slopes.sensor.layout import GEOMETRIES, Layout
 
 _MOST_FRAMES = 200  # averaged to find the spots
-_MOST_NAMED = 12  # sub-apertures in one line
 _FIRST_FRAMES = 20  # measured for the settings
 _FEWEST_E = 10.0  # electrons of a spot that is seen in a single frame
 _array = partial(option, section="Lenslet array")
@@ -44,6 +45,9 @@ _OPTICS = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
 # What the finder calls what these options give.
 _OPTIONS = {
     "pitch_px": "--pitch-px",
+    "angle_deg": "--angle-deg",
+    "centre": "--centre",
+    "fit": "--fit",
     "illuminated_fraction": "--illuminated-fraction",
     "bad_pixels": "--bad-pixels",
 }
@@ -52,9 +56,23 @@ _OPTIONS = {
 @click.command(
     cls=SectionedCommand, short_help="Find the sub-apertures in a frame and write a configuration."
 )
-@click.argument("frames", nargs=-1, required=True, metavar="FRAME...")
+@click.argument("frames", nargs=-1, metavar="FRAME...")
 @_array("--geometry", type=click.Choice(["auto", *GEOMETRIES]), default="auto", help="Packing.")
-@_array("--pitch-px", type=float, metavar="PX", help="Distance of neighbouring lenslets.")
+@_array("--pitch-px", type=float, metavar="PX", help="Distance of neighbouring lenslets, used as stated.")
+@_array(
+    "--angle-deg", type=float, metavar="DEG", help="Angle of the rows from +x towards +y, used as stated."
+)
+@_array(
+    "--centre",
+    metavar="X,Y",
+    help="Point of the lattice [px], used as stated: the middle of a lenslet, of an edge, or a corner.",
+)
+@_array(
+    "--fit",
+    metavar="LIST",
+    help="Which of pitch, angle, centre to fit to the frame although stated, such as pitch,angle.",
+    show_default="those not stated",
+)
 @_array(
     "--grid",
     metavar="ROWSxCOLUMNS",
@@ -123,6 +141,7 @@ _OPTIONS = {
 @SUBAPERTURE
 @DIAMETER
 @KEY
+@option("--accept", is_flag=True, help="Settle the doubts of the layout that --output has; without FRAME.")
 @option("--output", "-o", metavar="TOML", default="faintspot.toml", help="Configuration to write.")
 @option(
     "--picture", metavar="PNG", help="Picture of frame and grid to write.", show_default="beside the output"
@@ -141,6 +160,7 @@ def command(
     mask_hot_pixels: bool,
     key: str | None,
     overwrite: bool,
+    accept: bool,
     **options: Any,
 ) -> None:
     """Find the sub-apertures in a frame and write a configuration.
@@ -166,15 +186,20 @@ def command(
       faintspot layout quad_cells.fits --grid 40x40 --dark dark.fits
     """
     target = Path(output)
+    if accept or not frames:
+        _accept(target, accept, frames)
+        return
     keeps_settings = configuration.has(target, "settings") and not configuration.has(target, "layout")
     if target.exists() and not overwrite and not keeps_settings:
         raise InputError(f"{output}: already exists; --overwrite replaces its layout and settings")
     for name, counts, expected in (
         ("pupil", (3, 4), "X,Y,R or X,Y,R,INNER in pixels"),
         ("roi", (4,), "X0,Y0,X1,Y1 in pixels"),
+        ("centre", (2,), "X,Y in pixels"),
         ("pixels", (1, 2), "a number of pixels, or height and width, such as 12,16"),
     ):
         options[name] = layout_options.numbers(f"--{name}", options[name], counts, expected)
+    options["fit"] = tuple(part.strip() for part in (options["fit"] or "").split(",") if part.strip())
     if options["pixels"] is not None and len(options["pixels"]) == 1:
         (options["pixels"],) = options["pixels"]
     optics = layout_options.optics(target, {name: options.pop(name) for name in _OPTICS})
@@ -182,6 +207,7 @@ def command(
     drawing = picture_file(target, picture, ".png")
     with open_frames(frames, key=key) as source:
         calibration = layout_options.calibration(target, of_camera)
+        stated = layout_options.kept_calibration(calibration, of_camera)
         mean, values = _mean_frame(source, calibration)
         hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
         mean[tuple(hot.T)] = np.nan
@@ -191,18 +217,24 @@ def command(
         else:
             found = _found(source.description, mean, options)
         kept = layout_options.kept(len(found.layout), exclude)
-        layout = replace(found.layout[kept], **optics)
+        if isinstance(found, FoundLayout):
+            found = found[kept]
+            layout = replace(found.layout, **optics, doubts=doubts_of(found))
+        else:
+            layout = replace(found.layout[kept], **optics, doubts=(found.doubt,) if found.doubt else ())
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
     calibration, notes = _completed(calibration, found, layout, mean, hot)
     if calibration.saturation_adu is None and values.saturation_adu is not None:
-        calibration = replace(calibration, saturation_adu=values.saturation_adu)
+        estimated = (*calibration.estimated, "saturation_adu")
+        calibration = replace(calibration, saturation_adu=values.saturation_adu, estimated=estimated)
         notes.append(f"  saturation {values.saturation_adu:g} ADU, at which values pile up")
     unit = "ADU" if of_camera["gain_e_per_adu"] is None and calibration.gain_e_per_adu == 1.0 else "e-"
     seen = first_settings(layout, calibration, first)
     if unit == "ADU" and 0 < seen.flux < _FEWEST_E:
         likely = float(f"{(calibration.typical_read_noise_e or ASSUMED_NOISE_E) / seen.noise:.3g}")
         notes.append(f"  gain: 1 would leave {plain(seen.flux)} electrons of a spot; {likely:g} is assumed")
-        calibration = replace(calibration, gain_e_per_adu=likely)
+        estimated = (*calibration.estimated, "gain_e_per_adu")
+        calibration = replace(calibration, gain_e_per_adu=likely, estimated=estimated)
         unit, seen = "e-", first_settings(layout, calibration, first)
     if (measured := measured_darks(of_camera["dark"])) is not None:
         keeps_noise = of_camera["read_noise_e"] is not None
@@ -213,7 +245,7 @@ def command(
         notes.append(f"  the settings that {output} has are kept")
     marks: dict[str, Any] = {}
     if isinstance(found, FoundLayout):
-        marks = {"outside": found.outside, "doubtful": (found.clipped | found.unlike)[kept]}
+        marks = {"outside": found.outside, "doubtful": found.clipped | found.unlike}
     if drawing is not None:
         from faintspot.slopes.recorded.layout_picture import layout_picture
 
@@ -224,8 +256,8 @@ def command(
     if isinstance(found, KnownGrid):
         lines = layout_grid.describe(output, found, layout, calibration)
     else:
-        lines = _describe(output, found[kept], layout)
-    for line in [*lines, *_describe_settings(settings, layout, seen, unit), *notes]:
+        lines = describe(output, found, layout)
+    for line in [*lines, *describe_settings(settings, layout, seen, unit), *stated, *notes]:
         click.echo(line)
     if unit == "ADU":
         click.echo(
@@ -237,6 +269,17 @@ def command(
     click.echo(f"Next: faintspot slopes {shlex.join(arguments)}")
 
 
+def _accept(target: Path, accept: bool, frames: tuple[str, ...]) -> None:
+    """Settle the doubts of a layout."""
+    if frames or not accept:
+        raise InputError("FRAME, --accept: expected frames to find the sub-apertures in, or --accept without")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtWarning)
+        layout: Layout = configuration.load(target, "layout")
+    configuration.save(target, replace(layout, doubts=()))
+    click.echo(f"{target}: {'accepted: ' + '; '.join(layout.doubts) if layout.doubts else 'no doubts'}")
+
+
 def _found(description: str, mean: NDArray[np.float64], options: dict[str, Any]) -> FoundLayout:
     """Find the layout, and say in an error where, and which option changes it."""
     bad = np.isnan(mean)
@@ -245,90 +288,10 @@ def _found(description: str, mean: NDArray[np.float64], options: dict[str, Any])
     except InputError as error:
         text = str(error)
         for name, option in _OPTIONS.items():
-            text = text.replace(name, option)
+            text = re.sub(rf"\b{name}\b", option, text)
         if "found no" in text:
             text += "; --grid is for an array that is known, such as quad cells"
         raise InputError(f"{description}: {text}") from None
-
-
-def _describe_settings(settings: Settings, layout: Layout, seen: FirstSettings, unit: str) -> list[str]:
-    """Describe noise and flux of the spots, and the settings."""
-    estimator, reach = settings.estimator, settings.search_range_px
-    within = "" if reach is None else f", slopes within {np.max(reach):g} px"
-    lines = [
-        f"  background noise {plain(seen.noise)} {unit}, flux of a spot {plain(seen.flux)} {unit}",
-        f"  {estimator.name}: {estimator.in_words(len(layout), layout.pixels)}{within}",
-    ]
-    if seen.response < 1:
-        lines.append(
-            f"  the flux of single frames is too low for full slopes: they show {seen.response:.2f} of the "
-            "displacements; `faintspot tune --recording` says what is possible"
-        )
-    return lines
-
-
-def _describe(output: str, found: FoundLayout, layout: Layout) -> list[str]:
-    """Describe the lenslets that were found and those left out."""
-    rows, columns = np.ptp(layout.cells, axis=0) + 1
-    height, width = layout.window
-    lines = [
-        f"{output}: {len(layout)} sub-apertures lit of a {layout.geometry} array of {rows} x {columns}, "
-        f"pitch {layout.pitch_px:.2f} px, angle {layout.angle_deg:.2f} deg, windows of {height} x {width} px"
-    ]
-    lines += layout_options.largest_window_note(layout)
-    if found.lenslets.doubt:
-        lines.append(f"  doubtful: {found.lenslets.doubt} (see the picture; try --pitch-px, --pupil)")
-    if len(found.cut):
-        lines.append(
-            f"  {len(found.cut)} lit lenslets at the frame's edge left out, their windows do not fit: "
-            f"{_sides(found)}; smaller windows (--pixels) or --move-windows take more"
-        )
-    lines += _doubtful_spots(found)
-    moved = np.abs(np.median(layout.offsets, axis=0))
-    if moved.max() > 1:
-        lines.append(
-            f"  windows moved off the spots by ({moved[0]:.1f}, {moved[1]:.1f}) px: "
-            "centres of gravity are worse in them"
-        )
-    return lines
-
-
-def _doubtful_spots(found: FoundLayout) -> list[str]:
-    """Describe spots outside all windows, far from their lattice, or doubtful."""
-    lines = []
-    if (count := len(found.outside)) > 0:
-        size = np.array(found.layout.frame_shape[::-1])
-        depth = np.minimum(found.outside, size - 1 - found.outside).min(axis=1)
-        at_edge = np.count_nonzero(depth < 0.5 * found.lenslets.pitch_px)
-        where = f", {at_edge} of them at the frame's edge" if at_edge else ""
-        spots = "1 bright spot lies" if count == 1 else f"{count} bright spots lie"
-        lines.append(f"  {spots} outside all windows{where}: see the circles in the picture")
-    if (drift := np.linalg.norm(found.lenslets.drifts, axis=1).max()) > 0:
-        lines.append(
-            f"  the windows follow spots that lie up to {drift:.1f} px from the regular lattice, which stays "
-            "the reference"
-        )
-    for reason, doubtful in (
-        ("at their window's edge, which cuts them", found.clipped),
-        ("displaced unlike those of all neighbours", found.unlike),
-    ):
-        if doubtful.any():
-            numbers = np.flatnonzero(doubtful)
-            named = ", ".join(map(str, numbers[:_MOST_NAMED])) + (
-                ", ..." if len(numbers) > _MOST_NAMED else ""
-            )
-            lines.append(f"  doubtful slopes of {named} ({len(numbers)}): spots {reason}")
-    return lines
-
-
-def _sides(found: FoundLayout) -> str:
-    """Count the lenslets left out at each side of the frame, such as '7 at small x'."""
-    height, width = found.layout.frame_shape
-    x, y = found.cut.T
-    distances = np.stack([x, width - 1 - x, y, height - 1 - y])
-    counts = np.bincount(distances.argmin(axis=0), minlength=4)
-    names = ("at small x", "at large x", "at small y", "at large y")
-    return ", ".join(f"{count} {name}" for count, name in zip(counts, names, strict=True) if count)
 
 
 def _mean_frame(source: FrameSource, calibration: Calibration) -> tuple[NDArray[np.float64], LargestValues]:
@@ -363,11 +326,13 @@ def _completed(
     level = float(np.nanmedian(edges)) * calibration.em_gain / calibration.gain_e_per_adu
     spread = float(np.nanmedian(np.abs(edges - np.nanmedian(edges))))
     if calibration.dark is None and level > spread > 0:
-        calibration = replace(calibration, dark=float(f"{level:.7g}"), rough_dark=True)
+        estimated = (*calibration.estimated, "dark")
+        calibration = replace(calibration, dark=float(f"{level:.7g}"), estimated=estimated)
         notes.append(
             f"  dark {calibration.dark:g} ADU, the frame's background; --dark gives the camera's own"
         )
     if len(hot):
-        calibration = calibration.with_bad_pixels(hot)
+        estimated = (*calibration.estimated, "bad_pixels")
+        calibration = replace(calibration.with_bad_pixels(hot), estimated=estimated)
         notes.append(f"  {len(hot)} hot pixels masked")
     return calibration, notes

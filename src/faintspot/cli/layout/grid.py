@@ -14,14 +14,21 @@ from faintspot.slopes.sensor.known_grid import KnownGrid, find_illuminated
 from faintspot.slopes.sensor.layout import Layout
 
 _QUAD_CELL = 2  # pixels on a side
-_ONLY_WITHOUT = {"geometry": "--geometry", "pitch_px": "--pitch-px", "move_windows": "--move-windows"}
+_ONLY_WITHOUT = {
+    "geometry": "--geometry",
+    "pitch_px": "--pitch-px",
+    "angle_deg": "--angle-deg",
+    "centre": "--centre",
+    "fit": "--fit",
+    "move_windows": "--move-windows",
+}
 
 
 def illuminated(
     description: str, mean: NDArray[np.float64], grid: str, calibration: Calibration, options: dict[str, Any]
 ) -> KnownGrid:
     """Return the illuminated sub-apertures of the grid; name the frame in an error."""
-    wrong = [flag for name, flag in _ONLY_WITHOUT.items() if options[name] not in (None, False, "auto")]
+    wrong = [flag for name, flag in _ONLY_WITHOUT.items() if options[name] not in (None, False, "auto", ())]
     if wrong:
         raise InputError(f"--grid, {', '.join(wrong)}: expected one of them; a grid fills the frame or --roi")
     shape = layout_options.grid_shape(grid)
@@ -47,8 +54,7 @@ def describe(output: str, found: KnownGrid, layout: Layout, calibration: Calibra
         f"pitch {layout.pitch_px:.4g} px, windows of {height} x {width} px"
     ]
     lines += layout_options.largest_window_note(layout)
-    if found.doubt:
-        lines.append(f"  doubtful: {found.doubt} (look at the picture)")
+    lines += [f"  doubtful: {doubt} (look at the picture)" for doubt in layout.doubts]
     if not is_quad_cell(layout):
         return lines
     lines.append(

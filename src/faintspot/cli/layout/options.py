@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.tables import read_tables
+from faintspot.base.config.tables import chosen_fields, read_tables
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration, read_map
 from faintspot.slopes.pipeline import configuration
@@ -61,8 +61,14 @@ def kept(count: int, text: str | None) -> NDArray[np.bool_]:
 
 
 def calibration(target: Path, given: Mapping[str, Any]) -> Calibration:
-    """Return the calibration that the configuration has already, with what was given now (None: nothing)."""
+    """Return the calibration that the configuration states already, with what was given now (None: nothing).
+
+    What an earlier `faintspot layout` estimated from its frames is left out, to be estimated again.
+    """
     known: Calibration = configuration.load(target, "calibration") if target.exists() else Calibration()
+    defaults = Calibration()
+    forgotten = {name: getattr(defaults, name) for name in known.estimated}
+    known = replace(known, **forgotten, estimated=())
     maps: dict[str, Callable[[str], Any]] = {
         "dark": partial(number_or_map, "dark"),
         "read_noise_e": partial(number_or_map, "read_noise_e"),
@@ -74,9 +80,17 @@ def calibration(target: Path, given: Mapping[str, Any]) -> Calibration:
         for name, value in given.items()
         if value is not None
     }
-    if "dark" in changes:
-        changes["rough_dark"] = False
     return replace(known, **changes)
+
+
+def kept_calibration(calibration: Calibration, given: Mapping[str, Any]) -> list[str]:
+    """Return a line on what an existing configuration states and was not given now."""
+    kept = [
+        f"{name} {plain(value) if not isinstance(value, np.ndarray) else 'map'}"
+        for name, value in chosen_fields(calibration).items()
+        if given.get(name) is None
+    ]
+    return [f"  kept as the configuration states: {', '.join(kept)}"] if kept else []
 
 
 def optics(target: Path, given: Mapping[str, float | None]) -> dict[str, Any]:

@@ -181,8 +181,8 @@ def _measure(
     loop = load_loop(configuration)
     folder = output or (f"{loop.name}-quick" if quick else loop.name)
     with progress_bar("loop") as advance:
-        place = WorkerPool(workers, advance, lambda text: click.echo(text, err=True))
-        result = run(loop, folder, *what, quick=quick, place=place, overwrite=overwrite)
+        pool = WorkerPool(workers, advance, lambda text: click.echo(text, err=True))
+        result = run(loop, folder, *what, quick=quick, pool=pool, overwrite=overwrite)
     click.echo(loop_summary(LoopResults(**{name: result})))
     page = Path(folder) / "report.html"
     write_loop_report(folder, page)

@@ -92,7 +92,7 @@ def tune(
     folder = results or f"{question.configuration.name}-tune"
     with progress_bar("loop") as advance:
         place = WorkerPool(options["workers"], progress=advance)
-        answer = tune_loop(question, folder, place=place, overwrite=overwrite)
+        answer = tune_loop(question, folder, pool=place, overwrite=overwrite)
     show(answer)
     loop = answer.save(target)
     click.echo(f"{target}: written, and {loop}, the loop with this star and gain")

@@ -6,7 +6,6 @@ from typing import ClassVar
 
 import click
 
-from faintspot.cli.realtime.advise import advise
 from faintspot.cli.realtime.calibrate import calibrate
 from faintspot.cli.realtime.camera import camera
 from faintspot.cli.realtime.control import control, get, interleave, set_settings, status, stop_engine, top
@@ -26,9 +25,9 @@ _SECTIONS = {
     "Estimators": (load, swap, unload),
     "Sources of frames": (camera, replay, bridge, telescope, demo),
     "Calibration and control": (calibrate, learn, follow),
-    "Telemetry": (record, export, advise),
+    "Telemetry": (record, export),
 }
-_OF_RECORDINGS = (learn, advise, export)
+_OF_RECORDINGS = (learn, export)
 
 
 class _RealTime(Group):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from faintspot.base.statistics import Estimate
     from faintspot.engine.page.demonstration import MethodShown, Shown
 
-_NEEDED = {"realtime": ("pyshmem",), "live": ("tornado", "zarr"), "loop": ("hcipy",)}
+_NEEDED = {"realtime": ("pyshmem", "tornado", "zarr"), "loop": ("hcipy",)}
 
 
 @click.command("demo", short_help="Run a simulated telescope, the engine and its page together.")
@@ -47,7 +47,7 @@ def demo(
     """Run a simulated telescope, the real-time engine and its web page together.
 
     The loop is closed on a faint star, methods alternate, and a table at the end gives the Strehl ratio of
-    each. Needs the extras `realtime`, `live` and `loop`.
+    each. Needs the extras `realtime` and `loop`.
     """
     _check_extras()
     from faintspot.engine.page.demonstration import LiveDemonstration

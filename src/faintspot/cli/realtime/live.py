@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _NICENESS = 5  # the engine comes first
 
 
-@needs("live", "tornado", "pyshmem", "zarr")
+@needs("realtime", "tornado", "pyshmem", "zarr")
 @click.command(short_help="Show a running engine, or a recording, as a web page.")
 @click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[RECORDING]")
 @ENGINE_NAME
@@ -67,7 +67,7 @@ def command(recording: Path | None, name: str, bind: str, port: int, private: bo
 @contextmanager
 def page_beside(name: str) -> Iterator[None]:
     """Serve the page of an engine in a process of its own, which ends with this one's work."""
-    require("live", "tornado", purpose="--live")
+    require("realtime", "tornado", purpose="--live")
     process = subprocess.Popen([sys.executable, "-m", "faintspot", "live", "--name", name])
     try:
         yield

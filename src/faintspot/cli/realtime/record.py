@@ -38,10 +38,6 @@ def record(out: Path, name: str, frames: int | None, seconds: float | None, ao_m
     Example:
       faintspot realtime record night.zarr --seconds 60
     """
-    from faintspot.cli.realtime.camera import stop_on_signal
-    from faintspot.cli.shared.progress import progress_bar
-    from faintspot.engine.telemetry.recorder import Recorder
-
     if out.suffix not in (".zarr", ".fits"):
         raise InputError(f"{out}: expected a name that ends in .zarr or .fits")
     if out.suffix == ".fits" and out.exists():
@@ -49,13 +45,8 @@ def record(out: Path, name: str, frames: int | None, seconds: float | None, ao_m
     if out.suffix == ".fits":
         require("realtime", "aotpy", purpose="Writing an AOT file")
     store = out.with_suffix(".zarr")
-    recorder = Recorder(name, store)
-    total: Any = frames  # None, where it is not known, makes the bar a moving one
-    with stop_on_signal() as stop, progress_bar(f"{store.name}") as advance:
-        report = recorder.run(
-            n_frames=frames, seconds=seconds, stop=stop, progress=lambda done: advance(done, total)
-        )
-    click.echo(f"{store}: {_summary(report)}")
+    report = record_engine(name, store, frames, seconds)
+    click.echo(f"{store}: {summary(report)}")
     if out.suffix == ".fits" and report.frames:
         _export(store, out, ao_mode)
 
@@ -86,7 +77,21 @@ def _export(store: Path, out: Path, ao_mode: str) -> None:
     click.echo(f"{out}: {len(telemetry.frame)} frames, {len(telemetry.image_frame)} images")
 
 
-def _summary(report: RecordingReport) -> str:
+def record_engine(name: str, store: Path, frames: int | None, seconds: float | None) -> RecordingReport:
+    """Record a running engine to a new store, with a progress bar, until a limit or Ctrl-C."""
+    from faintspot.cli.realtime.camera import stop_on_signal
+    from faintspot.cli.shared.progress import progress_bar
+    from faintspot.engine.telemetry.recorder import Recorder
+
+    recorder = Recorder(name, store)
+    total: Any = frames  # None, where it is not known, makes the bar a moving one
+    with stop_on_signal() as stop, progress_bar(store.name) as advance:
+        return recorder.run(
+            n_frames=frames, seconds=seconds, stop=stop, progress=lambda done: advance(done, total)
+        )
+
+
+def summary(report: RecordingReport) -> str:
     """Describe what was recorded and what was lost."""
     ended = {
         "frames": "all that were asked for",

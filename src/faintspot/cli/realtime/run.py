@@ -23,7 +23,7 @@ from faintspot.engine.requests.private_socket import socket_path
 @click.command("run", short_help="Measure frames as they arrive and publish their slopes.")
 @configuration_option("Configuration.")
 @name_option("Name of the pixel ring, the streams and the engine.")
-@option("--stream", metavar="NAME", help="Take whole frames from a stream: pyshmem's, isio:NAME or dao:FILE.")
+@option("--stream", metavar="NAME", help="Take whole frames from a stream: pyshmem's, or isio:NAME.")
 @option("--threads", type=click.IntRange(1), default=1, help="Worker threads.")
 @option("--cpus", metavar="LIST", help="Processors to run on, such as 2,3 or 4-7.")
 @option(
@@ -152,24 +152,24 @@ def run(
 
 def _learning(engine: Any, config: str) -> Any:
     """The process that learns for the engine, as a context, if it can learn and shall."""
-    from faintspot.engine.background.learning import learning_beside
+    from faintspot.engine.background.learning import background_learning
     from faintspot.loop.control.identification.model import KALMAN
 
     options = None if engine.loop is None else engine.loop.control.options
     if options is None or options.controller != KALMAN or not options.learn_every_s:
         return nullcontext()
-    return learning_beside(engine, config, options.learn_every_s, partial(click.echo, err=True))
+    return background_learning(engine, config, options.learn_every_s, partial(click.echo, err=True))
 
 
 def _following(engine: Any, config: str) -> Any:
     """The process that follows a laser guide star's profile, as a context, if the configuration wants it."""
-    from faintspot.engine.background.sodium import following_beside
+    from faintspot.engine.background.sodium import background_sodium
     from faintspot.slopes.spots.laser_spots import load_laser
 
     laser = load_laser(config)
     if laser is None or not laser.follow_every_s:
         return nullcontext()
-    return following_beside(engine, config, partial(click.echo, err=True))
+    return background_sodium(engine, config, partial(click.echo, err=True))
 
 
 def _followed(stream: str, name: str) -> Any:

@@ -104,8 +104,8 @@ def replay(
 @needs("realtime", "pyshmem")
 @click.command("bridge", short_help="Connect the engine with other software's streams.")
 @click.argument("stream", required=False)
-@option("--to", "slopes", metavar="STREAM", help="Publish the slopes as isio:NAME or dao:FILE.")
-@option("--commands-to", "commands", metavar="STREAM", help="Publish the commands as isio:NAME or dao:FILE.")
+@option("--to", "slopes", metavar="STREAM", help="Publish the slopes as isio:NAME.")
+@option("--commands-to", "commands", metavar="STREAM", help="Publish the commands as isio:NAME.")
 @name_option("Name of the pixel ring and of the engine's streams.")
 @FRAMES
 @SLOTS
@@ -120,11 +120,11 @@ def bridge(
     """Connect `faintspot realtime run` with other software's streams in shared memory.
 
     Frames of STREAM go into the pixel ring NAME; with --to and --commands-to the engine's slopes
-    (all x, then all y, px) and commands come out. Streams are pyshmem's (frames only), isio:NAME of
-    ImageStreamIO (milk, cacao) in $MILK_SHM_DIR, /milk/shm or /tmp, or dao:FILE.
+    (all x, then all y, px) and commands come out. Streams are pyshmem's (frames only), or isio:NAME
+    of ImageStreamIO (milk, cacao) in $MILK_SHM_DIR, /milk/shm or /tmp.
 
     The streams may come later, go away and come back, also with frames of another size. Frames keep the
-    number that their producer gave them (frame_id; of ImageStreamIO and dao the counter less one); where it
+    number that their producer gave them (frame_id; of ImageStreamIO the counter less one); where it
     gives none they are counted, from 0. uint16 frames stay so, other real ones become float32. Ctrl-C ends
     it.
 

@@ -21,7 +21,7 @@ ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_
 _WATCH_S = 1.0
 
 
-class BesideEngine(ABC):
+class BackgroundProcess(ABC):
     """Reader of a running engine's telemetry that answers to it, in another process than the engine.
 
     Parameters
@@ -92,7 +92,9 @@ class BesideEngine(ABC):
 
 
 @contextmanager
-def process_beside(command: str, arguments: Sequence[str], on_fault: Callable[[str], None]) -> Iterator[None]:
+def background_process(
+    command: str, arguments: Sequence[str], on_fault: Callable[[str], None]
+) -> Iterator[None]:
     """Run `faintspot realtime COMMAND ARGUMENTS` within a context; `on_fault` takes a line if it ends."""
     done = threading.Event()
     with (

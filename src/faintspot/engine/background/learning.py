@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.engine.background.background_process import BesideEngine, process_beside
+from faintspot.engine.background.background_process import BackgroundProcess, background_process
 from faintspot.engine.engine import Engine
 from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
 from faintspot.io.telemetry.recording import Telemetry, stored_names
 from faintspot.loop.control.configuration import Control, load_control, prior_std_px
 from faintspot.loop.control.identification.model import KALMAN
-from faintspot.loop.control.identification.relearning import FEWEST_FRAMES, Relearnt, relearn
+from faintspot.loop.control.identification.relearning import FEWEST_FRAMES, RelearntControl, relearn
 from faintspot.loop.telemetry.recording import CLOSED, site_of, telemetry_of_recording
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
@@ -30,7 +30,7 @@ from faintspot.slopes.sensor.layout import Layout
 _FROM_NOTHING_EVERY = 6  # learnings, as a search from known layers finds no new one
 
 
-class LearningBeside(BesideEngine):
+class BackgroundLearning(BackgroundProcess):
     """Learner of a running engine's Kalman filter, in another process than the engine.
 
     Parameters
@@ -62,7 +62,7 @@ class LearningBeside(BesideEngine):
         super().__init__(name)
         self._every_s = every_s
         self._cursor, self._records = self._reader.records.written, list[NDArray[Any]]()
-        self._last: Relearnt | None = None
+        self._last: RelearntControl | None = None
         self._count = 0
 
     def take(self) -> bool:
@@ -91,11 +91,11 @@ class LearningBeside(BesideEngine):
         return (int(last) - int(first)) / 1e9
 
     def answer(self) -> str:
-        """See `BesideEngine`: learn, and offer the filter."""
-        found, taken = self.learn()
-        return f"{found.summary()}; {'taken' if taken else 'not taken'}"
+        """See `BackgroundProcess`: learn, and offer the filter."""
+        relearnt, is_taken = self.learn()
+        return f"{relearnt.summary()}; {'taken' if is_taken else 'not taken'}"
 
-    def learn(self) -> tuple[Relearnt, bool]:
+    def learn(self) -> tuple[RelearntControl, bool]:
         """Learn from the records since the last time; return the result and whether the engine took it.
 
         Raises
@@ -111,34 +111,34 @@ class LearningBeside(BesideEngine):
         recording = Telemetry(**arrays, **images, changes=[], attributes=dict(self._reader.description))
         telemetry, rate_hz = telemetry_of_recording(recording, self._control, self._prior_std_px())
         anew = self._last is None or self._count % _FROM_NOTHING_EVERY == 0
-        start = None if anew or self._last is None else self._last.learnt.found
-        self._last = found = relearn(
+        start = None if anew or self._last is None else self._last.learnt.identified
+        self._last = relearnt = relearn(
             self._control.plant, self._control.model, telemetry, self._site, rate_hz, start
         )
         self._count += 1
-        self._report(found)
-        if found.is_better:
-            self._control = self._control.with_model(found.learnt.model)
-        return found, found.is_better
+        self._report(relearnt)
+        if relearnt.is_better:
+            self._control = self._control.with_model(relearnt.learnt.model)
+        return relearnt, relearnt.is_better
 
     def _prior_std_px(self) -> NDArray[np.float64] | None:
         """Return the prior of the engine's present estimator; None without one."""
         values = request(self._path, "get")["settings"]
-        given = {name: value for name, value in values.items() if value is not None}
-        return prior_std_px(Settings(given.pop("estimator"), **given), self._layout)
+        stated = {name: value for name, value in values.items() if value is not None}
+        return prior_std_px(Settings(stated.pop("estimator"), **stated), self._layout)
 
-    def _report(self, found: Relearnt) -> None:
+    def _report(self, relearnt: RelearntControl) -> None:
         """Tell the engine what was found, and hand the new filter to it if it is better."""
         with tempfile.TemporaryDirectory(prefix="faintspot-learn-") as folder:
             path = Path(folder) / "model.npz"
-            if found.is_better:
-                found.learnt.model.save(path)
+            if relearnt.is_better:
+                relearnt.learnt.model.save(path)
             request(
                 self._path,
                 "learnt",
                 timeout_s=LENGTHY_TIMEOUT_S,
-                found=found.summary(),
-                model=f"{path}" if found.is_better else None,
+                found=relearnt.summary(),
+                model=f"{path}" if relearnt.is_better else None,
             )
 
 
@@ -150,13 +150,13 @@ def learn_repeatedly(name: str, config: str | Path, every_s: float, say: Callabl
     Raises
     ------
     InputError
-        See `LearningBeside`.
+        See `BackgroundLearning`.
     """
-    LearningBeside(name, config, every_s).run(say)
+    BackgroundLearning(name, config, every_s).run(say)
 
 
 @contextmanager
-def learning_beside(
+def background_learning(
     engine: Engine, config: str | Path, every_s: float, say: Callable[[str], None]
 ) -> Iterator[None]:
     """Run the process that learns for an engine within a context; `say` takes a line if it ends."""
@@ -165,6 +165,6 @@ def learning_beside(
         engine.learning = {"fault": text}
         say(f"winds are not learnt again, the loop goes on: {text}")
 
-    known = "--config", f"{config}", "--name", engine.name, "--every", f"{every_s:g}"
-    with process_beside("learn", known, fault):
+    arguments = "--config", f"{config}", "--name", engine.name, "--every", f"{every_s:g}"
+    with background_process("learn", arguments, fault):
         yield

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.flags import INVALID
-from faintspot.engine.background.background_process import BesideEngine, process_beside
+from faintspot.engine.background.background_process import BackgroundProcess, background_process
 from faintspot.engine.engine import Engine
 from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
 from faintspot.loop.control.configuration import load_control
@@ -39,7 +39,7 @@ _LEAST_CHANGE = 0.02  # of the flux at other altitudes
 _LEAST_FLUX_CHANGE = 0.2
 
 
-class SodiumFollower(BesideEngine):
+class SodiumFollower(BackgroundProcess):
     """Follower of the sodium layer that a running engine's laser guide star shows.
 
     Parameters
@@ -76,8 +76,8 @@ class SodiumFollower(BesideEngine):
         super().__init__(name)
         self._cursors = [self._reader.records.written, self._reader.images.written]
         self._mean: MeanImages | None = None
-        self._known: KnownSodium | None = None
-        self._handed: KnownSodium | None = None
+        self._sodium: KnownSodium | None = None
+        self._in_use: KnownSodium | None = None
         self._fits, self._count, self._times_s = 0, 0, [0.0, 0.0]
         self._due_s = time.monotonic() + laser.follow_every_s
 
@@ -120,35 +120,35 @@ class SodiumFollower(BesideEngine):
         """
         assert self._mean is not None
         self._due_s = time.monotonic() + self._laser.follow_every_s
-        if self._known is None or self._fits % _SPOT_EVERY == 0:
-            self._known = KnownSodium.learnt(self._mean, self._star, self._profile, self._dark)
+        if self._sodium is None or self._fits % _SPOT_EVERY == 0:
+            self._sodium = KnownSodium.learnt(self._mean, self._star, self._profile, self._dark)
         else:
-            self._known = self._known.updated(self._mean)
+            self._sodium = self._sodium.updated(self._mean)
         self._fits += 1
-        self._profile = self._known.fit.profile
-        return self._known
+        self._profile = self._sodium.fit.profile
+        return self._sodium
 
     def answer(self) -> str | None:
-        """See `BesideEngine`: fit the profile, and hand it over if it is new."""
-        known = self.fit()
-        if not self.is_new(known):
+        """See `BackgroundProcess`: fit the profile, and hand it over if it is new."""
+        sodium = self.fit()
+        if not self.is_new(sodium):
             return None
-        frame = self.hand_over(known)
-        return f"{known.fit.profile}, spot {known.spot_fwhm_arcsec:.2f} arcsec, from frame {frame} on"
+        frame = self.hand_over(sodium)
+        return f"{sodium.fit.profile}, spot {sodium.spot_fwhm_arcsec:.2f} arcsec, from frame {frame} on"
 
-    def is_new(self, known: KnownSodium) -> bool:
+    def is_new(self, sodium: KnownSodium) -> bool:
         """Return whether profile, spot or flux differ from what the engine has."""
-        last = self._handed
+        last = self._in_use
         if last is None:
             return True
-        flux, before = known.fit.flux_e, np.maximum(last.fit.flux_e, 1e-3)
+        flux, before = sodium.fit.flux_e, np.maximum(last.fit.flux_e, 1e-3)
         return (
-            known.star is not last.star
-            or moved_part(known.fit.profile, last.fit.profile) > _LEAST_CHANGE
+            sodium.star is not last.star
+            or moved_part(sodium.fit.profile, last.fit.profile) > _LEAST_CHANGE
             or float(np.median(np.abs(flux / before - 1.0))) > _LEAST_FLUX_CHANGE
         )
 
-    def hand_over(self, known: KnownSodium) -> int | None:
+    def hand_over(self, sodium: KnownSodium) -> int | None:
         """Give the engine the spots of a profile; return the first frame measured with them.
 
         Raises
@@ -156,13 +156,13 @@ class SodiumFollower(BesideEngine):
         InputError
             When the engine refuses them, or does not answer.
         """
-        before = self._star.focused(self._laser.profile) if self._handed is None else self._handed.fit.profile
-        psf = known.psf(self._layout.window)
+        before = self._star.focused(self._laser.profile) if self._in_use is None else self._in_use.fit.profile
+        psf = sodium.psf(self._layout.window)
         with tempfile.TemporaryDirectory(prefix="faintspot-follow-") as folder:
             files = {"psf": f"{folder}/psf.npz", "score": None}
             psf.save(f"{folder}/psf.npz")
             if self._laser.matched_filter:
-                flux = np.maximum(known.fit.flux_e, 1.0)
+                flux = np.maximum(sodium.fit.flux_e, 1.0)
                 files["score"] = f"{folder}/score.npz"
                 matched_filter(psf, self._layout, self._calibration, flux).save(f"{folder}/score.npz")
             answer = request(
@@ -170,30 +170,30 @@ class SodiumFollower(BesideEngine):
                 "spots",
                 timeout_s=LENGTHY_TIMEOUT_S,
                 **files,
-                sodium=_as_values(known, before),
+                sodium=_as_values(sodium, before),
             )
-        self._handed = known
+        self._in_use = sodium
         frame: int | None = answer["frame"]
         return frame
 
 
-def moved_part(profile: SodiumProfile, other: SodiumProfile) -> float:
+def moved_part(profile: SodiumProfile, earlier: SodiumProfile) -> float:
     """Return the part of the flux that comes from other altitudes than in another profile."""
-    altitudes = np.union1d(profile.altitudes_m, other.altitudes_m)
+    altitudes = np.union1d(profile.altitudes_m, earlier.altitudes_m)
     density, before = (
-        np.interp(altitudes, each.altitudes_m, each.density, 0.0, 0.0) for each in (profile, other)
+        np.interp(altitudes, layer.altitudes_m, layer.density, 0.0, 0.0) for layer in (profile, earlier)
     )
     return 0.5 * float(np.trapezoid(np.abs(density - before), altitudes))
 
 
-def _as_values(known: KnownSodium, before: SodiumProfile) -> dict[str, Any]:
+def _as_values(sodium: KnownSodium, before: SodiumProfile) -> dict[str, Any]:
     """Return a profile and the one before as plain values: altitudes [km], flux per km."""
-    profile = known.fit.profile
+    profile = sodium.fit.profile
     earlier = np.interp(profile.altitudes_m, before.altitudes_m, before.density, 0.0, 0.0)
     return {
         "mean_km": round(profile.mean_m / 1e3, 2),
         "std_km": round(profile.std_m / 1e3, 2),
-        "spot_fwhm_arcsec": round(known.spot_fwhm_arcsec, 3),
+        "spot_fwhm_arcsec": round(sodium.spot_fwhm_arcsec, 3),
         "altitude_km": (profile.altitudes_m / 1e3).round(3).tolist(),
         "flux_per_km": (1e3 * profile.density).round(5).tolist(),
         "before_per_km": (1e3 * earlier).round(5).tolist(),
@@ -214,12 +214,12 @@ def follow_repeatedly(name: str, config: str | Path, say: Callable[[str], None])
 
 
 @contextmanager
-def following_beside(engine: Engine, config: str | Path, say: Callable[[str], None]) -> Iterator[None]:
+def background_sodium(engine: Engine, config: str | Path, say: Callable[[str], None]) -> Iterator[None]:
     """Run the process that follows the profile within a context; `say` takes a line if it ends."""
 
     def fault(text: str) -> None:
         engine.sodium = {**(engine.sodium or {}), "fault": text}
         say(f"the sodium profile is not followed, the engine goes on with the last one: {text}")
 
-    with process_beside("follow", ("--config", f"{config}", "--name", engine.name), fault):
+    with background_process("follow", ("--config", f"{config}", "--name", engine.name), fault):
         yield

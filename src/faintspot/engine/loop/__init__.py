@@ -1,1 +1,1 @@
-"""From slopes to commands: the control loop and its guard."""
+"""From slopes to commands: `control_loop`, its `guard`, new controllers (`successor`), and `poking`."""

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.engine.loop.guard import Guard
-from faintspot.engine.loop.successor import Ready, Successor
-from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.loop.successor import ControllerSuccessor, PreparedController
+from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.timing import Latencies
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import CompiledIntegrator, true_slopes
 from faintspot.loop.control.configuration import Control
-from faintspot.loop.control.identification.model import Model
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.guarded import Guarded
 from faintspot.slopes.kernels.compilation.compiling import Direct
@@ -64,21 +64,21 @@ class ControlLoop:
         self,
         control: Control,
         layout: Layout,
-        held: NDArray[np.floating] | None = None,
-        prior: Prior | None = None,
+        commands: NDArray[np.floating] | None = None,
+        prior: SlopePrior | None = None,
         threads: int = 1,
     ) -> None:
         self.control, self.latencies, self._threads = control, Latencies(), threads
         self._prior = prior
-        self._ready: dict[str, Ready] = {}
-        self._successor: Successor | None = None
+        self._ready: dict[str, PreparedController] = {}
+        self._successor: ControllerSuccessor | None = None
         self.make_ready(control.options.controller)
         self._on = self._ready[control.options.controller]
-        if held is not None:
-            self._line.hold(held.astype(np.float64))
+        if commands is not None:
+            self._line.hold(commands.astype(np.float64))
         self._slopes, self._errors = np.zeros((2, 2 * len(layout)))
         self._covariance = np.zeros(len(layout))
-        self._said = np.zeros(2)
+        self._statistics = np.zeros(2)
         self._true_slopes = Direct(true_slopes)
         self._removed_modes = control.removed_modes
         self._centroid_gain = float(control.options.centroid_gain)
@@ -141,10 +141,10 @@ class ControlLoop:
             self._slopes,
             self._errors,
             self._covariance,
-            self._said,
+            self._statistics,
         )
         if self._removed_modes:
-            self._removed_modes.remove(slopes.flags, self._slopes, self._said)
+            self._removed_modes.remove(slopes.flags, self._slopes, self._statistics)
         if self._flattened:
             self._flattened = False
             line.hold(np.zeros_like(line.latest))
@@ -166,7 +166,7 @@ class ControlLoop:
             Flux of that frame.
         """
         line, guard = self._line, self.guard
-        frame = self._said, line.spare, flux
+        frame = self._statistics, line.spare, flux
         if not self.closed:
             guard.watch(*frame)
             if guard.may_close_again:
@@ -175,10 +175,10 @@ class ControlLoop:
             self.closed, self.opened_because = False, reason
             self._flattened = guard.flattens
         if self._successor is not None:
-            self._follow_beside(self._successor)
+            self._let_follow(self._successor)
         self._expect()
 
-    def _follow_beside(self, successor: Successor) -> None:
+    def _let_follow(self, successor: ControllerSuccessor) -> None:
         """Let a new controller follow the last frame, or take over if it has settled or the loop is open."""
         on, prior = self._on, self._prior
         if self.closed and not self._begins and successor.is_settling:
@@ -231,7 +231,7 @@ class ControlLoop:
         if prior is not None:
             prior.forget()
 
-    def _update(self, on: Ready) -> None:
+    def _update(self, on: PreparedController) -> None:
         """Let a controller compute its command from the slopes."""
         try:
             if self._begins:
@@ -261,10 +261,10 @@ class ControlLoop:
             return
         self._ready[kind] = _prepared(self.control.with_controller(kind))
 
-    def renew(self, model: Model) -> None:
+    def renew(self, model: ControlModel) -> None:
         """Replace the model of a learnt controller.
 
-        While the loop is closed, a new filter first follows it, see `Successor`.
+        While the loop is closed, a new filter first follows it, see `ControllerSuccessor`.
 
         Raises
         ------
@@ -273,7 +273,7 @@ class ControlLoop:
         """
         ready = _prepared(self.control.with_model(model))
         if ready.takes_prior:
-            self._successor = Successor(ready)
+            self._successor = ControllerSuccessor(ready)
         else:
             self._ready[model.kind] = ready
         self.control = replace(self.control, model=model)
@@ -333,8 +333,8 @@ class ControlLoop:
 
     @property
     def _integrator(self) -> CompiledIntegrator | None:
-        controllers = [each.controller for each in list(self._ready.values())]
-        return next((each for each in controllers if isinstance(each, CompiledIntegrator)), None)
+        controllers = [ready.controller for ready in list(self._ready.values())]
+        return next((made for made in controllers if isinstance(made, CompiledIntegrator)), None)
 
     @property
     def state(self) -> str:
@@ -356,16 +356,16 @@ class ControlLoop:
 
     def _warm_up(self, n: int) -> None:
         """Compile all controllers; the mirror's commands stay."""
-        held = self._line.latest.copy()
+        commands = self._line.latest.copy()
         self.closed = True
         self.follow(Slopes(*(np.zeros(n, kind) for kind in RESULT_TYPES)), -1)
         self.closed, self._begins = False, False
-        self._line.hold(held)
+        self._line.hold(commands)
 
 
-def _prepared(control: Control) -> Ready:
+def _prepared(control: Control) -> PreparedController:
     """Return the controller; refuse one whose commands are not finite."""
     control.rehearse()
     # A learnt controller may not know its errors while its integrator is used.
     with np.errstate(all="ignore"):
-        return Ready.of(control)
+        return PreparedController.of(control)

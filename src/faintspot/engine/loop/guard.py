@@ -61,27 +61,27 @@ class Guard:
         self._returns = False
         self._forget()
 
-    def watch(self, said: Floats, commands: Floats, flux: NDArray[np.float32]) -> None:
+    def watch(self, summary: Floats, commands: Floats, flux: NDArray[np.float32]) -> None:
         """Take a frame: the summary of `true_slopes`, the commands that acted in it, and its flux (n,)."""
         self._frames += 1
-        self._invalid += self._share * (said.item(INVALID_PART) - self._invalid)
+        self._invalid += self._share * (summary.item(INVALID_PART) - self._invalid)
         most = self._largest_px**2 * max(2.0, _MOST_OF_A_FRAME / self._share)
-        self._square += self._share * (min(said.item(MEAN_SQUARE), most) - self._square)
+        self._square += self._share * (min(summary.item(MEAN_SQUARE), most) - self._square)
         self._spots.take(commands, flux)
 
-    def objection(self, said: Floats, commands: Floats, flux: NDArray[np.float32], latest: Floats) -> str:
+    def objection(self, summary: Floats, commands: Floats, flux: NDArray[np.float32], latest: Floats) -> str:
         """Take a frame of a closed loop; return why the loop must be opened, or "".
 
         A mean starts as if all earlier values had been 0, so that no single frame decides.
 
         Parameters
         ----------
-        said, commands, flux
+        summary, commands, flux
             As for `watch`.
         latest : (commands,) array
             Commands computed from this frame.
         """
-        self.watch(said, commands, flux)
+        self.watch(summary, commands, flux)
         options = self._options
         if options.largest_command is not None:
             at_limit = np.count_nonzero(np.abs(latest) >= options.largest_command) / len(latest)
@@ -164,7 +164,7 @@ class LostSpots:
 
     def __init__(self, interaction: Floats, frames: int) -> None:
         self._columns = np.ascontiguousarray(interaction.T, np.float32)
-        self._of_late, self._said = frames, np.zeros(3)
+        self._of_late, self._statistics = frames, np.zeros(3)
         self._work = tuple(np.zeros((1, side), np.float32) for side in self._columns.shape)
         self._summarise = Direct(displaced_flux)
         self.forget()
@@ -178,15 +178,15 @@ class LostSpots:
 
     def take(self, commands: Floats, flux: NDArray[np.float32]) -> None:
         """Take a frame: the commands that acted in it, and its flux (n,)."""
-        self._summarise(commands, flux, self._columns, self._work, self._said)
-        said = self._said
-        seen = said.item(FLUX)
+        self._summarise(commands, flux, self._columns, self._work, self._statistics)
+        statistics = self._statistics
+        flux_e = statistics.item(FLUX)
         self._frames += 1
         share = 1 / min(self._frames, _MEMORY * self._of_late)
-        self._flux += share * (seen - self._flux)
-        self._displacement += share * (said.item(DISPLACEMENT) - self._displacement)
-        self._product += share * (said.item(FLUX_TIMES_DISPLACEMENT) - self._product)
-        self._late += (seen - self._late) / min(self._frames, self._of_late)
+        self._flux += share * (flux_e - self._flux)
+        self._displacement += share * (statistics.item(DISPLACEMENT) - self._displacement)
+        self._product += share * (statistics.item(FLUX_TIMES_DISPLACEMENT) - self._product)
+        self._late += (flux_e - self._late) / min(self._frames, self._of_late)
         if self._frames >= _FIRST * self._of_late:
             self._largest = max(self._largest, self._late)
 
@@ -198,5 +198,5 @@ class LostSpots:
 
     def described(self) -> str:
         """Return what is wrong."""
-        left = 100 * self._late / self._largest
-        return f"{left:.0f} % of the flux left, as the mirror has moved spots away"
+        percent = 100 * self._late / self._largest
+        return f"{percent:.0f} % of the flux left, as the mirror has moved spots away"

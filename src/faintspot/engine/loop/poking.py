@@ -81,7 +81,7 @@ class StreamedMirror(Closing):
         self._send(command)
         cursor = self._reader.records.written
         after = None
-        found: list[NDArray[np.void]] = []
+        blocks: list[NDArray[np.void]] = []
         count, end = 0, time.monotonic() + _NO_FRAMES_S
         while count < self._frames:
             records, cursor, _ = self._reader.records.since(cursor)
@@ -91,10 +91,10 @@ class StreamedMirror(Closing):
             end = time.monotonic() + _NO_FRAMES_S
             after = int(records["sequence"][0]) + self._settle if after is None else after
             settled = records[records["sequence"] >= after][: self._frames - count]
-            found.append(settled)
+            blocks.append(settled)
             count += len(settled)
-        seen = np.concatenate(found)
-        return np.concatenate([seen["x"], seen["y"]], axis=1).astype(np.float64), seen["flags"]
+        records_ = np.concatenate(blocks)
+        return np.concatenate([records_["x"], records_["y"]], axis=1).astype(np.float64), records_["flags"]
 
     def _send(self, command: Floats) -> None:
         self._stream.write(command.astype(np.float32), frame_id=max(self._reader.records.written - 1, 0))

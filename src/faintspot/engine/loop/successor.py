@@ -19,7 +19,7 @@ from faintspot.loop.control.telemetry import without_prior
 Floats = NDArray[np.float64]
 
 
-class Ready(NamedTuple):
+class PreparedController(NamedTuple):
     """A controller that has been prepared."""
 
     kind: str
@@ -51,7 +51,7 @@ class Ready(NamedTuple):
         )
 
 
-class Successor:
+class ControllerSuccessor:
     """Controller that follows the frames of a loop beside the controller that drives the mirror.
 
     Its own commands are sent nowhere: with each frame, its delay line is that of the mirror again. On large
@@ -63,7 +63,7 @@ class Successor:
         With a guarded controller.
     """
 
-    def __init__(self, ready: Ready) -> None:
+    def __init__(self, ready: PreparedController) -> None:
         self.ready, self._frames = ready, 0
         self._settles_in = 0 if isinstance(ready.controller, LargeGuarded) else SETTLE_FRAMES
         self.has_failed = False
@@ -103,7 +103,7 @@ class Successor:
             self.has_failed = True
         self._frames += 1
 
-    def take_over(self, line: CommandDelayLine) -> Ready:
+    def take_over(self, line: CommandDelayLine) -> PreparedController:
         """Return the controller, whose commands go on from the mirror's."""
         self.ready.line.copy_from(line)
         if self._frames == 0:

@@ -57,7 +57,7 @@ class Source(Protocol):
         """Return the data since the last call; None if there is no source."""
         ...
 
-    def place(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
         """Return the state of the source as plain values for the page."""
         ...
 

@@ -22,19 +22,19 @@ _MOST_CHANGES = 100
 class ClientRequests(Protocol):
     """Requests that a page may make, by name; a refused request raises InputError."""
 
-    def known(self) -> Mapping[str, ClientRequest]:
+    def functions(self) -> Mapping[str, ClientRequest]:
         """Return the functions of the requests, by name."""
         ...
 
 
-def answered(client_requests: ClientRequests, asked: dict[str, Any]) -> dict[str, Any]:
+def answered(client_requests: ClientRequests, request: dict[str, Any]) -> dict[str, Any]:
     """Carry out a request; always return an answer."""
-    known = client_requests.known()
+    functions = client_requests.functions()
     try:
-        wish = known.get(asked["do"])
+        wish = functions.get(request["do"])
         if wish is None:
-            raise InputError(f"do = {asked['do']!r:.40}: expected one of {', '.join(known)}")
-        return {"ok": True, **wish(asked)}
+            raise InputError(f"do = {request['do']!r:.40}: expected one of {', '.join(functions)}")
+        return {"ok": True, **wish(request)}
     except InputError as error:
         return {"ok": False, "error": str(error)}
     except Exception as error:  # a fault in a request must not end the server
@@ -56,23 +56,23 @@ class EngineRequests:
         self._name, self._path = name, socket_path(name)
         self.recording = Recording(name, Path(folder))
 
-    def known(self) -> Mapping[str, ClientRequest]:
+    def functions(self) -> Mapping[str, ClientRequest]:
         """Return the functions of the requests, by name."""
         return {
             "set": self._set,
             "interleave": self._interleave,
             "loop": self._loop,
-            "record": lambda asked: self.recording.start(asked.get("file")),
-            "stop_recording": lambda asked: self.recording.stop(),
+            "record": lambda request: self.recording.start(request.get("file")),
+            "stop_recording": lambda request: self.recording.stop(),
         }
 
     def close(self) -> None:
         """End a recording."""
         self.recording.stop()
 
-    def _set(self, asked: dict[str, Any]) -> Mapping[str, Any]:
+    def _set(self, request: dict[str, Any]) -> Mapping[str, Any]:
         """Change settings: "changes" (a list of NAME=VALUE) and "subapertures" ("" for all)."""
-        texts, where = asked.get("changes"), asked.get("subapertures") or ""
+        texts, where = request.get("changes"), request.get("subapertures") or ""
         if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
             raise InputError("changes: expected a list of NAME=VALUE")
         if len(texts) > _MOST_CHANGES or not isinstance(where, str):
@@ -80,18 +80,18 @@ class EngineRequests:
                 f"changes: expected at most {_MOST_CHANGES}, and sub-apertures such as 4,5,10-20"
             )
         changes = parse_changes(texts)
-        places = parse_subapertures(where) if where.strip() else None
-        reply = self._ask("set", changes=changes, where=places)
+        indices = parse_subapertures(where) if where.strip() else None
+        reply = self._ask("set", changes=changes, where=indices)
         return {"text": since(reply["frame"])}
 
-    def _interleave(self, asked: dict[str, Any]) -> Mapping[str, Any]:
+    def _interleave(self, request: dict[str, Any]) -> Mapping[str, Any]:
         """Interleave configurations as `faintspot realtime interleave`."""
-        reply = self._ask("interleave", methods=asked.get("methods"), every=asked.get("every"))
+        reply = self._ask("interleave", methods=request.get("methods"), every=request.get("every"))
         return {"text": since(reply.get("frame"))}
 
-    def _loop(self, asked: dict[str, Any]) -> Mapping[str, Any]:
+    def _loop(self, request: dict[str, Any]) -> Mapping[str, Any]:
         """Control the loop: "action" open, close, flat or gain, with "gain"."""
-        fields = {name: asked[name] for name in ("action", "gain") if asked.get(name) is not None}
+        fields = {name: request[name] for name in ("action", "gain") if request.get(name) is not None}
         loop = self._ask("loop", **fields)["loop"]
         gain = "" if loop.get("gain") is None else f", gain {loop['gain']:g}"
         return {"text": f"{loop['state']}{gain}"}
@@ -115,7 +115,7 @@ class Recording:
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
-        self._said: dict[str, Any] = {"running": False}
+        self._status: dict[str, Any] = {"running": False}
 
     def start(self, file: Any) -> Mapping[str, Any]:
         """Start a recording to a new store.
@@ -133,7 +133,7 @@ class Recording:
                 raise InputError("file: a recording is already running; stop it first")
             recorder = Recorder(self._name, self._folder / file)
             self._stopping.clear()
-            self._said = {"running": True, "file": file, "frames": 0}
+            self._status = {"running": True, "file": file, "frames": 0}
             self._thread = threading.Thread(
                 target=self._record, args=(recorder, file), name="faintspot-recording", daemon=True
             )
@@ -150,16 +150,16 @@ class Recording:
 
     def status(self) -> dict[str, Any]:
         """Return the state of the present or last recording."""
-        return dict(self._said)
+        return dict(self._status)
 
     def _record(self, recorder: Recorder, file: str) -> None:
         def progress(frames: int) -> None:
-            self._said["frames"] = frames
+            self._status["frames"] = frames
 
         try:
             report = recorder.run(stop=self._stopping, progress=progress)
         except InputError as error:
-            self._said = {"running": False, "error": str(error)}
+            self._status = {"running": False, "error": str(error)}
             return
         text = f"{file}: {report.frames} frames in {report.seconds:.0f} s, {report.dropped} dropped"
-        self._said = {"running": False, "text": f"{text} ({report.ended_because})"}
+        self._status = {"running": False, "text": f"{text} ({report.ended_because})"}

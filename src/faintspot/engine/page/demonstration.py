@@ -32,7 +32,7 @@ from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.simulation import measure_gains
 from faintspot.loop.simulation.telescope.calibration import make_pipeline
 from faintspot.loop.simulation.telescope.model import prepare
-from faintspot.slopes.pipeline import configuration as configuration_file
+from faintspot.slopes.pipeline.configuration import save
 from faintspot.slopes.pipeline.settings import Settings
 
 Floats = NDArray[np.float64]
@@ -128,7 +128,7 @@ class LiveDemonstration:
         # Settings of one method, which the other methods ignore.
         settings = Settings("map", prior_std_px=_PRIOR_PX, flux_e=self.photons)
         engine = self.folder / "faintspot.toml"
-        configuration_file.save(engine, settings)
+        save(engine, settings)
         write_engine_files(observed, self.folder, KALMAN)
         save_control(engine, gain=_GAIN, centroid_gain=1.0, prediction=CONTROLLER)
         return loop, engine
@@ -165,16 +165,16 @@ class LiveDemonstration:
             processes.start(_ENGINE, ["realtime", "run", "--config", str(engine), *name, *turns, *images])
             say("starting telescope and engine; on first use the engine compiles for about a minute")
 
-            def wait(condition: Callable[[], bool], what: str, timeout_s: float) -> None:
-                processes.wait_until(lambda: stop.is_set() or condition(), what, timeout_s)
+            def wait(condition: Callable[[], bool], awaited: str, timeout_s: float) -> None:
+                processes.wait_until(lambda: stop.is_set() or condition(), awaited, timeout_s)
 
             wait(lambda: self._frames_measured() > 0, "slopes of the engine", _COMPILING_S)
             processes.start(_PAGE, ["live", *name, "--port", str(self.port)])
-            wait(lambda: len(processes.said(_PAGE)) > 0, "the page", _PATIENCE_S)
+            wait(lambda: len(processes.output(_PAGE)) > 0, "the page", _PATIENCE_S)
             if stop.is_set():
                 return shown
             processes.check()
-            say(f"{processes.said(_PAGE)[0]}\nOpen it in a browser; Ctrl-C ends it and prints a table")
+            say(f"{processes.output(_PAGE)[0]}\nOpen it in a browser; Ctrl-C ends it and prints a table")
             begun = self._frames_measured()
             wait(lambda: self._frames_measured() >= begun + _OPEN_FRAMES, "frames", _PATIENCE_S)
             with _Watcher(self.name, shown, _LOOKS_PER_FRAME * self.rate_hz) as watcher:
@@ -220,8 +220,8 @@ class Shown:
     @property
     def table(self) -> Floats:
         """`rows` and `truth` together, (frames, 6); NaN where the truth is not known."""
-        known = [self.truth.get(int(row[0]), (np.nan, np.nan)) for row in self.rows]
-        return np.hstack([np.array(self.rows).reshape(-1, 4), np.array(known).reshape(-1, 2)])
+        truths = [self.truth.get(int(row[0]), (np.nan, np.nan)) for row in self.rows]
+        return np.hstack([np.array(self.rows).reshape(-1, 4), np.array(truths).reshape(-1, 2)])
 
     @property
     def open_strehl(self) -> float:
@@ -254,9 +254,9 @@ class Shown:
         strehl = np.where(since < _SETTLE_FRAMES, np.nan, frames[:, 4])
         return [
             MethodShown(
-                compared, int(np.sum(method == place)), *np.percentile(frames[method == place, 3], (50, 99))
+                compared, int(np.sum(method == index)), *np.percentile(frames[method == index, 3], (50, 99))
             )
-            for place, compared in enumerate(compared_methods(method, self.methods, strehl))
+            for index, compared in enumerate(compared_methods(method, self.methods, strehl))
         ]
 
 
@@ -300,4 +300,4 @@ class _Watcher(Closing):
         records, self._cursor, _ = self._reader.records.since(self._cursor)
         latency_us = (records["published_time_ns"] - records["last_row_time_ns"]) / 1e3
         columns = (records["frame"], records["method"], records["loop"], latency_us)
-        self._shown.rows += zip(*(each.tolist() for each in columns), strict=True)
+        self._shown.rows += zip(*(column.tolist() for column in columns), strict=True)

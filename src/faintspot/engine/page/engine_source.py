@@ -71,10 +71,10 @@ class EngineSource:
             anew=anew,
         )
 
-    def place(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
         """Return the engine's name and whether it is running."""
-        there = self._reader is not None
-        return {"kind": "engine", "name": self.name, "there": there}
+        is_running = self._reader is not None
+        return {"kind": "engine", "name": self.name, "there": is_running}
 
     def close(self) -> None:
         """Close the shared memory."""

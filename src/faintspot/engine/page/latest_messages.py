@@ -27,8 +27,8 @@ class LatestMessages:
         """Remove the message of a kind: later clients do not get it."""
         self._messages.pop(kind, None)
 
-    async def newer(self, seen: int) -> list[tuple[int, bytes]]:
-        """Wait for messages posted after number `seen`; return them with their numbers, in order."""
-        while not (messages := sorted(item for item in self._messages.values() if item[0] > seen)):
+    async def newer(self, last: int) -> list[tuple[int, bytes]]:
+        """Wait for messages posted after number `last`; return them with their numbers, in order."""
+        while not (messages := sorted(item for item in self._messages.values() if item[0] > last)):
             await self._changed.wait()
         return messages

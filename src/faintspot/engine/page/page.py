@@ -33,15 +33,15 @@ class Page:
         self._drawing: FrameDrawing | None = None
         self._figures_s = self._methods_s = 0.0
         self._methods: list[dict[str, Any]] = []
-        self._place: dict[str, Any] | None = None
+        self._state: dict[str, Any] | None = None
 
     def step(self) -> None:
         """Read the source once and send updates."""
         try:
             batch = self.source.read()
-            place = self.source.place()
+            state = self.source.state()
         except InputError as error:  # a damaged recording
-            batch, place = None, {**self.source.place(), "error": str(error)}
+            batch, state = None, {**self.source.state(), "error": str(error)}
         if batch is not None:
             if batch.anew or self._drawing is None:
                 self._begin()
@@ -52,9 +52,9 @@ class Page:
             if len(batch.records) or batch.anew:
                 self._tell("now", packed("now", *self.page_state.now()))
             self._tell_figures(now=batch.anew)
-        if place != self._place:
-            self._place = place
-            self._tell("place", packed("place", place))
+        if state != self._state:
+            self._state = state
+            self._tell("place", packed("place", state))
 
     def _begin(self) -> None:
         """Clear data of another engine, or of another part of the recording."""

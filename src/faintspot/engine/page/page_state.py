@@ -58,7 +58,7 @@ class PageState:
         self._frames: deque[Floats] = deque()
         self._first_method = 0  # number of the first method of the present interleaving
         self._means: dict[int, Floats] = {}  # mean slopes by method, and their numbers of frames
-        self._seen_of: defaultdict[int, int] = defaultdict(int)
+        self._frames_of: defaultdict[int, int] = defaultdict(int)
         # The last ones: a frame's truth may be known before its record.
         self._truths: deque[tuple[int, float, float]] = deque(maxlen=4)
         self._last: NDArray[Any] | None = None  # records of the previous read
@@ -89,8 +89,8 @@ class PageState:
         """Return the record of a frame from the last read; None if it is older."""
         if self._last is None:
             return None
-        places = np.flatnonzero(self._last["frame"] == frame)
-        return self._last[places[-1]] if len(places) else None
+        indices = np.flatnonzero(self._last["frame"] == frame)
+        return self._last[indices[-1]] if len(indices) else None
 
     # Messages to the page ------------------------------------------------------------------------------
 
@@ -148,10 +148,10 @@ class PageState:
         present = np.unique(method)
         if len(present) < 2:
             return []
-        names = [self._method_name(place) for place in present]
+        names = [self._method_name(number) for number in present]
         rows: list[dict[str, Any]] = [
-            {"method": name, "frames": int(np.sum(method == place)), "figures": {}}
-            for name, place in zip(names, present, strict=True)
+            {"method": name, "frames": int(np.sum(method == number)), "figures": {}}
+            for name, number in zip(names, present, strict=True)
         ]
         for title, (column, factor) in _COMPARED.items():
             values = factor * frames[:, _FRAME.index(column)]
@@ -166,37 +166,37 @@ class PageState:
         """Return a row of `_FRAME` for each record."""
         valid = (records["flags"] & INVALID) == 0
         count = valid.sum(axis=1)
-        some = np.where(count > 0, count, np.nan)
+        n_valid = np.where(count > 0, count, np.nan)
         rows = np.full((len(records), len(_FRAME)), np.nan)
         columns: Mapping[str, Any] = {
             "time_s": records["last_row_time_ns"] / 1e9,
             "method": records["method"],
             "latency_us": (records["published_time_ns"] - records["last_row_time_ns"]) / 1e3,
-            "rms_px": self._rms(records, valid, some),
-            "flux_e": np.where(valid, records["flux"], 0.0).sum(axis=1) / some,
+            "rms_px": self._rms(records, valid, n_valid),
+            "flux_e": np.where(valid, records["flux"], 0.0).sum(axis=1) / n_valid,
             "valid": valid.mean(axis=1),
         }
         for name, values in columns.items():
             rows[:, _FRAME.index(name)] = values
         return rows
 
-    def _rms(self, records: NDArray[Any], valid: NDArray[np.bool_], some: Floats) -> Floats:
+    def _rms(self, records: NDArray[Any], valid: NDArray[np.bool_], n_valid: Floats) -> Floats:
         """Return the rms of each frame's slopes about the sub-apertures' running means for its method."""
         squares = np.full(len(records), np.nan)
         for method in np.unique(records["method"]):
-            own = records["method"] == method
-            self._seen_of[int(method)] += own.sum()
-            used = valid[own]
-            slopes = np.stack([records["x"][own], records["y"][own]]).astype(np.float64)
+            rows = records["method"] == method
+            self._frames_of[int(method)] += rows.sum()
+            used = valid[rows]
+            slopes = np.stack([records["x"][rows], records["y"][rows]]).astype(np.float64)
             mean = np.where(used, slopes, 0.0).sum(axis=1) / np.maximum(used.sum(axis=0), 1)
             before = self._means.get(int(method), mean)
-            weight = min(1.0, own.sum() / _MEAN_FRAMES)
+            weight = min(1.0, rows.sum() / _MEAN_FRAMES)
             self._means[int(method)] = before + weight * (mean - before)
-            if self._seen_of[int(method)] < _FEWEST_FRAMES:
+            if self._frames_of[int(method)] < _FEWEST_FRAMES:
                 continue
             deviation = np.where(used, slopes - self._means[int(method)][:, None], 0.0)
-            squares[own] = np.sum(deviation**2, axis=(0, 2))
-        return np.asarray(np.sqrt(squares / (2 * some)))
+            squares[rows] = np.sum(deviation**2, axis=(0, 2))
+        return np.asarray(np.sqrt(squares / (2 * n_valid)))
 
     def _lost_in(self, records: NDArray[Any]) -> int:
         """Return the number of missing frame numbers; 0 if the camera restarted its numbering."""

@@ -29,7 +29,7 @@ class FrameDrawing:
         height, width = layout.window
         rows = layout.corners[:, 0, None, None] + np.arange(height)[:, None]
         columns = layout.corners[:, 1, None, None] + np.arange(width)
-        self._places = np.broadcast_arrays(rows, columns)
+        self._pixels = np.broadcast_arrays(rows, columns)
 
     def sensor(self) -> bytes:
         """Return the message with the sensor's geometry: positions in pixels of the frame."""
@@ -47,7 +47,7 @@ class FrameDrawing:
         raw, raw_range = _in_bytes(picture.raw)
         stack, denoised_range = _in_bytes(picture.denoised)
         denoised = np.zeros(self.layout.frame_shape, np.uint8)
-        denoised[tuple(self._places)] = np.maximum(stack, 1)  # 0: no sub-aperture
+        denoised[tuple(self._pixels)] = np.maximum(stack, 1)  # 0: no sub-aperture
         arrays = {"raw": raw, "denoised": denoised}
         if record is not None:
             arrays |= {name: record[name] for name in ("x", "y", "flags")}

@@ -56,9 +56,9 @@ class RecordingSource:
         times = store.read("last_row_time_ns", 0, store.frames)
         self._times_s = np.maximum.accumulate((times - times[0]) / 1e9)
         frames = store.read("frame", 0, store.frames)
-        self._pictures = places_of(store.read("image_frame", 0, store.images), frames)
-        self._change_places = np.searchsorted(frames, changed)
-        self._told = 0
+        self._pictures = indices_of(store.read("image_frame", 0, store.images), frames)
+        self._change_indices = np.searchsorted(frames, changed)
+        self._n_sent = 0
         self._lock = threading.Lock()  # for the state below: read by one thread, changed by others
         self._playing, self._speed, self._position_s = True, 1.0, 0.0
         self._looked_s = time.monotonic()
@@ -91,7 +91,7 @@ class RecordingSource:
             anew=moved,
         )
 
-    def place(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
         """Return the moment that is shown, and whether it is playing."""
         with self._lock:
             return {
@@ -110,13 +110,13 @@ class RecordingSource:
 
     # Requests of clients -------------------------------------------------------------------------------
 
-    def known(self) -> Mapping[str, ClientRequest]:
+    def functions(self) -> Mapping[str, ClientRequest]:
         """Return the functions of the requests, by name."""
         return {"play": self._play}
 
-    def _play(self, asked: dict[str, Any]) -> Mapping[str, Any]:
+    def _play(self, request: dict[str, Any]) -> Mapping[str, Any]:
         """Move to "position_s", play or pause ("playing"), and set the "speed"."""
-        position, speed, playing = (asked.get(name) for name in ("position_s", "speed", "playing"))
+        position, speed, playing = (request.get(name) for name in ("position_s", "speed", "playing"))
         if position is not None:
             position = number_between("position_s", position, 0)
         if speed is not None:
@@ -175,23 +175,23 @@ class RecordingSource:
 
     def _changes(self, end: int, anew: bool) -> list[dict[str, Any]]:
         """Return the changes of settings up to this moment that have not been sent yet."""
-        told = 0 if anew else self._told
-        self._told = int(np.searchsorted(self._change_places, end))
-        return self._store.changes[told : self._told]
+        sent = 0 if anew else self._n_sent
+        self._n_sent = int(np.searchsorted(self._change_indices, end))
+        return self._store.changes[sent : self._n_sent]
 
 
-def places_of(wanted: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArray[np.int64]:
+def indices_of(sought: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the index of each wanted frame among the frames, both in order of arrival.
 
     A camera may restart its frame numbers, so each number is searched for after the previous match. A missing
     frame gets the index before it.
     """
-    places = np.zeros(len(wanted), np.int64)
+    indices = np.zeros(len(sought), np.int64)
     candidates: dict[int, list[int]] = {}
-    for place in np.flatnonzero(np.isin(frames, wanted)):
-        candidates.setdefault(int(frames[place]), []).append(int(place))
+    for row in np.flatnonzero(np.isin(frames, sought)):
+        candidates.setdefault(int(frames[row]), []).append(int(row))
     before = 0
-    for index, frame in enumerate(wanted):
-        before = next((place for place in candidates.get(int(frame), []) if place >= before), before)
-        places[index] = before
-    return places
+    for index, frame in enumerate(sought):
+        before = next((match for match in candidates.get(int(frame), []) if match >= before), before)
+        indices[index] = before
+    return indices

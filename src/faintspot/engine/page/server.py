@@ -30,7 +30,7 @@ try:
     from tornado.web import Application, HTTPError, RequestHandler
     from tornado.websocket import WebSocketClosedError, WebSocketHandler
 except ImportError:
-    raise MissingExtraError("tornado", "live", "The live page") from None
+    raise MissingExtraError("tornado", "realtime", "The live page") from None
 
 LARGEST_REQUEST = 16 * 1024
 MOST_CLIENTS = 32
@@ -270,31 +270,31 @@ class Client(_Guarded, WebSocketHandler):
     async def _greeted(self, request: dict[str, Any]) -> dict[str, Any]:
         """Admit a client with the rights of its token."""
         token, access = request.get("token"), self.server.access
-        known = request.get("do") == "hello" and access.knows(token)
-        if not known and (token or access.reading_needs_token):
+        is_known = request.get("do") == "hello" and access.knows(token)
+        if not is_known and (token or access.reading_needs_token):
             await asyncio.sleep(_WRONG_TOKEN_S)
             if access.reading_needs_token:
                 return {"ok": False, "error": "this page needs the token that was printed at the start"}
-        self._may_change = self._may_change or known
+        self._may_change = self._may_change or is_known
         if self._feeding is None:
             self._too_late.cancel()
             self._feeding = asyncio.get_running_loop().create_task(self._feed())
-        if token and not known:
+        if token and not is_known:
             return {"ok": False, "error": "wrong token, expected the one that was printed at the start"}
         return {"ok": True, "may_change": self._may_change}
 
     async def _feed(self) -> None:
         """Send the newest messages one after another; messages missed by a slow client are skipped."""
-        seen = 0
+        last = 0
         with contextlib.suppress(WebSocketClosedError):
             while True:
-                number, message = (await self.server.latest_messages.newer(seen))[0]
+                number, message = (await self.server.latest_messages.newer(last))[0]
                 try:
                     await asyncio.wait_for(self.write_message(message, binary=True), _SLOW_S)
                 except TimeoutError:
                     self.close(_TOO_SLOW)
                     return
-                seen = number
+                last = number
 
 
 def _parsed(message: str | bytes) -> dict[str, Any]:

@@ -63,11 +63,11 @@ def serve(
             requests = used.enter_context(closing(EngineRequests(shown, folder)))
             server = LiveServer(source, requests, access, address, port)
 
-            def told(kind: str, values: dict[str, Any]) -> None:
+            def send(kind: str, values: dict[str, Any]) -> None:
                 recording = {"recording": requests.recording.status()} if kind == "status" else {}
                 server.tell(kind, values | recording)
 
-            used.enter_context(closing(StatusPoller(shown, told)))
+            used.enter_context(closing(StatusPoller(shown, send)))
         ready(server)
         await server.run(stop)
 

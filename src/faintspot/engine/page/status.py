@@ -32,7 +32,7 @@ class StatusPoller:
     def __init__(self, name: str, tell: Callable[[str, dict[str, Any]], None]) -> None:
         self._path, self._tell = socket_path(name), tell
         self._stopping = threading.Event()
-        self._known: tuple[Any, ...] | None = None
+        self._version: tuple[Any, ...] | None = None
         self._thread = threading.Thread(target=self._run, name="faintspot-status", daemon=True)
         self._thread.start()
 
@@ -46,7 +46,7 @@ class StatusPoller:
             try:
                 self._ask()
             except InputError as error:
-                self._known = None
+                self._version = None
                 self._tell("status", {"there": False, "error": str(error)})
             self._stopping.wait(_EVERY_S)
 
@@ -56,10 +56,10 @@ class StatusPoller:
         counters, source = status["counters"], status["source"]
         version = (counters["settings_changes"], status["estimator"], source and source["pid"])
         self._tell("status", {"there": True, **status})
-        if version != self._known:
+        if version != self._version:
             values = request(self._path, "get", timeout_s=_PATIENCE_S)["settings"]
             self._tell("settings", {"settings": settings_rows(values)})
-            self._known = version
+            self._version = version
 
 
 def settings_rows(values: dict[str, Any]) -> list[dict[str, Any]]:

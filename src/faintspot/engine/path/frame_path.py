@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.workers import Workers
 from faintspot.loop.control.configuration import prior_std_px
 from faintspot.slopes.kernels.compilation.compiling import Direct
@@ -80,7 +80,7 @@ class _Groups:
         slots: Sequence[NDArray[Any]] | NDArray[Any],
         groups: tuple[int, int],
         shares: int,
-        prior: Prior | None,
+        prior: SlopePrior | None,
     ) -> None:
         self._last_rows = last_rows_of_groups(pipeline, pipeline.width)
         first, count = groups[0], groups[1] - groups[0]
@@ -120,11 +120,11 @@ class _Groups:
         control, pace = waiting
         cells = progress.cells, progress.frame_cell, progress.rows_cell
         arrival = Arrival(*cells, control, STOP_CELL, pace, self._due)
-        rest = self._scratch[share], *after, part
+        arguments = self._scratch[share], *after, part
         pace[PENDING] = start
         if rehearse is not None:
             for group in sorted({start, last}):
-                if self._kernel(arrival, number, self._last_rows, *work, start, group, *rest) < group:
+                if self._kernel(arrival, number, self._last_rows, *work, start, group, *arguments) < group:
                     return False
                 start = group
                 if group == stop:
@@ -133,10 +133,10 @@ class _Groups:
                 self._multiply(arrival, number, rows, group, self._width, after[0], part)
                 if self._sleep(arrival, number, rows, group):
                     # A frame that has passed is not waited for: only code and data come into the cache again.
-                    self._kernel(arrival, -1, self._last_rows, *work, last, last + 1, *rest)
+                    self._kernel(arrival, -1, self._last_rows, *work, last, last + 1, *arguments)
                     rehearse()
                     pace[COLD] = 0
-        done: int = self._kernel(arrival, number, self._last_rows, *work, start, stop, *rest)
+        done: int = self._kernel(arrival, number, self._last_rows, *work, start, stop, *arguments)
         self._multiply(arrival, number, self._frame_rows, done, self._width, after[0], part)
         return done == stop
 
@@ -173,7 +173,7 @@ class FramePath:
         progress: Progress,
         *,
         workers: Workers | None = None,
-        prior: Prior | None = None,
+        prior: SlopePrior | None = None,
     ) -> None:
         self.pipeline, self._progress, self._workers = pipeline, progress, workers
         self._check(slots)
@@ -240,11 +240,11 @@ class FramePath:
         progress = self._progress
         cells = np.zeros_like(progress.cells)  # of the same type, to avoid an extra compilation
         cells.flat[progress.frame_cell] = 1
-        there = Progress(cells, progress.frame_cell, progress.rows_cell)
+        cell_progress = Progress(cells, progress.frame_cell, progress.rows_cell)
         if self._prior is not None:
-            self._await_row(there, 0)
+            self._await_row(cell_progress, 0)
         for share in range(self._shares):
-            self._work(share, (0, 0), there, self._explaining, rehearse=lambda: None)
+            self._work(share, (0, 0), cell_progress, self._explaining, rehearse=lambda: None)
         self.flag_doubtful()
 
     def measure(
@@ -290,8 +290,8 @@ class FramePath:
         if self._workers is None:
             return self._work(0, frame, self._progress, after, parts[0], rehearse)
         self._workers.post(lambda share: self._work(share, frame, self._progress, after, parts[share]))
-        whole = self._work(0, frame, self._progress, after, parts[0], rehearse)
-        return self._workers.wait() and whole
+        completed = self._work(0, frame, self._progress, after, parts[0], rehearse)
+        return self._workers.wait() and completed
 
     def flag_doubtful(self) -> None:
         """Set the flags of the last frame that depend on all its slopes; see `SlopePipeline`."""
@@ -349,12 +349,12 @@ class FramePath:
         """Measure one share of a frame's groups; the last share includes the narrow group."""
         waiting = self._control, self._pace[share]
         narrow = self._narrow if share == self._shares - 1 else None
-        whole = self._wide.measure(share, frame, progress, waiting, after, part, rehearse)
+        completed = self._wide.measure(share, frame, progress, waiting, after, part, rehearse)
         if narrow is None:
-            return whole
-        return whole and narrow.measure(0, frame, progress, waiting, after, rehearse=rehearse)
+            return completed
+        return completed and narrow.measure(0, frame, progress, waiting, after, rehearse=rehearse)
 
-    def _widen(self, prior: Prior) -> None:
+    def _widen(self, prior: SlopePrior) -> None:
         """Set the width of the estimator's prior to the uncertainty of the prediction, where known."""
         self._prior_changes = prior.changes
         row = self.pipeline.plan.prepared.prior_weight_row
@@ -380,12 +380,7 @@ class FramePath:
 
 
 def check_real_time(pipeline: SlopePipeline) -> None:
-    """Refuse a GPU, and settings that need the frame's own flux, which is not known before its last row."""
-    if pipeline.on_device is not None:
-        raise InputError(
-            f"pipeline: device = {pipeline.device!r}, but the real-time engine measures on the CPU; leave "
-            "device out, or measure frames on the GPU with slopes.pipeline.device_stream.FrameStream"
-        )
+    """Refuse settings that need the frame's own flux, which is not known before its last row."""
     if pipeline.needs_flux:
         raise InputError(
             "settings.flux_e: expected the flux (electrons) that a spot has in a frame, got none: in "

@@ -28,5 +28,5 @@ class PipelineMaker:
 
     def __call__(self, settings: Settings) -> SlopePipeline:
         """Return the pipeline with settings."""
-        known = self.layout, settings, self.calibration, self.reference
-        return SlopePipeline(*known, psf=self.psf, score=self.score)
+        parts = self.layout, settings, self.calibration, self.reference
+        return SlopePipeline(*parts, psf=self.psf, score=self.score)

@@ -84,9 +84,9 @@ class PythonPath(FramePath):
         """Measure a frame, waiting for its rows; see `FramePath.measure`. No product is begun."""
         if not super().measure(number, slot, explain=True, **waiting):
             return False
-        found = self._find_positions() if self.fault is None else self.fault
-        self.failed = isinstance(found, str)
-        positions = None if isinstance(found, str) else found
+        result = self._find_positions() if self.fault is None else self.fault
+        self.failed = isinstance(result, str)
+        positions = None if isinstance(result, str) else result
         self._prepared.write(positions, self._wide.settings, 0, self._results)
         return True
 
@@ -96,19 +96,19 @@ class PythonPath(FramePath):
         self._requests.put(zero.copy() if prior is None else zero + prior.mean_px[0].T)
         begin = time.perf_counter()
         try:
-            found, took_s = self._reply(begin)
+            result, took_s = self._reply(begin)
         except Empty:
             end_thread(self._thread)
             spent_ms = 1e3 * (time.perf_counter() - begin)
-            return self._given_up(f"{_title(self.pipeline)}: did not return within {spent_ms:.0f} ms")
+            return self._disabled(f"{_title(self.pipeline)}: did not return within {spent_ms:.0f} ms")
         late = took_s > self._budget_s and not call_is_under_way()
-        self._failures = self._failures + 1 if late or isinstance(found, str) else 0
+        self._failures = self._failures + 1 if late or isinstance(result, str) else 0
         if self._failures >= MOST_FAILURES:
-            reason = found if isinstance(found, str) else _too_slow(self.pipeline, took_s, self._budget_s)
-            self._given_up(f"{reason}; {MOST_FAILURES} frames in a row failed or were late")
-        return found
+            reason = result if isinstance(result, str) else _too_slow(self.pipeline, took_s, self._budget_s)
+            self._disabled(f"{reason}; {MOST_FAILURES} frames in a row failed or were late")
+        return result
 
-    def _given_up(self, fault: str) -> str:
+    def _disabled(self, fault: str) -> str:
         self._requests.put(None)
         self.fault = fault
         return fault
@@ -179,7 +179,7 @@ def _serve(
     while (prior := requests.get()) is not None:
         begin = time.perf_counter()
         try:
-            found: Found = prepared.found(images, prior)
+            result: Found = prepared.found(images, prior)
         except InputError as error:
-            found = str(error)
-        replies.put((found, time.perf_counter() - begin))
+            result = str(error)
+        replies.put((result, time.perf_counter() - begin))

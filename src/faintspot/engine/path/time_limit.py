@@ -15,14 +15,14 @@ Result = TypeVar("Result")
 _TRIAL = "faintspot-trial"
 
 
-def call_within(limit_s: float, what: str, function: Callable[..., Result], *arguments: Any) -> Result:
+def call_within(limit_s: float, name: str, function: Callable[..., Result], *arguments: Any) -> Result:
     """Call a function in a thread of its own and return what it returns.
 
     Parameters
     ----------
     limit_s : float
         Time limit; a call that exceeds it is abandoned and its thread asked to end, see `end_thread`.
-    what : str
+    name : str
         Subject of the error message.
 
     Raises
@@ -45,11 +45,11 @@ def call_within(limit_s: float, what: str, function: Callable[..., Result], *arg
         result, error = replies.get(timeout=limit_s)
     except Empty:
         end_thread(thread)
-        raise InputError(f"{what}: did not return within {limit_s:g} s") from None
+        raise InputError(f"{name}: did not return within {limit_s:g} s") from None
     if isinstance(error, Exception):
         raise error
     if error is not None:
-        raise InputError(f"{what}: {one_line(error)}")
+        raise InputError(f"{name}: {one_line(error)}")
     return result  # type: ignore[return-value]
 
 

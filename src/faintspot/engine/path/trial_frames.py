@@ -22,8 +22,8 @@ def trial_frames(pipeline: SlopePipeline) -> list[NDArray[np.float32]]:
     dark, scale = _dark_and_scale(pipeline)
     noise = _NOISE_E * np.random.default_rng(1503).standard_normal(dark.shape)
     level = _SATURATED_ADU if calibration.saturation_adu is None else calibration.saturation_adu
-    others = dark, dark + noise / scale, np.full_like(dark, level)
-    return [typical_frame(pipeline), *(frame.astype(np.float32) for frame in others)]
+    frames_adu = dark, dark + noise / scale, np.full_like(dark, level)
+    return [typical_frame(pipeline), *(frame.astype(np.float32) for frame in frames_adu)]
 
 
 def typical_frame(pipeline: SlopePipeline) -> NDArray[np.float32]:

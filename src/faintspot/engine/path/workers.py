@@ -37,7 +37,7 @@ class Workers:
         self.count, self._cpus = count, list(cpus or ())
         self._cells = np.zeros((1 + count) * _LINE, np.int64)
         self._control = np.zeros(1, np.int64)
-        self._whole = [False] * (1 + count)
+        self._completed = [False] * (1 + count)
         self._task: Task | None = None
         self.fault: str | None = None
         """Error of the last worker that died."""
@@ -56,7 +56,7 @@ class Workers:
         for number in range(1, 1 + self.count):
             cell = number * _LINE
             streaming.wait_for_rows(self._cells, cell, cell + 1, job, 0, _NEVER, _STOP_CELL)
-        return all(self._whole[1:])
+        return all(self._completed[1:])
 
     def park(self) -> None:
         """Let the threads sleep between two tasks."""
@@ -73,7 +73,7 @@ class Workers:
         dead = [index for index, thread in enumerate(self._threads) if not thread.is_alive()]
         for index in dead:
             number = index + 1
-            self._whole[number] = False
+            self._completed[number] = False
             store(self._cells, number * _LINE, load(self._cells, _POSTED))
             self._threads[index] = self._started(number)
         return len(dead)
@@ -105,7 +105,7 @@ class Workers:
                 continue
             task = self._task
             try:
-                self._whole[number] = task is not None and task(number)
+                self._completed[number] = task is not None and task(number)
             except BaseException as error:
                 self.fault = f"{type(error).__name__}: {error}".split("\n")[0]
                 return

@@ -186,7 +186,7 @@ class Readout(ABC):
             When `n_frames` is not a whole number of at least 1.
         """
         limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
-        start, tick, published, told = time.monotonic_ns(), 0, 0, 0
+        start, tick, published, reported_ns = time.monotonic_ns(), 0, 0, 0
         self.late = self.overruns = 0
         while (limit is None or published < limit) and not (stop is not None and stop.is_set()):
             frame = self._frame()  # before its scheduled time, because it may have to be fetched
@@ -200,9 +200,9 @@ class Readout(ABC):
             published += 1
             tick = max(tick + 1, int((time.monotonic_ns() - start) // self._period_ns))
             self.overruns = tick - published
-            if progress is not None and now - told > _BETWEEN_REPORTS_NS:
+            if progress is not None and now - reported_ns > _BETWEEN_REPORTS_NS:
                 progress(published)
-                told = now
+                reported_ns = now
         if published:
             # The last frame takes its full frame time too, so that rates are right.
             self._wait_until(start + round(tick * self._period_ns))
@@ -328,8 +328,8 @@ def readout_type(detector: Detector) -> np.dtype[np.generic]:
 
 def _wait_until(moment: int) -> None:
     """Wait until a time of CLOCK_MONOTONIC, ns; return at once if it is past."""
-    left = moment - time.monotonic_ns()
-    if left > _SPIN_NS:
-        time.sleep((left - _SPIN_NS) / 1e9)
+    remaining = moment - time.monotonic_ns()
+    if remaining > _SPIN_NS:
+        time.sleep((remaining - _SPIN_NS) / 1e9)
     while time.monotonic_ns() < moment:
         pass

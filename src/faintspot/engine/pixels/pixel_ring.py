@@ -179,14 +179,14 @@ class PixelRing:
         if number < 0:
             raise InputError(f"frame_number = {number}: expected a number of at least 0")
         slot = number % self.slots
-        held = (FIRST_SLOT + slot) * _LINE
+        header = (FIRST_SLOT + slot) * _LINE
         arrival = self._look(ARRIVALS) + 1
         # The order is the protocol: the slot's old frame number is cleared first, the new one is set last.
-        store(flat, held + SLOT_FRAME, -1)
-        store(flat, held + SLOT_TIME, 0)
-        store(flat, held + SLOT_ARRIVAL, arrival)
+        store(flat, header + SLOT_FRAME, -1)
+        store(flat, header + SLOT_TIME, 0)
+        store(flat, header + SLOT_ARRIVAL, arrival)
         store(flat, ROWS * _LINE, 0)
-        store(flat, held + SLOT_FRAME, number)
+        store(flat, header + SLOT_FRAME, number)
         store(flat, FRAME * _LINE, number)
         store(flat, ARRIVALS * _LINE, arrival)
         fence()  # before its first pixel is overwritten
@@ -201,8 +201,8 @@ class PixelRing:
                 f"rows = {rows}: expected {before} to {self.shape[0]} rows of a frame that was begun"
             )
         if rows == self.shape[0]:
-            held = FIRST_SLOT + number % self.slots
-            store(self._flat, held * _LINE + SLOT_TIME, time.monotonic_ns())
+            header = FIRST_SLOT + number % self.slots
+            store(self._flat, header * _LINE + SLOT_TIME, time.monotonic_ns())
         store(self._flat, ROWS * _LINE, rows)
 
     def end(self) -> None:
@@ -230,7 +230,7 @@ class PixelRing:
 
         This asks the operating system, as `stale` does.
         """
-        arrivals, lost, pid, start = (load(self.follower, place) for place in range(len(self.follower)))
+        arrivals, lost, pid, start = (load(self.follower, cell) for cell in range(len(self.follower)))
         return (arrivals, lost) if pid and process_lives(pid, start) else None
 
     # ---- reader
@@ -313,8 +313,8 @@ class PixelRing:
 
     def _holds(self, frame: int, arrival: int | None) -> bool:
         slot = FIRST_SLOT + frame % self.slots
-        held = self._look(slot, SLOT_FRAME) == frame
-        return held and (arrival is None or self._look(slot, SLOT_ARRIVAL) == arrival)
+        holds_frame = self._look(slot, SLOT_FRAME) == frame
+        return holds_frame and (arrival is None or self._look(slot, SLOT_ARRIVAL) == arrival)
 
     # ---- both
 

@@ -90,8 +90,8 @@ class Replay(Readout):
         waits: bool = False,
     ) -> None:
         begin = int(number_between("first", first, 0, source.n_frames - 1, integer=True))
-        left = source.n_frames - begin
-        count = left if n_frames is None else int(number_between("n_frames", n_frames, 1, left, integer=True))
+        most = source.n_frames - begin
+        count = most if n_frames is None else int(number_between("n_frames", n_frames, 1, most, integer=True))
         super().__init__(
             ring,
             source.shape,

@@ -1,1 +1,1 @@
-"""Requests to a running engine, and processes."""
+"""Requests to a running engine (`requests`, `private_socket`), its priority and its child processes."""

@@ -71,7 +71,7 @@ class ChildProcesses(Closing):
         finally:
             os.close(log)
 
-    def said(self, name: str) -> list[str]:
+    def output(self, name: str) -> list[str]:
         """Return the lines that a command has written so far."""
         return self._log(name).read_text(encoding="utf-8", errors="replace").splitlines()
 
@@ -86,22 +86,22 @@ class ChildProcesses(Closing):
         for name, process in self._started.items():
             code = process.poll()
             if code is not None:
-                words = (self.said(name) or [f"exit code {code}"])[-1] if code >= 0 else f"signal {-code}"
+                words = (self.output(name) or [f"exit code {code}"])[-1] if code >= 0 else f"signal {-code}"
                 raise InputError(f"{name}: the process has ended: {words.removeprefix(_ERROR)}")
 
-    def wait_until(self, condition: Callable[[], bool], what: str, timeout_s: float) -> None:
+    def wait_until(self, condition: Callable[[], bool], awaited: str, timeout_s: float) -> None:
         """Wait for a condition that needs all processes.
 
         Raises
         ------
         InputError
-            When a process ends or the time is over; `what` names the condition in the message.
+            When a process ends or the time is over; `awaited` names the condition in the message.
         """
         end = time.monotonic() + timeout_s
         while not condition():
             self.check()
             if time.monotonic() > end:
-                raise InputError(f"{what}: not ready after {timeout_s:g} s")
+                raise InputError(f"{awaited}: not ready after {timeout_s:g} s")
             time.sleep(_LOOK_S)
 
     def close(self) -> None:

@@ -221,8 +221,8 @@ class ControlServer(Closing):
             fields = _parsed_request(line)
             command = fields.pop("command", None)
             if not isinstance(command, str) or command not in self._handlers:
-                known = ", ".join(sorted(self._handlers))
-                raise InputError(f"command = {command!r:.80}: expected one of {known}")
+                commands = ", ".join(sorted(self._handlers))
+                raise InputError(f"command = {command!r:.80}: expected one of {commands}")
         except InputError as error:
             return _encoded(_refusal(str(error)))
         work = partial(_answer, self._handlers[command], fields)

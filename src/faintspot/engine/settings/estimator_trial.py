@@ -34,7 +34,7 @@ _PROGRAM = (
 
 
 @dataclass(frozen=True)
-class Trial:
+class EstimatorTrial:
     """A file to try, and the pipelines to try it with.
 
     Parameters
@@ -110,7 +110,7 @@ def main() -> None:
     """Try the file that standard input describes; the main function of the process."""
     answer = os.dup(1)
     os.dup2(2, 1)  # the file's output is not the answer
-    trial: Trial = pickle.load(sys.stdin.buffer)
+    trial: EstimatorTrial = pickle.load(sys.stdin.buffer)
     signal.alarm(max(1, round(trial.limit_s)))  # interrupts compiled code, too
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no core file after a crash
     try:

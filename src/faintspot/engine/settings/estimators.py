@@ -11,10 +11,10 @@ from typing import Any
 from faintspot.base.errors import InputError
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S
 from faintspot.engine.settings.estimator_file import EstimatorFile, load_estimators
-from faintspot.engine.settings.estimator_trial import Trial
+from faintspot.engine.settings.estimator_trial import EstimatorTrial
 from faintspot.engine.settings.interleaving import EVERY, FIRST_METHOD, METHODS
 from faintspot.engine.settings.plan import EnginePlan, SettingsPreparer
-from faintspot.engine.settings.running_settings import Change, LiveSettings
+from faintspot.engine.settings.running_settings import Change, RunningSettings
 from faintspot.slopes.estimators import registry
 
 
@@ -27,7 +27,7 @@ class EngineEstimators:
     preparer : SettingsPreparer
     """
 
-    def __init__(self, live: LiveSettings[EnginePlan], preparer: SettingsPreparer) -> None:
+    def __init__(self, live: RunningSettings[EnginePlan], preparer: SettingsPreparer) -> None:
         self._live, self._preparer = live, preparer
         self._lock = threading.Lock()
         self.loaded: dict[str, EstimatorFile] = {}
@@ -52,7 +52,7 @@ class EngineEstimators:
         """
         path = Path(source)
         settings = self._preparer.built_in(self._live.settings)
-        tried = Trial(path, self._preparer.make_pipeline, settings).elsewhere()
+        tried = EstimatorTrial(path, self._preparer.make_pipeline, settings).elsewhere()
         with self._lock:
             for name in tried["estimators"]:
                 if name in self.loaded and not swap:
@@ -85,14 +85,14 @@ class EngineEstimators:
         """
         with self._lock:
             if name not in self.loaded:
-                known = ", ".join(self.loaded) or "none"
-                raise InputError(f"estimator {name!r}: not loaded, expected one of: {known}")
+                names = ", ".join(self.loaded) or "none"
+                raise InputError(f"estimator {name!r}: not loaded, expected one of: {names}")
             newest, frame = self._live.newest, None
             if name in newest.estimator_names and newest.fallback is not None:
                 frame = self._live.wait(self._fallen_back(newest.fallback), EFFECT_TIMEOUT_S)
             kind = self.loaded.pop(name).kinds[name]
-            registry.restore({key: each for key, each in registry.estimators().items() if key != name})
-            if all(kind.__module__ != each.__module__ for each in registry.estimators().values()):
+            registry.restore({key: other for key, other in registry.estimators().items() if key != name})
+            if all(kind.__module__ != other.__module__ for other in registry.estimators().values()):
                 sys.modules.pop(kind.__module__, None)
         gc.collect()
         return {"frame": frame}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.engine.settings.plan import EnginePlan
-from faintspot.engine.settings.running_settings import LiveSettings
+from faintspot.engine.settings.running_settings import RunningSettings
 from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
 
@@ -46,7 +46,7 @@ class FluxFollower:
     """
 
     def __init__(
-        self, live: LiveSettings[EnginePlan], time_constant_frames: float = TIME_CONSTANT_FRAMES
+        self, live: RunningSettings[EnginePlan], time_constant_frames: float = TIME_CONSTANT_FRAMES
     ) -> None:
         self._live = live
         self._longest = number_between("mean_flux", time_constant_frames, 1)

@@ -130,8 +130,8 @@ def _parsed_settings(text: str) -> InterleavedMethod:
         changes = parse_changes(text.split("+"))
         check_names(list(changes))
         return InterleavedMethod(text, changes)
-    known = ", ".join([_SET, _NONE, *estimators()])
+    names = ", ".join([_SET, _NONE, *estimators()])
     raise InputError(
-        f"interleave: {text!r}: expected {known}, or NAME=VALUE with + between several, perhaps "
+        f"interleave: {text!r}: expected {names}, or NAME=VALUE with + between several, perhaps "
         f"followed by + and one of {', '.join(CONTROLS)}"
     )

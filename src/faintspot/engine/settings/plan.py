@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.engine.path.frame_path import FramePath, Progress, check_real_time
-from faintspot.engine.path.predicted_positions import Prior
 from faintspot.engine.path.python_path import PythonPath, tried
+from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.time_limit import call_within
 from faintspot.engine.path.workers import Workers
 from faintspot.engine.pixels.pixel_ring import PixelRing
@@ -103,7 +103,7 @@ class SettingsPreparer:
         interleaving: Interleaving,
         workers: Workers | None,
         budget_s: float,
-        prior: Prior | None = None,
+        prior: SlopePrior | None = None,
     ) -> None:
         self.make_pipeline = make_pipeline
         self.interleaving = interleaving
@@ -121,14 +121,12 @@ class SettingsPreparer:
         InputError
             When the settings or those of a configuration do not fit, or an estimator fails its trial.
         """
-        each_settings = [method.of(settings) for method in self.interleaving.methods]
-        pipelines = [self._pipeline(each) for each in each_settings]
+        pipelines = [self._pipeline(method.of(settings)) for method in self.interleaving.methods]
         for pipeline in pipelines:
             check_real_time(pipeline)
-        own = all(is_built_in(each.estimator) for each in each_settings)
-        prepared = EnginePlan(
-            pipelines, settings, self.interleaving, self._new_path, None if own else self._fallback(settings)
-        )
+        built_in = all(is_built_in(pipeline.settings.estimator) for pipeline in pipelines)
+        fallback = None if built_in else self._fallback(settings)
+        prepared = EnginePlan(pipelines, settings, self.interleaving, self._new_path, fallback)
         if self.ring is None:
             prepared.warm_up()
         else:
@@ -139,8 +137,9 @@ class SettingsPreparer:
 
     def built_in(self, settings: Settings) -> Settings:
         """Return settings in which the last built-in estimator replaces a user-defined one."""
-        own = is_built_in(settings.estimator)
-        return settings if own else settings.replace(estimator=self._built_in)
+        if is_built_in(settings.estimator):
+            return settings
+        return settings.replace(estimator=self._built_in)
 
     def _fallback(self, settings: Settings) -> EnginePlan:
         """Prepare the same settings with a built-in estimator and no interleaving."""

@@ -66,7 +66,7 @@ class _Version(Generic[Prepared]):
     change: Change
 
 
-class LiveSettings(Generic[Prepared]):
+class RunningSettings(Generic[Prepared]):
     """The running settings of an engine, and the changes that wait for the next frame.
 
     Any thread may propose changes; they are checked and prepared there. Between two frames the engine's
@@ -165,11 +165,11 @@ class LiveSettings(Generic[Prepared]):
         with self._proposing:
             newest = self._newest.prepared
             layout = newest.layout
-            places = None if where is None else _checked_places(where, len(layout))
-            settings = newest.settings.replace(where=places, **changes)
+            indices = None if where is None else _checked_indices(where, len(layout))
+            settings = newest.settings.replace(where=indices, **changes)
             for name in settings.declared():  # including options that the estimator does not use at present
                 settings.values(name, len(layout), layout.pixels)
-            return self._offered(settings, copy.deepcopy(dict(changes)), places)
+            return self._offered(settings, copy.deepcopy(dict(changes)), indices)
 
     def renew(self, changes: Mapping[str, Any]) -> Change:
         """Prepare the same settings again because something else has changed, named in `changes`.
@@ -191,14 +191,14 @@ class LiveSettings(Generic[Prepared]):
         changes, begin = under_way
         return {"changes": copy.deepcopy(changes), "seconds": time.monotonic() - begin}
 
-    def _offered(self, settings: Settings, changes: dict[str, Any], places: list[int] | None) -> Change:
+    def _offered(self, settings: Settings, changes: dict[str, Any], where: list[int] | None) -> Change:
         """Prepare settings and offer them to the engine; for the thread that proposes."""
         self._under_way = changes, time.monotonic()
         try:
             prepared = self._prepare(settings)
         finally:
             self._under_way = None
-        change = self.offer(prepared, changes, places)
+        change = self.offer(prepared, changes, where)
         self.let_go()
         return change
 
@@ -215,8 +215,8 @@ class LiveSettings(Generic[Prepared]):
         with self._lock:
             if self._record and change.number < self._record[0].number:
                 return change.frame_number
-            later = takewhile(lambda each: each.number >= change.number, reversed(self._record))
-            frames = [each.frame_number for each in later if each.frame_number is not None]
+            later = takewhile(lambda accepted: accepted.number >= change.number, reversed(self._record))
+            frames = [accepted.frame_number for accepted in later if accepted.frame_number is not None]
         return frames[-1] if frames else None
 
     def wait(self, change: Change, timeout_s: float = 1.0) -> int | None:
@@ -236,7 +236,7 @@ class LiveSettings(Generic[Prepared]):
         taken: list[tuple[int, int, dict[str, Any], list[int] | None]] = []
         with self._lock:
             frame_number = None
-            for change in takewhile(lambda each: each.number > after, reversed(self._record)):
+            for change in takewhile(lambda entry: entry.number > after, reversed(self._record)):
                 # A replaced change took effect with the next one that was taken.
                 frame_number = frame_number if change.frame_number is None else change.frame_number
                 if frame_number is not None:
@@ -268,8 +268,8 @@ class LiveSettings(Generic[Prepared]):
         for name in names or ():
             if name != "estimator":
                 check_shared_or_own(name, settings)
-        wanted = names or ["estimator", *settings.declared()]
-        return {name: _plain(settings, name, n, pixels) for name in wanted}
+        asked_names = names or ["estimator", *settings.declared()]
+        return {name: _plain(settings, name, n, pixels) for name in asked_names}
 
 
 def check_names(names: Sequence[str] | None) -> None:
@@ -298,14 +298,14 @@ def check_shared_or_own(name: str, settings: Settings) -> None:
         check_option(name, type(settings.estimator))
 
 
-def _checked_places(where: Sequence[int], n: int) -> list[int]:
+def _checked_indices(where: Sequence[int], n: int) -> list[int]:
     """Return the indices of sub-apertures as plain ints, after checking that they exist."""
     array = numbers_between("where", where, 0, integer=True)
     if array.ndim != 1:
         raise InputError(f"where: expected a list of sub-apertures, got shape {array.shape}")
     if array.max() >= n:
         raise InputError(f"where: sub-aperture {array.max()} does not exist; there are {n}, counted from 0")
-    return [int(place) for place in array]
+    return [int(index) for index in array]
 
 
 def _plain(settings: Settings, name: str, n: int, pixels: int) -> Any:
@@ -317,5 +317,5 @@ def _plain(settings: Settings, name: str, n: int, pixels: int) -> Any:
     if value is not None and not differs:
         return value
     items = settings.values(name, n, pixels).tolist()
-    each = [None if isinstance(item, float) and math.isnan(item) else item for item in items]
-    return each if differs else each[0]
+    values = [None if isinstance(item, float) and math.isnan(item) else item for item in items]
+    return values if differs else values[0]

@@ -53,7 +53,7 @@ class StreamBridge:
     Parameters
     ----------
     stream : str
-        Name of the stream, which need not exist yet: NAME (pyshmem), isio:NAME or dao:FILE.
+        Name of the stream, which need not exist yet: NAME (pyshmem) or isio:NAME.
     name : str
         Name of the pixel ring.
     say : function, optional
@@ -138,12 +138,12 @@ class StreamBridge:
 
     def _new_one(self) -> bool:
         """Wait for a publication; return False if none comes in time."""
-        source, seen = self._follower.source, self._follower.seen
+        source, last_count = self._follower.source, self._follower.seen
         assert source is not None
         end = self._arrived + self._spin_s
-        while source.count == seen:
+        while source.count == last_count:
             if time.monotonic() > end:
-                return source.wait(seen, _PARK_S)
+                return source.wait(last_count, _PARK_S)
         return True
 
     def _pass_on(self) -> bool:
@@ -181,8 +181,8 @@ class StreamBridge:
             time.sleep(_LOOK_S)
         elif not self._silent and time.monotonic() - self._arrived > STALL_S:
             lives = {True: ", which made it, is alive", False: ", which made it, has ended", None: ""}
-            made = f"{follower.source.maker}{lives[follower.source.maker_lives()]}"
-            follower.say(f"no frame for {STALL_S:g} s; {made}")
+            maker = f"{follower.source.maker}{lives[follower.source.maker_lives()]}"
+            follower.say(f"no frame for {STALL_S:g} s; {maker}")
             self.counters.stalls += 1
             self._silent = True
 

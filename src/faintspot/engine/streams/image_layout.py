@@ -1,8 +1,7 @@
-"""Memory layout of the streams of ImageStreamIO (milk, cacao) and dao, with checks of their metadata.
+"""Memory layout of the streams of ImageStreamIO (milk, cacao), with checks of their metadata.
 
-Offsets and sizes hold for 64-bit Linux and follow the public headers: version 2.00 of ImageStreamIO
-(ImageStruct.h), and dao's daoImageStruct.h, which has no version. A file consists of metadata, values,
-keywords and, in ImageStreamIO, the signals between readers and writers.
+Offsets and sizes hold for 64-bit Linux and follow the public header of version 2.00 (ImageStruct.h). A file
+consists of metadata, values, keywords and the signals between readers and writers.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ import numpy as np
 from faintspot.base.errors import InputError
 from faintspot.engine.streams.semaphores import BYTES as SEMAPHORE_BYTES
 
-ISIO, DAO = "isio", "dao"
+ISIO = "isio"
+"""Kind of the streams, which begins their names: isio:NAME."""
 VERSION = b"2.00"
-"""Version of ImageStreamIO."""
 SEMAPHORES, TRACES = 10, 10
-"""Default numbers of semaphores and of entries in ImageStreamIO's write-trace table."""
-MOST_POSTED = {ISIO: 10, DAO: 1}
+"""Default numbers of semaphores and of entries in the write-trace table."""
+MOST_POSTED = 10
 """Semaphore value up to which a publication posts."""
 TYPES = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "u8", 8: "i8", 9: "f4", 10: "f8", 13: "f2"}
 MATH_DATA = 2
@@ -33,7 +32,7 @@ _CIRCULAR, _KINDS_OF_IMAGE, _CIRCULAR_IN_TIME = 0x1, 0xF, (0xF000F, 0x20001)
 _TRACE_BYTES, _CIRCULAR_FRAME_BYTES, _TIME_BYTES = 64, 48, 16
 _LARGEST_BYTES = 1 << 36
 
-_ISIO_FIELDS = {
+_FIELDS = {
     "version": ("S32", 0),
     "name": ("S80", 32),
     "naxis": ("u1", 112),
@@ -58,20 +57,6 @@ _ISIO_FIELDS = {
     "CBsize": ("u4", 292),
     "imdatamemsize": ("u8", 312),
 }
-_DAO_FIELDS = {
-    "name": ("S80", 0),
-    "naxis": ("u1", 80),
-    "size": ("3u4", 84),
-    "nelement": ("u8", 96),
-    "datatype": ("u1", 104),
-    "atime": ("2i8", 128),
-    "shared": ("u1", 144),
-    "sem": ("u2", 148),
-    "cnt0": ("u8", 152),
-    "cnt1": ("u8", 160),
-    "write": ("u1", 176),
-    "NBkw": ("u2", 178),
-}
 
 
 def _record(fields: Mapping[str, tuple[str, int]], size: int) -> np.dtype[np.void]:
@@ -79,19 +64,15 @@ def _record(fields: Mapping[str, tuple[str, int]], size: int) -> np.dtype[np.voi
     return np.dtype({"names": [*fields], "formats": formats, "offsets": offsets, "itemsize": size})
 
 
-COUNTER = {ISIO: _ISIO_FIELDS["cnt0"][1], DAO: _DAO_FIELDS["cnt0"][1]}
-WRITING = {ISIO: _ISIO_FIELDS["write"][1], DAO: _DAO_FIELDS["write"][1]}
-"""Byte offsets of the flag that a write is in progress."""
-METADATA = {ISIO: _record(_ISIO_FIELDS, 384), DAO: _record(_DAO_FIELDS, 4296)}
-KEYWORD = {
-    ISIO: _record({"name": ("S16", 0), "type": ("S1", 16), "value": ("i8", 24), "cnt": ("u8", 40)}, 128),
-    DAO: _record({"name": ("S16", 0), "type": ("S1", 16), "value": ("i8", 24)}, 120),
-}
+COUNTER, WRITING = _FIELDS["cnt0"][1], _FIELDS["write"][1]
+"""Byte offsets of the number of publications, and of the flag that a write is in progress."""
+METADATA = _record(_FIELDS, 384)
+KEYWORD = _record({"name": ("S16", 0), "type": ("S1", 16), "value": ("i8", 24), "cnt": ("u8", 40)}, 128)
 
 
 @dataclass(frozen=True)
 class Places:
-    """Byte offsets of the parts of a file; -1 for missing parts."""
+    """Byte offsets of the parts of a file."""
 
     values: int
     keywords: int
@@ -107,22 +88,20 @@ class IncompatibleStreamError(Exception):
     """A stream that cannot be used; the text gives the reason, to follow "stream NAME: "."""
 
 
-def places_of(kind: str, metadata: Any) -> Places:
+def places_of(metadata: Any) -> Places:
     """Return the offsets of the parts of a file with these metadata."""
-    end = METADATA[kind].itemsize
+    end = METADATA.itemsize
 
     def take(size: int) -> int:
         nonlocal end
         start = end
-        end += size if kind == DAO else -(-size // 8) * 8
+        end += -(-size // 8) * 8
         return start
 
     sizes = metadata["size"].tolist()
     data = math.prod(sizes[: metadata["naxis"]]) * np.dtype(TYPES[int(metadata["datatype"])]).itemsize
     values = take(data)
-    keywords = take(KEYWORD[kind].itemsize * int(metadata["NBkw"]))
-    if kind == DAO:
-        return Places(values, keywords, -1, -1, -1, -1, end)
+    keywords = take(KEYWORD.itemsize * int(metadata["NBkw"]))
     count = int(metadata["sem"])
     semaphores, log = take(SEMAPHORE_BYTES * count), take(SEMAPHORE_BYTES)
     readers, writers, *_ = (take(4 * count) for _ in range(4))
@@ -136,7 +115,7 @@ def places_of(kind: str, metadata: Any) -> Places:
     return Places(values, keywords, semaphores, log, readers, writers, end)
 
 
-def checked(kind: str, metadata: Any, size: int) -> tuple[Places, tuple[int, ...], np.dtype[Any], bool]:
+def checked(metadata: Any, size: int) -> tuple[Places, tuple[int, ...], np.dtype[Any], bool]:
     """Check the metadata of a file of `size` bytes.
 
     Returns
@@ -153,7 +132,7 @@ def checked(kind: str, metadata: Any, size: int) -> tuple[Places, tuple[int, ...
     IncompatibleStreamError
         When the metadata are not those of a supported stream.
     """
-    if kind == ISIO and bytes(metadata["version"]) != VERSION:
+    if bytes(metadata["version"]) != VERSION:
         version = bytes(metadata["version"]).decode("ascii", "replace")
         raise IncompatibleStreamError(f"has version {version!r}, expected {VERSION.decode()!r}")
     axes, code = int(metadata["naxis"]), int(metadata["datatype"])
@@ -164,35 +143,29 @@ def checked(kind: str, metadata: Any, size: int) -> tuple[Places, tuple[int, ...
         )
     if code not in TYPES:
         raise IncompatibleStreamError(f"holds values of type {code}, expected real numbers")
-    if kind == ISIO and int(metadata["location"]) != -1:
+    if int(metadata["location"]) != -1:
         raise IncompatibleStreamError("is in the memory of a GPU, expected CPU memory")
-    places = places_of(kind, metadata)
+    places = places_of(metadata)
     if places.total != size or size > _LARGEST_BYTES:
         raise IncompatibleStreamError(
             f"has {size} bytes, expected {places.total} from its metadata; it may have another version"
         )
-    circular = kind == ISIO and axes == 3 and int(metadata["imagetype"]) & _KINDS_OF_IMAGE == _CIRCULAR
+    circular = axes == 3 and int(metadata["imagetype"]) & _KINDS_OF_IMAGE == _CIRCULAR
     shape = tuple(sizes[1::-1]) if circular else tuple(sizes[::-1])
     return places, shape, np.dtype(TYPES[code]), circular
 
 
-def path_of(kind: str, name: str) -> Path:
-    """Return the file of a stream: NAME in ImageStreamIO's folder, or for dao a path or NAME in /tmp.
+def path_of(name: str) -> Path:
+    """Return the file of a stream, in the folder of ImageStreamIO.
 
     Raises
     ------
     InputError
         When the name is not valid.
     """
-    if kind == DAO and "/" in name:
-        path = Path(name)
-    else:
-        if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,78}", name):
-            raise InputError(f"{kind}:{name}: expected up to 79 letters, digits, '_', '-' and '.'")
-        path = (_folder() if kind == ISIO else Path("/tmp")) / f"{name}.im.shm"
-    if kind == DAO and (len(str(path)) > 79 or not path.name.split(".")[0]):
-        raise InputError(f"{kind}:{name}: expected a path of up to 79 characters, as /tmp/NAME.im.shm")
-    return path
+    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,78}", name):
+        raise InputError(f"{ISIO}:{name}: expected up to 79 letters, digits, '_', '-' and '.'")
+    return _folder() / f"{name}.im.shm"
 
 
 def _folder() -> Path:

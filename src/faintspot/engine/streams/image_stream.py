@@ -1,4 +1,4 @@
-"""Streams of ImageStreamIO (milk, cacao) and dao in shared memory: frames in, slopes and commands out."""
+"""Streams of ImageStreamIO (milk, cacao) in shared memory: frames in, slopes and commands out."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from faintspot.engine.pixels.pixel_segment import identity_of, new_memory
 from faintspot.engine.pixels.processes import process_start
 from faintspot.engine.streams.image_layout import (
     COUNTER,
-    DAO,
     ISIO,
     KEYWORD,
     MATH_DATA,
@@ -48,12 +47,12 @@ _OPEN = os.O_NONBLOCK | os.O_CLOEXEC  # never block on a named pipe
 class _Mapped:
     """A memory-mapped stream, with its parts as arrays."""
 
-    def __init__(self, kind: str, memory: mmap.mmap, places: Places, shape: tuple[int, ...]) -> None:
-        self.fields = np.ndarray((), METADATA[kind], memory)
+    def __init__(self, memory: mmap.mmap, places: Places, shape: tuple[int, ...]) -> None:
+        self.fields = np.ndarray((), METADATA, memory)
         """Metadata as arrays, which change when other processes write."""
         self.memory, self.places = memory, places
-        self.counter = np.ndarray((1,), np.int64, memory, COUNTER[kind])
-        self.writing = np.ndarray((), np.uint8, memory, WRITING[kind])
+        self.counter = np.ndarray((1,), np.int64, memory, COUNTER)
+        self.writing = np.ndarray((), np.uint8, memory, WRITING)
         dtype = np.dtype(TYPES[int(self.fields["datatype"])])
         self.values: NDArray[Any] = np.ndarray(shape, dtype, memory, places.values)
         self.address = np.frombuffer(memory, np.uint8).ctypes.data
@@ -70,12 +69,10 @@ class _Mapped:
 class ImageStream:
     """A stream that another program writes, with the interface of `faintspot.engine.streams.stream.Stream`.
 
-    To wait, it takes a free semaphore of ImageStreamIO. dao's semaphores have no owner, so for dao it only
-    polls the counter. A publication's number is the counter minus one.
+    To wait, it takes a free semaphore. A publication's number is the counter minus one.
 
     Parameters
     ----------
-    kind : {"isio", "dao"}
     name : str
         See `path_of`.
 
@@ -89,8 +86,8 @@ class ImageStream:
         When the name is not valid.
     """
 
-    def __init__(self, kind: str, name: str) -> None:
-        self._path = path_of(kind, name)
+    def __init__(self, name: str) -> None:
+        self._path = path_of(name)
         try:
             descriptor = os.open(self._path, os.O_RDWR | _OPEN)
             writable = True
@@ -98,11 +95,11 @@ class ImageStream:
             descriptor, writable = os.open(self._path, os.O_RDONLY | _OPEN), False
         try:
             status = os.fstat(descriptor)
-            size, head = status.st_size, METADATA[kind]
+            size, head = status.st_size, METADATA
             if not stat.S_ISREG(status.st_mode) or size <= head.itemsize:
                 raise IncompatibleStreamError(f"{self._path} is not a stream")
             metadata = np.frombuffer(os.pread(descriptor, head.itemsize, 0), head)[0]
-            places, self.shape, self.dtype, self._circular = checked(kind, metadata, size)
+            places, self.shape, self.dtype, self._circular = checked(metadata, size)
             access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
             memory = mmap.mmap(descriptor, size, access=access)
         except BaseException:
@@ -110,9 +107,9 @@ class ImageStream:
             raise
         self._descriptor, self._size, self._identity = descriptor, size, identity_of(status)
         whole = (int(metadata["size"][2]), *self.shape) if self._circular else self.shape
-        self._mapped = _Mapped(kind, memory, places, whole)
-        self._maker = int(metadata["creatorPID"]) if kind == ISIO else 0
-        self._turn = self._claimed() if kind == ISIO and writable else None
+        self._mapped = _Mapped(memory, places, whole)
+        self._maker = int(metadata["creatorPID"])
+        self._turn = self._claimed() if writable else None
 
     @property
     def count(self) -> int:
@@ -194,15 +191,13 @@ class ImageStream:
 
 
 class ImageStreamWriter:
-    """A stream that faintspot writes for programs of ImageStreamIO or dao.
+    """A stream that faintspot writes for programs of ImageStreamIO.
 
     Each publication increments `cnt0` and posts all semaphores. The keyword FRAME is the frame's number;
-    times are those of publication (TAI; for dao Unix time). An existing dao stream of the same size and type
-    is reused, as dao's programs do; a stream of ImageStreamIO is always recreated.
+    times are those of publication (TAI). An existing stream is recreated unless its maker is alive.
 
     Parameters
     ----------
-    kind : {"isio", "dao"}
     name : str
         See `path_of`.
     shape : (int,) or (int, int)
@@ -215,21 +210,17 @@ class ImageStreamWriter:
         When a living process made a stream of that name, the file is something else, or it cannot be made.
     """
 
-    def __init__(self, kind: str, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> None:
-        self.kind, self.path = kind, path_of(kind, name)
+    def __init__(self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> None:
+        self.path = path_of(name)
         self.shape = (1, *shape) if len(shape) == 1 else shape
         head = self._head(np.dtype(dtype))
-        places = places_of(kind, head)
-        there = _there(kind, self.path)
-        if kind == DAO and there is not None:
-            memory = self._joined(head, *there)
-            places = places_of(kind, np.ndarray((), METADATA[kind], memory))
-            self._mapped = _Mapped(kind, memory, places, self.shape)
-        else:
-            self._mapped = self._made(head, places)
+        _check_free(self.path)
+        self._mapped = self._made(head, places_of(head))
         self._identity = identity_of(self.path.stat())
-        self._keyword = self._keywords()
-        self._semaphores = self._posted()
+        self._keyword: Any = np.ndarray((), KEYWORD, self._mapped.memory, self._mapped.places.keywords)
+        self._keyword["name"], self._keyword["type"] = b"FRAME", b"L"
+        log = Semaphore(self._mapped.address + self._mapped.places.log_semaphore)
+        self._semaphores = [*(Semaphore(self._mapped.semaphore(each)) for each in range(SEMAPHORES)), log]
 
     def publish(self, values: NDArray[Any], number: int) -> None:
         """Publish the values of a frame."""
@@ -237,42 +228,33 @@ class ImageStreamWriter:
         mapped.writing[...] = 1
         fence()
         mapped.values[...] = values.reshape(self.shape)
-        if self._keyword is not None:
-            self._keyword["value"] = number
-        if self.kind == ISIO:
-            self._keyword["cnt"] += 1
-            fields["atime"] = fields["writetime"] = _clock()
-        else:
-            fields["atime"][1] = time.time_ns()
+        self._keyword["value"] = number
+        self._keyword["cnt"] += 1
+        fields["atime"] = fields["writetime"] = _clock()
         store(mapped.counter, 0, load(mapped.counter, 0) + 1)
         fence()
         mapped.writing[...] = 0
         for semaphore in self._semaphores:
-            semaphore.post(MOST_POSTED[self.kind])
+            semaphore.post(MOST_POSTED)
 
     def close(self) -> None:
         """Remove the stream, unless another process has replaced it."""
         with contextlib.suppress(OSError):
             if identity_of(self.path.stat()) == self._identity:
                 self.path.unlink()
-                if self.kind == DAO:
-                    for name in self._names():
-                        Semaphore.unlink(name)
 
     def _made(self, head: NDArray[Any], places: Places) -> _Mapped:
         """Make the stream's file."""
         try:
             with new_memory(self.path, places.total, 0o666) as (memory, hidden):
-                if self.kind == ISIO:
-                    head["inode"] = hidden.stat().st_ino
+                head["inode"] = hidden.stat().st_ino
                 memory[: head.nbytes] = head.tobytes()
-                mapped = _Mapped(self.kind, memory, places, self.shape)
-                if self.kind == ISIO:
-                    for number in range(SEMAPHORES):
-                        Semaphore.made(mapped.semaphore(number))
-                    Semaphore.made(mapped.address + places.log_semaphore)
-                    mapped.pids(places.readers)[:] = -1
-                    mapped.pids(places.writers)[:] = os.getpid()
+                mapped = _Mapped(memory, places, self.shape)
+                for number in range(SEMAPHORES):
+                    Semaphore.make(mapped.semaphore(number))
+                Semaphore.make(mapped.address + places.log_semaphore)
+                mapped.pids(places.readers)[:] = -1
+                mapped.pids(places.writers)[:] = os.getpid()
                 os.replace(hidden, self.path)
                 return mapped
         except OSError as error:
@@ -282,14 +264,11 @@ class ImageStreamWriter:
 
     def _head(self, dtype: np.dtype[Any]) -> NDArray[Any]:
         """Return the metadata of a new stream."""
-        head = np.zeros((), METADATA[self.kind])
+        head = np.zeros((), METADATA)
         code = next(code for code, each in TYPES.items() if np.dtype(each) == dtype)
         head["naxis"], head["size"] = 2, (*self.shape[::-1], 0)
         head["nelement"], head["datatype"] = math.prod(self.shape), code
         head["shared"], head["sem"], head["NBkw"] = 1, SEMAPHORES, 1
-        if self.kind == DAO:
-            head["name"] = str(self.path).encode()
-            return head
         head["name"] = self.path.name.removesuffix(".im.shm").encode()
         head["version"], head["imagetype"], head["location"] = VERSION, MATH_DATA, -1
         head["NBproctrace"], head["creatorPID"] = TRACES, os.getpid()
@@ -297,49 +276,14 @@ class ImageStreamWriter:
         head["creationtime"] = head["lastaccesstime"] = _clock()
         return head
 
-    def _joined(self, wanted: NDArray[Any], there: NDArray[Any], memory: mmap.mmap) -> mmap.mmap:
-        """Return the memory of an existing stream if it has the size and type that are needed."""
-        sizes = [each["size"][: int(each["naxis"])].tolist() for each in (wanted, there)]
-        if sizes[0] != sizes[1] or wanted["datatype"] != there["datatype"]:
-            raise InputError(
-                f"{self.kind}:{self.path}: expected a stream of {sizes[0]} float32 values, or none, found "
-                f"{sizes[1]} of type {TYPES[int(there['datatype'])]}; remove it or choose another name"
-            )
-        return memory
-
-    def _keywords(self) -> Any:
-        """The keyword FRAME; None if another program's stream has no keywords."""
-        mapped = self._mapped
-        if not mapped.fields["NBkw"]:
-            return None
-        keyword = np.ndarray((), KEYWORD[self.kind], mapped.memory, mapped.places.keywords)
-        keyword["name"], keyword["type"] = b"FRAME", b"L"
-        return keyword
-
-    def _posted(self) -> list[Semaphore]:
-        """Semaphores that a publication posts."""
-        if self.kind == DAO:
-            found = [Semaphore.named(name) for name in self._names()]
-            return [each for each in found if each is not None]
-        mapped = self._mapped
-        numbers = range(int(mapped.fields["sem"]))
-        log = Semaphore(mapped.address + mapped.places.log_semaphore)
-        return [*(Semaphore(mapped.semaphore(number)) for number in numbers), log]
-
-    def _names(self) -> list[str]:
-        """Names of dao's semaphores."""
-        local = self.path.name.split(".")[0]
-        count = int(self._mapped.fields["sem"])
-        return [*(f"{local}_sem{number:02d}" for number in range(count)), f"{local}_semlog"]
-
 
 def _number(count: int) -> int:
     """Return the number of the last published frame."""
     return max(count - 1, 0) & LARGEST_NUMBER
 
 
-def _there(kind: str, path: Path) -> tuple[NDArray[Any], mmap.mmap] | None:
-    """Return metadata and memory of a stream that may be replaced or reused; None without one.
+def _check_free(path: Path) -> None:
+    """Check that there is no file, or a stream that may be replaced.
 
     Raises
     ------
@@ -349,26 +293,24 @@ def _there(kind: str, path: Path) -> tuple[NDArray[Any], mmap.mmap] | None:
     try:
         descriptor = os.open(path, os.O_RDWR | _OPEN)
     except FileNotFoundError:
-        return None
+        return
     except OSError as error:
-        raise InputError(f"{kind}:{path}: cannot be opened ({error.strerror})") from None
+        raise InputError(f"{ISIO}:{path}: cannot be opened ({error.strerror})") from None
     try:
-        status, layout = os.fstat(descriptor), METADATA[kind]
-        if not stat.S_ISREG(status.st_mode) or status.st_size <= layout.itemsize:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode) or status.st_size <= METADATA.itemsize:
             raise IncompatibleStreamError("is not a stream")
-        head = np.frombuffer(os.pread(descriptor, layout.itemsize, 0), layout)[0]
-        checked(kind, head, status.st_size)
-        memory = mmap.mmap(descriptor, status.st_size)
+        head = np.frombuffer(os.pread(descriptor, METADATA.itemsize, 0), METADATA)[0]
+        checked(head, status.st_size)
     except IncompatibleStreamError as error:
-        raise InputError(f"{kind}:{path}: {error}; remove it or choose another name") from None
+        raise InputError(f"{ISIO}:{path}: {error}; remove it or choose another name") from None
     finally:
         os.close(descriptor)
-    maker = int(head["creatorPID"]) if kind == ISIO else 0
+    maker = int(head["creatorPID"])
     if maker not in (0, os.getpid()) and process_start(maker) >= 0:
         raise InputError(
-            f"{kind}:{path}: a living process made this stream (pid {maker}); stop it or choose another name"
+            f"{ISIO}:{path}: a living process made this stream (pid {maker}); stop it or choose another name"
         )
-    return np.array(head), memory
 
 
 def _clock() -> tuple[int, int]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.engine.path.predicted_positions import Prior
+from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.streams.stream import Follower
 
 _READ_S = 2e-4  # to wait for a writer in the middle of a publication
@@ -47,7 +47,7 @@ class PredictionStream:
         When pyshmem is not installed.
     """
 
-    def __init__(self, name: str, prior: Prior) -> None:
+    def __init__(self, name: str, prior: SlopePrior) -> None:
         self.stream, self._prior = f"{name}_prediction", prior
         self._values = np.zeros(2 * prior.mean_px.size + 1)
         self.counters = PredictionCounters()

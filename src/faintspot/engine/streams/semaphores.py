@@ -1,9 +1,8 @@
-"""POSIX semaphores, in shared memory or named, that other programs post and wait for."""
+"""POSIX semaphores in shared memory, that other programs post and wait for."""
 
 from __future__ import annotations
 
 import ctypes
-import os
 import time
 from functools import cache
 from typing import Any
@@ -19,9 +18,7 @@ class _Time(ctypes.Structure):
 
 @cache
 def _libc() -> Any:
-    library = ctypes.CDLL(None, use_errno=True)
-    library.sem_open.restype = ctypes.c_void_p
-    return library
+    return ctypes.CDLL(None, use_errno=True)
 
 
 class Semaphore:
@@ -36,22 +33,10 @@ class Semaphore:
         self._at = ctypes.c_void_p(address)
         self._value = ctypes.c_int()
 
-    @classmethod
-    def made(cls, address: int) -> Semaphore:
-        """Initialise a semaphore in shared memory with the value 0."""
-        _libc().sem_init(ctypes.c_void_p(address), 1, 0)
-        return cls(address)
-
-    @classmethod
-    def named(cls, name: str) -> Semaphore | None:
-        """Open a named semaphore, creating it if necessary; return None where that is not allowed."""
-        address = _libc().sem_open(f"/{name}".encode(), os.O_CREAT, 0o644, 0)
-        return cls(address) if address else None
-
     @staticmethod
-    def unlink(name: str) -> None:
-        """Remove a name, if it exists."""
-        _libc().sem_unlink(f"/{name}".encode())
+    def make(address: int) -> None:
+        """Initialise a semaphore with the value 0."""
+        _libc().sem_init(ctypes.c_void_p(address), 1, 0)
 
     @property
     def value(self) -> int:

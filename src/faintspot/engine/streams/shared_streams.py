@@ -209,7 +209,7 @@ def _left_behind(pyshmem: Any, name: str) -> list[Path]:
     parts = [path for part in _PARTS if os.path.lexists(path := FOLDER / f"{_base(name)}{part}")]
     if not parts:
         return []
-    made = min(os.lstat(path).st_mtime for path in parts)
+    made_s = min(os.lstat(path).st_mtime for path in parts)
     try:
         stream = pyshmem.open(name)
     except (OSError, ValueError):  # damaged or incomplete
@@ -217,7 +217,7 @@ def _left_behind(pyshmem: Any, name: str) -> list[Path]:
     pid = stream.creator_pid
     stream.close()
     # A process younger than the stream has merely reused its maker's id, e.g. after a container restart.
-    if process_age_s(pid) >= time.time() - made - _CLOCKS_AGREE_S:
+    if process_age_s(pid) >= time.time() - made_s - _CLOCKS_AGREE_S:
         raise InputError(
             f"{name}: a living process publishes under this name (pid {pid}); stop it or choose another "
             "--name"

@@ -166,14 +166,14 @@ class SlopeStreams:
 
     def commands_obstacle(self) -> str | None:
         """Return why the commands cannot be read by other programs, or None; for any thread."""
-        (name, (commands,)), own = self._of_commands, self._commands
+        (name, (commands,)), stream = self._of_commands, self._commands
         if not commands or self._closed:
             return None
         try:
-            there = pyshmem_module("publishing commands in shared memory").stat(name)["instance_id"]
+            instance = pyshmem_module("publishing commands in shared memory").stat(name)["instance_id"]
         except (OSError, ValueError):
             return f"{name} was removed"
-        same = own is not None and there == own.instance_id
+        same = stream is not None and instance == stream.instance_id
         return None if same else f"{name} was recreated by another program; end that program"
 
     def close(self) -> None:
@@ -199,16 +199,16 @@ def commands_left_behind(stream: str, commands: int) -> NDArray[np.float32] | No
     pyshmem = pyshmem_module("publishing commands in shared memory")
     lock_file(stream)
     try:
-        left = pyshmem.open(stream, gpu_device=False)
+        stream_left = pyshmem.open(stream, gpu_device=False)
     except (OSError, ValueError):  # missing or damaged
         return None
     try:
-        if not left.count or tuple(left.shape) != (commands,) or left.dtype.kind != "f":
+        if not stream_left.count or tuple(stream_left.shape) != (commands,) or stream_left.dtype.kind != "f":
             return None
-        with left.locked(timeout=LOCK_LIMIT_S):
-            values = np.array(left.read(safe=False), np.float32)
+        with stream_left.locked(timeout=LOCK_LIMIT_S):
+            values = np.array(stream_left.read(safe=False), np.float32)
     except (TimeoutError, RuntimeError):  # a living process holds it
         return None
     finally:
-        left.close()
+        stream_left.close()
     return values if np.isfinite(values).all() else None

@@ -1,4 +1,4 @@
-"""Streams that other programs publish: pyshmem's NAME, ImageStreamIO's isio:NAME, dao's dao:FILE."""
+"""Streams that other programs publish: pyshmem's NAME and ImageStreamIO's isio:NAME."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.engine.streams.image_layout import DAO, ISIO, IncompatibleStreamError, path_of
+from faintspot.engine.streams.image_layout import ISIO, IncompatibleStreamError, path_of
 from faintspot.engine.streams.image_stream import ImageStream
 from faintspot.engine.streams.publication import LARGEST_NUMBER, Publication
 from faintspot.engine.streams.shared_streams import lock_file, pyshmem_module
@@ -139,10 +139,10 @@ def _number(frame_id: int, count: int) -> int:
     return (frame_id or max(count - 1, 0)) & LARGEST_NUMBER
 
 
-def split_name(name: str) -> tuple[str, str]:
-    """Return the kind ("isio", "dao" or "" for pyshmem) and the name without it."""
+def image_name(name: str) -> str | None:
+    """Return NAME of isio:NAME; None for a stream of pyshmem."""
     kind, separator, rest = name.partition(":")
-    return (kind, rest) if separator and kind in (ISIO, DAO) else ("", name)
+    return rest if separator and kind == ISIO else None
 
 
 def check_stream(name: str) -> None:
@@ -153,9 +153,9 @@ def check_stream(name: str) -> None:
     InputError, MissingExtraError
         When it cannot, or pyshmem is missing.
     """
-    kind, rest = split_name(name)
-    if kind:
-        path_of(kind, rest)
+    image = image_name(name)
+    if image is not None:
+        path_of(image)
     else:
         pyshmem_module("reading a stream in shared memory")
 
@@ -170,10 +170,10 @@ def open_stream(name: str) -> Stream:
     IncompatibleStreamError
         When it is not a usable stream; the text gives the reason.
     """
-    kind, rest = split_name(name)
-    if kind:
+    image = image_name(name)
+    if image is not None:
         try:
-            return ImageStream(kind, rest)
+            return ImageStream(image)
         except FileNotFoundError:
             raise
         except OSError as error:
@@ -243,7 +243,7 @@ class Follower:
         self.using = threading.Lock()
         self.obstacle = "is not there"
         self.counters = StreamCounters() if counters is None else counters
-        self.seen, self._said, self._next_look_s = 0, "", -math.inf
+        self.seen, self._reported, self._next_look_s = 0, "", -math.inf
 
     def say(self, text: str) -> None:
         """Report a change of the stream."""
@@ -269,9 +269,9 @@ class Follower:
             self.close()
             self.say("was removed" if same is None else "was recreated")
         self.obstacle = self._opened()
-        if self.obstacle != self._said and self.obstacle:
+        if self.obstacle != self._reported and self.obstacle:
             self.say(f"{self.obstacle}; {self._meanwhile()}")
-        self._said = self.obstacle
+        self._reported = self.obstacle
         source = self.source
         if source is not None:
             self._prepare(source)

@@ -1,4 +1,4 @@
-"""The engine's slopes and commands as ImageStreamIO or dao streams, for milk, cacao and dao."""
+"""The engine's slopes and commands as ImageStreamIO streams, for milk and cacao."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from faintspot.base.errors import InputError
 from faintspot.engine.pixels.camera import StopEvent
 from faintspot.engine.streams.image_stream import ImageStreamWriter
-from faintspot.engine.streams.stream import Follower, Stream, split_name
+from faintspot.engine.streams.stream import Follower, Stream, image_name
 
 _PARK_S = 0.05
 
@@ -24,7 +24,7 @@ class StreamOut:
     stream : str
         Name of the stream, e.g. NAME_slopes or NAME_commands; it need not exist yet.
     target : str
-        isio:NAME or dao:FILE.
+        isio:NAME.
     say : function, optional
         Called with a one-line message when the stream changes.
 
@@ -41,9 +41,10 @@ class StreamOut:
     """
 
     def __init__(self, stream: str, target: str, say: Callable[[str], None] | None = None) -> None:
-        self._kind, self._target = split_name(target)
-        if not self._kind:
-            raise InputError(f"{target}: expected isio:NAME or dao:FILE (pyshmem programs can read {stream})")
+        name = image_name(target)
+        if name is None:
+            raise InputError(f"{target}: expected isio:NAME (pyshmem programs can read {stream})")
+        self._target = name
         self._follower = Follower(stream, say or (lambda _: None), _incompatible, prepare=self._prepare)
         self._writer: ImageStreamWriter | None = None
         self.counters = self._follower.counters
@@ -90,8 +91,8 @@ class StreamOut:
             return
         if writer is not None:
             writer.close()
-        self._writer = ImageStreamWriter(self._kind, self._target, source.shape)
-        self._follower.say(f"passed on as {self._kind}:{self._writer.path}")
+        self._writer = ImageStreamWriter(self._target, source.shape)
+        self._follower.say(f"passed on as isio:{self._writer.path}")
 
 
 def _incompatible(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:

@@ -1,1 +1,1 @@
-"""Telemetry of an engine: ring, recorder, report."""
+"""Telemetry of an engine: `segment` and `ring` (shared memory), `recorder`, and the report (`page`)."""

@@ -27,11 +27,11 @@ def latency_figure(telemetry: Telemetry) -> FigureWithData:
     low, high = float(latency.min()), float(latency.max())
     edges = np.geomspace(max(low, 0.1), max(high, low + 1, 1.0) * 1.001, _BINS + 1)
     rows = []
-    for place, (method, name) in enumerate(
+    for index, (method, name) in enumerate(
         zip(np.unique(telemetry.method), method_names(telemetry), strict=True)
     ):
         counts = np.histogram(latency[telemetry.method == method], edges)[0]
-        left.stairs(counts, edges, color=METHOD_COLOURS[place % len(METHOD_COLOURS)], label=name, lw=1.5)
+        left.stairs(counts, edges, color=METHOD_COLOURS[index % len(METHOD_COLOURS)], label=name, lw=1.5)
         rows += [
             (name, f"{a:.4g}", f"{b:.4g}", int(n)) for a, b, n in zip(edges, edges[1:], counts, strict=False)
         ]
@@ -50,33 +50,33 @@ def latency_figure(telemetry: Telemetry) -> FigureWithData:
     right.plot(middle, medians, color="black", marker=marker, ms=3, lw=1.3, label="median")
     right.set(yscale="log", xlabel="time since the first frame (s)", ylabel="latency (µs)")
     right.legend(frameon=False)
-    together = len(parts[0])
-    course = f"median and longest of stretches of {together} frames" if together > 1 else "every frame"
+    n_together = len(parts[0])
+    course = f"median and longest of stretches of {n_together} frames" if n_together > 1 else "every frame"
     return _TEXT.figure("latency", figure, rows, course=course)
 
 
 @styled
-def methods_figure(telemetry: Telemetry, found: Mapping[str, Sequence[MethodDifference]]) -> FigureWithData:
+def methods_figure(telemetry: Telemetry, values: Mapping[str, Sequence[MethodDifference]]) -> FigureWithData:
     """Draw by how much every method differs from the first, a panel for each quantity."""
     figure = new_figure(WIDTH, 1.6 + 0.45 * len(method_names(telemetry)))
     rows = []
-    for panel, (name, compared) in zip(figure.subplots(1, len(found)), found.items(), strict=True):
-        others = [method for method in compared if method.difference is not None]
-        for place, method in enumerate(others):
-            of = method.difference
-            assert of is not None
-            spread = np.nan_to_num([[of.value - of.low], [of.high - of.value]])
-            colour = METHOD_COLOURS[(place + 1) % len(METHOD_COLOURS)]
-            panel.errorbar([of.value], [place], xerr=spread, fmt="o", color=colour, capsize=3)
-            rows.append((name, method.method, of.value, of.low, of.high, of.count))
+    for panel, (name, compared) in zip(figure.subplots(1, len(values)), values.items(), strict=True):
+        methods = [method for method in compared if method.difference is not None]
+        for row, method in enumerate(methods):
+            shift = method.difference
+            assert shift is not None
+            spread = np.nan_to_num([[shift.value - shift.low], [shift.high - shift.value]])
+            colour = METHOD_COLOURS[(row + 1) % len(METHOD_COLOURS)]
+            panel.errorbar([shift.value], [row], xerr=spread, fmt="o", color=colour, capsize=3)
+            rows.append((name, method.method, shift.value, shift.low, shift.high, shift.count))
         panel.axvline(0, color=GREY, lw=1)
         panel.set_yticks(
-            range(len(others)),
-            [method.method for method in others] if not panel.get_subplotspec().colspan.start else [],
+            range(len(methods)),
+            [method.method for method in methods] if not panel.get_subplotspec().colspan.start else [],
         )
-        panel.set_ylim(len(others) - 0.4, -0.6)
+        panel.set_ylim(len(methods) - 0.4, -0.6)
         panel.set_title(name, fontsize=10)
         panel.tick_params(axis="x", labelsize=9)
         panel.locator_params(axis="x", nbins=4)
-    first = next(iter(found.values()))[0].method
+    first = next(iter(values.values()))[0].method
     return _TEXT.figure("methods", figure, rows, first=first)

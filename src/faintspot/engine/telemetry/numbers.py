@@ -53,10 +53,10 @@ class MethodDifference:
 def timing(telemetry: Telemetry) -> Timing:
     """Return the timing of the frames recorded."""
     interval = np.diff(telemetry.last_row_time_ns)[np.diff(telemetry.frame) == 1] / 1e9
-    some = interval.size > 0
+    has_interval = interval.size > 0
     return Timing(
-        float(1 / np.median(interval)) if some and np.median(interval) > 0 else np.nan,
-        float(interval.max()) if some else np.nan,
+        float(1 / np.median(interval)) if has_interval and np.median(interval) > 0 else np.nan,
+        float(interval.max()) if has_interval else np.nan,
         np.percentile(telemetry.latency_s, PERCENTILES),
     )
 
@@ -95,10 +95,10 @@ def quantities(telemetry: Telemetry) -> dict[str, Floats]:
             values = np.where(used, axis[rows], 0.0).astype(np.float64)
             mean = values.sum(axis=0) / np.maximum(used.sum(axis=0), 1)
             squares[rows] += np.sum(np.where(used, values - mean, 0.0) ** 2, axis=1)
-    some = np.where(count > 0, count, np.nan)
-    flux = np.where(valid, telemetry.flux, 0.0).sum(axis=1) / some
+    n_valid = np.where(count > 0, count, np.nan)
+    flux = np.where(valid, telemetry.flux, 0.0).sum(axis=1) / n_valid
     return {
-        "rms of slopes about their mean (px)": np.sqrt(squares / (2 * some)),
+        "rms of slopes about their mean (px)": np.sqrt(squares / (2 * n_valid)),
         "flux (e-)": flux,
         "valid (%)": 100.0 * valid.mean(axis=1),
         "latency (µs)": 1e6 * telemetry.latency_s,
@@ -129,21 +129,21 @@ def compared_methods(
     by_turn = [_by_turn(methods, method, values) for method in np.unique(methods)]
     first = by_turn[0]
     compared = []
-    for place, (name, own) in enumerate(zip(names, by_turn, strict=True)):
-        length = min(len(own), len(first))
-        difference = None if place == 0 else _mean(own[:length] - first[:length], len(by_turn) - 1)
-        compared.append(MethodDifference(name, _mean(own), difference))
+    for index, (name, means) in enumerate(zip(names, by_turn, strict=True)):
+        length = min(len(means), len(first))
+        difference = None if index == 0 else _mean(means[:length] - first[:length], len(by_turn) - 1)
+        compared.append(MethodDifference(name, _mean(means), difference))
     return compared
 
 
 def _by_turn(methods: NDArray[np.int64], method: int, values: Floats) -> Floats:
     """Return the mean of each turn of a method: of frames of its, one after the other; NaN without any."""
     number = np.cumsum(np.concatenate([[0], np.diff(methods) != 0]))[methods == method]
-    own = values[methods == method]
+    method_values = values[methods == method]
     _, turn = np.unique(number, return_inverse=True)
-    kept = np.isfinite(own)
+    kept = np.isfinite(method_values)
     count = np.bincount(turn, weights=kept)
-    sums = np.bincount(turn, weights=np.where(kept, own, 0.0))
+    sums = np.bincount(turn, weights=np.where(kept, method_values, 0.0))
     return np.asarray(np.divide(sums, count, out=np.full(len(count), np.nan), where=count > 0))
 
 
@@ -157,13 +157,13 @@ def change_rows(telemetry: Telemetry) -> Sequence[tuple[int, float, str, str]]:
     rows = []
     start = telemetry.last_row_time_ns[0]
     for change in telemetry.changes:
-        place = int(np.searchsorted(telemetry.frame, change["frame"]))
-        inside = place < len(telemetry.frame) and change["frame"] >= telemetry.frame[0]
-        seconds = float(telemetry.last_row_time_ns[place] - start) / 1e9 if inside else np.nan
-        what = ", ".join(f"{name} = {_shortened(value)}" for name, value in change["changes"].items())
+        index = int(np.searchsorted(telemetry.frame, change["frame"]))
+        inside = index < len(telemetry.frame) and change["frame"] >= telemetry.frame[0]
+        seconds = float(telemetry.last_row_time_ns[index] - start) / 1e9 if inside else np.nan
+        change_text = ", ".join(f"{name} = {_shortened(value)}" for name, value in change["changes"].items())
         where = change["where"]
         shown = "all" if where is None else where if isinstance(where, str) else ", ".join(map(str, where))
-        rows.append((int(change["frame"]), seconds, what, shown))
+        rows.append((int(change["frame"]), seconds, change_text, shown))
     return rows
 
 

@@ -76,9 +76,9 @@ def _measured(telemetry: Telemetry) -> list[MeasuredSlopes]:
     measured = []
     for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
         rows = telemetry.method == method
-        arrays = [getattr(telemetry, of)[rows] for of in ARRAYS]
-        known = errors[rows][np.isfinite(errors[rows])]
-        stated = float(np.median(known)) if known.size else np.nan
+        arrays = [getattr(telemetry, array)[rows] for array in ARRAYS]
+        finite = errors[rows][np.isfinite(errors[rows])]
+        stated = float(np.median(finite)) if finite.size else np.nan
         frames = telemetry.frame[rows].astype(np.int64)
         measured.append(MeasuredSlopes(name, *arrays, frames=frames, standard_error_px=stated))
     return measured
@@ -112,56 +112,56 @@ def _warnings(telemetry: Telemetry) -> list[str]:
 
 
 def _timing(telemetry: Telemetry) -> Section:
-    found = timing(telemetry)
+    measured = timing(telemetry)
     latency = 1e6 * telemetry.latency_s
     rows = []
     for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
-        own = latency[telemetry.method == method]
-        rows.append([name, str(len(own)), *(f"{value:.1f}" for value in np.percentile(own, PERCENTILES))])
+        us = latency[telemetry.method == method]
+        rows.append([name, str(len(us)), *(f"{value:.1f}" for value in np.percentile(us, PERCENTILES))])
     header = ["", "frames", "median (µs)", "99 % (µs)", "99.9 % (µs)", "longest (µs)"]
     table = Table(header, rows, caption="Latency: from a frame's last row to its slopes.")
     rate = "not known: no two frames have consecutive numbers"
-    if np.isfinite(found.rate_hz):
-        rate = _TEXT("telemetry.rate", rate=found.rate_hz, longest=1e3 * found.longest_interval_s)
+    if np.isfinite(measured.rate_hz):
+        rate = _TEXT("telemetry.rate", rate=measured.rate_hz, longest=1e3 * measured.longest_interval_s)
     return Section("timing", "Rate and latency", [f"Rate: {rate}."], [table], [latency_figure(telemetry)])
 
 
 def _lost(telemetry: Telemetry) -> Section:
-    found = gaps(telemetry)
-    lost = sum(gap.lost for gap in found)
+    gap_list = gaps(telemetry)
+    lost = sum(gap.lost for gap in gap_list)
     dropped = {
         name: telemetry.attributes.get(f"dropped_{name}", 0) for name in ("records", "images", "changes")
     }
     rows = [
         ["frame numbers that are missing", str(lost)],
         ["of them overwritten before the recorder read them", str(dropped["records"])],
-        ["gaps", str(len(found))],
-        ["longest gap, frames", str(max((gap.lost for gap in found), default=0))],
+        ["gaps", str(len(gap_list))],
+        ["longest gap, frames", str(max((gap.lost for gap in gap_list), default=0))],
         ["times that frame numbers began anew", str(restarts(telemetry))],
         ["images lost to the record", str(dropped["images"])],
         ["changes of settings lost to the record", str(dropped["changes"])],
     ]
     text = [_TEXT["telemetry.lost"]]
     tables = [Table(["", "number"], rows)]
-    if found:
-        listed = [[str(gap.after_frame), str(gap.lost)] for gap in found[:_MOST_GAPS]]
-        caption = f"The first {len(listed)} of {len(found)} gaps."
+    if gap_list:
+        listed = [[str(gap.after_frame), str(gap.lost)] for gap in gap_list[:_MOST_GAPS]]
+        caption = f"The first {len(listed)} of {len(gap_list)} gaps."
         tables.append(Table(["after frame", "frames lost"], listed, caption, folded="Where"))
     return Section("lost", "Lost frames", text, tables)
 
 
 def _methods(telemetry: Telemetry) -> Section:
     rows = []
-    found = {name: methods_in_turn(telemetry, values) for name, values in quantities(telemetry).items()}
-    for name, compared in found.items():
+    differences = {name: methods_in_turn(telemetry, values) for name, values in quantities(telemetry).items()}
+    for name, compared in differences.items():
         for method in compared:
             difference = "–" if method.difference is None else _in_words(method.difference)
             rows.append([name, method.method, _with_error(method.mean), difference])
-    first = next(iter(found.values()))[0].method
+    first = next(iter(differences.values()))[0].method
     header = ["", "method", "mean ± standard error", f"less {first!r} (95 %)"]
     text = [_TEXT["methods.text"]]
     return Section(
-        "methods", "Methods in turn", text, [Table(header, rows)], [methods_figure(telemetry, found)]
+        "methods", "Methods in turn", text, [Table(header, rows)], [methods_figure(telemetry, differences)]
     )
 
 
@@ -181,14 +181,14 @@ def _with_error(estimate: Estimate) -> str:
 
 def _changes(telemetry: Telemetry) -> Section:
     title = "Changes of settings"
-    found = change_rows(telemetry)
-    if not found:
+    change_list = change_rows(telemetry)
+    if not change_list:
         return Section("changes", title, ["None: the settings are those at the end of this page."])
     rows = [
-        [str(frame), f"{seconds:.3f}" if np.isfinite(seconds) else "before", where, what]
-        for frame, seconds, what, where in found[:_MOST_CHANGES]
+        [str(frame), f"{seconds:.3f}" if np.isfinite(seconds) else "before", where, change]
+        for frame, seconds, change, where in change_list[:_MOST_CHANGES]
     ]
-    caption = f"The first {len(rows)} of {len(found)} changes." if len(rows) < len(found) else ""
+    caption = f"The first {len(rows)} of {len(change_list)} changes." if len(rows) < len(change_list) else ""
     table = Table(["from frame", "at (s)", "sub-apertures", "change"], rows, caption, words=True)
     return Section("changes", title, tables=[table])
 
@@ -197,8 +197,8 @@ def _slopes(telemetry: Telemetry) -> dict[str, Slopes]:
     """Return the slopes of every method."""
     errors = "standard_error_x", "standard_error_y", "covariance_xy"
     names = ("x", "y", "flux", "flags", "iterations", *errors)
-    found = {}
+    slopes = {}
     for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
-        own = {of: getattr(telemetry, of)[telemetry.method == method] for of in names}
-        found[name] = Slopes(**own, bad_pixels=np.zeros(own["x"].shape, np.int32))
-    return found
+        arrays = {array: getattr(telemetry, array)[telemetry.method == method] for array in names}
+        slopes[name] = Slopes(**arrays, bad_pixels=np.zeros(arrays["x"].shape, np.int32))
+    return slopes

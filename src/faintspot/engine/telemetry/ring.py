@@ -78,7 +78,7 @@ class TelemetryRing(Closing):
         self._rings = rings = Rings(ring.pixels[0, 0], begin, description)
         self._written = 0
         items = rings.records.items
-        self._places, self._itemsize, self._begin = len(items), items.itemsize, rings.first_record
+        self._slots, self._itemsize, self._begin = len(items), items.itemsize, rings.first_record
         # One array per field; each row is the target of one copy, without temporary objects.
         self._x, self._y, self._flux = items["x"], items["y"], items["flux"]
         self._error_x, self._error_y = items["standard_error_x"], items["standard_error_y"]
@@ -183,10 +183,10 @@ class TelemetryRing(Closing):
             Commands that follow from the slopes; needed if the telemetry has commands.
         """
         written = self._written
-        place = written % self._places
+        slot = written % self._slots
         _HEAD.pack_into(
             self._memory,
-            self._begin + place * self._itemsize,
+            self._begin + slot * self._itemsize,
             written,
             frame,
             method,
@@ -196,12 +196,12 @@ class TelemetryRing(Closing):
             time.time_ns() - time.monotonic_ns(),
             *causes,
         )
-        self._x[place], self._y[place], self._flux[place] = slopes.x, slopes.y, slopes.flux
-        self._error_x[place], self._error_y[place] = slopes.standard_error_x, slopes.standard_error_y
-        self._covariance_xy[place] = slopes.covariance_xy
-        self._iterations[place], self._flags[place] = slopes.iterations, slopes.flags
+        self._x[slot], self._y[slot], self._flux[slot] = slopes.x, slopes.y, slopes.flux
+        self._error_x[slot], self._error_y[slot] = slopes.standard_error_x, slopes.standard_error_y
+        self._covariance_xy[slot] = slopes.covariance_xy
+        self._iterations[slot], self._flags[slot] = slopes.iterations, slopes.flags
         if commands is not None:
-            self._loop[place], self._commands[place] = loop, commands
+            self._loop[slot], self._commands[slot] = loop, commands
         self._written = written = written + 1
         self._rings.records.count(written)
 
@@ -233,12 +233,12 @@ class TelemetryRing(Closing):
         where : sequence of int, optional
             Indices of the sub-apertures; None: all.
         """
-        place = {"frame": int(frame), "number": int(number)}
-        whole = {**place, "changes": dict(changes), "where": where}
-        text = json.dumps(whole, default=plain).encode()
+        head = {"frame": int(frame), "number": int(number)}
+        entry = {**head, "changes": dict(changes), "where": where}
+        text = json.dumps(entry, default=plain).encode()
         if len(text) > CHANGE_BYTES - 8:
             names = dict.fromkeys(list(changes)[:20], "too long")
-            short = {**place, "changes": names, "where": "too long", "too_long_bytes": len(text)}
+            short = {**head, "changes": names, "where": "too long", "too_long_bytes": len(text)}
             text = json.dumps(short).encode()
         ring = self._rings.changes
         written = ring.written
@@ -322,7 +322,7 @@ def _segment(name: str, description: Mapping[str, Any]) -> tuple[PixelRing, int]
     """Create the segment, with its description and empty rings; return it and the offset of the rings."""
     text = json.dumps(description).encode()
     begin = up_to_pages(_START.size + len(text))
-    rings = sum(up_to_pages(kind.itemsize * places) for kind, places in kinds_of(description))
+    rings = sum(up_to_pages(kind.itemsize * slots) for kind, slots in kinds_of(description))
     pid, segment = os.getpid(), f"{name}_telemetry"
     size = begin + PAGE + rings
     header = Header(pid, process_start(pid), secrets.randbits(64), 1, size, 1, _BYTE.str)

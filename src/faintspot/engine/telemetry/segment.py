@@ -95,12 +95,12 @@ class Ring:
         dropped : int
             Items that were overwritten before they could be copied.
         """
-        places, written = len(self.items), self.written
-        first = max(cursor, written - places + 1)  # one place may be in use by the writer
+        slots, written = len(self.items), self.written
+        first = max(cursor, written - slots + 1)  # one place may be in use by the writer
         last = max(first, written if most is None else min(written, first + most))
-        copies = self.items[np.arange(first, last) % places]
+        copies = self.items[np.arange(first, last) % slots]
         fence()  # before checking what was overwritten meanwhile
-        overwritten = min(max(self.written - places + 1 - first, 0), len(copies))
+        overwritten = min(max(self.written - slots + 1 - first, 0), len(copies))
         return copies[overwritten:], last, first - cursor + overwritten
 
 
@@ -112,8 +112,8 @@ class Rings:
         begin += PAGE
         self.first_record = begin
         rings = []
-        for row, (kind, places) in enumerate(kinds_of(description)):
-            size = kind.itemsize * places
+        for row, (kind, slots) in enumerate(kinds_of(description)):
+            size = kind.itemsize * slots
             rings.append(Ring(cells, row, memory[begin : begin + size].view(kind)))
             begin += up_to_pages(size)
         self.records, self.images, self.changes = rings

@@ -1,1 +1,1 @@
-"""The simulated telescope of an engine."""
+"""Simulated telescope that publishes frames and reads commands, and its changing conditions (`orders`)."""

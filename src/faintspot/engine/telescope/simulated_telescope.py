@@ -242,10 +242,10 @@ class SimulatedTelescope(Readout, Closing):
         self, number: int, time_s: float, commands_nm: NDArray[np.float64], stamps: tuple[float, ...]
     ) -> Exposure:
         """Simulate one frame; runs in a separate thread."""
-        after, seen = self.telescope_model.wavefronts(time_s, commands_nm)
+        after, residual_nm = self.telescope_model.wavefronts(time_s, commands_nm)
         truth = self.telescope_model.truth(time_s, after)
-        known = (float(number), truth.strehl, truth.rms_nm, truth.r0_m, time_s)
-        return Exposure(self.telescope_model.frame(number, seen), known + stamps)
+        truth_values = (float(number), truth.strehl, truth.rms_nm, truth.r0_m, time_s)
+        return Exposure(self.telescope_model.frame(number, residual_nm), truth_values + stamps)
 
     def _complain(self) -> None:
         """Report, at intervals, that the pace cannot be kept."""

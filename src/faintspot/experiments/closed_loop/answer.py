@@ -131,8 +131,8 @@ class LoopAnswer:
     @property
     def level(self) -> float:
         """The Strehl ratio that limiting magnitudes are for."""
-        asked = self.question.strehl
-        return float(0.5 * self.runs(BASELINE)[-1].mean()) if asked is None else float(asked)
+        strehl = self.question.strehl
+        return float(0.5 * self.runs(BASELINE)[-1].mean()) if strehl is None else float(strehl)
 
     def runs(self, name: str) -> Floats:
         """Return a candidate's Strehl ratios (F, R).
@@ -142,15 +142,15 @@ class LoopAnswer:
         InputError
             For one that was not tried.
         """
-        runs: Floats = self.measured.strehl[self._place(name)]
+        runs: Floats = self.measured.strehl[self._index(name)]
         return runs
 
     def choice(self, name: str, flux: int) -> dict[str, Any]:
         """Return a candidate's tuned values at a measured flux."""
-        choice: dict[str, Any] = json.loads(str(self.measured.choices[self._place(name), flux]))
+        choice: dict[str, Any] = json.loads(str(self.measured.choices[self._index(name), flux]))
         return choice
 
-    def _place(self, name: str) -> int:
+    def _index(self, name: str) -> int:
         names = self.measured.names
         if name not in names:
             raise InputError(f"method {name!r}: expected one that was tried: {', '.join(names)}")
@@ -160,14 +160,14 @@ class LoopAnswer:
         """Return which tuned values are the first or last that were on offer, but could be beyond."""
         kind, choice = self.kinds[name], self.choice(name, flux)
         declared = kind.estimator.declared()
-        found = []
-        for option, each in kind.tuned(self.star(flux)).items():
-            if len(each.values) < 2 or isinstance(choice[option], str):
+        limited = []
+        for option, tunable in kind.tuned(self.star(flux)).items():
+            if len(tunable.values) < 2 or isinstance(choice[option], str):
                 continue
             limits = (declared[option].low, declared[option].high) if option in declared else ()
-            if choice[option] in (min(each.values), max(each.values)) and choice[option] not in limits:
-                found.append(option)
-        return found
+            if choice[option] in (min(tunable.values), max(tunable.values)) and choice[option] not in limits:
+                limited.append(option)
+        return limited
 
     def strehl(self, name: str, flux: int) -> Estimate:
         """Return a method's Strehl ratio at a measured flux."""
@@ -213,14 +213,14 @@ class LoopAnswer:
     def gain(self, name: str, reference: str) -> Limit:
         """Return the gain in limiting magnitude over another method; NaN where one of them has no limit."""
         faint, strehl = self._from_bright(name)
-        found = magnitude_gain(faint, strehl, self._from_bright(reference)[1], self.level)
-        if not math.isfinite(found.value):
-            return Limit(found, 0.0)
-        curves = [self._from_bright(each)[1].mean(axis=1) for each in (name, reference)]
+        gain = magnitude_gain(faint, strehl, self._from_bright(reference)[1], self.level)
+        if not math.isfinite(gain.value):
+            return Limit(gain, 0.0)
+        curves = [self._from_bright(method)[1].mean(axis=1) for method in (name, reference)]
         values = [float(limiting_magnitudes(faint, curve, self.level)) for curve in curves]
         # Curves that bend alike are wrong alike.
-        mine, other = (_interpolation_error(faint, *each) for each in zip(curves, values, strict=True))
-        return Limit(found, abs(mine - other))
+        errors = [_interpolation_error(faint, *pair) for pair in zip(curves, values, strict=True)]
+        return Limit(gain, abs(errors[0] - errors[1]))
 
     def coverage(self, name: str, place: str) -> Coverage | None:
         """Return what part of a place of `PLACES` a method can use; None: no radius."""
@@ -303,7 +303,7 @@ class LoopAnswer:
         if NOISE_SCALE in choice:
             table["noise_scale"] = float(choice[NOISE_SCALE])
         if self.method(best.name, flux).correct_gain:
-            gains = self.measured.centroid_gain[self._place(best.name), flux]
+            gains = self.measured.centroid_gain[self._index(best.name), flux]
             table["centroid_gain"] = round(float(gains.mean()), 3)
         if math.isfinite(strehl.standard_error):
             table["strehl_error"] = round(strehl.standard_error, 4)
@@ -329,5 +329,5 @@ def _interpolation_error(faint: Floats, strehl: Floats, value: float) -> float:
 
 
 def _simplicity(kind: MethodKind) -> tuple[Any, ...]:
-    own = kind.name != BASELINE, kind.control != INTEGRATOR
-    return *own, int(Knowledge.of(kind.estimator)), kind.estimator.cost, kind.name
+    beyond_baseline = kind.name != BASELINE, kind.control != INTEGRATOR
+    return *beyond_baseline, int(Knowledge.of(kind.estimator)), kind.estimator.cost, kind.name

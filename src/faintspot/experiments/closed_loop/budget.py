@@ -50,7 +50,7 @@ def run_budget(
     *,
     quick: bool = False,
     search: Search | None = None,
-    place: WorkerPool | None = None,
+    pool: WorkerPool | None = None,
     overwrite: bool = False,
 ) -> BudgetResult:
     """Measure the Strehl ratio of methods with each of `TERMS` switched off, or what is left of it.
@@ -62,7 +62,7 @@ def run_budget(
     ----------
     methods : sequence of str, optional
         Default: brightest pixels, Gaussian smoothing and TV.
-    configuration, folder, quick, search, place, overwrite
+    configuration, folder, quick, search, pool, overwrite
         As for `run_magnitude`.
 
     Raises
@@ -80,18 +80,18 @@ def run_budget(
         raise InputError(
             f"control.mode = {configuration.control.mode!r}: expected 'closed' for an error budget"
         )
-    experiment = Experiment.begun(configuration, folder, KIND, quick, search, place, overwrite)
+    experiment = Experiment.begun(configuration, folder, KIND, quick, search, pool, overwrite)
     configuration, flux = experiment.configuration, configuration.photons
     kinds = checked_methods(DEFAULT_METHODS if methods is None else methods)
-    _, of = experiment.measured(
+    _, array_of = experiment.measured(
         kinds,
         [flux],
         budget_run,
         {term: term for term in TERMS},
         lambda kind, term, choices: (configuration, choices[flux], term),
     )
-    names, labels = (tuple(getattr(kind, what) for kind in kinds) for what in ("name", "label"))
-    result = BudgetResult(names, tuple(TERMS), labels, of("strehl"), of("residual_nm"))
+    names, labels = (tuple(getattr(kind, attribute) for kind in kinds) for attribute in ("name", "label"))
+    result = BudgetResult(names, tuple(TERMS), labels, array_of("strehl"), array_of("residual_nm"))
     result.save(experiment.folder / BUDGET_FILE)
     return result
 

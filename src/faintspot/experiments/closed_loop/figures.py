@@ -37,13 +37,13 @@ def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> Fig
         runs = [paired_mean(values) for values in result.strehl[method]]
         value = np.array([run.value for run in runs])
         error = np.nan_to_num([run.standard_error for run in runs])
-        place = result.magnitudes + (method - len(result.labels) / 2) * shift
+        shifted = result.magnitudes + (method - len(result.labels) / 2) * shift
         style = method_style(result.names[method])
         left.errorbar(result.magnitudes, value, error, label=name, capsize=2, **style)
         differences = differences_by_flux(result, method, reference)
         low, middle, high = np.array([[d.low, d.value, d.high] for d in differences]).T
         if method != reference:
-            right.errorbar(place, middle, np.nan_to_num([middle - low, high - middle]), capsize=2, **style)
+            right.errorbar(shifted, middle, np.nan_to_num([middle - low, high - middle]), capsize=2, **style)
         count = np.full(len(value), result.strehl.shape[-1])
         columns = result.magnitudes, result.photons, value, error, count, low, middle, high
         rows += [[name, *row] for row in zip(*columns, strict=True)]
@@ -89,9 +89,9 @@ def budget_figure(result: BudgetResult, label: str) -> FigureWithData:
         runs = [paired_mean(values) for values in result.strehl[method]]
         value = np.array([run.value for run in runs])
         error = np.nan_to_num([run.standard_error for run in runs])
-        place = np.arange(terms) + (method - (methods - 1) / 2) * 0.8 / methods
+        y = np.arange(terms) + (method - (methods - 1) / 2) * 0.8 / methods
         colour = method_style(result.names[method])["color"]
-        panel.barh(place, value, 0.72 / methods, xerr=error, color=colour, label=name, capsize=2, ecolor=GREY)
+        panel.barh(y, value, 0.72 / methods, xerr=error, color=colour, label=name, capsize=2, ecolor=GREY)
         panel.plot([value[0]] * 2, [-0.5, terms - 0.5], color=colour, lw=0.8, ls=":")
         rows += [[name, t, v, e] for t, v, e in zip(result.terms, value, error, strict=True)]
     panel.set_yticks(range(terms), [_switched(term) for term in result.terms])
@@ -110,9 +110,9 @@ def method_style(name: str) -> dict[str, Any]:
 
     Lines of control that learns are dash-dotted.
     """
-    known = estimators()
-    base = next((name[:end] for end in range(len(name), 0, -1) if name[:end] in known), "")
-    style = known[base].style if base else Style("#666666")
+    kinds = estimators()
+    base = next((name[:end] for end in range(len(name), 0, -1) if name[:end] in kinds), "")
+    style = kinds[base].style if base else Style("#666666")
     return {
         "color": style.colour,
         "marker": style.marker,

@@ -52,7 +52,7 @@ def run_magnitude(
     *,
     quick: bool = False,
     search: Search | None = None,
-    place: WorkerPool | None = None,
+    pool: WorkerPool | None = None,
     overwrite: bool = False,
 ) -> MagnitudeResult:
     """Measure the Strehl ratio of methods against the star's flux, or what is left of it.
@@ -74,7 +74,7 @@ def run_magnitude(
         Few fluxes, short runs, a coarse search.
     search : Search, optional
         Search for the settings.
-    place : WorkerPool, optional
+    pool : WorkerPool, optional
         Where the work is done. Default: processes on this machine.
     overwrite : bool
         Whether another experiment in the folder is replaced.
@@ -93,12 +93,12 @@ def run_magnitude(
     >>> result = run_magnitude(load_loop("canary"), "magnitude", quick=True)  # doctest: +SKIP
     """
     kinds = checked_methods(methods if methods is not None else _default(configuration, quick))
-    experiment = Experiment.begun(configuration, folder, KIND, quick, search, place, overwrite)
+    experiment = Experiment.begun(configuration, folder, KIND, quick, search, pool, overwrite)
     configuration = experiment.configuration
     fluxes = _checked_fluxes(
         photons if photons is not None else configuration.run.photons_per_subaperture, quick
     )
-    choices, of = experiment.measured(
+    choices, array_of = experiment.measured(
         kinds,
         fluxes,
         scored_run,
@@ -110,9 +110,9 @@ def run_magnitude(
         tuple(kind.label for kind in kinds),
         np.array(fluxes),
         configuration.photometry.magnitude(fluxes),
-        of("strehl"),
-        of("centroid_gain"),
-        of("settings")[:, :, 0],
+        array_of("strehl"),
+        array_of("centroid_gain"),
+        array_of("settings")[:, :, 0],
         np.array([[json.dumps(choices[kind.name, flux]) for flux in fluxes] for kind in kinds]),
         configuration.to_text(),
     )
@@ -129,7 +129,7 @@ class Experiment:
     """Plan: a `Search`, or a dataclass of the experiment."""
     folder: Path
     name: str
-    place: WorkerPool
+    pool: WorkerPool
     overwrite: bool
 
     @classmethod
@@ -140,13 +140,13 @@ class Experiment:
         name: str,
         quick: bool,
         search: Search | None,
-        place: WorkerPool | None,
+        pool: WorkerPool | None,
         overwrite: bool,
     ) -> Experiment:
         """Return an experiment with a search, in a folder that is made where it is not there."""
         configuration = quick_run(configuration) if quick else configuration
         search = search or (QUICK if quick else Search())
-        return cls(configuration, search, make_folder(folder), name, place or WorkerPool(), overwrite)
+        return cls(configuration, search, make_folder(folder), name, pool or WorkerPool(), overwrite)
 
     def store(self, units: Sequence[Unit], suffix: str = "") -> ZarrStore:
         """Return where units are kept.
@@ -219,20 +219,20 @@ class Experiment:
         """
         stars = {flux: with_flux(self.configuration, flux) for flux in fluxes}
         plain, learning = _plain_and_learning(kinds)
-        alone = self._tuned("tuning", plain, stars, {}, stages[0])
-        best = {key: tuned.choice for key, tuned in alone.items()}
+        first = self._tuned("tuning", plain, stars, {}, stages[0])
+        best = {key: tuned.choice for key, tuned in first.items()}
         smooth: dict[tuple[str, float], Choice] = {
             (kind.name, flux): choice
             for kind in plain
-            for found in [[best[kind.name, flux] for flux in fluxes]]
-            for flux, choice in zip(fluxes, smoothed(kind, list(stars.values()), found), strict=True)
+            for chosen in [[best[kind.name, flux] for flux in fluxes]]
+            for flux, choice in zip(fluxes, smoothed(kind, list(stars.values()), chosen), strict=True)
         }
         if smooth != best:
             again = self._tuned("tuning of the loop gain", plain, stars, smooth, stages[1])
-            kept = {key: each for key, each in again.items() if each.strehl >= alone[key].strehl - _NO_LOSS}
-            best |= {key: each.choice for key, each in kept.items()}
-        own = self._tuned("tuning of control", learning, stars, best, stages[2])
-        return {**best, **{key: tuned.choice for key, tuned in own.items()}}
+            kept = {key: new for key, new in again.items() if new.strehl >= first[key].strehl - _NO_LOSS}
+            best |= {key: tuned.choice for key, tuned in kept.items()}
+        of_control = self._tuned("tuning of control", learning, stars, best, stages[2])
+        return {**best, **{key: tuned.choice for key, tuned in of_control.items()}}
 
     def _tuned(
         self,
@@ -240,7 +240,7 @@ class Experiment:
         kinds: Sequence[MethodKind],
         stars: Mapping[float, LoopConfiguration],
         slopes: Mapping[tuple[str, float], Choice],
-        place: WorkerPool,
+        pool: WorkerPool,
     ) -> dict[tuple[str, float], Tuned]:
         """Return the tuned values of every method with every star, given those of its slopes."""
         units = {
@@ -252,16 +252,16 @@ class Experiment:
         }
         if not units:
             return {}
-        place.say(stage)
+        pool.say(stage)
         store = self.store(list(units.values()), "-tuning")
-        results = run_units(tuning_unit, list(units.values()), store, place)
+        results = run_units(tuning_unit, list(units.values()), store, pool)
         return {key: stored(results[unit.key]) for key, unit in units.items()}
 
     def _stages(self, kinds: Sequence[MethodKind], fluxes: Sequence[float], columns: int) -> list[WorkerPool]:
         """Return where each stage runs, with a progress that is the whole experiment's."""
         star, (plain, learning) = with_flux(self.configuration, fluxes[0]), _plain_and_learning(kinds)
-        known = {
-            kind.name: {name: each.first[0] for name, each in kind.tuned(star).items()} for kind in plain
+        slopes = {
+            kind.name: {name: axis.first[0] for name, axis in kind.tuned(star).items()} for kind in plain
         }
 
         def tuning(kinds: Sequence[MethodKind], slopes: Mapping[str, Choice]) -> int:
@@ -271,8 +271,8 @@ class Experiment:
 
         run = self.configuration.run
         scoring = sum(learning_frames(kind, star) + run.realisations * run.frames for kind in kinds)
-        sizes = tuning(plain, {}), tuning(plain, known), tuning(learning, known), columns * scoring
-        return in_stages(self.place, sizes)
+        sizes = tuning(plain, {}), tuning(plain, slopes), tuning(learning, slopes), columns * scoring
+        return in_stages(self.pool, sizes)
 
     def _scoring_unit(
         self, kind: MethodKind, name: str, function: Callable[..., Arrays], arguments: tuple[Any, ...]
@@ -297,9 +297,9 @@ def _tuning_unit(kind: MethodKind, star: LoopConfiguration, search: Search, slop
     return Unit(key, (kind, star, search, slopes), tuning_frames(kind, star, search, slopes))
 
 
-def _digest(of: object) -> str:
+def _digest(value: object) -> str:
     """Return a short text that differs between choices."""
-    return fingerprint_of(repr(of))[:8]
+    return fingerprint_of(repr(value))[:8]
 
 
 def all_realisations(
@@ -317,11 +317,11 @@ def all_realisations(
         The last one is `advance`.
     """
     count, frames = runs
-    *others, advance = arguments
-    every = [
-        function(*others, run, lambda done, run=run: advance(run * frames + done)) for run in range(count)
+    *constants, advance = arguments
+    results = [
+        function(*constants, run, lambda done, run=run: advance(run * frames + done)) for run in range(count)
     ]
-    return {name: np.array([each[name] for each in every]) for name in every[0]}
+    return {name: np.array([arrays[name] for arrays in results]) for name in results[0]}
 
 
 def scored_run(
@@ -374,5 +374,5 @@ def _checked_fluxes(photons: Sequence[float], quick: bool) -> list[float]:
         raise InputError("photons: expected at least one flux, got none: see run.photons_per_subaperture")
     if quick and len(fluxes) > _QUICK_FLUXES:
         chosen = np.linspace(0, len(fluxes) - 1, _QUICK_FLUXES).round().astype(int)
-        return [fluxes[place] for place in chosen]
+        return [fluxes[index] for index in chosen]
     return fluxes

@@ -68,7 +68,7 @@ class Tunable:
 
     def nearest(self, value: float) -> Tunable:
         """Return only the value that is nearest to another one."""
-        near = min(self.values, key=lambda each: abs(each - value))
+        near = min(self.values, key=lambda candidate: abs(candidate - value))
         return Tunable((near,), (near,))
 
 
@@ -124,7 +124,7 @@ class MethodKind:
     def name(self) -> str:
         """Name in commands and results."""
         # The Kalman filter always predicts.
-        variants = [each for each in self.variants if each != _PREDICTED or self.control != KALMAN]
+        variants = [variant for variant in self.variants if variant != _PREDICTED or self.control != KALMAN]
         slopes = "".join([self.estimator.name, *variants])
         return slopes if self.control == INTEGRATOR else f"{slopes}{CONTROL_SIGN}{self.control}"
 
@@ -177,11 +177,11 @@ class MethodKind:
         for name in self.tuned(configuration):
             if name not in choice:
                 raise InputError(f"choice: expected a value for {name!r} of the method {self.name!r}")
-        of_loop = (LOOP_GAIN, NOISE_SCALE)
-        options = {name: value for name, value in choice.items() if name not in of_loop}
+        loop_options = (LOOP_GAIN, NOISE_SCALE)
+        options = {name: value for name, value in choice.items() if name not in loop_options}
         estimator = self._untuned(configuration).replaced(options)
         laser, needs_psf = configuration.laser is not None, Need.PSF in estimator.required
-        if not laser and any(each in self.variants for each in _OF_LASER):
+        if not laser and any(name in self.variants for name in _OF_LASER):
             raise InputError(f"method = {self.name!r}: expected a configuration with a laser")
         changes = {key: value for name in self.variants for key, value in VARIANTS[name].changes.items()}
         return Method(
@@ -198,7 +198,7 @@ class MethodKind:
         )
 
     def _untuned(self, configuration: LoopConfiguration) -> Estimator:
-        automatic = {name: AUTO for name, each in self.estimator.declared().items() if each.automatic}
+        automatic = {name: AUTO for name, option in self.estimator.declared().items() if option.automatic}
         return self.estimator(**automatic).for_scene(configuration.scene)
 
 
@@ -283,7 +283,7 @@ def _spread(values: Sequence[Any], count: int) -> Tunable:
     if len(ordered) <= count:
         return Tunable(tuple(ordered), tuple(ordered))
     middles = (2 * np.arange(count) + 1) / (2 * count) * (len(ordered) - 1)
-    return Tunable(tuple(ordered), tuple(ordered[int(place + 0.5)] for place in middles))
+    return Tunable(tuple(ordered), tuple(ordered[int(position + 0.5)] for position in middles))
 
 
 def _flat_psf(configuration: LoopConfiguration) -> PSF:

@@ -99,11 +99,11 @@ def _magnitude(result: MagnitudeResult) -> list[Section]:
     base = " and then with ".join(result.labels[method] for method in references)
     wavelength = LoopConfiguration.from_text(result.configuration).science.wavelength_m
     tables = [strehl_table(result)]
-    for place, reference in enumerate(references):
-        others = [method for method in range(len(result.labels)) if method not in references[: place + 1]]
+    for rank, reference in enumerate(references):
+        compared = [method for method in range(len(result.labels)) if method not in references[: rank + 1]]
         tables += [
-            gain_table(result, others, reference),
-            difference_table(result, [(method, reference) for method in others]),
+            gain_table(result, compared, reference),
+            difference_table(result, [(method, reference) for method in compared]),
         ]
     pairs = [(method, without) for _, method, without in options_that_may_pay(result)]
     if pairs:

@@ -129,8 +129,8 @@ def isoplanatic_angle_arcsec(configuration: LoopConfiguration) -> float:
 def _averaged(visual: Floats, latitude_deg: float) -> Floats:
     """Return the model's density, averaged over longitude."""
     longitudes = np.radians(np.arange(15.0, 360.0, 30.0))
-    mean: Floats = np.mean([_model(visual, math.radians(latitude_deg), each) for each in longitudes], axis=0)
-    return mean
+    latitude = math.radians(latitude_deg)
+    return np.asarray(np.mean([_model(visual, latitude, longitude) for longitude in longitudes], axis=0))
 
 
 def _model(visual: Floats, latitude: float, longitude: float) -> Floats:
@@ -222,9 +222,9 @@ class LoopQuestion:
     def kinds(self) -> tuple[MethodKind, ...]:
         """Candidates: those with the integrator first, also that of each one whose control learns."""
         names = (SECOND, BASELINE, *(self._default() if self.methods is None else self.methods))
-        asked = {kind.name: kind for kind in map(method_kind, names)}
-        plain = [replace(kind, control=INTEGRATOR) for kind in asked.values()]
-        learning = [kind for kind in asked.values() if kind.control != INTEGRATOR]
+        kinds = {kind.name: kind for kind in map(method_kind, names)}
+        plain = [replace(kind, control=INTEGRATOR) for kind in kinds.values()]
+        learning = [kind for kind in kinds.values() if kind.control != INTEGRATOR]
         return tuple({kind.name: kind for kind in [*plain, *learning]}.values())
 
     @property

@@ -78,11 +78,11 @@ def differences_by_flux(result: MagnitudeResult, method: int, reference: int) ->
 def gains_in_magnitude(result: MagnitudeResult, method: int, reference: int) -> dict[float, Estimate]:
     """Return the gain in limiting magnitude at each Strehl ratio that the reference's curve passes."""
     curve = np.array([paired_mean(values).value for values in result.strehl[reference]])
-    known = curve[np.isfinite(curve)]
+    finite = curve[np.isfinite(curve)]
     return {
         level: magnitude_gain(result.magnitudes, result.strehl[method], result.strehl[reference], level)
         for level in _STREHL_LEVELS
-        if len(known) and known.min() < level <= known.max()
+        if len(finite) and finite.min() < level <= finite.max()
     }
 
 
@@ -125,8 +125,8 @@ def magnitude_gain(
         raise InputError("strehl, reference: expected the same shape (magnitudes, realisations)")
     if len(curves[0]) != len(faint):
         raise InputError(f"strehl: expected {len(faint)} magnitudes, got {len(curves[0])}")
-    whole = ~np.isnan(curves[0] + curves[1]).any(axis=1)
-    order = np.flatnonzero(whole)[np.argsort(faint[whole])]
+    complete = ~np.isnan(curves[0] + curves[1]).any(axis=1)
+    order = np.flatnonzero(complete)[np.argsort(faint[complete])]
     if len(order) < 2:
         return Estimate(math.nan)
     faint, curves = faint[order], [curve[order] for curve in curves]
@@ -157,7 +157,7 @@ def limiting_magnitudes(magnitudes: ArrayLike, strehl: ArrayLike, level: float) 
     curves = falling(strehl)
     after = np.argmax(curves < level, axis=-1)[..., None]
     before = np.maximum(after - 1, 0)
-    high, low = (np.take_along_axis(curves, place, -1)[..., 0] for place in (before, after))
+    high, low = (np.take_along_axis(curves, index, -1)[..., 0] for index in (before, after))
     first, last = faint[before[..., 0]], faint[after[..., 0]]
     part = (high - level) / np.where(high > low, high - low, 1.0)
     crossing = first + part * (last - first)
@@ -175,8 +175,8 @@ def falling(values: ArrayLike) -> Floats:
     series = np.asarray(values, np.float64)
     count = series.shape[-1]
     sums = np.concatenate([np.zeros((*series.shape[:-1], 1)), np.cumsum(series, axis=-1)], axis=-1)
-    place = np.arange(count)
-    lengths = place[None, :] + 1 - place[:, None]  # from begin (rows) to end (columns)
+    index = np.arange(count)
+    lengths = index[None, :] + 1 - index[:, None]  # from begin (rows) to end (columns)
     means = (sums[..., None, 1:] - sums[..., :-1, None]) / np.maximum(lengths, 1)
     means = np.where(lengths > 0, means, -np.inf)
     largest = np.maximum.accumulate(means[..., ::-1], axis=-1)[..., ::-1]  # over ends at or after the column

@@ -47,18 +47,18 @@ def coordinate_search(axes: Axes, badness: Callable[[Choice, str, Sequence[Any]]
     best: Choice = {name: values[0] for name, values in axes.items()}
     looked: dict[str, Choice] = {}
     for name in list(axes) * (_ROUNDS if len(axes) > 1 else 1):
-        others = {key: value for key, value in best.items() if key != name}
-        if looked.get(name) != others:  # else nothing has changed since
-            looked[name] = others
+        fixed = {key: value for key, value in best.items() if key != name}
+        if looked.get(name) != fixed:  # else nothing has changed since
+            looked[name] = fixed
             best = {**best, name: axes[name][int(np.argmin(badness(best, name, axes[name])))]}
     return best
 
 
 def corrected_badness(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> float:
     """Return the gain-corrected rms; where nothing is measured, the rms, behind all that measure."""
-    found = slope_statistics(x, y, truth)
-    corrected = found.corrected_rms.value
-    return corrected if math.isfinite(corrected) else 1e6 + found.rms.value
+    statistics = slope_statistics(x, y, truth)
+    corrected = statistics.corrected_rms.value
+    return corrected if math.isfinite(corrected) else 1e6 + statistics.rms.value
 
 
 FIRST_TUNING_REALISATION = 1000
@@ -102,9 +102,9 @@ class Search:
 
     def __post_init__(self) -> None:
         lowest = {"coarse_frames": self.settle_frames + 1, "frames": self.settle_frames + 1, "rounds": 0}
-        for each in fields(self):
-            value = getattr(self, each.name)
-            number_between(f"search.{each.name}", value, lowest.get(each.name, 1), 10**6, integer=True)
+        for item in fields(self):
+            value = getattr(self, item.name)
+            number_between(f"search.{item.name}", value, lowest.get(item.name, 1), 10**6, integer=True)
 
 
 QUICK = Search(coarse_frames=160, frames=160, settle_frames=40, realisations=1, finalists=1, rounds=0)
@@ -188,12 +188,12 @@ def _sought(
     advance: Advance | None,
 ) -> Tuned:
     """Return the best of the values that are tuned."""
-    if all(len(each.values) == 1 for each in tuned.values()):
-        return Tuned({name: each.values[0] for name, each in tuned.items()}, math.nan, 0)
+    if all(len(tunable.values) == 1 for tunable in tuned.values()):
+        return Tuned({name: tunable.values[0] for name, tunable in tuned.items()}, math.nan, 0)
     trials = _Trials(kind, configuration, search, advance)
     coarse = [
         dict(zip(tuned, values, strict=True))
-        for values in itertools.product(*(each.first for each in tuned.values()))
+        for values in itertools.product(*(tunable.first for tunable in tuned.values()))
     ]
     ranked = sorted(coarse, key=lambda choice: -trials.coarse(choice))
     if search.rounds == 0:
@@ -219,18 +219,18 @@ def _climbed(
 
 def _between(best: Choice, tuned: Mapping[str, Tunable], trials: _Trials) -> dict[str, Any]:
     """Return the best choice with each positive number at the top of the parabola through its neighbours."""
-    found = dict(best)
-    for name, each in tuned.items():
-        near = [best, *(other for other in _neighbours(best, tuned) if other[name] != best[name])]
-        if len(near) < 3 or not _is_scale(each.values):
+    choice = dict(best)
+    for name, tunable in tuned.items():
+        near = [best, *(choice for choice in _neighbours(best, tuned) if choice[name] != best[name])]
+        if len(near) < 3 or not _is_scale(tunable.values):
             continue
         strehl = [trials.fine(choice) for choice in near]
-        place = np.log([choice[name] for choice in near])
-        bend, slope, _ = np.polyfit(place - place[0], strehl, 2)
+        logarithms = np.log([choice[name] for choice in near])
+        bend, slope, _ = np.polyfit(logarithms - logarithms[0], strehl, 2)
         if bend < 0:
-            top = np.clip(place[0] - slope / (2 * bend), place.min(), place.max())
-            found[name] = float(f"{math.exp(top):.3g}")
-    return found
+            top = np.clip(logarithms[0] - slope / (2 * bend), logarithms.min(), logarithms.max())
+            choice[name] = float(f"{math.exp(top):.3g}")
+    return choice
 
 
 def _is_scale(values: Sequence[Any]) -> bool:
@@ -268,16 +268,16 @@ def smoothed(
         return [dict(choice) for choice in choices]
     tuned, declared = [kind.tuned(star) for star in stars], kind.estimator.declared()
     flux = np.log([star.photons for star in stars])
-    found = [dict(choice) for choice in choices]
+    results = [dict(choice) for choice in choices]
     for name in tuned[0].keys() & declared.keys():
-        offered = [each[name].values for each in tuned]
+        offered = [options[name].values for options in tuned]
         if declared[name].whole or not all(_is_scale(values) for values in offered):
             continue
         line = theilslopes(np.log([choice[name] for choice in choices]), flux, method="joint")
-        for choice, log_flux, each in zip(found, flux, offered, strict=True):
-            value = float(np.clip(math.exp(line.intercept + line.slope * log_flux), min(each), max(each)))
+        for choice, log_flux, values in zip(results, flux, offered, strict=True):
+            value = float(np.clip(math.exp(line.intercept + line.slope * log_flux), min(values), max(values)))
             choice[name] = float(f"{value:.3g}")
-    return found
+    return results
 
 
 def stored(result: Mapping[str, NDArray[Any]]) -> Tuned:
@@ -290,8 +290,8 @@ def tuning_frames(
 ) -> int:
     """Return about how many frames `tune` simulates, with `slopes` for control that learns."""
     search, tuned = _searched(kind, configuration, search, slopes)
-    combinations = math.prod(len(each.first) for each in tuned.values())
-    several = sum(len(each.values) > 1 for each in tuned.values())
+    combinations = math.prod(len(tunable.first) for tunable in tuned.values())
+    several = sum(len(tunable.values) > 1 for tunable in tuned.values())
     if several == 0:
         return 0
     climbs = min(search.climbs, search.finalists)
@@ -352,10 +352,10 @@ class _Trials:
 
 def _neighbours(choice: Choice, tuned: Mapping[str, Tunable]) -> list[dict[str, Any]]:
     """Return the choices one step away in one option."""
-    near = []
-    for name, each in tuned.items():
-        place = each.values.index(choice[name])
-        for other in (place - 1, place + 1):
-            if 0 <= other < len(each.values):
-                near.append({**choice, name: each.values[other]})
-    return near
+    neighbours = []
+    for name, tunable in tuned.items():
+        index = tunable.values.index(choice[name])
+        for step in (index - 1, index + 1):
+            if 0 <= step < len(tunable.values):
+                neighbours.append({**choice, name: tunable.values[step]})
+    return neighbours

@@ -29,8 +29,8 @@ def gain_table(result: MagnitudeResult, methods: Sequence[int], reference: int) 
     """Return the gains in limiting magnitude of methods over a reference at equal Strehl."""
     gains = {method: gains_in_magnitude(result, method, reference) for method in methods}
     rows = [
-        [result.labels[method], *(with_interval(gain, 2) for gain in found.values())]
-        for method, found in gains.items()
+        [result.labels[method], *(with_interval(gain, 2) for gain in at_levels.values())]
+        for method, at_levels in gains.items()
     ]
     levels = next(iter(gains.values()), {})
     columns = [f"at Strehl {level:g}" for level in levels]
@@ -42,10 +42,10 @@ def difference_table(result: MagnitudeResult, pairs: Sequence[tuple[int, int]]) 
     rows = [
         [
             result.labels[method],
-            result.labels[other],
-            *map(with_interval, differences_by_flux(result, method, other)),
+            result.labels[reference],
+            *map(with_interval, differences_by_flux(result, method, reference)),
         ]
-        for method, other in pairs
+        for method, reference in pairs
     ]
     return _TEXT.table("tables.difference", rows, _fluxes(result))
 

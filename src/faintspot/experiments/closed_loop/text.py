@@ -50,8 +50,8 @@ def recommendation(answer: LoopAnswer) -> list[str]:
     wavelength = 1e6 * answer.question.configuration.science.wavelength_m
     lines.append(_TEXT("loop_answer.expected", strehl=strehl, wavelength_um=wavelength))
     if same:
-        taken = "the baseline" if best.name == BASELINE else "what is simplest"
-        lines.append(_TEXT("loop_answer.no_winner", same=", ".join(same), taken=taken))
+        chosen = "the baseline" if best.name == BASELINE else "what is simplest"
+        lines.append(_TEXT("loop_answer.no_winner", same=", ".join(same), taken=chosen))
     lines += [
         f"against {reference}: {difference_in_words(answer, best.name, reference)}"
         for reference in REFERENCES
@@ -64,23 +64,23 @@ def recommendation(answer: LoopAnswer) -> list[str]:
 
 def difference_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
     """Describe the gain of a method over another, in Strehl ratio and limiting magnitude."""
-    found = answer.difference(name, reference, answer.at_star)
-    verdict = {1: "", 0: " (its 95 % interval includes 0)", -1: ", less beyond its error"}[found.decided]
-    text = f"Strehl ratio {with_error(found, sign=True, smallest=_SMALLEST_ERROR)}{verdict}"
+    difference = answer.difference(name, reference, answer.at_star)
+    verdict = {1: "", 0: " (its 95 % interval includes 0)", -1: ", less beyond its error"}[difference.decided]
+    text = f"Strehl ratio {with_error(difference, sign=True, smallest=_SMALLEST_ERROR)}{verdict}"
     return f"{text}; limiting magnitude {gain_in_words(answer, name, reference)}"
 
 
 def gain_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
     """Return the gain in limiting magnitude with its error, or what is known of it."""
-    found = answer.gain(name, reference)
-    if found.is_known:
-        return found.in_words(sign=True)
-    mine, other = (answer.limit(each).magnitude.value for each in (name, reference))
-    if math.isinf(mine) and mine == other:
+    gain = answer.gain(name, reference)
+    if gain.is_known:
+        return gain.in_words(sign=True)
+    limit, reference_limit = (answer.limit(method).magnitude.value for method in (name, reference))
+    if math.isinf(limit) and limit == reference_limit:
         return "not within what was measured"
     ends = float(answer.magnitudes[-1]), float(answer.magnitudes[0])
-    least = (min(max(mine, ends[0]), ends[1])) - (min(max(other, ends[0]), ends[1]))
-    return f"{'>' if mine > other else '<'}{least:+.2f}"
+    least = (min(max(limit, ends[0]), ends[1])) - (min(max(reference_limit, ends[0]), ends[1]))
+    return f"{'>' if limit > reference_limit else '<'}{least:+.2f}"
 
 
 def about_the_limits(answer: LoopAnswer) -> str:
@@ -115,15 +115,15 @@ def about_the_sky(answer: LoopAnswer) -> list[str]:
     radius = answer.question.radius
     if radius is None:
         return [_TEXT["loop_answer.no_sky"]]
-    given = "given" if answer.question.radius_arcsec is not None else "the isoplanatic angle of the layers"
+    origin = "given" if answer.question.radius_arcsec is not None else "the isoplanatic angle of the layers"
     best, parts = answer.best.name, []
     for place in PLACES:
-        found = answer.coverage(best, place)
-        assert found is not None
-        parts.append(f"{plain_number(100 * found.model_error, 2)} ({place})")
+        coverage = answer.coverage(best, place)
+        assert coverage is not None
+        parts.append(f"{plain_number(100 * coverage.model_error, 2)} ({place})")
     percent = 100 * MODEL_ERROR
     return [
-        _TEXT("loop_answer.sky", level=answer.level, radius=radius, given=given),
+        _TEXT("loop_answer.sky", level=answer.level, radius=radius, given=origin),
         _TEXT("loop_answer.sky_errors", percent=percent, best=best, parts=", ".join(parts)),
     ]
 

@@ -57,7 +57,7 @@ def tune_loop(
     folder: str | Path,
     *,
     plan: LoopPlan | None = None,
-    place: WorkerPool | None = None,
+    pool: WorkerPool | None = None,
     overwrite: bool = False,
 ) -> LoopAnswer:
     """Find out which estimator and control suit a closed loop, and with which settings.
@@ -71,7 +71,7 @@ def tune_loop(
     folder : path
         Where finished units are remembered; made where it is not there. Interrupted, the same call goes on.
     plan : LoopPlan, optional
-    place : WorkerPool, optional
+    pool : WorkerPool, optional
         Where the work is done. Default: processes on this machine.
     overwrite : bool
         Whether another question's units in the folder are replaced.
@@ -95,5 +95,5 @@ def tune_loop(
     plan = LoopPlan() if plan is None else plan
     base, fluxes = plan.configuration(question.configuration), question.photons(plan.fluxes)
     names = [kind.name for kind in question.kinds]
-    result = run_magnitude(base, folder, names, fluxes, search=plan.search, place=place, overwrite=overwrite)
+    result = run_magnitude(base, folder, names, fluxes, search=plan.search, pool=pool, overwrite=overwrite)
     return LoopAnswer(question, result, plan.frames - plan.settle_frames, dict(question.left_out))

@@ -90,32 +90,32 @@ def better_and_worse(result: MagnitudeResult, method: int, reference: int) -> tu
 
     "" for none.
     """
-    decided = [each.decided for each in differences_by_flux(result, method, reference)]
+    decided = [difference.decided for difference in differences_by_flux(result, method, reference)]
     if decided == [1] * len(decided):
         return "all fluxes", ""
     if decided == [-1] * len(decided):
         return "", "all fluxes"
     above, below = (
         ", ".join(
-            f"{photons:.3g}" for photons, sign in zip(result.photons, decided, strict=True) if sign == wanted
+            f"{photons:.3g}" for photons, sign in zip(result.photons, decided, strict=True) if sign == outcome
         )
-        for wanted in (1, -1)
+        for outcome in (1, -1)
     )
     unit = " photo-electrons"
     return above and above + unit, below and below + unit
 
 
 def _headline(comparisons: list[Estimate]) -> str:
-    known = [each for each in comparisons if np.isfinite(each.low)]
-    if not known:
+    finite = [comparison for comparison in comparisons if np.isfinite(comparison.low)]
+    if not finite:
         return "Too few measurements to say whether TV raises the Strehl ratio."
-    gains, losses = (sum(each.decided == sign for each in known) for sign in (1, -1))
+    gains, losses = (sum(comparison.decided == sign for comparison in finite) for sign in (1, -1))
     if gains:
-        first = f"TV raises the Strehl ratio beyond its error in {gains} of {len(known)} comparisons"
+        first = f"TV raises the Strehl ratio beyond its error in {gains} of {len(finite)} comparisons"
     else:
         first = NOWHERE
     return (
-        f"{first}; it lowers it beyond its error in {losses} of {len(known)} comparisons."
+        f"{first}; it lowers it beyond its error in {losses} of {len(finite)} comparisons."
         if losses
         else f"{first}."
     )
@@ -123,14 +123,14 @@ def _headline(comparisons: list[Estimate]) -> str:
 
 def _magnitude_lines(result: MagnitudeResult) -> list[str]:
     references, lines = reference_methods(result), []
-    for place, reference in enumerate(references):
-        others = [method for method in range(len(result.labels)) if method not in references[: place + 1]]
-        lines += [_comparison(result, method, reference) for method in others]
+    for rank, reference in enumerate(references):
+        compared = [method for method in range(len(result.labels)) if method not in references[: rank + 1]]
+        lines += [_comparison(result, method, reference) for method in compared]
     for option, method, without in options_that_may_pay(result):
         above, below = better_and_worse(result, method, without)
-        found = f"pays at {above}" if above else "pays nowhere beyond its error"
-        found += f", costs at {below}" if below else ""
-        lines.append(f"{result.labels[method]} against {result.labels[without]}: {option} {found}.")
+        verdict = f"pays at {above}" if above else "pays nowhere beyond its error"
+        verdict += f", costs at {below}" if below else ""
+        lines.append(f"{result.labels[method]} against {result.labels[without]}: {option} {verdict}.")
     return lines
 
 
@@ -138,16 +138,16 @@ def _comparison(result: MagnitudeResult, method: int, reference: int) -> str:
     above, below = better_and_worse(result, method, reference)
     parts = [f"more Strehl beyond its error at {above}"] if above else []
     parts += [f"less Strehl beyond its error at {below}"] if below else []
-    found = "; ".join(parts) if parts else "no difference beyond its error at any flux"
+    verdict = "; ".join(parts) if parts else "no difference beyond its error at any flux"
     gain = _gain_in_magnitude(result, method, reference)
-    return f"Magnitudes, {result.labels[method]} against {result.labels[reference]}: {found}{gain}."
+    return f"Magnitudes, {result.labels[method]} against {result.labels[reference]}: {verdict}{gain}."
 
 
 def _gain_in_magnitude(result: MagnitudeResult, method: int, reference: int) -> str:
     """Return the gain at the middle one of the Strehl ratios at which there is one."""
-    every = gains_in_magnitude(result, method, reference)
+    levels = gains_in_magnitude(result, method, reference)
     gains = [
-        (level, each) for level, each in every.items() if np.isfinite(each.value) and not np.isnan(each.low)
+        (level, gain) for level, gain in levels.items() if np.isfinite(gain.value) and not np.isnan(gain.low)
     ]
     if not gains:
         return ""

@@ -1,1 +1,1 @@
-"""Basden et al. (2015): claims, verdicts, figures and tables."""
+"""Basden et al. (2015): claims and their verdicts (`claims`, `judges`), figures and tables."""

@@ -13,12 +13,7 @@ from faintspot.experiments.curves import Curve, Gain, gain_at_error
 from faintspot.experiments.methods import NO_TV, SMOOTHING, TV, TV_OVER_NO_TV
 from faintspot.experiments.paper import judges
 from faintspot.experiments.paper.judges import LEVEL_PX
-from faintspot.experiments.study.curves import (
-    Configuration,
-    Finding,
-    Verdict,
-    study_curves,
-)
+from faintspot.experiments.study.curves import Configuration, Finding, Verdict, study_curves
 from faintspot.experiments.study.specification import BEST
 
 if TYPE_CHECKING:
@@ -104,15 +99,15 @@ def guidance(dataset: xarray.Dataset, seed: int = 2015) -> list[str]:
 def _compared(
     curves: dict[Configuration, Curve], rng: np.random.Generator, gaussian: bool
 ) -> list[_Compared]:
-    found = []
+    compared = []
     for key, curve in sorted(curves.items()):
         gain = gain_at_error(curve, LEVEL_PX, rng, **TV_OVER_NO_TV)
         if gain is None or not np.isfinite(gain.log_se):
             continue
-        over = gain_at_error(curve, LEVEL_PX, rng, method=TV, reference=SMOOTHING) if gaussian else None
-        known = over is not None and np.isfinite(over.log_se)
-        found.append(_Compared(key, gain, over if known else None))
-    return found
+        gain_over = gain_at_error(curve, LEVEL_PX, rng, method=TV, reference=SMOOTHING) if gaussian else None
+        is_known = gain_over is not None and np.isfinite(gain_over.log_se)
+        compared.append(_Compared(key, gain, gain_over if is_known else None))
+    return compared
 
 
 def _flux_gains(reference: str, gains: list[Gain]) -> str:
@@ -135,9 +130,9 @@ def _choosing_k(best: dict[Configuration, Curve], fixed: dict[Configuration, Cur
     ratios = []
     for key, curve in best.items():
         if key in fixed:
-            error, other = curve.of(NO_TV), fixed[key].of(NO_TV)
-            known = np.isfinite(error) & np.isfinite(other) & (other < 0.8 * key.prior_error_px)
-            ratios += (other[known] / error[known]).tolist()
+            error, fixed_error = curve.of(NO_TV), fixed[key].of(NO_TV)
+            usable = np.isfinite(error) & np.isfinite(fixed_error) & (fixed_error < 0.8 * key.prior_error_px)
+            ratios += (fixed_error[usable] / error[usable]).tolist()
     if not ratios:
         return []
     k = mode.removeprefix("fixed")

@@ -85,7 +85,7 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
     styles = _styles([line.label for line in everything])
     for panels, (profile, reach) in zip(axes, rows, strict=True):
         part = [row["profile"] == profile and row["position_range_px"] == reach for row in table]
-        kept = [index for index, wanted in enumerate(part) if wanted]
+        kept = [index for index, belongs in enumerate(part) if belongs]
         lines = _lines([table[i] for i in kept], [cells[i] for i in kept], axis, labelled)
         for panel, mode in zip(panels, modes, strict=True):
             _limit(panel, axis, [row[axis] for row in table])
@@ -107,15 +107,15 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
     """Draw R against the number of brightest pixels kept (the paper's figure 5); None without cells."""
     profiles = sorted({str(p) for p in dataset["profile"].values[dataset["done"].values]})
     panels = [(profile, kept_panels(dataset, profile)) for profile in profiles]
-    panels = [(profile, found) for profile, found in panels if found]
+    panels = [(profile, parts) for profile, parts in panels if parts]
     if not panels or not {NO_TV, TV} <= set(dataset["estimator"].values):
         return None
     figure = new_figure(WIDTH * 1.25, _ROW_HEIGHT * len(panels) * 1.1)
     axes = figure.subplots(len(panels), 3, squeeze=False)
     rows: list[list[Any]] = []
     fixed = fixed_mode(dataset).removeprefix("fixed")
-    for line, (_, found) in zip(axes, panels, strict=True):
-        for panel, part in zip(line, found, strict=True):
+    for line, (_, parts) in zip(axes, panels, strict=True):
+        for panel, part in zip(line, parts, strict=True):
             styles = _styles([label for label, _ in part.cells])
             for label, cell in part.cells:
                 rows += _draw_over_k(panel, dataset, cell, label, styles[label][0])
@@ -176,8 +176,8 @@ def _axis_of(table: list[dict[str, Any]]) -> str:
 
 
 def _modes(dataset: xarray.Dataset) -> list[str]:
-    known = [str(mode) for mode in dataset["mode"].values]
-    return [mode for mode in (BEST, fixed_mode(dataset)) if mode in known]
+    measured = [str(mode) for mode in dataset["mode"].values]
+    return [mode for mode in (BEST, fixed_mode(dataset)) if mode in measured]
 
 
 def _lines(
@@ -202,7 +202,7 @@ def _styles(labels: Sequence[str]) -> dict[str, tuple[Any, str]]:
     if len(labels) <= 4:
         colours: list[Any] = list(METHOD_COLOURS)
     else:
-        colours = [colormaps["viridis"](place) for place in np.linspace(0.0, 0.9, len(labels))]
+        colours = [colormaps["viridis"](fraction) for fraction in np.linspace(0.0, 0.9, len(labels))]
     return {label: (colours[i], _MARKERS[i % len(_MARKERS)]) for i, label in enumerate(dict.fromkeys(labels))}
 
 
@@ -216,9 +216,9 @@ def _draw_lines(
                 continue
             part = dataset[["error", "error_se"]].sel(estimator=method, mode=mode).isel(cell=line.cells)
             y, se = part["error"].values, part["error_se"].values
-            known = np.isfinite(y)
+            finite = np.isfinite(y)
             bars = {"color": colour, "marker": marker, "ms": 5, "mfc": face, "elinewidth": 1, "capsize": 0}
-            panel.errorbar(line.x[known], y[known], se[known], ls=style, lw=1.9, **bars)
+            panel.errorbar(line.x[finite], y[finite], se[finite], ls=style, lw=1.9, **bars)
 
 
 def _limit(panel: Axes, axis: str, values: Any) -> None:
@@ -267,16 +267,16 @@ def _draw_over_k(panel: Axes, dataset: xarray.Dataset, cell: int, label: str, co
     for method, style in ((TV, "-"), (NO_TV, "--")):
         part = dataset.sel(estimator=method).isel(cell=cell)
         y, se = part["error_at_k"].values, part["error_at_k_se"].values
-        known = np.isfinite(y)
-        panel.plot(k[known], y[known], ls=style, color=colour, lw=1.9, label=label if method == TV else None)
-        panel.fill_between(k[known], (y - se)[known], (y + se)[known], color=colour, alpha=0.25, lw=0)
+        ok = np.isfinite(y)
+        panel.plot(k[ok], y[ok], ls=style, color=colour, lw=1.9, label=label if method == TV else None)
+        panel.fill_between(k[ok], (y - se)[ok], (y + se)[ok], color=colour, alpha=0.25, lw=0)
         chosen = float(part["chosen_k"].sel(mode=BEST))
         if np.isfinite(chosen):
-            there = y[k == int(chosen)]
-            panel.plot([chosen] * len(there), there, "o", color=colour, mfc="white", ms=7, mew=1.6)
+            error = y[k == int(chosen)]
+            panel.plot([chosen] * len(error), error, "o", color=colour, mfc="white", ms=7, mew=1.6)
         rows += [
             [label, method, int(number), f"{value:.6g}", f"{error:.3g}", *parameters.values()]
-            for number, value, error in zip(k[known], y[known], se[known], strict=True)
+            for number, value, error in zip(k[ok], y[ok], se[ok], strict=True)
         ]
     return rows
 
@@ -291,11 +291,11 @@ def _main_cells(dataset: xarray.Dataset, profile: str) -> dict[float, list[int]]
     if not kept:
         return {}
     reach = min(row["position_range_px"] for _, row in kept)
-    found: dict[float, list[int]] = {}
+    cells: dict[float, list[int]] = {}
     for i, row in sorted(kept, key=lambda item: item[1]["flux_e"]):
         if row["read_noise_e"] in MAIN_NOISES_E and row["position_range_px"] == reach:
-            found.setdefault(row["read_noise_e"], []).append(i)
-    return dict(sorted(found.items()))
+            cells.setdefault(row["read_noise_e"], []).append(i)
+    return dict(sorted(cells.items()))
 
 
 def _ratio(
@@ -305,14 +305,14 @@ def _ratio(
     part = dataset.isel(cell=list(cells)).sel(mode=mode)
     error, plain = part["error"].sel(estimator=method).values, part["error"].sel(estimator=NO_TV).values
     covariance = part["error_covariance"]
-    own, its, both = (
+    of_method, of_plain, of_both = (
         covariance.sel(estimator=a, estimator2=b).values
         for a, b in ((method, method), (NO_TV, NO_TV), (method, NO_TV))
     )
     ratio = error / plain
-    variance = (own + ratio**2 * its - 2 * ratio * both) / plain**2
-    known = np.isfinite(ratio)
-    return part["flux_e"].values[known], ratio[known], np.sqrt(np.maximum(variance, 0))[known]
+    variance = (of_method + ratio**2 * of_plain - 2 * ratio * of_both) / plain**2
+    finite = np.isfinite(ratio)
+    return part["flux_e"].values[finite], ratio[finite], np.sqrt(np.maximum(variance, 0))[finite]
 
 
 FLUX_E = 200.0
@@ -345,17 +345,17 @@ def triple_picture() -> FigureWithData:
         frame = np.full(layout.frame_shape, np.nan)
         for (row, left), image in zip(layout.corners, stack, strict=True):
             frame[row : row + layout.window[0], left : left + layout.window[1]] = image
-        whole = _show(axes[0, column], frame, brightest, f"sensor, {name}")
-        spot = _show(axes[1, column], stack[shown], brightest, f"one spot, {name}")
-    colour_bar(list(axes[0]), whole, "signal (e- per pixel)")
-    colour_bar(list(axes[1]), spot, "signal (e- per pixel)")
+        sensor_image = _show(axes[0, column], frame, brightest, f"sensor, {name}")
+        spot_image = _show(axes[1, column], stack[shown], brightest, f"one spot, {name}")
+    colour_bar(list(axes[0]), sensor_image, "signal (e- per pixel)")
+    colour_bar(list(axes[1]), spot_image, "signal (e- per pixel)")
     rows = [
         [y, x, *(f"{stack[shown, y, x]:.6g}" for stack in images)]
         for y in range(layout.window[0])
         for x in range(layout.window[1])
     ]
-    told = {"flux": FLUX_E, "noise": READ_NOISE_E, "reach": POSITION_RANGE_PX}
-    return _TEXT.figure("fig1", figure, rows, **told)
+    values = {"flux": FLUX_E, "noise": READ_NOISE_E, "reach": POSITION_RANGE_PX}
+    return _TEXT.figure("fig1", figure, rows, **values)
 
 
 def _show(panel: Axes, image: NDArray[np.float64], brightest: float, title: str) -> object:

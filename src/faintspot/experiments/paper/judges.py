@@ -46,7 +46,7 @@ _FAMILY_FALSE_ALARM = 0.05
 _FREE = ("size", "elongation", "pixels", "background_e", "em_gain")
 
 
-def selected(curves: Curves, **wanted: float | str) -> list[tuple[Configuration, Curve]]:
+def selected(curves: Curves, **parameters: float | str) -> list[tuple[Configuration, Curve]]:
     """Return curves by their parameters; others are size 1, round, 16 pixels, no background or EM."""
     standard: dict[str, float | str] = {
         "size": 1.0,
@@ -55,11 +55,11 @@ def selected(curves: Curves, **wanted: float | str) -> list[tuple[Configuration,
         "background_e": 0.0,
         "em_gain": 1.0,
     }
-    asked = {name: value for name, value in (standard | wanted).items() if value != "any"}
+    required = {name: value for name, value in (standard | parameters).items() if value != "any"}
     return [
         (key, curve)
         for key, curve in sorted(curves.items())
-        if all(getattr(key, name) == value for name, value in asked.items())
+        if all(getattr(key, name) == value for name, value in required.items())
     ]
 
 
@@ -98,10 +98,10 @@ def two_to_three(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -
     """Look for the largest flux gain of every Nyquist-sampled configuration."""
     cases = []
     for key, curve in selected(study_curves(dataset, mode)):
-        found = largest_gain(key, curve, rng)
-        if found is None:
+        largest = largest_gain(key, curve, rng)
+        if largest is None:
             continue
-        flux, gain = found
+        flux, gain = largest
         finding = f"largest gain {gain.in_words()}, {_in_magnitudes(gain)}, at {flux:g} e-"
         cases.append(Case(key.in_words(), finding, _reaches(gain, 2.0)))
     return cases
@@ -115,12 +115,12 @@ def small_spots(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) ->
         gains = _level_gains(group, rng)
         if len(gains) < 2:
             continue
-        (_, smallest), *others = gains
-        apart = [_difference(smallest, other) for _, other in others]
+        (_, smallest), *larger = gains
+        differences = [_difference(smallest, gain) for _, gain in larger]
         words = "; ".join(f"size {key.size:g} {gain.in_words()}" for key, gain in gains)
         finding = _TEXT("findings.gain_level", level=LEVEL_PX, gains=words)
-        holds = all(difference > _SIGMAS * error for difference, error in apart)
-        fails = any(difference < -_SIGMAS * error for difference, error in apart)
+        holds = all(difference > _SIGMAS * error for difference, error in differences)
+        fails = any(difference < -_SIGMAS * error for difference, error in differences)
         cases.append(Case(_shared_words(gains, "size"), finding, judged(holds, not fails)))
     return cases
 
@@ -136,12 +136,12 @@ def independent_of_pixels(dataset: xarray.Dataset, mode: str, rng: np.random.Gen
             if any(change is None for change in changes):
                 continue
             (tv, tv_error), (plain, plain_error) = (change for change in changes if change is not None)
-            both = _in_both((tv, tv_error), (plain, plain_error))
-            finding = f"R at {large_key.pixels} px / R at {small_key.pixels} px: {both}"
+            words = _in_both((tv, tv_error), (plain, plain_error))
+            finding = f"R at {large_key.pixels} px / R at {small_key.pixels} px: {words}"
             within = abs(tv) - _SIGMAS * tv_error <= np.log1p(EQUAL)
             less = abs(plain) - abs(tv) > _SIGMAS * np.hypot(tv_error, plain_error)
-            where = f"{flux:g} e-, {_words_without(large_key, 'pixels')}"
-            cases.append(Case(where, finding, judged(bool(within), bool(less))))
+            condition = f"{flux:g} e-, {_words_without(large_key, 'pixels')}"
+            cases.append(Case(condition, finding, judged(bool(within), bool(less))))
     return cases
 
 
@@ -156,7 +156,7 @@ def less_dependence_on_k(dataset: xarray.Dataset, mode: str, rng: np.random.Gene
     modes = [
         str(name) for name in dataset["mode"].values if mode.startswith("fixed") and name.startswith("fixed")
     ]
-    names = ", ".join(each.removeprefix("fixed") for each in modes) or f"{KEPT_RANGE[0]} to {KEPT_RANGE[1]}"
+    names = ", ".join(name.removeprefix("fixed") for name in modes) or f"{KEPT_RANGE[0]} to {KEPT_RANGE[1]}"
     cases = []
     for panel in (panel for profile in _profiles(dataset) for panel in kept_panels(dataset, profile)):
         for label, cell in panel.cells:
@@ -178,20 +178,20 @@ def elongated(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> l
     ]
     for group in _grouped(curves, "read_noise_e"):
         gains = _level_gains(group, rng)
-        known = [(key, gain) for key, gain in gains if np.isfinite(gain.log_se) and gain.log_se > 0]
-        if len(known) < 2:
+        clear = [(key, gain) for key, gain in gains if np.isfinite(gain.log_se) and gain.log_se > 0]
+        if len(clear) < 2:
             continue
-        slope, error = _slope_with_noise(known)
-        saved = [100 * (1 - 1 / np.array([g.factor, g.low, g.high])) for k, g in known if k.read_noise_e >= 3]
+        slope, error = _slope_with_noise(clear)
+        saved = [100 * (1 - 1 / np.array([g.factor, g.low, g.high])) for k, g in clear if k.read_noise_e >= 3]
         most = max(saved, key=lambda item: item[1], default=None)
-        gains_words = "; ".join(f"{key.read_noise_e:g} e- {gain.in_words()}" for key, gain in known)
+        gains_words = "; ".join(f"{key.read_noise_e:g} e- {gain.in_words()}" for key, gain in clear)
         finding = _TEXT("findings.elongated", slope=slope, error=error, level=LEVEL_PX, gains=gains_words)
         reached = most is not None and most[2] >= 25
         if most is not None:
             finding += f"; most flux saved at 3 e- or more: {most[0]:.0f} % ({most[1]:.0f} to {most[2]:.0f})"
         grows = slope > _SIGMAS * error
         cases.append(
-            Case(_shared_words(known, "read_noise_e"), finding, judged(grows and reached, grows or reached))
+            Case(_shared_words(clear, "read_noise_e"), finding, judged(grows and reached, grows or reached))
         )
     return cases
 
@@ -201,10 +201,10 @@ def one_magnitude(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) 
     cases = []
     for key, curve in selected(study_curves(dataset, mode), read_noise_e=16.0, size="any"):
         gains = [(level, gain_at_error(curve, level, rng, **TV_OVER_NO_TV)) for level in _LEVELS_PX]
-        known = [(level, gain) for level, gain in gains if gain is not None and gain.is_bounded]
-        if not known:
+        bounded = [(level, gain) for level, gain in gains if gain is not None and gain.is_bounded]
+        if not bounded:
             continue
-        level, gain = max(known, key=lambda item: item[1].low)
+        level, gain = max(bounded, key=lambda item: item[1].low)
         finding = f"most at R = {level:g} px: {_in_magnitudes(gain)}"
         cases.append(Case(key.in_words(), finding, _reaches(gain, 10**0.4)))
     return cases
@@ -234,7 +234,7 @@ def never_worse(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) ->
         worse = sum(change < -limit * error for change, error, _ in changes)
         mean = float(np.mean([change for change, _, _ in changes]))
         mean_error = float(np.sqrt(np.sum([error**2 for _, error, _ in changes])) / len(changes))
-        least, least_error, where = min(changes)
+        least, least_error, condition = min(changes)
         finding = _TEXT(
             "findings.never_worse",
             cells=len(changes),
@@ -245,7 +245,7 @@ def never_worse(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) ->
             mean_error=100 * mean_error,
             least=-100 * least,
             least_error=100 * least_error,
-            where=where,
+            where=condition,
         )
         cases.append(Case(f"{profile} spots", finding, judged(worse == 0, better > worse)))
     return cases
@@ -293,7 +293,7 @@ def _log_change(small: Curve, large: Curve, flux_e: float, method: str) -> tuple
     first, second = small.at(flux_e, method), large.at(flux_e, method)
     if first is None or second is None:
         return None
-    errors = (each.standard_error / each.value for each in (first, second))
+    errors = (value.standard_error / value.value for value in (first, second))
     return math.log(second.value / first.value), math.hypot(*errors)
 
 

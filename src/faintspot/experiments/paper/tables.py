@@ -97,27 +97,27 @@ def verdicts_section(judged: list[Verdict], fixed: str) -> Section:
 def cases_section(judged: list[Verdict]) -> Section:
     """Return the section of all cases that the verdicts rest on."""
     title = "All cases behind the verdicts"
-    found = [
+    cases = [
         (item, finding.mode, case)
         for item in judged
         for finding in (item.best, item.fixed)
         for case in finding.cases
     ]
-    if not found:
+    if not cases:
         return Section(_CASES, title, missing="There are none.")
     data = [
         [item.number, item.claim, mode, case.where, case.finding, case.outcome.value]
-        for item, mode, case in found
+        for item, mode, case in cases
     ]
     table = Table(
         ["Claim", "mode", "where", "finding", "outcome"],
         [
             [str(item.number), mode_in_words(mode), case.where, case.finding, case.outcome.value]
-            for item, mode, case in found
+            for item, mode, case in cases
         ],
         prose=True,
         csv=("verdicts.csv", csv_text(["number", "claim", "mode", "where", "finding", "outcome"], data)),
-        folded=f"{len(found)} cases",
+        folded=f"{len(cases)} cases",
     )
     return Section(_CASES, title, tables=[table])
 
@@ -197,11 +197,11 @@ def _summary(judged: list[Verdict], fixed: str) -> str:
         counts = [(outcome.value, outcomes.count(outcome)) for outcome in Outcome]
         return ", ".join(f"{outcome} {n}" for outcome, n in counts if n)
 
-    best, other, both = (
+    best, at_fixed, together = (
         counted([getattr(item, name).outcome if name else item.outcome for item in judged])
         for name in ("best", "fixed", "")
     )
-    return f"Of {len(judged)} claims: best k: {best}; {fixed}: {other}; both together: {both}"
+    return f"Of {len(judged)} claims: best k: {best}; {fixed}: {at_fixed}; both together: {together}"
 
 
 def _badge(outcome: Outcome) -> Badge:

@@ -1,1 +1,5 @@
-"""The planner: which estimator and settings for a camera and a star."""
+"""The planner: which estimator and settings suit a camera and a star. Read in this order.
+
+`question` (camera and star), `recorded` (the same from frames), `simulated` (spots to choose settings on),
+`tuning` (the choice), `promise` (its check on recorded frames), `answer`, `text` and `figures`.
+"""

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
-from faintspot.base.notebook import table
 from faintspot.base.statistics import Estimate, SlopeStatistics
 from faintspot.experiments.curves import Curve
 from faintspot.experiments.methods import Knowledge
@@ -91,10 +90,10 @@ class Answer:
     @property
     def best_without_psf(self) -> MethodResult:
         """The best method of those that need not know the spot."""
-        free = [result for result in self.results if Knowledge.of(result.method.estimator) < Knowledge.SPOT]
-        if self.best in free:
+        blind = [result for result in self.results if Knowledge.of(result.method.estimator) < Knowledge.SPOT]
+        if self.best in blind:
             return self.best
-        return min(free, key=lambda result: result.statistics.ranking_rms)
+        return min(blind, key=lambda result: result.statistics.ranking_rms)
 
     @property
     def prior_rms_px(self) -> float:
@@ -135,15 +134,6 @@ class Answer:
             background_e=question.background_e,
         )
 
-    def _repr_html_(self) -> str:
-        rows = {"recommended": f"{self.best.method.label} ({settings_in_words(self.best.settings)})"}
-        for result in sorted(self.results, key=lambda each: each.statistics.ranking_rms):
-            rows[result.method.label] = (
-                f"rms {result.statistics.corrected_rms.value:.3g} px, corrected for the gain; "
-                f"R {result.error_px[self.at_star]:.3g} px"
-            )
-        return table(f"Estimators for a star of {self.question.star_flux_e:.4g} e-", rows)
-
     def __getitem__(self, name: str) -> MethodResult:
         """Return the result of an estimator.
 
@@ -153,10 +143,10 @@ class Answer:
             For one that was not tried.
         """
         results = {result.method.name: result for result in self.results}
-        found = results.get(name)
-        if found is None:
+        result = results.get(name)
+        if result is None:
             raise InputError(f"estimator {name!r}: expected one that was tried: {', '.join(results)}")
-        return found
+        return result
 
     @property
     def _psf(self) -> PSF | None:

@@ -41,19 +41,18 @@ def tune_figure(answer: Answer) -> Figure:
     """
     figure = new_figure(_WIDTH, _HEIGHT)
     axes = figure.subplots()
-    place = answer.magnitudes(answer.flux_e)
+    magnitudes = answer.magnitudes(answer.flux_e)
     for result in answer.results:
-        _draw_method(axes, answer, result, place)
+        _draw_method(axes, answer, result, magnitudes)
     saturated = answer.question.search_range_px / 2
     bound = np.where(answer.bound_px < 1.5 * saturated, answer.bound_px, np.nan)
-    axes.plot(place, bound, color="black", lw=1.3, label="Cramér-Rao bound", zorder=6)
+    axes.plot(magnitudes, bound, color="black", lw=1.3, label="Cramér-Rao bound", zorder=6)
     axes.axhline(saturated, color=GREY, lw=1, ls=(0, (1, 4)), label="always the reference")
     axes.set_yscale("log")
     _axis_limits(axes, answer, saturated)
     _mark_star(axes, answer)
     _mark_budget(axes, answer)
-    place_above = answer.magnitudes(answer.flux_e)
-    axis_above(axes, place_above, answer.flux_e, "electrons per sub-aperture and frame")
+    axis_above(axes, magnitudes, answer.flux_e, "electrons per sub-aperture and frame")
     plain_ticks(axes.yaxis, _TICKS)
     axes.grid(which="major", color=FLUX_GREY, lw=0.7)
     if answer.promise is not None and answer.promise.contradicted:
@@ -64,11 +63,11 @@ def tune_figure(answer: Answer) -> Figure:
     return figure
 
 
-def _draw_method(axes: Axes, answer: Any, result: Any, place: NDArray[np.float64]) -> None:
+def _draw_method(axes: Axes, answer: Any, result: Any, magnitudes: NDArray[np.float64]) -> None:
     style = result.method.estimator.style
     best = result is answer.best
     axes.errorbar(
-        place,
+        magnitudes,
         result.error_px,
         result.standard_error_px,
         color=style.colour,
@@ -103,14 +102,14 @@ def _mark_budget(axes: Axes, answer: Any) -> None:
     if budget is None:
         return
     axes.axhline(budget, color="#E69F00", lw=1.4, zorder=0)
-    words, place = f"budget {budget:.3g} px", (0.99, budget)
-    note(axes, words, place, "axes fraction, data", xytext=(0, 3), ha="right", color="#8a5f00")
+    words, position = f"budget {budget:.3g} px", (0.99, budget)
+    note(axes, words, position, "axes fraction, data", xytext=(0, 3), ha="right", color="#8a5f00")
     if limit is None or not 0 < limit.value < math.inf:
         return
-    where = float(answer.magnitudes(limit.value))
-    axes.plot([where], [budget], "o", ms=13, mfc="none", mec="#E69F00", mew=2.5, zorder=5)
+    magnitude = float(answer.magnitudes(limit.value))
+    axes.plot([magnitude], [budget], "o", ms=13, mfc="none", mec="#E69F00", mew=2.5, zorder=5)
     style: dict[str, Any] = {"color": "#8a5f00", "weight": "bold"}
-    note(axes, f"limit {where:.2f}", (where, budget), "data", xytext=(12, -16), **style)
+    note(axes, f"limit {magnitude:.2f}", (magnitude, budget), "data", xytext=(12, -16), **style)
 
 
 _LOOP_WIDTH, _LOOP_HEIGHT = 13.0, 5.6
@@ -149,21 +148,21 @@ def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
         axes.plot(magnitudes, answer.curve(name), **{**drawn, "marker": ""})
         axes.plot([], [], label=label, **drawn)
         values = [answer.strehl(name, flux) for flux in range(len(magnitudes))]
-        errors = [each.standard_error for each in values]
+        errors = [strehl.standard_error for strehl in values]
         bars = {**drawn, "lw": 0, "elinewidth": 1.2, "capsize": 2.5}
-        axes.errorbar(magnitudes, [each.value for each in values], errors, **bars)
+        axes.errorbar(magnitudes, [strehl.value for strehl in values], errors, **bars)
         limit = answer.limit(name)
         if limit.is_known:
             error = limit.error if np.isfinite(limit.error) else 0.0
             mark = {"color": drawn["color"], "marker": "|", "ms": 16, "mew": 2.2, "lw": 0, "elinewidth": 2.2}
             axes.errorbar(limit.magnitude.value, answer.level, xerr=error, zorder=5, **mark)
     axes.axhline(answer.level, color=GREY, lw=1, zorder=0)
-    words, place = f"Strehl {answer.level:.2f}: limiting magnitudes", (0.01, answer.level)
-    note(axes, words, place, "axes fraction, data", xytext=(0, 3), color="#666666")
+    words, position = f"Strehl {answer.level:.2f}: limiting magnitudes", (0.01, answer.level)
+    note(axes, words, position, "axes fraction, data", xytext=(0, 3), color="#666666")
     if answer.question.configuration.photons in answer.photons:
         axes.axvline(magnitudes[answer.at_star], color="black", lw=0.8, ls=":", zorder=0)
-        where = (magnitudes[answer.at_star], 0.99)
-        note(axes, "the star", where, "data, axes fraction", xytext=(4, -10))
+        text_at = (magnitudes[answer.at_star], 0.99)
+        note(axes, "the star", text_at, "data, axes fraction", xytext=(4, -10))
     axes.set_ylim(0, 1)
     axes.grid(color=FLUX_GREY, lw=0.7)
     loop = answer.question.configuration
@@ -178,13 +177,13 @@ def _draw_sky(axes: Axes, answer: LoopAnswer) -> None:
     for number, (name, kind) in enumerate(answer.kinds.items()):
         drawn = method_style(name)
         for group, place in enumerate(PLACES):
-            found = answer.coverage(name, place)
-            assert found is not None
-            where, value = group + (number + 0.5) * width - 0.4, 100 * found.fraction
-            own = 100 * np.nan_to_num(found.strehl_error)
-            both = float(np.hypot(own, 100 * found.model_error))
+            coverage = answer.coverage(name, place)
+            assert coverage is not None
+            x, value = group + (number + 0.5) * width - 0.4, 100 * coverage.fraction
+            error = 100 * np.nan_to_num(coverage.strehl_error)
+            total = float(np.hypot(error, 100 * coverage.model_error))
             axes.bar(
-                where,
+                x,
                 value,
                 width * 0.9,
                 color=drawn["color"],
@@ -192,12 +191,12 @@ def _draw_sky(axes: Axes, answer: LoopAnswer) -> None:
                 hatch="//" if kind.control != INTEGRATOR else "",
                 ec="white",
             )
-            axes.errorbar(where, value, min(both, 0.95 * value), color="black", lw=0, elinewidth=0.8)
-            axes.errorbar(where, value, min(own, 0.95 * value), color="black", lw=0, elinewidth=3)
-            if found.bound:
+            axes.errorbar(x, value, min(total, 0.95 * value), color="black", lw=0, elinewidth=0.8)
+            axes.errorbar(x, value, min(error, 0.95 * value), color="black", lw=0, elinewidth=3)
+            if coverage.bound:
                 axes.annotate(
-                    "≥" if found.bound > 0 else "≤",
-                    (where, value + both),
+                    "≥" if coverage.bound > 0 else "≤",
+                    (x, value + total),
                     ha="center",
                     va="bottom",
                     fontsize=12,

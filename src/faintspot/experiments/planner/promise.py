@@ -173,17 +173,17 @@ def check_promises(
     else:
         spots = np.maximum(fitted.psf.images(fitted.positions, question.shape, fitted.flux_e), 0.0)
         pair = _split(images, excess * spots.reshape(images.shape), dark, ratio, share, pair_rng)
-    places, camera = _places(question, fitted), question.detector
-    alike = []
-    for flux_e, each in zip((share * flux, share * flux, question.star_flux_e), exposures, strict=True):
-        mean = _simulated(question, fitted.psf, places, flux_e).reshape(images.shape)
-        exposed = np.asarray(camera.to_electrons(camera.expose(mean, each)), np.float64)
-        alike.append(exposed - question.background_e)
+    positions, camera = _spot_positions(question, fitted), question.detector
+    exposed_images = []
+    for flux_e, noise in zip((share * flux, share * flux, question.star_flux_e), exposures, strict=True):
+        mean = _simulated(question, fitted.psf, positions, flux_e).reshape(images.shape)
+        exposed = np.asarray(camera.to_electrons(camera.expose(mean, noise)), np.float64)
+        exposed_images.append(exposed - question.background_e)
     assert question.layout is not None
-    truth = places.reshape(*images.shape[:2], 2) - question.layout.offsets
+    truth = positions.reshape(*images.shape[:2], 2) - question.layout.offsets
     promises = {}
     for name, (method, promised_px) in methods.items():
-        first, second, *simulated = (_measure(question, method, part) for part in (*pair, *alike))
+        first, second, *simulated = (_measure(question, method, part) for part in (*pair, *exposed_images))
         promises[name] = Promise(
             share * flux,
             _error_of(simulated[0] - simulated[1], 2),
@@ -245,24 +245,24 @@ def _recorded(question: Question) -> tuple[Floats, LearntPSF]:
     return images, fit_spots(flat, psf, calibration=camera, search_range_px=search)
 
 
-def _places(question: Question, fitted: LearntPSF) -> Floats:
-    """Places (n, 2) of the recording's spots, which vary as these do without the noise of their positions."""
+def _spot_positions(question: Question, fitted: LearntPSF) -> Floats:
+    """Positions (n, 2) of spots that vary as the recorded ones do, without the noise of their positions."""
     assert question.layout is not None
     n_frames, reach = len(fitted.positions) // len(question.layout), question.search_range_px
     middle = np.tile(question.layout.offsets, (n_frames, 1))
-    away = np.clip(fitted.positions - middle, -reach, reach)
-    mean, noise = away.mean(axis=0), np.mean(np.square(fitted.standard_error_px), axis=0)
-    share = np.sqrt(np.maximum(1 - noise / np.maximum(away.var(axis=0), 1e-12), 0.0))
-    places: Floats = middle + mean + share * (away - mean)
-    return places
+    offsets = np.clip(fitted.positions - middle, -reach, reach)
+    mean, noise = offsets.mean(axis=0), np.mean(np.square(fitted.standard_error_px), axis=0)
+    share = np.sqrt(np.maximum(1 - noise / np.maximum(offsets.var(axis=0), 1e-12), 0.0))
+    positions: Floats = middle + mean + share * (offsets - mean)
+    return positions
 
 
-def _simulated(question: Question, psf: PSF, places: Floats, flux_e: float) -> Floats:
+def _simulated(question: Question, psf: PSF, positions: Floats, flux_e: float) -> Floats:
     """Mean images (n, ny, nx) of simulated spots, electrons."""
     assert question.layout is not None
     relative = np.ones(len(question.layout)) if question.relative_flux is None else question.relative_flux
-    flux = flux_e * np.tile(relative, len(places) // len(question.layout))
-    return np.maximum(psf.images(places, question.shape, flux), 0.0)
+    flux = flux_e * np.tile(relative, len(positions) // len(question.layout))
+    return np.maximum(psf.images(positions, question.shape, flux), 0.0)
 
 
 def _split(
@@ -280,8 +280,8 @@ def _split(
     """
     expected = photon_variance + dark_variance
     opposite = share * np.sqrt(ratio * expected) * rng.standard_normal(images.shape)
-    rest = share * photon_variance + dark_variance - 2 * share**2 * expected
-    deviation = np.sqrt(np.maximum(rest, 0.0))
+    remainder = share * photon_variance + dark_variance - 2 * share**2 * expected
+    deviation = np.sqrt(np.maximum(remainder, 0.0))
     first, second = (deviation * rng.standard_normal(images.shape) for _ in range(2))
     return share * images + opposite + first, share * images - opposite + second
 
@@ -323,15 +323,15 @@ def _positions(slopes: Slopes) -> Floats:
 
 def _error_of(differences: Floats, variances: float) -> Estimate:
     """R from differences that have so many times the variance of one slope."""
-    each = np.abs(differences).mean(axis=-1).ravel() / math.sqrt(variances)
-    return Estimate(float(each.mean()), float(each.std() / math.sqrt(max(each.size - 1, 1))))
+    errors = np.abs(differences).mean(axis=-1).ravel() / math.sqrt(variances)
+    return Estimate(float(errors.mean()), float(errors.std() / math.sqrt(max(errors.size - 1, 1))))
 
 
 def _frame_to_frame(slopes: Floats) -> Estimate:
     """R from differences of neighbouring frames; no movement can make it smaller than it is."""
-    found = [
+    estimates = [
         _error_of(np.diff(slopes, order, axis=0), math.comb(2 * order, order))
         for order in _ORDERS
         if order < len(slopes)
     ]
-    return min(found, key=lambda estimate: estimate.value, default=Estimate(math.nan))
+    return min(estimates, key=lambda estimate: estimate.value, default=Estimate(math.nan))

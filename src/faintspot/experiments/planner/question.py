@@ -256,32 +256,32 @@ class Question:
         """The error budget in px."""
         if self.budget is None:
             return None
-        found = _BUDGET.fullmatch(str(self.budget))
+        match = _BUDGET.fullmatch(str(self.budget))
         try:
-            value = float(found[1]) if found else math.nan
+            value = float(match[1]) if match else math.nan
         except ValueError:
             value = math.nan
-        if found is None or not 0 < value < math.inf:
+        if match is None or not 0 < value < math.inf:
             raise InputError(
                 f"budget = {self.budget!r}: expected a slope error such as 0.1 (px), 0.05arcsec or 50mas"
             )
-        if found[2] in (None, "px"):
+        if match[2] in (None, "px"):
             return value
         if self.pixel_scale_arcsec is None:
             raise InputError(
-                f"budget = {self.budget!r}: in {found[2]} it needs the pixel scale; give pixel_scale_arcsec"
+                f"budget = {self.budget!r}: in {match[2]} it needs the pixel scale; give pixel_scale_arcsec"
             )
-        return value * (1e-3 if found[2] == "mas" else 1.0) / float(self.pixel_scale_arcsec)
+        return value * (1e-3 if match[2] == "mas" else 1.0) / float(self.pixel_scale_arcsec)
 
     # Checks -----------------------------------------------------------------------------------------
 
     def _put(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
 
-    def _needed(self, name: str, what: str) -> Any:
+    def _needed(self, name: str, meaning: str) -> Any:
         value = getattr(self, name)
         if value is None:
-            raise InputError(f"{name}: expected {what}, got none")
+            raise InputError(f"{name}: expected {meaning}, got none")
         return value
 
     def _check_window(self) -> None:
@@ -310,8 +310,8 @@ class Question:
             # The PSF includes the pixel, which widens it; exact for Gaussian spots.
             self._put("fwhm_px", math.sqrt(max(float(widths.prod()) - PIXEL_BLUR_PX2, 0.01)))
         if self.fwhm_px is None:
-            known = [self.subaperture_m, self.wavelength_nm, self.pixel_scale_arcsec]
-            if any(value is None for value in known):
+            needed = [self.subaperture_m, self.wavelength_nm, self.pixel_scale_arcsec]
+            if any(value is None for value in needed):
                 raise InputError(
                     "spot: expected fwhm_px, or subaperture_m, wavelength_nm and pixel_scale_arcsec together"
                 )
@@ -349,12 +349,12 @@ class Question:
             )
         if self.magnitude is not None:
             number_between("magnitude", self.magnitude, -30, 40)
-            for name, what in (
+            for name, meaning in (
                 ("subaperture_m", "the side of a sub-aperture (m)"),
                 ("frame_rate_hz", "frames per s"),
             ):
                 if getattr(self, name) is None:
-                    raise InputError(f"magnitude: with it, expected {name}, {what}, got none")
+                    raise InputError(f"magnitude: with it, expected {name}, {meaning}, got none")
         one_of("band", self.band, list(ZERO_POINTS))
         for name in ("throughput", "quantum_efficiency"):
             number_between(name, getattr(self, name), 0.0, 1.0, low_open=True)
@@ -407,15 +407,15 @@ def read_camera(path: str | Path) -> dict[str, Any]:
     check_keys(f"{path}: ", document, [*TABLES, _LAYOUT, _LASER], what="table")
     values: dict[str, Any] = {}
     for table, content in document.items():
-        found = checked_table(f"{path}: {table}", content)
+        entries = checked_table(f"{path}: {table}", content)
         if table == _LAYOUT:
-            values[_LAYOUT] = _layout(path, found)
+            values[_LAYOUT] = _layout(path, entries)
             continue
         if table == _LASER:
-            values[_LASER] = LaserSpots.from_table(path, found)
+            values[_LASER] = LaserSpots.from_table(path, entries)
             continue
-        check_keys(f"{path}: {table}.", found, TABLES[table])
-        values |= found
+        check_keys(f"{path}: {table}.", entries, TABLES[table])
+        values |= entries
     return values
 
 

@@ -35,7 +35,7 @@ _DARK_PIXELS = 1 << 24  # that the read noise is measured in
 _FEWEST_FOR_FLUX = 4  # images of each sub-aperture that tell its flux
 
 
-def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **given: Any) -> Question:
+def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **stated: Any) -> Question:
     """Return the question that recorded frames answer for the most part.
 
     The layout is found (`Layout.from_frame`), gain, read noise and dark level are measured
@@ -82,38 +82,38 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **gi
     if dark_stack is not None and dark_stack.shape[1:] != stack.shape[1:]:
         raise InputError(f"darks: expected frames of {stack.shape[1:]}, got {dark_stack.shape[1:]}")
     facts: list[str] = []
-    given = {name: value for name, value in given.items() if value is not None}
-    layout = given.pop("layout", None)
+    stated = {name: value for name, value in stated.items() if value is not None}
+    layout = stated.pop("layout", None)
     if layout is None:
         dark_mean = 0.0 if dark_stack is None else dark_stack.mean(axis=0)
-        layout = Layout.from_frame(stack.mean(axis=0) - dark_mean, pixels=given.get("pixels"))
+        layout = Layout.from_frame(stack.mean(axis=0) - dark_mean, pixels=stated.get("pixels"))
         ny, nx = layout.window
         facts.append(f"{len(layout)} sub-apertures of {ny} x {nx} px found in the frames")
     check_not_quad_cells(layout.window)
-    given.pop("pixels", None)
+    stated.pop("pixels", None)
     stack = stack[: 2 * frames_to_check(layout)]  # every second one; more cost memory and tell nothing
-    calibration = _calibration(stack, dark_stack, layout, given, facts)
-    given["em_gain"] = calibration.em_gain
-    learning, kept = (stack[0::2], stack[1::2]) if len(stack) > 1 else (stack, None)
-    fitted, used = _fitted(learning, layout, calibration, given, facts)
-    calibration = _without_background(calibration, fitted, darks is not None, given, facts)
-    if given.get("flux_e") is None and given.get("magnitude") is None:
-        given["flux_e"] = float(fitted.flux_e.mean())
+    calibration = _calibration(stack, dark_stack, layout, stated, facts)
+    stated["em_gain"] = calibration.em_gain
+    learning, recording = (stack[0::2], stack[1::2]) if len(stack) > 1 else (stack, None)
+    fitted, used = _fitted(learning, layout, calibration, stated, facts)
+    calibration = _without_background(calibration, fitted, darks is not None, stated, facts)
+    if stated.get("flux_e") is None and stated.get("magnitude") is None:
+        stated["flux_e"] = float(fitted.flux_e.mean())
         sums = float(_electrons(used, layout, calibration).sum(axis=(-2, -1)).mean())
         facts.append(
-            f"light measured by fitting spots and background: {given['flux_e']:.0f} electrons per "
+            f"light measured by fitting spots and background: {stated['flux_e']:.0f} electrons per "
             f"sub-aperture and frame, on average (pixels above the background add up to {sums:.0f})"
         )
-    given["relative_flux"] = _relative_flux(fitted, len(layout), facts)
+    stated["relative_flux"] = _relative_flux(fitted, len(layout), facts)
     values = {
         "gain_e_per_adu": calibration.gain_e_per_adu,
         "em_gain": calibration.em_gain,
         "read_noise_e": calibration.read_noise_e,
     }
     values["background_e"] = calibration.background_e
-    earlier = tuple(given.pop("facts", ()))
-    parts = {"layout": layout, "calibration": calibration, "recording": kept}
-    return Question(**{**given, **values, **parts}, facts=(*earlier, *facts))
+    earlier = tuple(stated.pop("facts", ()))
+    parts = {"layout": layout, "calibration": calibration, "recording": recording}
+    return Question(**{**stated, **values, **parts}, facts=(*earlier, *facts))
 
 
 def _stack(name: str, value: Any) -> NDArray[Any]:
@@ -124,32 +124,32 @@ def _stack(name: str, value: Any) -> NDArray[Any]:
 
 
 def _calibration(
-    stack: NDArray[Any], darks: NDArray[Any] | None, layout: Layout, given: dict[str, Any], facts: list[str]
+    stack: NDArray[Any], darks: NDArray[Any] | None, layout: Layout, stated: dict[str, Any], facts: list[str]
 ) -> Calibration:
     """Dark, gain and read noise: measured, or given."""
-    em_gain = float(given.get("em_gain") or 1.0)
-    found = _measured(stack, darks, layout, em_gain)
-    gain, read_noise = given.get("gain_e_per_adu"), given.get("read_noise_e")
+    em_gain = float(stated.get("em_gain") or 1.0)
+    measured = _measured(stack, darks, layout, em_gain)
+    gain, read_noise = stated.get("gain_e_per_adu"), stated.get("read_noise_e")
     dark: Any = float(np.median(layout.images(stack)[..., [0, -1], :]))
     if darks is not None:
         dark = darks.mean(axis=0)
-    elif found is not None:
-        dark = found.dark_level_adu
-    read_noise_adu = pixel_noise(layout.images(stack)) if found is None else found.read_noise_adu
+    elif measured is not None:
+        dark = measured.dark_level_adu
+    read_noise_adu = pixel_noise(layout.images(stack)) if measured is None else measured.read_noise_adu
     how = "from the darkest pixels of the frames" if darks is None or len(darks) < 2 else "from the darks"
     if gain is None:
-        if found is None or found.gain_e_per_adu is None or found.gain_e_per_adu_error is None:
+        if measured is None or measured.gain_e_per_adu is None or measured.gain_e_per_adu_error is None:
             raise InputError(
                 "gain_e_per_adu: expected a value, as the frames do not tell the gain: a single frame is not "
                 "enough"
             )
-        gain, error, way = found.gain_e_per_adu, found.gain_e_per_adu_error, "from frame to frame"
+        gain, error, way = measured.gain_e_per_adu, measured.gain_e_per_adu_error, "from frame to frame"
         about_spots = _measured_on_spots(stack, dark, layout, em_gain)
         if isinstance(about_spots, str):
-            if not found.reliable:
+            if not measured.reliable:
                 raise InputError(
                     "gain_e_per_adu: expected a value, as the frames do not tell the gain: "
-                    f"{found.notes[-1]}; about fitted spots: {about_spots}"
+                    f"{measured.notes[-1]}; about fitted spots: {about_spots}"
                 )
         else:  # where it is possible, it is the better one: movement and faint flux do not bias it
             gain, error = about_spots.gain_e_per_adu, about_spots.gain_e_per_adu_error
@@ -160,7 +160,7 @@ def _calibration(
     if read_noise is None:
         read_noise = float(f"{read_noise_adu * gain:.3g}")
         facts.append(f"read noise measured {how}: {read_noise:g} electrons")
-    background = float(given.get("background_e") or 0.0)
+    background = float(stated.get("background_e") or 0.0)
     # Electrons for an ADU at the output; the multiplication is divided out by the calibration.
     return Calibration(
         dark=dark,
@@ -168,7 +168,7 @@ def _calibration(
         em_gain=em_gain,
         read_noise_e=read_noise,
         background_e=background,
-        rough_dark=darks is None,
+        estimated=("dark",) if darks is None else (),
     )
 
 
@@ -188,8 +188,8 @@ def _measured_on_spots(stack: NDArray[Any], dark: Any, layout: Layout, em_gain: 
     """Camera properties from the noise about fitted spots, or the reason why there are none."""
     from faintspot.slopes.training.spot_transfer import measure_on_spots
 
-    some = _some(stack, layout)
-    images = layout.images(some) - layout.images(np.broadcast_to(dark, stack.shape[1:]))
+    sample = _some(stack, layout)
+    images = layout.images(sample) - layout.images(np.broadcast_to(dark, stack.shape[1:]))
     try:
         images = images.reshape(-1, *layout.window)
         measured = measure_on_spots(images, em_gain=em_gain, rng=np.random.default_rng(1))
@@ -201,8 +201,8 @@ def _measured_on_spots(stack: NDArray[Any], dark: Any, layout: Layout, em_gain: 
 def _some(frames: NDArray[Any], layout: Layout) -> NDArray[Any]:
     """Frames from all of a recording, as many as hold enough spots."""
     count = min(len(frames), max(1, _SPOTS_TO_LEARN_FROM // len(layout)))
-    some: NDArray[Any] = frames[np.linspace(0, len(frames) - 1, count).round().astype(int)]
-    return some
+    sample: NDArray[Any] = frames[np.linspace(0, len(frames) - 1, count).round().astype(int)]
+    return sample
 
 
 def _electrons(stack: NDArray[Any], layout: Layout, calibration: Calibration) -> NDArray[np.float64]:
@@ -212,38 +212,38 @@ def _electrons(stack: NDArray[Any], layout: Layout, calibration: Calibration) ->
 
 
 def _fitted(
-    frames: NDArray[Any], layout: Layout, calibration: Calibration, given: dict[str, Any], facts: list[str]
+    frames: NDArray[Any], layout: Layout, calibration: Calibration, stated: dict[str, Any], facts: list[str]
 ) -> tuple[LearntPSF, NDArray[Any]]:
     """Fit spots and background in some of the frames, returned as well; learn PSF and range if need be."""
     used = _some(frames, layout)
     images = _electrons(used, layout, calibration).reshape(-1, *layout.window)
     plain = replace(calibration, dark=0.0, gain_e_per_adu=1.0, em_gain=1.0)
     plain = replace(plain, read_noise_e=calibration.read_noise_photoelectrons)
-    assumed, reach = _assumed_psf(layout, given), given.get("search_range_px")
+    assumed, reach = _assumed_psf(layout, stated), stated.get("search_range_px")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         fitted = _fit(images, plain, assumed, layout, reach)
         if reach is None:
             measured = _range(images, plain, fitted, layout)
-            reach = given["search_range_px"] = _range_to_use(measured, fitted.psf, layout, facts)
+            reach = stated["search_range_px"] = _range_to_use(measured, fitted.psf, layout, facts)
             if measured.flux_scale < _NOISE_AMONG_SPOTS:
                 del caught[:]
                 fitted = _fit(images, plain, assumed, layout, reach)
-    if given.get("fwhm_px") is None and given.get("psf") is None:
-        given["psf"] = fitted.psf
+    if stated.get("fwhm_px") is None and stated.get("psf") is None:
+        stated["psf"] = fitted.psf
         width = float(fitted.psf.fwhm_px.mean())
         facts.append(f"PSF learnt from {len(images)} spots: {width:.2f} px wide, pixel included")
         facts += [str(warning.message) for warning in caught]
     return fitted, used
 
 
-def _assumed_psf(layout: Layout, given: dict[str, Any]) -> PSF | None:
+def _assumed_psf(layout: Layout, stated: dict[str, Any]) -> PSF | None:
     """Return the PSF where it is given or its width is."""
-    if given.get("psf") is not None or given.get("fwhm_px") is None:
-        psf: PSF | None = given.get("psf")
+    if stated.get("psf") is not None or stated.get("fwhm_px") is None:
+        psf: PSF | None = stated.get("psf")
         return psf
-    profile = given.get("profile") or "diffraction"
-    size = given["fwhm_px"] / FWHM_OF_SIZE_1_PX[profile]
+    profile = stated.get("profile") or "diffraction"
+    size = stated["fwhm_px"] / FWHM_OF_SIZE_1_PX[profile]
     return PSF.analytic(profile, size=size, radius_px=max(layout.window))
 
 
@@ -263,21 +263,21 @@ def _fit(
 def _range(images: NDArray[Any], calibration: Calibration, fitted: LearntPSF, layout: Layout) -> SpotRange:
     """Measure how far spots are from their references."""
     n, background = len(layout), float(fitted.background_e[0])
-    each = fitted.flux_e.reshape(-1, n)
+    fluxes = fitted.flux_e.reshape(-1, n)
     relative = _relative_flux(fitted, n, [])
-    flux = each.mean() * (np.ones(n) if relative is None else relative)
+    flux = fluxes.mean() * (np.ones(n) if relative is None else relative)
     noise = calibration.read_noise_photoelectrons
     assert noise is not None
     excess = calibration.excess_noise
     dark = noise**2 + excess * max(background, calibration.background_e, 0.0)
-    repeated = np.tile(layout.offsets, (len(each), 1)), np.tile(flux, len(each))
+    repeated = np.tile(layout.offsets, (len(fluxes), 1)), np.tile(flux, len(fluxes))
     return spot_range(Images(images - background, *repeated, max(dark, _LEAST_VARIANCE), excess), fitted.psf)
 
 
 def _range_to_use(measured: SpotRange, psf: PSF, layout: Layout, facts: list[str]) -> float:
     """Return the measured range with a margin, or the default where the flux does not tell it."""
     limit = min(layout.window) / 2
-    if measured.told:
+    if measured.is_measured:
         facts.append(
             f"search range: 99 % of the spots are within {measured.quantile_px:.2f} px of the reference on "
             "each axis, noise accounted for"
@@ -292,7 +292,7 @@ def _range_to_use(measured: SpotRange, psf: PSF, layout: Layout, facts: list[str
 
 
 def _without_background(
-    calibration: Calibration, fitted: LearntPSF, has_darks: bool, given: dict[str, Any], facts: list[str]
+    calibration: Calibration, fitted: LearntPSF, has_darks: bool, stated: dict[str, Any], facts: list[str]
 ) -> Calibration:
     """Take the fitted background off with the dark; above the camera's own, it is light with noise."""
     background = float(fitted.background_e[0])
@@ -305,18 +305,18 @@ def _without_background(
         )
         return calibration
     facts.append(f"background fitted with the spots: {background:.2g} electrons per pixel above the darks")
-    if given.get("background_e") is None:
+    if stated.get("background_e") is None:
         calibration = replace(calibration, background_e=float(f"{max(background, 0.0):.3g}"))
     return calibration
 
 
 def _relative_flux(fitted: LearntPSF, n: int, facts: list[str]) -> NDArray[np.float64] | None:
     """Flux of every sub-aperture over the mean, where there are images enough to tell it from noise."""
-    each = fitted.flux_e.reshape(-1, n)
-    if len(each) < _FEWEST_FOR_FLUX or each.mean() <= 0:
+    fluxes = fitted.flux_e.reshape(-1, n)
+    if len(fluxes) < _FEWEST_FOR_FLUX or fluxes.mean() <= 0:
         return None
-    flux: NDArray[np.float64] = np.maximum(each.mean(axis=0), 0.0) / each.mean()
-    scatter = float(np.sqrt(np.mean(each.var(axis=0, ddof=1)) / len(each)) / each.mean())
+    flux: NDArray[np.float64] = np.maximum(fluxes.mean(axis=0), 0.0) / fluxes.mean()
+    scatter = float(np.sqrt(np.mean(fluxes.var(axis=0, ddof=1)) / len(fluxes)) / fluxes.mean())
     if flux.std() < _SURELY * scatter:
         return None
     low, high = np.quantile(flux, [0.05, 0.95])

@@ -96,14 +96,14 @@ class SimulatedSpots:
         Where sub-apertures may have values of their own, the values share one pipeline.
         """
         if not method.estimator.declared()[name].per_subaperture:
-            slopes = [self.measure(sample, method.with_options({name: value})) for value in values]
-            return [(each.x, each.y) for each in slopes]
+            results = [self.measure(sample, method.with_options({name: value})) for value in values]
+            return [(slopes.x, slopes.y) for slopes in results]
         count = len(values)
         layout = Layout.grid((count * SPOTS_PER_FRAME, 1), pixels=self.layout.window)
-        each = method.settings.replace(**{name: np.repeat(values, SPOTS_PER_FRAME)})
-        pipeline = SlopePipeline(layout, each, self.calibration, **method.parts)
-        found = pipeline(np.tile(sample.frames, (1, count, 1)))
-        x, y = (part.reshape(len(part), count, SPOTS_PER_FRAME).swapaxes(0, 1) for part in (found.x, found.y))
+        settings = method.settings.replace(**{name: np.repeat(values, SPOTS_PER_FRAME)})
+        pipeline = SlopePipeline(layout, settings, self.calibration, **method.parts)
+        slopes = pipeline(np.tile(sample.frames, (1, count, 1)))
+        x, y = (part.reshape(-1, count, SPOTS_PER_FRAME).swapaxes(0, 1) for part in (slopes.x, slopes.y))
         return list(zip(x, y, strict=True))
 
 
@@ -126,9 +126,9 @@ def _even_spots(question: Question, n: int, rng: np.random.Generator) -> tuple[F
     positions = position_rng.uniform(-half, half, (n, 2))
     middle = np.zeros((1, 2))
     if question.psf is not None:
-        which = phase_rng.integers(0, len(question.psf.samples), n)
-        images = question.psf.images(positions, shape, which=which)
-        flux = question.psf.images(np.repeat(middle, n, axis=0), shape, which=which).sum(axis=(1, 2))
+        index = phase_rng.integers(0, len(question.psf.samples), n)
+        images = question.psf.images(positions, shape, which=index)
+        flux = question.psf.images(np.repeat(middle, n, axis=0), shape, which=index).sum(axis=(1, 2))
         # A learnt PSF's wings may be a little negative; light is not.
         return np.maximum(images / flux[:, None, None], 0.0), positions
     form: dict[str, Any] = {"shape": shape, "profile": question.profile, "size": question.size}

@@ -174,16 +174,16 @@ def _limiting(answer: Answer) -> list[str]:
 def _limit(answer: Answer, result: MethodResult) -> str:
     limit: Any = result.limiting_flux_e
     if limit.value == 0:
-        return f"fainter than all that was tried ({_place(answer, answer.flux_e[0])})"
+        return f"fainter than all that was tried ({_star(answer, answer.flux_e[0])})"
     if math.isinf(limit.value):
-        return f"brighter than all that was tried ({_place(answer, answer.flux_e[-1])})"
+        return f"brighter than all that was tried ({_star(answer, answer.flux_e[-1])})"
     if answer.question.photometry is None:
         return f"{plain_number(limit.value)} ± {plain_number(limit.standard_error, 1)} electrons"
     error = 2.5 / math.log(10) * limit.standard_error / limit.value
     return f"{_magnitude(answer, limit.value):.2f} ± {error:.2f}"
 
 
-def _place(answer: Answer, flux_e: float) -> str:
+def _star(answer: Answer, flux_e: float) -> str:
     if answer.question.photometry is None:
         return f"{plain_number(flux_e)} electrons"
     return f"{_magnitude(answer, flux_e):.2f}"

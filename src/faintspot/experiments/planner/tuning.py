@@ -14,13 +14,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
-from faintspot.base.statistics import (
-    OUTLIER_PX,
-    Estimate,
-    SlopeStatistics,
-    absolute_errors,
-    slope_statistics,
-)
+from faintspot.base.statistics import OUTLIER_PX, Estimate, SlopeStatistics, absolute_errors, slope_statistics
 from faintspot.experiments.closed_loop.methods import Choice
 from faintspot.experiments.closed_loop.search import coordinate_search, corrected_badness
 from faintspot.experiments.curves import Curve, limiting_flux, magnitude_gain
@@ -112,14 +106,14 @@ def tune(
     """
     if not isinstance(question, Question):
         raise InputError(f"question: expected a Question, got {type(question).__name__}")
-    wanted = _default_realisations(question) if realisations is None else realisations
-    number = int(number_between("realisations", wanted, 256, integer=True))
-    around = int(number_between("steps", steps, 1, 20, integer=True))
+    count = _default_realisations(question) if realisations is None else realisations
+    number = int(number_between("realisations", count, 256, integer=True))
+    each_side = int(number_between("steps", steps, 1, 20, integer=True))
     spots_rng, score_rng, noise_rng, resampling_rng = spawn(
         np.random.default_rng(1) if rng is None else rng, 4
     )
     trial = _Trial(question, number, spots_rng, score_rng, noise_rng, progress)
-    trial.add(range(-around, around + 1))
+    trial.add(range(-each_side, each_side + 1))
     answer = trial.answer(resampling_rng)
     while question.budget_px is not None and (further := _further(answer, trial.steps)):
         trial.add(further)
@@ -129,13 +123,13 @@ def tune(
 
 def _further(answer: Answer, steps: Sequence[int]) -> list[int]:
     """Return steps of flux beyond those tried, where limiting fluxes are wanted that were not found."""
-    wanted = [answer.best, answer[BrightestPixels.name]]
-    limits = [result.limiting_flux_e.value for result in wanted if result.limiting_flux_e is not None]
+    results = [answer.best, answer[BrightestPixels.name]]
+    limits = [result.limiting_flux_e.value for result in results if result.limiting_flux_e is not None]
     further = []
     if 0.0 in limits:
-        further += [min(steps) - 1 - each for each in range(_SEARCH_STEPS)]
+        further += [min(steps) - 1 - step for step in range(_SEARCH_STEPS)]
     if math.inf in limits:
-        further += [max(steps) + 1 + each for each in range(_SEARCH_STEPS)]
+        further += [max(steps) + 1 + step for step in range(_SEARCH_STEPS)]
     low, high = _SEARCHED_E
     star = answer.question.star_flux_e
     return sorted(step for step in further if low <= _flux_of(star, step) <= high)
@@ -270,7 +264,9 @@ class _Trial:
         """The methods at the star's flux, checked on the recording."""
         if self._question.recording is None:
             return {}
-        methods = {name: (each.method, each.statistics.error.value) for name, each in self._scored[0].items()}
+        methods = {
+            name: (scored.method, scored.statistics.error.value) for name, scored in self._scored[0].items()
+        }
         return check_promises(self._question, methods)
 
 
@@ -313,8 +309,8 @@ def _chosen_and_scored(
     """Choose a method's options on one sample, and score it on the other."""
 
     def badness(choice: Choice, name: str, values: Sequence[Any]) -> list[float]:
-        found = spots.measure_each(choosing, method.with_options(choice), name, values)
-        return [corrected_badness(x, y, choosing.truth) for x, y in found]
+        measured = spots.measure_each(choosing, method.with_options(choice), name, values)
+        return [corrected_badness(x, y, choosing.truth) for x, y in measured]
 
     chosen = method.with_options(coordinate_search(axes, badness))
     chosen = chosen.with_options(
@@ -372,10 +368,10 @@ def _ranked(
         with np.errstate(invalid="ignore"):
             difference = blocks[result.method.name] - blocks[best.method.name]
             difference += math.log(factors.get(result.method.name, 1.0) / factors.get(best.method.name, 1.0))
-        known = difference[np.isfinite(difference)]
-        if result is not best and len(known) == len(difference) > 1:
-            error = float(known.std(ddof=1)) / math.sqrt(len(known))
-            if float(known.mean()) <= _TIE_ERRORS * error:
+        finite = difference[np.isfinite(difference)]
+        if result is not best and len(finite) == len(difference) > 1:
+            error = float(finite.std(ddof=1)) / math.sqrt(len(finite))
+            if float(finite.mean()) <= _TIE_ERRORS * error:
                 equal.append(result)
     equal.sort(key=lambda result: (Knowledge.of(result.method.estimator), result.method.estimator.cost))
     return tuple(result.method.name for result in equal)

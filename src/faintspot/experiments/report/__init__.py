@@ -1,1 +1,1 @@
-"""The page of a study."""
+"""Page of a study: `page`, `estimator_figures`, and `efficiency` (tables and findings)."""

@@ -85,30 +85,30 @@ class _Cells:
 
 def findings(dataset: xarray.Dataset) -> list[str]:
     """Return what a study says about the estimators, a sentence or two each."""
-    found = []
+    sentences = []
     cells = _Cells(dataset, speckled=False)
     if cells.count:
-        found += _efficient(cells)
-        found += _outlier_dominated(cells)
+        sentences += _efficient(cells)
+        sentences += _outlier_dominated(cells)
     speckled = _Cells(dataset, speckled=True)
     if speckled.count:
-        found += _near_the_best(speckled, dataset)
-    return found
+        sentences += _near_the_best(speckled, dataset)
+    return sentences
 
 
 def _efficient(cells: _Cells) -> list[str]:
     conditions = zip(cells.coordinate("read_noise_e"), cells.coordinate("flux_e"), strict=True)
     enough = np.array([enough_photons(float(noise), float(flux)) for noise, flux in conditions])
-    found = []
+    sentences = []
     for method, target in EXPECTED_EFFICIENCY.items():
         if method in cells.methods and enough.any():
             values = np.where(enough, cells.of("photon_efficiency", method), np.inf)
             lowest = int(np.argmin(values))
             reached = int(np.sum(values[enough] >= target))
             words = {"method": method, "target": target, "reached": reached, "cells": enough.sum()}
-            where = cells.words(lowest)
-            found.append(_TEXT("findings.efficient", **words, lowest=values[lowest], where=where))
-    return found
+            condition = cells.words(lowest)
+            sentences.append(_TEXT("findings.efficient", **words, lowest=values[lowest], where=condition))
+    return sentences
 
 
 def _outlier_dominated(cells: _Cells) -> list[str]:
@@ -118,9 +118,9 @@ def _outlier_dominated(cells: _Cells) -> list[str]:
     if not dominated.any():
         return []
     errors, se = cells.values("error", BEST)[dominated], cells.of("error_se", MAP)[dominated]
-    own = cells.of("error", MAP)[dominated]
+    of_map = cells.of("error", MAP)[dominated]
     smallest = errors.min(axis=1)
-    ratio = own / smallest
+    ratio = of_map / smallest
     stated = cells.of("stated_over_actual_all", MAP, None)[dominated]
     return [
         _TEXT(
@@ -128,7 +128,7 @@ def _outlier_dominated(cells: _Cells) -> list[str]:
             limit=_OUTLIERS,
             cells=dominated.sum(),
             smallest=int(np.sum(ratio <= 1)),
-            near=int(np.sum(own - smallest <= 2 * se)),
+            near=int(np.sum(of_map - smallest <= 2 * se)),
             most=ratio.max(),
             low=stated.min(),
             high=stated.max(),
@@ -139,7 +139,7 @@ def _outlier_dominated(cells: _Cells) -> list[str]:
 def _near_the_best(cells: _Cells, dataset: xarray.Dataset) -> list[str]:
     ratio = _ratio_to_best(cells.values("corrected_rms", _corrected_mode(dataset)))
     d_over_r0 = cells.coordinate("d_over_r0")
-    found = []
+    sentences = []
     for words, part in (("all", d_over_r0 > 0), ("d/r0 up to 1", d_over_r0 <= 1), ("above 1", d_over_r0 > 1)):
         if part.any():
             near = {
@@ -152,8 +152,8 @@ def _near_the_best(cells: _Cells, dataset: xarray.Dataset) -> list[str]:
             )
             near_percent = 100 * (NEAR_BEST - 1)
             counts = {"which": words, "cells": part.sum(), "near": near_percent}
-            found.append(_TEXT("findings.near_best", **counts, ranked=listed))
-    return found
+            sentences.append(_TEXT("findings.near_best", **counts, ranked=listed))
+    return sentences
 
 
 def _ratio_to_best(values: Floats) -> Floats:
@@ -169,10 +169,10 @@ def result_sections(dataset: xarray.Dataset) -> list[Section]:
         efficiency, bound = cells.values("photon_efficiency", BEST), cells.coordinate("bound")
         rows = [[f"{bound[i]:.4f}", *map(number_or_dash, efficiency[i])] for i in cells.order()]
         sections.append(_section(cells, "efficiency", rows, cells.methods))
-        near, whole = (cells.values(f"stated_over_actual{part}") for part in ("", "_all"))
+        inliers, everything = (cells.values(f"stated_over_actual{part}") for part in ("", "_all"))
         kept = [i for i, method in enumerate(cells.methods) if knows_the_spot(method)]
         rows = [
-            [f"{number_or_dash(near[i, j])} ({number_or_dash(whole[i, j])})" for j in kept]
+            [f"{number_or_dash(inliers[i, j])} ({number_or_dash(everything[i, j])})" for j in kept]
             for i in cells.order()
         ]
         sections.append(_section(cells, "calibration", rows, [cells.methods[j] for j in kept]))
@@ -183,7 +183,7 @@ def result_sections(dataset: xarray.Dataset) -> list[Section]:
             [
                 f"{values[i, best[i]]:.4f}",
                 speckled.methods[best[i]],
-                *(number_or_dash(each, 0) for each in excess[i]),
+                *(number_or_dash(percent, 0) for percent in excess[i]),
             ]
             for i in speckled.order()
         ]

@@ -84,13 +84,13 @@ def _groups(dataset: xarray.Dataset, axis: str, by: Sequence[str], *, speckled: 
     """Yield the groups of cells that differ in `axis`, within a panel, and in `by`, between panels."""
     done = [int(cell) for cell in np.flatnonzero(dataset["done"].values)]
     table = dict(zip(done, parameters_of(dataset, done), strict=True))
-    found: dict[tuple[Any, ...], dict[tuple[Any, ...], list[int]]] = {}
+    groups: dict[tuple[Any, ...], dict[tuple[Any, ...], list[int]]] = {}
     common = [name for name in PARAMETERS if name not in (axis, *by)]
     for cell, row in table.items():
         if (row["d_over_r0"] > 0) == speckled:
-            panels = found.setdefault(tuple(row[name] for name in common), {})
+            panels = groups.setdefault(tuple(row[name] for name in common), {})
             panels.setdefault(tuple(row[name] for name in by), []).append(cell)
-    for values, panels in sorted(found.items()):
+    for values, panels in sorted(groups.items()):
         kept = [
             _Panel(
                 ", ".join(parameter_in_words(name, value) for name, value in zip(by, key, strict=True)),
@@ -115,14 +115,14 @@ def _figure(dataset: xarray.Dataset, group: _Group, kind: str, axis: str) -> Fig
     figure = new_figure(WIDTH, _ROW_HEIGHT * rows + 0.9)
     panels = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
     for index, (panel, part) in enumerate(zip(panels, group.panels, strict=False)):
-        found = dataset.isel(cell=part.cells).sel(estimator=_drawn_methods(dataset), mode=mode)
-        x = found[axis].values
-        for method in found["estimator"].values:
-            chosen = found.sel(estimator=method)
-            se = chosen[f"{kind}_se"].values if f"{kind}_se" in found else None
+        shown = dataset.isel(cell=part.cells).sel(estimator=_drawn_methods(dataset), mode=mode)
+        x = shown[axis].values
+        for method in shown["estimator"].values:
+            chosen = shown.sel(estimator=method)
+            se = chosen[f"{kind}_se"].values if f"{kind}_se" in shown else None
             panel.errorbar(x, chosen[kind].values, se, elinewidth=1, zorder=3, **_line_of(str(method)))
         label_axes(panel, axis, log_y=False)
-        _SCALES[kind](panel, found, x, found[kind].values)
+        _SCALES[kind](panel, shown, x, shown[kind].values)
         panel.set_title(part.title)
         if index % columns == 0:
             panel.set_ylabel(_TEXT[f"estimators.{kind}.axis"])
@@ -138,30 +138,30 @@ def _figure(dataset: xarray.Dataset, group: _Group, kind: str, axis: str) -> Fig
     return FigureWithData(name, title, caption, figure, *table_of_cells(dataset, group.cells))
 
 
-def _error_scale(panel: Axes, found: xarray.Dataset, x: Any, values: Any) -> None:
-    panel.plot(x, found["bound"].values, zorder=1, **_BOUND)
-    panel.axhline(float(found["position_range_px"][0]) / 2, color=GREY, lw=1, ls=":")
+def _error_scale(panel: Axes, dataset: xarray.Dataset, x: Any, values: Any) -> None:
+    panel.plot(x, dataset["bound"].values, zorder=1, **_BOUND)
+    panel.axhline(float(dataset["position_range_px"][0]) / 2, color=GREY, lw=1, ls=":")
     panel.set_yscale("log")
     plain_ticks(panel.yaxis, (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2))
 
 
-def _efficiency_scale(panel: Axes, found: xarray.Dataset, x: Any, values: Any) -> None:
+def _efficiency_scale(panel: Axes, dataset: xarray.Dataset, x: Any, values: Any) -> None:
     panel.axhline(1.0, zorder=1, **_BOUND)
     panel.set_ylim(0, 1.35)
 
 
-def _gain_scale(panel: Axes, found: xarray.Dataset, x: Any, values: Any) -> None:
+def _gain_scale(panel: Axes, dataset: xarray.Dataset, x: Any, values: Any) -> None:
     panel.axhline(1.0, zorder=1, **_BOUND)
 
 
-def _outlier_scale(panel: Axes, found: xarray.Dataset, x: Any, values: Any) -> None:
+def _outlier_scale(panel: Axes, dataset: xarray.Dataset, x: Any, values: Any) -> None:
     panel.set_yscale("symlog", linthresh=1e-3)
     plain_ticks(panel.yaxis, (0, 1e-3, 1e-2, 0.1, 0.5))
     panel.set_ylim(-1e-4, max(2e-3, min(1.0, 1.5 * float(np.nanmax(values)))))
 
 
-def _rms_scale(panel: Axes, found: xarray.Dataset, x: Any, values: Any) -> None:
-    best = found["corrected_rms"].min("estimator").values
+def _rms_scale(panel: Axes, dataset: xarray.Dataset, x: Any, values: Any) -> None:
+    best = dataset["corrected_rms"].min("estimator").values
     panel.plot(x, best, "o", ms=15, mfc="none", mec="black", mew=1.4, zorder=4)
     panel.set(xscale="log", yscale="log")
     plain_ticks(panel.xaxis, (0.3, 0.5, 1, 2, 3, 5, 10))

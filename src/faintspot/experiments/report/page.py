@@ -113,14 +113,14 @@ def _cells_by_figure(dataset: xarray.Dataset) -> dict[str, list[int]]:
     specification = StudySpecification.from_text(str(dataset.attrs["specification"]))
     columns = [dataset[name].values.tolist() for name in PARAMETERS]
     done = dataset["done"].values
-    place = {values: i for i, values in enumerate(zip(*columns, strict=True)) if done[i]}
+    index = {values: i for i, values in enumerate(zip(*columns, strict=True)) if done[i]}
     groups: dict[str, dict[int, None]] = {}
     for sweep in specification.sweeps:
         group = groups.setdefault(sweep.name.split()[0], {})
         for cell in sweep.cells():
             values = tuple(getattr(cell, name) for name in PARAMETERS)
-            if values in place:
-                group[place[values]] = None
+            if values in index:
+                group[index[values]] = None
     return {name: list(group) for name, group in sorted(groups.items())}
 
 
@@ -130,11 +130,11 @@ def _is_paper(names: Iterable[str]) -> bool:
 
 def _widths_in_words(specification: StudySpecification) -> str:
     widths = {profile: f"{fwhm:.2f} s" for profile, fwhm in FWHM_OF_SIZE_1_PX.items()}
-    said = "FWHM in px: " + ", ".join(f"{width} ({profile})" for profile, width in widths.items())
+    text = "FWHM in px: " + ", ".join(f"{width} ({profile})" for profile, width in widths.items())
     largest = 2 * FWHM_OF_SIZE_1_PX["diffraction"]
     if _is_paper(sweep.name.split()[0] for sweep in specification.sweeps):
-        said += _TEXT("study.widths", largest=largest)
-    return said
+        text += _TEXT("study.widths", largest=largest)
+    return text
 
 
 def _page(dataset: xarray.Dataset) -> Page:
@@ -165,10 +165,10 @@ def _page(dataset: xarray.Dataset) -> Page:
 
 
 def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
-    found = findings(dataset)
-    missing = "" if found else _TEXT["study.no_findings"]
+    points = findings(dataset)
+    missing = "" if points else _TEXT["study.no_findings"]
     return [
-        Section("findings", "What was found", points=found, missing=missing),
+        Section("findings", "What was found", points=points, missing=missing),
         *_figure_sections(dataset),
         *result_sections(dataset),
         baselines_section(dataset),

@@ -33,15 +33,15 @@ def paper_study(quick: bool = False, figures: Sequence[str] | None = None) -> St
     InputError
         For an unknown figure, and for figure 1, which needs no study.
     """
-    wanted = FIGURES if figures is None else tuple(figures)
-    for name in wanted:
+    names = FIGURES if figures is None else tuple(figures)
+    for name in names:
         if name == "fig1":
             raise InputError("figure 'fig1': expected fig2 to fig7; it needs no study and is on every report")
         one_of("figure", name, FIGURES)
-    if not wanted:
+    if not names:
         raise InputError("figures: expected at least one of fig2 to fig7, got none")
     study = _study("paper", quick)
-    return replace(study, sweeps=[each for each in study.sweeps if each.name.split()[0] in wanted])
+    return replace(study, sweeps=[sweep for sweep in study.sweeps if sweep.name.split()[0] in names])
 
 
 def estimators_study(quick: bool = False) -> StudySpecification:

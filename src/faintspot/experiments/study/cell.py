@@ -57,12 +57,12 @@ class Tuning:
             if len(candidates) == 1 and not keeps_every_k(self._methods.kinds[method]):
                 continue  # there is nothing to choose
             for images, truth in self._methods.parts(method, blocks):
-                found = [self._methods.positions(method, candidate, images)[0] for candidate in candidates]
+                estimates = [self._methods.positions(method, option, images)[0] for option in candidates]
                 self._errors[method] += np.stack(
-                    [errors_of(each, truth[:, None]).sum(axis=0) for each in found]
+                    [errors_of(xy, truth[:, None]).sum(axis=0) for xy in estimates]
                 )
                 if CORRECTED in self._modes:
-                    self._moments[method] += np.stack([moments_of(each, truth) for each in found], axis=1)
+                    self._moments[method] += np.stack([moments_of(xy, truth) for xy in estimates], axis=1)
 
     def choices(self) -> dict[tuple[str, str], Choice]:
         """Return the choice of every method and mode."""
@@ -91,10 +91,10 @@ def _corrected_rms(moments: Floats) -> Floats:
     """Root mean square of the residuals over the gain, as `slope_statistics`."""
     n, true_x, true_y, true_squares, x, y, squares, across = moments
     spread = true_squares - (np.square(true_x) + np.square(true_y)) / n
-    together = across - (x * true_x + y * true_y) / n
-    own = squares - (np.square(x) + np.square(y)) / n
-    gain = together / spread
-    residual = np.maximum(own - gain * together, 0.0) / (2 * n)
+    product = across - (x * true_x + y * true_y) / n
+    spread_of_estimates = squares - (np.square(x) + np.square(y)) / n
+    gain = product / spread
+    residual = np.maximum(spread_of_estimates - gain * product, 0.0) / (2 * n)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(gain > 0, np.sqrt(residual) / gain, np.inf)
 
@@ -267,20 +267,20 @@ def _results(cell: Cell, specification: StudySpecification, scores: Scores) -> d
 
 def _stated_over_actual(methods: Any, scores: Scores) -> dict[str, NDArray[Any]]:
     """Root mean squares of stated standard errors and of errors: their ratio, without outliers and with."""
-    without, whole = np.full((2, len(methods)), np.nan)
+    without, with_outliers = np.full((2, len(methods)), np.nan)
     for i, method in enumerate(methods):
         stated = scores.stated(method)
         if stated is not None:
             errors = scores.positions(method, BEST) - scores.truth
-            known = np.all(np.isfinite(stated), axis=1)
-            near = known & np.all(np.abs(errors) <= OUTLIER_PX, axis=1)
-            without[i], whole[i] = (
+            finite = np.all(np.isfinite(stated), axis=1)
+            near = finite & np.all(np.abs(errors) <= OUTLIER_PX, axis=1)
+            without[i], with_outliers[i] = (
                 np.sqrt(np.mean(np.square(stated[part])) / np.mean(np.square(errors[part])))
                 if part.any()
                 else np.nan
-                for part in (near, known)
+                for part in (near, finite)
             )
-    return {"stated_over_actual": without, "stated_over_actual_all": whole}
+    return {"stated_over_actual": without, "stated_over_actual_all": with_outliers}
 
 
 def _against_the_bound(cell: Cell, errors: Floats) -> dict[str, NDArray[Any]]:
@@ -297,8 +297,8 @@ def _against_the_bound(cell: Cell, errors: Floats) -> dict[str, NDArray[Any]]:
         }
         bound = cramer_rao(cell.flux_e, **conditions)
         bounds = np.array([MEAN_ABSOLUTE * bound.mean(), np.sqrt(np.mean(np.square(bound)))])
-        known = errors > 0
-        efficiency[known] = photon_efficiency(errors[known], cell.flux_e, **conditions)
+        measured = errors > 0
+        efficiency[measured] = photon_efficiency(errors[measured], cell.flux_e, **conditions)
     return {"bound": bounds[0], "bound_rms": bounds[1], "photon_efficiency": efficiency}
 
 

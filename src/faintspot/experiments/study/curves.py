@@ -81,12 +81,12 @@ def study_curves(dataset: xarray.Dataset, mode: str) -> dict[Configuration, Curv
 def cells_by_configuration(dataset: xarray.Dataset) -> dict[Configuration, NDArray[np.int64]]:
     """Return the indices of the finished cells of every configuration, by increasing flux."""
     columns = {field.name: dataset[field.name].values for field in fields(Configuration)}
-    found: dict[Configuration, list[int]] = {}
+    groups: dict[Configuration, list[int]] = {}
     for cell in np.flatnonzero(dataset["done"].values):
         values: dict[str, Any] = {name: column[cell].item() for name, column in columns.items()}
-        found.setdefault(Configuration(**values), []).append(int(cell))
+        groups.setdefault(Configuration(**values), []).append(int(cell))
     flux = dataset["flux_e"].values
-    return {key: np.array(sorted(cells, key=lambda cell: flux[cell])) for key, cells in found.items()}
+    return {key: np.array(sorted(cells, key=lambda cell: flux[cell])) for key, cells in groups.items()}
 
 
 KEPT_RANGE = (10, 60)
@@ -126,22 +126,22 @@ def kept_panels(dataset: xarray.Dataset, profile: str) -> list[KeptPanel]:
     fixed = f"{profile}, {pixels} × {pixels} px, ±{reach:g} px"
     low, high = _WANTED_SIGNALS_E
 
-    def nearest(configuration: Configuration, wanted_e: float) -> tuple[float, int]:
+    def nearest(configuration: Configuration, target_e: float) -> tuple[float, int]:
         flux = dataset["flux_e"].values[cells_of[configuration]]
-        best = int(np.argmin(np.abs(np.log(flux / wanted_e))))
+        best = int(np.argmin(np.abs(np.log(flux / target_e))))
         return float(flux[best]), int(cells_of[configuration][best])
 
-    def panel(what: str, named: Sequence[tuple[str, Configuration]], common: str) -> KeptPanel:
+    def panel(subject: str, named: Sequence[tuple[str, Configuration]], common: str) -> KeptPanel:
         """Return one cell of each configuration, at the flux nearest to the lower one that is wanted."""
-        found = [(name, *nearest(configuration, low)) for name, configuration in named]
-        fluxes = {flux for _, flux, _ in found}
+        closest = [(name, *nearest(configuration, low)) for name, configuration in named]
+        fluxes = {flux for _, flux, _ in closest}
         at = f"{fluxes.pop():g} e-" if len(fluxes) == 1 else ""
-        cells = [(name if at else f"{name}, {flux:g} e-", cell) for name, flux, cell in found]
-        return KeptPanel(f"{what} at {at or 'signals as named'}, {common}; {fixed}", cells)
+        cells = [(name if at else f"{name}, {flux:g} e-", cell) for name, flux, cell in closest]
+        return KeptPanel(f"{subject} at {at or 'signals as named'}, {common}; {fixed}", cells)
 
     quiet = [c for c in kept if c.read_noise_e == noise]
     sharp = [c for c in kept if c.size == size and c.read_noise_e in (*_SHOWN_NOISES_E, noise)]
-    at_signals = dict(nearest(c, wanted) for c in quiet if c.size == size for wanted in (low, high))
+    at_signals = dict(nearest(c, target) for c in quiet if c.size == size for target in (low, high))
     signals = [(f"{flux:g} e-", cell) for flux, cell in at_signals.items()]
     return [
         KeptPanel(f"signals, size {size:g}, {noise:g} e- read noise; {fixed}", signals),
@@ -209,19 +209,19 @@ def against_tv(dataset: xarray.Dataset, mode: str) -> list[AgainstTV]:
         for index, method in enumerate(methods):
             pairs = [curve.difference(TV, method) for curve in part]
             difference, se = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
-            known = np.isfinite(difference)
-            n = int(known.sum())
+            finite = np.isfinite(difference)
+            n = int(finite.sum())
             if method == TV or n == 0:
                 continue
             limit = float(norm.isf(_FAMILY_FALSE_ALARM / n))
-            ratio = error[known, index] / error[known, methods.index(TV)]
+            ratio = error[finite, index] / error[finite, methods.index(TV)]
             rows.append(
                 AgainstTV(
                     method,
                     mode,
                     profile,
-                    int(np.sum(difference[known] < -limit * se[known])),
-                    int(np.sum(difference[known] > limit * se[known])),
+                    int(np.sum(difference[finite] < -limit * se[finite])),
+                    int(np.sum(difference[finite] > limit * se[finite])),
                     n,
                     float(np.exp(np.mean(np.log(ratio)))),
                     int(np.sum(winner == index)),

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 try:
     import xarray
 except ImportError:
-    raise MissingExtraError("xarray", "study", "A study") from None
+    raise MissingExtraError("xarray", "loop", "A study") from None
 
 VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     name: (tuple(dimensions.split()), units, description.format(outlier=OUTLIER_PX))
@@ -105,8 +105,8 @@ def open_study(path: str | Path) -> xarray.Dataset:
     """
     path = Path(path)
     if kind_of_store(path) != KIND:
-        found = "something else" if path.exists() else "nothing"
-        raise InputError(f"{path}: expected the Zarr store of a study, found {found}")
+        contents = "something else" if path.exists() else "nothing"
+        raise InputError(f"{path}: expected the Zarr store of a study, found {contents}")
     try:
         dataset: xarray.Dataset = xarray.open_zarr(path, chunks=None, consolidated=False).load()
     except Exception as error:  # a broken chunk makes each codec raise its own kind
@@ -201,13 +201,13 @@ def run(
     """
     if not isinstance(specification, StudySpecification):
         raise InputError(f"specification: expected a StudySpecification, got {type(specification).__name__}")
-    place = WorkerPool(workers, progress, announce)
+    pool = WorkerPool(workers, progress, announce)
     units = [Unit(str(index), (cell, specification)) for index, cell in enumerate(specification.cells())]
     if store is None:
         memory = MemoryStore()
-        run_units(_measured, units, memory, place)
+        run_units(_measured, units, memory, pool)
         return dataset_of(specification, memory)
-    run_units(_measured, units, stored_units(specification, Path(store), overwrite=overwrite), place)
+    run_units(_measured, units, stored_units(specification, Path(store), overwrite=overwrite), pool)
     return open_study(store)
 
 

@@ -232,19 +232,19 @@ class StudySpecification:
         return cls.from_text(read_text(path), str(path))
 
 
-def _checked_list(name: str, given: Any) -> list[Any]:
+def _checked_list(name: str, values: Any) -> list[Any]:
     """Return a list without repeated items, or raise InputError when it is none or empty."""
-    if isinstance(given, str) or np.ndim(given) != 1:
-        raise InputError(f"{name}: expected a list, got {given!r}")
-    if not len(given):
+    if isinstance(values, str) or np.ndim(values) != 1:
+        raise InputError(f"{name}: expected a list, got {values!r}")
+    if not len(values):
         raise InputError(f"{name}: expected at least one value, got an empty list")
-    return list(dict.fromkeys(given))
+    return list(dict.fromkeys(values))
 
 
-def _checked_sweeps(given: Any) -> tuple[Sweep, ...]:
-    sweeps = tuple(given) if isinstance(given, Iterable) else ()
+def _checked_sweeps(values: Any) -> tuple[Sweep, ...]:
+    sweeps = tuple(values) if isinstance(values, Iterable) else ()
     if not sweeps or not all(isinstance(sweep, Sweep) for sweep in sweeps):
-        raise InputError(f"sweeps: expected at least one sweep, got {given!r}")
+        raise InputError(f"sweeps: expected at least one sweep, got {values!r}")
     names = [sweep.name for sweep in sweeps]
     for name in names:
         if names.count(name) > 1:
@@ -257,8 +257,8 @@ def _checked_sweeps(given: Any) -> tuple[Sweep, ...]:
 
 
 def _build(document: dict[str, Any]) -> StudySpecification:
-    known = [field.name for field in fields(StudySpecification)]
-    check_keys("", document, known, required=("name", "sweeps"))
+    names = [field.name for field in fields(StudySpecification)]
+    check_keys("", document, names, required=("name", "sweeps"))
     tables = document["sweeps"]
     if not isinstance(tables, dict) or not tables:
         raise InputError("sweeps: expected at least one table, such as [sweeps.signal]")

@@ -168,9 +168,9 @@ class Sweep:
         return [Cell(*values) for values in itertools.product(*(getattr(self, name) for name in PARAMETERS))]
 
 
-def _values(where: str, name: str, given: Any) -> tuple[Any, ...]:
+def _values(where: str, name: str, values: Any) -> tuple[Any, ...]:
     """Return the values of a parameter, checked, each once and in the order given."""
-    items: Sequence[Any] = [given] if isinstance(given, str) or np.ndim(given) == 0 else list(given)
+    items: Sequence[Any] = [values] if isinstance(values, str) or np.ndim(values) == 0 else list(values)
     if not items:
         raise InputError(f"{where}: expected at least one value, got an empty list")
     if name == "profile":

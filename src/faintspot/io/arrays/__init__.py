@@ -1,1 +1,1 @@
-"""Arrays in files, read in parts: raw bytes, FITS units, compressed data, Zarr stores."""
+"""Arrays in files, read in parts: `stored_array` is the interface; FITS headers, streams and Zarr stores."""

@@ -1,4 +1,4 @@
-"""Zarr stores on the disk: opening, checks, codecs and damaged chunks."""
+"""Zarr stores on the disk: opening, checks, codecs and lost chunks."""
 
 from __future__ import annotations
 
@@ -12,18 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import check_regular, parse_json, read_bytes, replace_file
+from faintspot.base.files import parse_json, read_bytes, replace_file
 from faintspot.base.sizes import MOST_TEXT_BYTES, check_bytes
-from faintspot.io.arrays.inflation import check_inflated
-from faintspot.io.arrays.raw import MOST_WHOLE_BYTES
+from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
 
 TELEMETRY = "faintspot telemetry"
 """Format attribute of a telemetry store."""
 _MARKS = ("zarr.json", ".zgroup", ".zarray")
-_METADATA = (*_MARKS, ".zattrs", ".zmetadata")
-_COMPRESSORS = ("blosc", "bz2", "gzip", "lz4", "lzma", "zlib", "zstd")
 
 
 def is_store(path: Path) -> bool:
@@ -34,38 +31,16 @@ def is_store(path: Path) -> bool:
 def open_store(path: Path, key: str = "") -> Any:
     """Open a group or an array of a store for reading.
 
-    On access, it refuses a pipe or a device in place of a file, and a chunk that inflates to more than
-    `MOST_WHOLE_BYTES`.
-
     Raises
     ------
     Exception
         On broken metadata zarr raises many kinds of errors.
     """
-    zarr = load_zarr()
-    local: Any = zarr.storage.LocalStore
-
-    class Checked(local):  # type: ignore[misc]  # Any, as zarr is imported here
-        async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
-            file = self.root / key
-            try:
-                size = check_regular(file)
-            except OSError:
-                return None
-            described = Path(key).name in _METADATA
-            if described or byte_range is None:
-                what = "metadata" if described else "a chunk"
-                check_bytes(file, size, MOST_TEXT_BYTES if described else MOST_WHOLE_BYTES, what)
-            found = await super().get(key, prototype, byte_range)
-            if found is not None and not described:
-                check_inflated(str(file), found.to_bytes())
-            return found
-
-    return zarr.open(store=Checked(path, read_only=True), mode="r", path=key, use_consolidated=False)
+    return load_zarr().open(str(path), mode="r", path=key, use_consolidated=False)
 
 
 def check_array(name: str, array: Any) -> None:
-    """Refuse an array of Python objects, or with chunks that are too large unpacked or compressed twice.
+    """Refuse an array of Python objects, or with chunks that are too large.
 
     Raises
     ------
@@ -77,9 +52,6 @@ def check_array(name: str, array: Any) -> None:
     ]
     if "pickle" in codecs:
         raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
-    inflating = [codec for codec in codecs if codec.lower().removesuffix("codec") in _COMPRESSORS]
-    if len(inflating) > 1:
-        raise InputError(f"{name}: expected chunks compressed once, got {' and '.join(inflating)}")
     check_bytes(name, math.prod(array.chunks) * array.dtype.itemsize, MOST_WHOLE_BYTES, "a chunk")
 
 

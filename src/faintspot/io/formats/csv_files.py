@@ -9,10 +9,16 @@ import numpy as np
 
 from faintspot.base.files import check_file_size
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.stored.slopes_format import UNITS, VARIABLES, StoredSlopes, most_slopes_bytes, with_absent
-from faintspot.io.stored.slopes_writer import ExistingOutput
+from faintspot.io.stored.slopes_format import (
+    UNITS,
+    VARIABLES,
+    ExistingOutput,
+    StoredSlopes,
+    most_slopes_bytes,
+    with_absent,
+)
 
-_LINES = 1 << 12
+_LINES = 1 << 14
 _INDEX = ("frame", "subaperture")
 
 

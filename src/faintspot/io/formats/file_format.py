@@ -6,10 +6,8 @@ from pathlib import Path
 from typing import IO
 
 from faintspot.base.errors import InputError
-from faintspot.io.locations import StoredArray
-from faintspot.io.stored.slopes_folder import FolderStorage, is_partial, partial_folder
-from faintspot.io.stored.slopes_format import RecordingHeader, StoredSlopes
-from faintspot.io.stored.slopes_writer import ExistingOutput, Storage
+from faintspot.io.arrays.stored_array import StoredArray
+from faintspot.io.stored.slopes_format import ExistingOutput, StoredSlopes
 
 
 class FileFormat:
@@ -30,14 +28,20 @@ class FileFormat:
         return start.startswith(self.signatures)
 
     def find(self, path: Path, key: str | None) -> StoredArray:
-        """Return an array of a file: the one named `key`, by default that of the frames."""
+        """Return an array of a file: the one named `key`, by default that of the frames.
+
+        Errors that are no InputError mean that the file is damaged.
+        """
         raise NotImplementedError
 
     def require(self) -> None:
         """Raise MissingExtraError when a package for slopes is missing; called before the work."""
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
-        """Write slopes to a file; the arrays may be memory-mapped and larger than memory."""
+        """Write slopes to a file.
+
+        The variables may be larger than memory: they have a shape and a dtype, and slices of them are arrays.
+        """
         raise NotImplementedError
 
     def read(self, path: Path) -> StoredSlopes:
@@ -54,14 +58,10 @@ class FileFormat:
             return None
         if not path.is_file():
             raise InputError(f"{path}: already exists and is not a file; choose another name")
-        stored = self.read(path)
-        frames, subapertures = stored.variables["x"].shape
-        return ExistingOutput(stored.attributes.get("fingerprint"), (frames, subapertures), complete=True)
+        slopes = self.read(path)
+        frames, subapertures = slopes.variables["x"].shape
+        return ExistingOutput(slopes.attributes.get("fingerprint"), (frames, subapertures), complete=True)
 
-    def leftovers(self, path: Path) -> bool:
-        """Return whether an unfinished output lies beside `path`."""
-        return is_partial(partial_folder(path))
-
-    def storage(self, path: Path, run: RecordingHeader) -> Storage:
-        """Return the storage of an unfinished output."""
-        return FolderStorage(path, run, self.write)
+    def store(self, path: Path) -> Path:
+        """Return the Zarr store with the slopes of an unfinished run."""
+        return path.with_name(f"{path.name}.partial.zarr")

@@ -1,14 +1,15 @@
 """FITS files: frames, plain, gzip-compressed (.gz) or tile-compressed (.fz); slopes, plain or .gz.
 
-astropy reads the headers. The numbers of uncompressed images are read here, block by block, from plain files
-and gzip streams alike. Values follow the FITS standard 4.0, section 4.4.2:
-physical = BZERO + BSCALE * stored, and BLANK marks integers without a value, which become NaN.
+Values follow the FITS standard 4.0, section 4.4.2: physical = BZERO + BSCALE * stored, and BLANK marks
+integers without a value, which become NaN.
 """
 
 from __future__ import annotations
 
 import gzip
+import json
 import warnings
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, cast
@@ -17,22 +18,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.base.files import parse_json
 from faintspot.base.sizes import check_bytes
-from faintspot.io.arrays.fits_units import AOT_VERSION, Unit, units_of, whole_units
-from faintspot.io.arrays.raw import GZIP_SIGNATURE, RawArray, is_gzip, open_plain_or_gzip
+from faintspot.io.arrays.fits_units import AOT_VERSION, Unit, units_of
+from faintspot.io.arrays.stored_array import StoredArray
+from faintspot.io.arrays.streams import (
+    GZIP_SIGNATURE,
+    StreamedArray,
+    check_present,
+    is_gzip,
+    open_plain_or_gzip,
+)
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.locations import StoredArray, one_line
+from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_fits
 from faintspot.io.stored.slopes_format import (
+    COORDINATE_UNITS,
     REQUIRED,
     VARIABLES,
     StoredSlopes,
     check_stated,
     most_slopes_bytes,
+    unit_of,
+    with_absent,
 )
 from faintspot.io.telemetry.aot_reading import frames_of_aot
 
-_STORED = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
+_BLOCK_BYTES, _PIECE_BYTES = 2880, 1 << 20
 
 
 class Fits(FileFormat):
@@ -51,26 +63,56 @@ class Fits(FileFormat):
             names = {name for unit in units_of(path) for name in (unit.name.upper(), str(unit.index))}
             if key is None or key.strip().upper() not in names:
                 key = frames_of_aot(path, key)
-        return _find_fits(path, key)
+        name = f"{path}:{key}" if key is not None else str(path)
+        return _image(name, path, _find_unit(path, key))
 
     def require(self) -> None:
         """Raise MissingExtraError when astropy is not installed."""
         load_fits()
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
-        """Write an image extension for each variable and coordinate, and one for the attributes."""
-        from faintspot.io.stored.slopes_fits import write_fits
+        """Write an image extension for each variable and coordinate, and ATTRIBUTES: a JSON text as bytes.
 
-        write_fits(stream, slopes)
+        One of them is in memory at a time.
+        """
+        fits = load_fits()
+        count, width = slopes.variables["x"].shape
+        cards = [
+            ("CREATOR", "faintspot"),
+            ("NFRAMES", count, "frames, the second axis of every variable"),
+            ("NSUBAP", width, "sub-apertures, the first axis of every variable"),
+        ]
+        primary = fits.PrimaryHDU(header=fits.Header(cards))
+        primary.header.set("EXTEND", True, after="NAXIS")
+        _write_unit(stream, primary)
+        for name, values in slopes.variables.items():
+            _write_image(stream, name, values[:], unit_of(name, slopes.attributes), VARIABLES[name].long_name)
+        for name, values in slopes.coordinates.items():
+            _write_image(stream, name, values, COORDINATE_UNITS.get(name, "1"), "of each sub-aperture")
+        text = np.frombuffer(json.dumps(dict(slopes.attributes)).encode(), np.uint8)
+        _write_image(stream, "attributes", text, "1", "JSON text, UTF-8")
 
     def read(self, path: Path) -> StoredSlopes:
         """Read a file of slopes and verify its checksums."""
-        from faintspot.io.stored.slopes_fits import read_fits
-
-        units = {unit.name.lower(): unit for unit in whole_units(path)}
-        check_bytes(path, sum(unit.data_bytes for unit in units.values()), most_slopes_bytes(), "slopes")
+        units = {unit.name.lower(): unit for unit in units_of(path)}
+        total = sum(unit.header.data_size for unit in units.values())
+        check_bytes(path, total, most_slopes_bytes(), "slopes")
         check_stated(path, {name: units[name].shape for name in VARIABLES if name in units})
-        return read_fits(path)
+        fits = load_fits()
+        with warnings.catch_warnings(), open_plain_or_gzip(path) as stream:
+            warnings.simplefilter("error")  # astropy only warns of truncated files and wrong checksums
+            with fits.open(stream, memmap=False, checksum=True) as opened:
+                arrays = {unit.name.lower(): unit.data for unit in opened if unit.data is not None}
+        variables = with_absent(
+            {
+                name: arrays.pop(name).astype(variable.dtype)
+                for name, variable in VARIABLES.items()
+                if name in arrays
+            }
+        )
+        attributes = parse_json(arrays.pop("attributes").tobytes())
+        coordinates = {name: array.astype(array.dtype.newbyteorder("=")) for name, array in arrays.items()}
+        return StoredSlopes(variables, coordinates, attributes, True, len(variables["x"]))
 
     def has_slopes(self, path: Path) -> bool:
         """Return whether the extensions have the names of slopes."""
@@ -89,38 +131,55 @@ class FitsGz(Fits):
             super().write(cast(IO[bytes], compressed), slopes)
 
 
-def _find_fits(path: Path, key: str | None) -> StoredArray:
-    """Return an image of a FITS file: the first, or the one whose EXTNAME or number is `key`.
+def _find_unit(path: Path, key: str | None) -> Unit:
+    """Return the first image, or the unit named `key`."""
+    names = []
+    for unit in units_of(path):
+        names.append(unit.name)
+        if key is None and unit.shape:
+            return unit
+        if key is not None and (unit.name.upper() == key.strip().upper() or str(unit.index) == key):
+            if not unit.shape:
+                raise InputError(f"{path}: expected an image in extension {key!r}, found none there")
+            return unit
+    wanted = "an image" if key is None else f"an extension {key!r}"
+    raise InputError(f"{path}: expected {wanted}, the file has only: {', '.join(names)}")
 
-    Raises
-    ------
-    InputError
-        When the file is not FITS, is truncated or has no such image.
-    MissingExtraError
-        When astropy is not installed.
-    """
-    unit = _find_unit(path, key)
-    name = f"{path}:{key}" if key is not None else str(path)
+
+def _image(name: str, path: Path, unit: Unit) -> StoredArray:
+    """Return the image of a unit: of plain bytes, or decompressed tile by tile by astropy."""
+    fits = load_fits()
     compressed_file = is_gzip(path)
-    needed, present = unit.data_start + unit.data_bytes, path.stat().st_size
-    if not compressed_file and present < needed:
-        raise InputError(
-            f"{name}: truncated: its header states data up to byte {needed}, the file has {present} bytes"
-        )
-    if unit.compressed:
-        return _TileCompressedImage(name, path, unit.index, unit.shape)
-    bits = unit.header["BITPIX"]
-    if bits not in _STORED:
-        raise InputError(f"{name}: BITPIX = {bits}: expected one of {', '.join(map(str, _STORED))}")
-    return RawArray(
-        name,
-        lambda: open_plain_or_gzip(path),
-        offset=unit.data_start,
-        dtype=np.dtype(_STORED[bits]),
-        shape=unit.shape,
-        forward_only=compressed_file,
-        convert=_Scaling.of(name, unit.header),
-    )
+    if not compressed_file:
+        check_present(name, path, unit.data_start + unit.header.data_size)
+    bits = unit.header["ZBITPIX" if unit.compressed else "BITPIX"]
+    if bits not in fits.BITPIX2DTYPE:
+        raise InputError(f"{name}: BITPIX = {bits}: expected one of {', '.join(map(str, fits.BITPIX2DTYPE))}")
+    stored_type = np.dtype(fits.BITPIX2DTYPE[bits])
+    scaling = _Scaling.of(name, unit.header, stored_type)
+
+    def open_array(files: ExitStack) -> Any:
+        stream = files.enter_context(open_plain_or_gzip(path))
+        if unit.compressed:
+            units = fits.open(stream, memmap=False, do_not_scale_image_data=True)
+            return _Image(files.enter_context(units)[unit.index].section, scaling)
+        big_endian = stored_type.newbyteorder(">")
+        numbers = StreamedArray(stream, unit.data_start, big_endian, unit.shape, compressed=compressed_file)
+        return _Image(numbers, scaling)
+
+    return StoredArray(name, unit.shape, scaling(np.zeros(1, stored_type)).dtype, open_array)
+
+
+@dataclass(frozen=True)
+class _Image:
+    """Physical values of an image."""
+
+    stored: Any
+    scaling: _Scaling
+
+    def __getitem__(self, part: slice) -> NDArray[Any]:
+        stored = np.asarray(self.stored[part])
+        return self.scaling(stored.astype(stored.dtype.newbyteorder("="), copy=False))
 
 
 @dataclass(frozen=True)
@@ -132,9 +191,9 @@ class _Scaling:
     blank: int | None
 
     @classmethod
-    def of(cls, name: str, header: Any) -> _Scaling:
+    def of(cls, name: str, header: Any, stored_type: np.dtype[Any]) -> _Scaling:
         try:
-            blank = int(header["BLANK"]) if "BLANK" in header and header["BITPIX"] > 0 else None
+            blank = int(header["BLANK"]) if "BLANK" in header and stored_type.kind != "f" else None
             return cls(float(header.get("BSCALE", 1.0)), float(header.get("BZERO", 0.0)), blank)
         except Exception as error:  # cards are parsed on access and may be broken
             raise InputError(f"{name}: BSCALE, BZERO and BLANK must be numbers ({one_line(error)})") from None
@@ -159,52 +218,20 @@ class _Scaling:
         return values
 
 
-class _TileCompressedImage:
-    """A tile-compressed image (.fz), decompressed tile by tile by astropy."""
-
-    def __init__(self, name: str, path: Path, index: int, shape: tuple[int, ...]) -> None:
-        self.name = name
-        self._path = path
-        self._index = index
-        self._file: Any = None
-        self.shape = shape
-        self.dtype: np.dtype[Any] = (
-            self.read(0, 1).dtype if shape and 0 not in shape else np.dtype(np.float32)
-        )
-
-    def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Return items `start` to `stop` of the first axis, in native byte order."""
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                if self._file is None:
-                    self._file = load_fits().open(self._path)
-                values = np.asarray(self._file[self._index].section[start:stop])
-        except Exception as error:  # decompressors raise many kinds of errors
-            self.close()
-            raise InputError(
-                f"{self.name}: frames {start} to {stop - 1} (counted from 0) cannot be decompressed: "
-                f"the file is damaged ({one_line(error)})"
-            ) from None
-        return values.astype(values.dtype.newbyteorder("="), copy=False)
-
-    def close(self) -> None:
-        """Close the file; a later `read` opens it again."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+def _write_image(stream: IO[bytes], name: str, values: NDArray[Any], units: str, comment: str) -> None:
+    """Write one image extension; FITS stores bool as bytes."""
+    stored = values.view(np.uint8) if values.dtype == np.bool_ else values
+    fits = load_fits()
+    header = fits.Header([("EXTNAME", name.upper()), ("BUNIT", units), ("COMMENT", comment)])
+    _write_unit(stream, fits.ImageHDU(stored.astype(stored.dtype.newbyteorder(">")), header))
 
 
-def _find_unit(path: Path, key: str | None) -> Unit:
-    """Return the first image, or the unit named `key`."""
-    names = []
-    for unit in units_of(path):
-        names.append(unit.name)
-        if key is None and unit.shape:
-            return unit
-        if key is not None and (unit.name.upper() == key.strip().upper() or str(unit.index) == key):
-            if not unit.shape:
-                raise InputError(f"{path}: expected an image in extension {key!r}, found none there")
-            return unit
-    wanted = "an image" if key is None else f"an extension {key!r}"
-    raise InputError(f"{path}: expected {wanted}, the file has only: {', '.join(names)}")
+def _write_unit(stream: IO[bytes], unit: Any) -> None:
+    """Write a header-and-data unit with its checksums, without their time."""
+    unit.add_checksum(when="")
+    stream.write(unit.header.tostring().encode("ascii"))
+    if unit.data is not None:
+        content = unit.data.reshape(-1).view(np.uint8)
+        for start in range(0, content.size, _PIECE_BYTES):
+            stream.write(content[start : start + _PIECE_BYTES])
+        stream.write(bytes(-content.size % _BLOCK_BYTES))

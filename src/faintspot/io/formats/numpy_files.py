@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
+import math
 import zipfile
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import parse_json
-from faintspot.base.npz import DAMAGE, Header, headers_of, open_archive, read_header, unpacked
-from faintspot.io.arrays.raw import MOST_WHOLE_BYTES, MappedArray, RawArray, WholeArray, pieces
+from faintspot.base.npz import DAMAGE, headers_of, open_archive, read_header, unpacked
+from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
+from faintspot.io.arrays.streams import StreamedArray
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.locations import PREFERRED_NAME, StoredArray, choose_name, one_line
+from faintspot.io.locations import PREFERRED_NAME, choose_name
 from faintspot.io.stored.slopes_format import (
     REQUIRED,
     VARIABLES,
@@ -23,6 +28,8 @@ from faintspot.io.stored.slopes_format import (
     most_slopes_bytes,
     with_absent,
 )
+
+_PIECE_NUMBERS = 1 << 18
 
 
 class Npy(FileFormat):
@@ -43,16 +50,15 @@ class Npy(FileFormat):
             raise InputError(f"{path}: a .npy file holds one unnamed array, expected no key, got {key!r}")
         with path.open("rb") as stream:
             header = read_header(str(path), stream, path.stat().st_size)
-        if header.fortran_order and len(header.shape) > 1:
-            return MappedArray(str(path), np.load(path, mmap_mode="r", allow_pickle=False))
-        return RawArray(
-            str(path),
-            lambda: path.open("rb"),
-            offset=header.offset,
-            dtype=header.dtype,
-            shape=header.shape,
-            forward_only=False,
-        )
+
+        def open_array(files: ExitStack) -> Any:
+            if header.fortran_order:
+                return np.load(path, mmap_mode="r", allow_pickle=False)
+            return StreamedArray(
+                files.enter_context(path.open("rb")), header.offset, header.dtype, header.shape
+            )
+
+        return StoredArray(str(path), header.shape, header.dtype, open_array)
 
 
 class Npz(FileFormat):
@@ -68,19 +74,36 @@ class Npz(FileFormat):
         Raises
         ------
         InputError
-            When the file is damaged, has no such array, or has several and no key is given.
+            When the file has no such array, has several and no key is given, or has a cube in Fortran order,
+            which cannot be read by frame.
         """
-        try:
-            archive, members = open_archive(path)
-            archive.close()
-            wanted = PREFERRED_NAME if key is None else key
-            # Without a name, the headers decide which array to read.
-            headers = headers_of(path, [wanted] if wanted in members or key is not None else None)
-        except DAMAGE as error:
-            raise InputError(f"{path}: expected a valid .npz file ({one_line(error)})") from None
+        archive, members = open_archive(path)
+        archive.close()
+        wanted = PREFERRED_NAME if key is None else key
+        # Without a name, the headers decide which array to read.
+        headers = headers_of(path, [wanted] if wanted in members or key is not None else None)
         dimensions = {name: len(headers[name].shape) if name in headers else 0 for name in members}
         chosen = choose_name(path, dimensions, key)
-        return _npz_array(path, chosen, members[chosen], headers[chosen])
+        name, header = f"{path}:{chosen}", headers[chosen]
+        if header.fortran_order and len(header.shape) > 2:
+            raise InputError(
+                f"{name}: stored in Fortran order, which cannot be read frame by frame: "
+                "save numpy.ascontiguousarray of it"
+            )
+        if header.fortran_order:
+            return StoredArray.whole(
+                name,
+                header.shape,
+                header.dtype,
+                lambda: unpacked(path, "a frame", [chosen], MOST_WHOLE_BYTES)[chosen],
+            )
+
+        def open_array(files: ExitStack) -> Any:
+            archive = files.enter_context(zipfile.ZipFile(path))
+            stream = files.enter_context(archive.open(members[chosen]))
+            return StreamedArray(stream, header.offset, header.dtype, header.shape, compressed=True)
+
+        return StoredArray(name, header.shape, header.dtype, open_array)
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
         """Write each variable and coordinate, and the attributes as a JSON text named `attributes`."""
@@ -95,7 +118,7 @@ class Npz(FileFormat):
                         "shape": array.shape,
                     }
                     np.lib.format.write_array_header_1_0(member, header)
-                    for piece in pieces(array):
+                    for piece in _pieces(array):
                         member.write(piece.tobytes())
 
     def read(self, path: Path) -> StoredSlopes:
@@ -118,24 +141,11 @@ class Npz(FileFormat):
         return {*REQUIRED, "attributes"} <= members.keys()
 
 
-def _npz_array(path: Path, key: str, member: zipfile.ZipInfo, header: Header) -> StoredArray:
-    """Return the array of a zip member; one in Fortran order cannot be read by frame, only as a whole."""
-    name = f"{path}:{key}"
-    if header.fortran_order and len(header.shape) > 1:
-        if len(header.shape) > 2:
-            raise InputError(
-                f"{name}: stored in Fortran order, which cannot be read frame by frame: "
-                "save numpy.ascontiguousarray of it"
-            )
-        return WholeArray(
-            name, header.shape, header.dtype, lambda: unpacked(path, "a frame", [key], MOST_WHOLE_BYTES)[key]
-        )
-
-    def open_member() -> IO[bytes]:
-        # The member keeps the file open after the archive object is closed.
-        with zipfile.ZipFile(path) as archive:
-            return archive.open(member)
-
-    return RawArray(
-        name, open_member, offset=header.offset, dtype=header.dtype, shape=header.shape, forward_only=True
-    )
+def _pieces(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """Yield an array in pieces of bounded size along its first axis."""
+    if not array.shape:
+        yield array
+        return
+    step = max(1, _PIECE_NUMBERS // max(1, math.prod(array.shape[1:])))
+    for start in range(0, array.shape[0], step):
+        yield array[start : start + step]

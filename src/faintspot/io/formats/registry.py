@@ -52,8 +52,8 @@ def frame_format(path: Path) -> FileFormat:
     for item in FORMATS:
         if item.has_frames(path, start):
             return item
-    known = list(dict.fromkeys(item.name for item in FORMATS if item.signatures))
-    raise InputError(f"{path}: expected a {_listed(known)} file or a Zarr store, it is none of them")
+    names = list(dict.fromkeys(item.name for item in FORMATS if item.signatures))
+    raise InputError(f"{path}: expected a {_listed(names)} file or a Zarr store, it is none of them")
 
 
 def slope_format(path: Path) -> FileFormat:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.io.arrays.inflation import check_inflated
-from faintspot.io.arrays.raw import RawArray
+from faintspot.io.arrays.stored_array import StoredArray
+from faintspot.io.arrays.streams import StreamedArray, check_present
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.locations import StoredArray, one_line
-from faintspot.io.optional_packages import load_pillow
+from faintspot.io.optional_packages import load_pillow, load_tifffile
 
 _PLAIN = (1, 8, 32946)  # uncompressed or deflated
 
@@ -32,71 +34,32 @@ class Tiff(FileFormat):
         A series in tifffile is a set of pages written together. Raises InputError when pages differ in size
         or type.
         """
-        _check_chain(path)
-        complaints = _Complaints()
-        try:
-            with complaints, _load_tifffile().TiffFile(path) as file:
-                chosen = _choose(path, list(file.series), key)
-                name = f"{path}:{key}" if key is not None else str(path)
-                array = _array(name, path, [file.series[number] for number in chosen], chosen)
-        except (InputError, OSError, MissingExtraError):
-            raise
-        except Exception as error:  # tifffile raises many kinds of errors on broken files
-            raise InputError(f"{path}: expected a whole TIFF file ({one_line(error)})") from None
-        if complaints.first:
-            raise InputError(f"{path}: expected a whole TIFF file ({complaints.first})")
+        with _complaints() as complaints, load_tifffile().TiffFile(path) as file:
+            len(file.pages)  # follows all links between pages, and so complains of a circle
+            chosen = _choose(path, list(file.series), key)
+            name = f"{path}:{key}" if key is not None else str(path)
+            array = _array(name, path, [file.series[number] for number in chosen], chosen)
+        if complaints:
+            raise ValueError(complaints[0])
         return array
 
 
-def _check_chain(path: Path) -> None:
-    """Refuse pages that link to each other in a circle, which tifffile would read without end."""
-    with path.open("rb") as stream:
-        start = stream.read(8)
-        order: Literal["little", "big"] = "little" if start[:2] == b"II" else "big"
-        big = int.from_bytes(start[2:4], order) == 43
-        count_bytes, tag_bytes, offset_bytes = (8, 20, 8) if big else (2, 12, 4)
-        offset = int.from_bytes(stream.read(8) if big else start[4:8], order)
-        seen: set[int] = set()
-        end = path.stat().st_size
-        while 0 < offset < end:
-            if offset in seen:
-                raise InputError(
-                    f"{path}: expected a whole TIFF file (its pages link to each other in a circle)"
-                )
-            seen.add(offset)
-            stream.seek(offset)
-            after = offset + count_bytes + tag_bytes * int.from_bytes(stream.read(count_bytes), order)
-            stream.seek(min(after, end))
-            offset = int.from_bytes(stream.read(offset_bytes), order)
+@contextmanager
+def _complaints() -> Iterator[list[str]]:
+    """Collect the errors that tifffile logs when it drops damaged pages; pass none of its messages on."""
+    messages: list[str] = []
 
+    def keep(record: logging.LogRecord) -> bool:
+        if record.levelno >= logging.ERROR:
+            messages.append(record.getMessage())
+        return False
 
-class _Complaints(logging.Handler):
-    """Context that keeps the first error that tifffile logs when it drops pages."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.ERROR)
-        self.first = ""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Keep the message in one line."""
-        self.first = self.first or " ".join(record.getMessage().split())
-
-    def __enter__(self) -> None:
-        self._logger = logging.getLogger("tifffile")
-        self._propagate, self._logger.propagate = self._logger.propagate, False
-        self._logger.addHandler(self)
-
-    def __exit__(self, *_: object) -> None:
-        self._logger.removeHandler(self)
-        self._logger.propagate = self._propagate
-
-
-def _load_tifffile() -> Any:
+    logger = logging.getLogger("tifffile")
+    logger.addFilter(keep)
     try:
-        import tifffile
-    except ImportError:
-        raise MissingExtraError("tifffile", "io", "Reading a TIFF file") from None
-    return tifffile
+        yield messages
+    finally:
+        logger.removeFilter(keep)
 
 
 def _choose(path: Path, series: list[Any], key: str | None) -> list[int]:
@@ -123,77 +86,42 @@ def _array(name: str, path: Path, chosen: list[Any], numbers: list[int]) -> Stor
     size = tuple(series.keyframe.shape)
     if series.keyframe.samplesperpixel != 1 or len(size) != 2:
         raise InputError(f"{name}: expected grey frames, got pages of shape {size}")
-    count = sum(item.size for item in chosen) // (size[0] * size[1])
+    count = sum(item.size for item in chosen) // math.prod(size)
     shape = (count, *size) if count > 1 else size
-    dtype = np.dtype(series.dtype)
+    dtype = np.dtype(series.dtype).newbyteorder(series.parent.byteorder)
     if len(chosen) == 1 and series.dataoffset is not None:
-        needed = series.dataoffset + int(np.prod(shape)) * dtype.itemsize
-        if path.stat().st_size < needed:
-            raise InputError(
-                f"{name}: truncated: it states data up to byte {needed}, "
-                f"the file has {path.stat().st_size} bytes"
-            )
-        return RawArray(
+        offset = series.dataoffset
+        check_present(name, path, offset + math.prod(shape) * dtype.itemsize)
+        return StoredArray(
             name,
-            lambda: path.open("rb"),
-            offset=series.dataoffset,
-            dtype=dtype.newbyteorder(series.parent.byteorder),
-            shape=shape,
-            forward_only=False,
+            shape,
+            dtype,
+            lambda files: StreamedArray(files.enter_context(path.open("rb")), offset, dtype, shape),
         )
-    return _Pages(name, path, numbers, shape, dtype)
+
+    def open_pages(files: ExitStack) -> Any:
+        file = files.enter_context(load_tifffile().TiffFile(path))
+        pages = _Pages(path, [page for number in numbers for page in file.series[number].pages])
+        return pages if count > 1 else pages[0:1][0]
+
+    return StoredArray(name, shape, dtype, open_pages)
 
 
 class _Pages:
     """Pages that are decompressed individually."""
 
-    def __init__(
-        self, name: str, path: Path, numbers: list[int], shape: tuple[int, ...], dtype: np.dtype[Any]
-    ) -> None:
-        self.name = name
-        self.shape = shape
-        self.dtype: np.dtype[Any] = dtype.newbyteorder("=")
-        self._path = path
-        self._numbers = numbers
-        self._file: Any = None
-        self._pages: list[Any] = []
+    def __init__(self, path: Path, pages: list[Any]) -> None:
+        self._path, self._pages = path, pages
 
-    def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Return pages `start` to `stop`, in native byte order; for a single page, rows."""
-        if len(self.shape) == 2:
-            return self._page(0)[start:stop]
-        return np.stack([self._page(number) for number in range(start, stop)])
-
-    def close(self) -> None:
-        """Close the file; a later `read` opens it again."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-            self._pages = []
+    def __getitem__(self, part: slice) -> NDArray[Any]:
+        """Return pages, decoded by tifffile if possible, else by Pillow."""
+        return np.stack([self._decoded(page) for page in self._pages[part]])
 
     def _decoded(self, page: Any) -> NDArray[Any]:
-        """Decode a page with tifffile if possible, else with Pillow."""
-        with self._path.open("rb") as stream:
-            for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
-                stream.seek(offset)
-                check_inflated(self.name, stream.read(count), 2 * page.nbytes)
         if page.compression in _PLAIN or importlib.util.find_spec("imagecodecs"):
             return np.asarray(page.asarray(maxworkers=1))
-        if self.dtype.itemsize > 4:
-            raise MissingExtraError("imagecodecs", "io", f"Reading {page.compression.name} of {self.dtype}")
+        if page.dtype.itemsize > 4:
+            raise MissingExtraError("imagecodecs", "io", f"Reading {page.compression.name} of {page.dtype}")
         with load_pillow().open(self._path, formats=["TIFF"]) as image:
             image.seek(page.index)
             return np.asarray(image)
-
-    def _page(self, number: int) -> NDArray[Any]:
-        try:
-            if self._file is None:
-                self._file = _load_tifffile().TiffFile(self._path)
-                self._pages = [page for i in self._numbers for page in self._file.series[i].pages]
-            values = self._decoded(self._pages[number])
-        except Exception as error:  # decompressors raise many kinds of errors
-            self.close()
-            raise InputError(
-                f"{self.name}: frame {number} (counted from 0) cannot be read ({one_line(error)})"
-            ) from None
-        return values.astype(self.dtype, copy=False)

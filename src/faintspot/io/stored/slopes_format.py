@@ -6,8 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,9 +111,13 @@ def check_stated(path: Path, shapes: Mapping[str, tuple[int, ...]], n_frames: in
             raise InputError(f"{path}: {name}: expected shape {expected}, got {other}")
     if n_frames is not None and not 0 <= n_frames <= shape[0]:
         raise InputError(f"{path}: expected up to {shape[0]} finished frames, got {n_frames}")
-    row = sum(np.dtype(variable.dtype).itemsize for variable in VARIABLES.values())
-    total = (shape[0] if n_frames is None else n_frames) * shape[1] * row
-    check_bytes(path, total, most_slopes_bytes(), "slopes")
+    check_memory(path, shape[0] if n_frames is None else n_frames, shape[1])
+
+
+def check_memory(path: Path, n_frames: int, n_subapertures: int) -> None:
+    """Raise InputError for slopes that need too much memory as a whole."""
+    slope_bytes = sum(np.dtype(variable.dtype).itemsize for variable in VARIABLES.values())
+    check_bytes(path, n_frames * n_subapertures * slope_bytes, most_slopes_bytes(), "slopes")
 
 
 def unit_of(name: str, attributes: Mapping[str, Any]) -> str:
@@ -166,43 +169,34 @@ class RecordingHeader:
         return str(self.attributes["fingerprint"])
 
 
-class SlopeWriter(Protocol):
-    """Writer of slopes, block by block; a `with` statement closes it.
+@dataclass(frozen=True)
+class ExistingOutput:
+    """Description of an existing output."""
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from faintspot.io import create_writer
-    >>> names = ("x", "y", "flux", "valid", "flags", "iterations", "bad_pixels")
-    >>> run = {"n_frames": 5, "n_subapertures": 3, "attributes": {"fingerprint": "mine"}, "coordinates": {}}
-    >>> with create_writer("slopes.npz", **run) as writer:
-    ...     writer.append(0, {name: np.zeros((2, 3)) for name in names})
-    ...     print(writer.finished(), "of 5 frames")
-    2 of 5 frames
-    """
+    fingerprint: str | None
+    """Fingerprint of the run; None if the format does not store it."""
+    sizes: tuple[int, int]
+    complete: bool
 
-    def finished(self) -> int:
-        """Return the number of frames so far: the next block starts there."""
-
-    def append(self, start: int, block: Mapping[str, NDArray[Any]]) -> None:
-        """Add frames `start`, `start` + 1 ...: every variable of `VARIABLES`, (n, n_subapertures).
-
-        Variables with a default may be omitted.
+    def may_be_continued(self, path: Path, run: RecordingHeader, *, resume: bool, overwrite: bool) -> bool:
+        """Return whether `run` continues the output (True) or replaces it (False).
 
         Raises
         ------
         InputError
-            When the block does not fit, or the disk is full or not writable.
+            When it may do neither; the message names `path`.
         """
-
-    def close(self) -> None:
-        """Finish the output if it has all frames; otherwise leave it to be resumed."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+        is_same = self.fingerprint == run.fingerprint and self.sizes == run.sizes
+        if is_same and resume and not (overwrite and self.complete):
+            return True
+        if overwrite:
+            return False
+        if is_same or self.fingerprint is None or not resume:
+            raise InputError(f"{path}: already exists; choose another name or --overwrite")
+        raise InputError(
+            f"{path}: belongs to another run (other frames or configuration); "
+            "choose another name or --overwrite"
+        )
 
 
 def checked_block(
@@ -225,12 +219,12 @@ def checked_block(
     return arrays
 
 
-def with_absent(found: Mapping[str, Any]) -> dict[str, Any]:
+def with_absent(variables: Mapping[str, Any]) -> dict[str, Any]:
     """Return all variables in order, with defaults; raise KeyError when a required one is missing."""
     return {
-        name: np.full(np.shape(found["x"]), variable.if_absent, variable.dtype)
-        if name not in found and variable.if_absent is not None
-        else found[name]
+        name: np.full(np.shape(variables["x"]), variable.if_absent, variable.dtype)
+        if name not in variables and variable.if_absent is not None
+        else variables[name]
         for name, variable in VARIABLES.items()
     }
 
@@ -250,15 +244,3 @@ def json_values(name: str, value: Mapping[str, Any]) -> dict[str, Any]:
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: expected numbers, texts and lists of them ({error})") from None
     return values
-
-
-def belongs_to_another_run(path: Path) -> InputError:
-    """Return the error for an output that a different run has begun or finished."""
-    return InputError(
-        f"{path}: belongs to another run (other frames or configuration); choose another name or --overwrite"
-    )
-
-
-def exists_already(path: Path) -> InputError:
-    """Return the error for an existing output that must not be replaced."""
-    return InputError(f"{path}: already exists; choose another name or --overwrite")

@@ -1,133 +1,68 @@
-"""Writer of slopes for all formats: stores whole chunks, marks progress, and locks the output."""
+"""Writers of slopes: chunk by chunk into a Zarr store with marks of progress, or from memory."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
-from faintspot.base.files import output_errors
+from faintspot.base.files import output_errors, replace_file
 from faintspot.io.stored.output_lock import OutputLock
-from faintspot.io.stored.slopes_format import (
-    VARIABLES,
-    RecordingHeader,
-    belongs_to_another_run,
-    checked_block,
-    exists_already,
-)
+from faintspot.io.stored.slopes_format import VARIABLES, RecordingHeader, StoredSlopes, checked_block
+from faintspot.io.stored.slopes_zarr import SlopeStore
 
 # A mark waits until the data are on the disk, which takes longer than measuring small blocks.
 _MARK_SECONDS = 1.0
 
-
-@dataclass(frozen=True)
-class ExistingOutput:
-    """Description of an existing output."""
-
-    fingerprint: str | None
-    """Fingerprint of the run; None if the format does not store it."""
-    sizes: tuple[int, int]
-    complete: bool
-
-    def may_be_continued(self, place: Path, run: RecordingHeader, *, resume: bool, overwrite: bool) -> bool:
-        """Return whether `run` continues the output (True) or replaces it (False).
-
-        Raises
-        ------
-        InputError
-            When it may do neither; the message names `place`.
-        """
-        equal = self.fingerprint == run.fingerprint and self.sizes == run.sizes
-        if equal and resume and not (overwrite and self.complete):
-            return True
-        if not overwrite:
-            known = self.fingerprint is not None
-            raise exists_already(place) if equal or not known or not resume else belongs_to_another_run(place)
-        return False
+Export = Callable[[IO[bytes], StoredSlopes], None]
+"""Writes slopes to a stream, as `FileFormat.write`."""
 
 
-class Storage(Protocol):
-    """Storage of the slopes of an unfinished run: a folder of flat files, or a Zarr store.
+class SlopeWriter(Closing):
+    """Writer of slopes, block by block; a `with` statement closes it.
 
-    Every method may raise OSError.
-    """
-
-    @property
-    def place(self) -> Path:
-        """Folder, for messages."""
-
-    @property
-    def chunk(self) -> int:
-        """Number of frames written at once; known after opening."""
-
-    def begun(self) -> ExistingOutput | None:
-        """Return the existing output; raise InputError if it is not slopes, or damaged."""
-
-    def remove(self) -> None:
-        """Delete the existing output."""
-
-    def create(self) -> None:
-        """Create an empty storage; it never appears incomplete."""
-
-    def open(self) -> None:
-        """Prepare to write to an existing storage; raise InputError if it is damaged."""
-
-    def marked(self) -> tuple[str, int]:
-        """Return the fingerprint and the number of frames from the mark on the disk."""
-
-    def mark(self, finished: int) -> None:
-        """Wait until the data are on the disk, then write the number of complete frames."""
-
-    def read(self, start: int, stop: int) -> dict[str, NDArray[Any]]:
-        """Return stored frames."""
-
-    def write(self, start: int, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Store frames from `start` on, which is the first of a chunk."""
-
-    def finish(self) -> None:
-        """Make the final output when all frames are marked."""
-
-
-class BlockWriter(Closing):
-    """Writer of slopes to an existing storage, from where it stopped.
-
-    Frames of an incomplete chunk are kept in memory until it is full, or until `close`. Before every write,
-    the mark on the disk must be the one that this writer has set; otherwise another program has replaced the
-    output. On file systems with locks, the lock prevents that.
+    This class keeps them in memory and writes the output when all frames are there.
 
     Parameters
     ----------
     path : Path
         Output.
-    run : Run
+    run : RecordingHeader
         Description of its contents.
-    storage : Storage
-        Storage until the output is complete.
-    lock : OutputLock
+    lock : OutputLock, optional
         Lock, which `close` releases.
+    export : callable, optional
+        Writes the output; None for an output that is complete already.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from faintspot.io import create_writer
+    >>> names = ("x", "y", "flux", "valid", "flags", "iterations", "bad_pixels")
+    >>> run = {"n_frames": 5, "n_subapertures": 3, "attributes": {"fingerprint": "mine"}, "coordinates": {}}
+    >>> with create_writer("slopes.npz", **run) as writer:
+    ...     writer.append(0, {name: np.zeros((2, 3)) for name in names})
+    ...     print(writer.finished(), "of 5 frames")
+    2 of 5 frames
     """
 
-    def __init__(self, path: Path, run: RecordingHeader, storage: Storage, lock: OutputLock) -> None:
-        self._path = path
-        self._run = run
-        self._storage = storage
-        self._lock = lock
-        self._is_open = True
-        self._next_mark = 0.0
-        with output_errors(path):
-            storage.open()
-            # One attribute, so that an interruption finds both parts of it changed or neither.
-            self._state: tuple[int, list[dict[str, NDArray[Any]]]] = (storage.marked()[1], [])
-            self._marks = {self._stored}
-            if self._stored < run.n_frames and self._stored % storage.chunk:
-                self._take_back_last_chunk()
+    def __init__(
+        self,
+        path: Path,
+        run: RecordingHeader,
+        lock: OutputLock | None = None,
+        export: Export | None = None,
+    ) -> None:
+        self._path, self._run, self._lock, self._export = path, run, lock, export
+        self._is_open = export is not None
+        # One attribute, so that an interruption finds both parts of it changed or neither.
+        self._state: tuple[int, list[dict[str, NDArray[Any]]]] = (0 if self._is_open else run.n_frames, [])
 
     @property
     def _stored(self) -> int:
@@ -144,92 +79,139 @@ class BlockWriter(Closing):
         return self._stored + sum(len(block["x"]) for block in self._waiting)
 
     def append(self, start: int, block: Mapping[str, NDArray[Any]]) -> None:
-        """Add a block of frames; write complete chunks to the disk."""
+        """Add frames `start`, `start` + 1 ...: every variable of `VARIABLES`, (n, n_subapertures).
+
+        Variables with a default may be omitted.
+
+        Raises
+        ------
+        InputError
+            When the block does not fit, or the disk is full or not writable.
+        """
         if not self._is_open:
-            raise InputError(f"{self._path}: expected no more slopes after close(), got frame {start}")
-        arrays = checked_block(self._run, self.finished(), start, block)
+            raise InputError(f"{self._path}: complete or closed, expected no more frames, got frame {start}")
+        variables = checked_block(self._run, self.finished(), start, block)
         before = self._state
-        self._state = (self._stored, [*self._waiting, {name: array.copy() for name, array in arrays.items()}])
+        copied = {name: values.copy() for name, values in variables.items()}
+        self._state = (self._stored, [*self._waiting, copied])
         try:
-            waiting = self.finished() - self._stored
-            if self.finished() == self._run.n_frames:
-                self._store(waiting)
-            elif waiting >= self._storage.chunk:
-                self._store(waiting - waiting % self._storage.chunk)
+            self._write_chunks()
         except InputError:
             self._state = before
             raise
 
     def close(self) -> None:
-        """Store and mark waiting frames, and finish the output if it has all frames."""
+        """Finish the output if it has all frames; otherwise leave it to be resumed, if that is possible."""
         if not self._is_open:
             return
         self._is_open = False
         try:
-            waiting = self.finished() - self._stored
-            if waiting:
-                self._store(waiting)
-            with output_errors(self._path):
-                if self._marks != {self._stored}:
-                    self._check_mark()
-                    self._mark(self._stored)
-                if self._stored == self._run.n_frames:
-                    self._check_mark()
-                    self._storage.finish()
+            self._finish()
         finally:
-            self._lock.release()
+            if self._lock is not None:
+                self._lock.release()
 
-    def _store(self, count: int) -> None:
+    def _joined(self) -> dict[str, NDArray[Any]]:
+        return {name: np.concatenate([block[name] for block in self._waiting]) for name in VARIABLES}
+
+    def _write_chunks(self) -> None:
+        """Write waiting frames to the disk, as far as they fill chunks."""
+
+    def _finish(self) -> None:
+        run = self._run
+        if self.finished() == run.n_frames:
+            self._write_output(
+                StoredSlopes(self._joined(), run.coordinates, run.attributes, True, run.n_frames)
+            )
+
+    def _write_output(self, slopes: StoredSlopes) -> None:
+        export = self._export
+        if export is not None:
+            with output_errors(self._path):
+                replace_file(self._path, lambda stream: export(stream, slopes))
+
+
+class StoreWriter(SlopeWriter):
+    """Writer of slopes to a Zarr store, from where it stopped.
+
+    Frames of an incomplete chunk are kept in memory until it is full, or until `close`. Before every write,
+    the mark on the disk must be the one that this writer has set; otherwise another program has replaced the
+    output. On file systems with locks, the lock prevents that.
+
+    Parameters
+    ----------
+    path, run, lock
+        As for `SlopeWriter`.
+    export : callable, optional
+        Writes the output from the complete store, which is then removed; by default the store is the output.
+    store : SlopeStore
+        Store to fill.
+    """
+
+    def __init__(
+        self, path: Path, run: RecordingHeader, lock: OutputLock, export: Export | None, store: SlopeStore
+    ) -> None:
+        super().__init__(path, run, lock, export)
+        self._is_open = True
+        self._store = store
+        self._next_mark = 0.0
+        with output_errors(path):
+            n_stored = store.marked()[1]
+            self._marks = {n_stored}
+            if n_stored == run.n_frames or n_stored % store.chunk == 0:
+                self._state = n_stored, []
+            else:  # take the incomplete chunk back into memory, to write the whole chunk again
+                start = n_stored - n_stored % store.chunk
+                incomplete_chunk = store.read(start, n_stored)
+                self._mark(start)
+                self._state = start, [incomplete_chunk]
+
+    def _write_chunks(self) -> None:
+        n_waiting = self.finished() - self._stored
+        is_last = self.finished() == self._run.n_frames
+        count = n_waiting if is_last else n_waiting - n_waiting % self._store.chunk
+        if count:
+            self._write(count)
+
+    def _finish(self) -> None:
+        n_waiting = self.finished() - self._stored
+        if n_waiting:
+            self._write(n_waiting)
+        with output_errors(self._path):
+            if self._marks != {self._stored}:
+                self._check_mark()
+                self._mark(self._stored)
+            if self._export is not None and self._stored == self._run.n_frames:
+                self._check_mark()
+                self._write_output(self._store.slopes())
+                self._store.remove()
+
+    def _write(self, count: int) -> None:
         """Write the first `count` waiting frames and, if it is due, the mark."""
-        joined = {name: np.concatenate([block[name] for block in self._waiting]) for name in VARIABLES}
+        joined = self._joined()
         finished = self._stored + count
         with output_errors(self._path):
             self._check_mark()
-            self._storage.write(self._stored, {name: array[:count] for name, array in joined.items()})
+            self._store.write(self._stored, {name: values[:count] for name, values in joined.items()})
             if finished == self._run.n_frames or time.monotonic() >= self._next_mark:
                 self._mark(finished)
-        rest = {name: array[count:] for name, array in joined.items()}
+        rest = {name: values[count:] for name, values in joined.items()}
         self._state = finished, [rest] if len(rest["x"]) else []
-
-    def _take_back_last_chunk(self) -> None:
-        """Read frames of an incomplete chunk back into memory, to write the whole chunk again."""
-        start = self._stored - self._stored % self._storage.chunk
-        taken_back = self._storage.read(start, self._stored)
-        self._mark(start)
-        self._state = start, [taken_back]
 
     def _mark(self, finished: int) -> None:
         self._marks.add(finished)  # after an interruption either may be on the disk
-        self._storage.mark(finished)
+        self._store.mark(finished)
         self._marks = {finished}
         self._next_mark = time.monotonic() + _MARK_SECONDS
 
     def _check_mark(self) -> None:
         try:
-            fingerprint, finished = self._storage.marked()
-            ours = fingerprint == self._run.fingerprint and finished in self._marks
+            fingerprint, finished = self._store.marked()
+            is_ours = fingerprint == self._run.fingerprint and finished in self._marks
         except (OSError, ValueError, KeyError):
-            ours = False
-        if not ours:
+            is_ours = False
+        if not is_ours:
             raise InputError(
                 f"{self._path}: another program has replaced the output of this run, which ends here; "
                 "choose another name for it"
             )
-
-
-class FinishedWriter(Closing):
-    """Writer for an output that an equal run has completed: nothing is left to do."""
-
-    def __init__(self, n_frames: int) -> None:
-        self._n_frames = n_frames
-
-    def finished(self) -> int:
-        """Return the number of frames, all of them."""
-        return self._n_frames
-
-    def append(self, start: int, block: Mapping[str, NDArray[Any]]) -> None:
-        """Raise InputError: the output is complete."""
-        raise InputError(f"slopes: expected no more frames, {self._n_frames} are complete, got frame {start}")
-
-    def close(self) -> None:
-        """Do nothing: nothing is open."""

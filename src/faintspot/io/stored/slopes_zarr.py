@@ -33,15 +33,14 @@ from faintspot.io.optional_packages import load_zarr
 from faintspot.io.stored.slopes_format import (
     COORDINATE_UNITS,
     VARIABLES,
+    ExistingOutput,
     RecordingHeader,
     StoredSlopes,
     check_stated,
     unit_of,
     with_absent,
 )
-from faintspot.io.stored.slopes_writer import ExistingOutput
 
-zarr = load_zarr()
 _MARK = "finished_frames"
 _COMPLETE = "complete"
 _COORDINATES = "coordinates"
@@ -51,68 +50,45 @@ _CHUNK_NUMBERS = 1 << 16
 _CHUNK_NAMES: dict[str, Any] = {"name": "default", "separator": "."}
 
 
-class StoreStorage:
-    """Storage of slopes in the Zarr store that is the output.
+class SlopeStore:
+    """Zarr store of the slopes of a run; every method may raise OSError.
 
     Parameters
     ----------
     path : Path
-        Store.
-    run : Run
+        Store; created if it does not exist.
+    run : RecordingHeader
         Description of its contents.
+
+    Raises
+    ------
+    InputError
+        When it is damaged.
+    MissingExtraError
+        When zarr is not installed.
     """
 
     def __init__(self, path: Path, run: RecordingHeader) -> None:
-        self.place = path
-        self.chunk = 1
-        self._run = run
-        self._arrays: dict[str, Any] = {}
+        zarr = load_zarr()
+        self._path, self._run = path, run
         self._not_synchronised: set[Path] = set()
-
-    def begun(self) -> ExistingOutput | None:
-        """Return the description of the existing store, or None."""
-        return describe_store(self.place)
-
-    def remove(self) -> None:
-        """Move the store away in one step, then delete it."""
-        aside = self.place.with_name(f".{self.place.name}.old")
-        shutil.rmtree(aside, ignore_errors=True)
-        self.place.rename(aside)
-        shutil.rmtree(aside)
-
-    def create(self) -> None:
-        """Create the store under a hidden name and rename it."""
-        hidden = self.place.with_name(f".{self.place.name}.new")
-        shutil.rmtree(hidden, ignore_errors=True)
-        hidden.mkdir()
-        _create_arrays(hidden, self._run)
-        with warnings.catch_warnings():
-            # Consolidated metadata are not yet in the standard of Zarr; xarray warns when they are missing.
-            warnings.simplefilter("ignore")
-            zarr.consolidate_metadata(str(hidden))
-        for file in (*hidden.rglob("*"), hidden):
-            (sync_folder if file.is_dir() else sync_file)(file)
-        hidden.rename(self.place)
-        sync_folder(self.place.parent)
-
-    def open(self) -> None:
-        """Open the arrays, and remove the remains of an interrupted replacement of the mark."""
-        for leftover in self.place.glob(".*.new"):
+        if not path.exists():
+            _create(path, run)
+        for leftover in path.glob(".*.new"):  # of an interrupted replacement of the mark
             leftover.unlink()
-        group: Any = zarr.open_group(str(self.place), mode="r+", use_consolidated=False)
+        group: Any = zarr.open_group(str(path), mode="r+", use_consolidated=False)
         try:
             # Write chunks of zeros, too, so that a missing chunk means lost data.
             with zarr.config.set({"array.write_empty_chunks": True}):
                 self._arrays = {name: group[name] for name in VARIABLES}
         except (KeyError, ValueError) as error:
-            raise InputError(
-                f"{self.place}: damaged, cannot be resumed; delete it ({one_line(error)})"
-            ) from None
+            raise InputError(f"{path}: damaged, cannot be resumed; delete it ({one_line(error)})") from None
         self.chunk = int(self._arrays["x"].chunks[0])
+        """Number of frames in a chunk."""
 
     def marked(self) -> tuple[str, int]:
         """Return the fingerprint and the number of complete frames."""
-        attributes = _stored_attributes(self.place)
+        attributes = _stored_attributes(self._path)
         return attributes["fingerprint"], attributes[_MARK]
 
     def mark(self, finished: int) -> None:
@@ -122,21 +98,49 @@ class StoreStorage:
         for folder in {file.parent for file in self._not_synchronised}:
             sync_folder(folder)
         self._not_synchronised.clear()
-        replace_attributes(self.place, {_MARK: finished, _COMPLETE: finished == self._run.n_frames})
+        replace_attributes(self._path, {_MARK: finished, _COMPLETE: finished == self._run.n_frames})
 
     def read(self, start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Return stored frames."""
-        return {name: read_items(self.place, array, start, stop) for name, array in self._arrays.items()}
+        return {name: read_items(self._path, array, start, stop) for name, array in self._arrays.items()}
 
-    def write(self, start: int, arrays: Mapping[str, NDArray[Any]]) -> None:
+    def write(self, start: int, variables: Mapping[str, NDArray[Any]]) -> None:
         """Store whole chunks."""
-        for name, values in arrays.items():
+        for name, values in variables.items():
             array = self._arrays[name]
             array[start : start + len(values)] = values
-            self._not_synchronised.update(chunk_files(self.place, array, start, start + len(values)))
+            self._not_synchronised.update(chunk_files(self._path, array, start, start + len(values)))
 
-    def finish(self) -> None:
-        """Do nothing: the mark is sufficient."""
+    def slopes(self) -> StoredSlopes:
+        """Return the slopes, each variable read in parts from the store."""
+        run = self._run
+        variables: Any = {name: _StoredVariable(self._path, array) for name, array in self._arrays.items()}
+        return StoredSlopes(variables, run.coordinates, run.attributes, True, run.n_frames)
+
+    def remove(self) -> None:
+        """Remove the store."""
+        remove_store(self._path)
+
+
+class _StoredVariable:
+    """A variable of a store; slices of it are arrays."""
+
+    def __init__(self, path: Path, array: Any) -> None:
+        self._path, self._array = path, array
+        self.shape: tuple[int, ...] = array.shape
+        self.dtype: np.dtype[Any] = array.dtype
+
+    def __getitem__(self, part: slice) -> NDArray[Any]:
+        start, stop, _ = part.indices(self.shape[0])
+        return read_items(self._path, self._array, start, stop)
+
+
+def remove_store(path: Path) -> None:
+    """Move a store away in one step, then delete it."""
+    aside = path.with_name(f".{path.name}.old")
+    shutil.rmtree(aside, ignore_errors=True)
+    path.rename(aside)
+    shutil.rmtree(aside)
 
 
 def describe_store(path: Path) -> ExistingOutput | None:
@@ -153,7 +157,8 @@ def describe_store(path: Path) -> ExistingOutput | None:
         attributes = _stored_attributes(path)
     except (OSError, ValueError, KeyError):
         raise InputError(
-            f"{path}: expected slopes or nothing, found other data; choose another name"
+            f"{path}: expected slopes or nothing, found other or damaged data; "
+            "choose another name or delete it"
         ) from None
     sizes = (attributes["n_frames"], attributes["n_subapertures"])
     return ExistingOutput(attributes["fingerprint"], sizes, attributes[_COMPLETE])
@@ -188,6 +193,23 @@ def read_store(path: Path) -> StoredSlopes:
     )
 
 
+def _create(path: Path, run: RecordingHeader) -> None:
+    """Create a store under a hidden name and rename it, so that it never appears incomplete."""
+    zarr = load_zarr()
+    hidden = path.with_name(f".{path.name}.new")
+    shutil.rmtree(hidden, ignore_errors=True)
+    hidden.mkdir()
+    _create_arrays(hidden, run)
+    with warnings.catch_warnings():
+        # Consolidated metadata are not yet in the standard of Zarr; xarray warns when they are missing.
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(str(hidden))
+    for file in (*hidden.rglob("*"), hidden):
+        (sync_folder if file.is_dir() else sync_file)(file)
+    hidden.rename(path)
+    sync_folder(path.parent)
+
+
 def _create_arrays(path: Path, run: RecordingHeader) -> None:
     attributes = {
         **run.attributes,
@@ -197,7 +219,7 @@ def _create_arrays(path: Path, run: RecordingHeader) -> None:
         _COMPLETE: False,
         _COORDINATES: " ".join(run.coordinates),
     }
-    group = zarr.create_group(str(path), zarr_format=3, attributes=attributes)
+    group = load_zarr().create_group(str(path), zarr_format=3, attributes=attributes)
     chunk = min(run.n_frames, max(1, _CHUNK_NUMBERS // run.n_subapertures))
     for name, variable in VARIABLES.items():
         group.create_array(

@@ -19,7 +19,7 @@ from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import parse_json
 from faintspot.base.sizes import check_bytes, memory_bytes
-from faintspot.io.arrays.fits_units import AOT_VERSION, units_of, whole_units
+from faintspot.io.arrays.fits_units import AOT_VERSION, units_of
 from faintspot.io.locations import one_line
 
 _PIXELS = ("pix", "pixel", "px")
@@ -164,7 +164,7 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
         raise InputError(f"{path}: no such file or directory")
     if not is_aot(path):
         raise InputError(f"{path}: expected an AOT file, whose header has {AOT_VERSION}")
-    total = sum(unit.data_bytes for unit in whole_units(path))
+    total = sum(unit.header.data_size for unit in units_of(path))
     check_bytes(path, total, memory_bytes() // 2, "telemetry")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about data that faintspot does not read

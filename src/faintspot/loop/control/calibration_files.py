@@ -16,14 +16,14 @@ from faintspot.slopes.sensor.layout import Layout
 Floats = NDArray[np.float64]
 
 
-def save_calibration(path: str | Path, found: MirrorCalibration, reference: Floats) -> Path:
+def save_calibration(path: str | Path, calibration: MirrorCalibration, reference: Floats) -> Path:
     """Write a calibration beside a configuration file, as NAME.control.npz, and name it in [control].
 
     Parameters
     ----------
     path : path
         faintspot.toml.
-    found : MirrorCalibration
+    calibration : MirrorCalibration
     reference : (2 n,) array
         Reference slopes, px: those found, on top of what was subtracted already.
 
@@ -39,10 +39,10 @@ def save_calibration(path: str | Path, found: MirrorCalibration, reference: Floa
     """
     store = derived(path, ".control.npz")
     arrays = {
-        INTERACTION: found.interaction,
-        "interaction_error": found.interaction_error,
+        INTERACTION: calibration.interaction,
+        "interaction_error": calibration.interaction_error,
         REFERENCE: reference,
-        "reference_error": found.reference_error,
+        "reference_error": calibration.reference_error,
     }
     save_arrays(store, arrays)
     names = {name: f"{store.name}:{name}" for name in (INTERACTION, REFERENCE)}
@@ -50,7 +50,7 @@ def save_calibration(path: str | Path, found: MirrorCalibration, reference: Floa
     return store
 
 
-def save_picture(path: str | Path, found: MirrorCalibration, reference: Floats, layout: Layout) -> None:
+def save_picture(path: str | Path, calibration: MirrorCalibration, reference: Floats, layout: Layout) -> None:
     """Draw a calibration as a PNG picture: matrix, response of each actuator, reference slopes.
 
     Raises
@@ -66,22 +66,22 @@ def save_picture(path: str | Path, found: MirrorCalibration, reference: Floats, 
     def drawn() -> bytes:
         figure = new_figure(WIDTH, 4.4)
         matrix, answers, spots = figure.subplots(1, 3, width_ratios=[1.2, 1, 1])
-        moved = found.interaction * found.amplitude
+        moved = calibration.interaction * calibration.amplitude
         largest = float(np.abs(moved).max())
         shown = matrix.imshow(
             moved, aspect="auto", cmap="RdBu_r", vmin=-largest, vmax=largest, origin="upper"
         )
-        figure.colorbar(shown, ax=matrix, label=f"px for {found.amplitude:g}")
+        figure.colorbar(shown, ax=matrix, label=f"px for {calibration.amplitude:g}")
         matrix.set(title="Interaction matrix", xlabel="command", ylabel="slope: all x, then all y")
         size, error = (
-            np.sqrt(np.square(each).mean(axis=0)) * found.amplitude
-            for each in (found.interaction, found.interaction_error)
+            np.sqrt(np.square(slopes).mean(axis=0)) * calibration.amplitude
+            for slopes in (calibration.interaction, calibration.interaction_error)
         )
-        places = np.arange(len(size))
-        answers.plot(places, size, "o", ms=4, color=METHOD_COLOURS[1], label="slopes")
-        answers.plot(places, error, "_", ms=6, color=METHOD_COLOURS[0], label="their standard error")
-        for place in places[~found.answers]:
-            answers.axvline(place, color=GREY, lw=1, ls=":")
+        actuators = np.arange(len(size))
+        answers.plot(actuators, size, "o", ms=4, color=METHOD_COLOURS[1], label="slopes")
+        answers.plot(actuators, error, "_", ms=6, color=METHOD_COLOURS[0], label="their standard error")
+        for actuator in actuators[~calibration.answers]:
+            answers.axvline(actuator, color=GREY, lw=1, ls=":")
         answers.set(title="How far each actuator answers", xlabel="command", ylabel="rms slope of a poke, px")
         answers.set_ylim(bottom=0)
         answers.legend(loc="best")

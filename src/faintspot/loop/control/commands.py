@@ -28,26 +28,26 @@ class CommandDelayLine:
     def __init__(self, commands: int, delay_frames: int, largest: float = math.inf) -> None:
         self.delay_frames, self.largest = delay_frames, largest
         self.rows = np.zeros((delay_frames + 1, commands))
-        """Number of commands."""
-        self.place = 0
+        """(delay_frames + 1, commands): the latest commands."""
+        self.next_row = 0
         """Row for the next command; the oldest other row acts."""
         self._rows = list(self.rows)
 
     @property
     def acting(self) -> Floats:
         """Commands that the mirror holds during this frame."""
-        return self._rows[(self.place + 1) % len(self._rows)]
+        return self._rows[(self.next_row + 1) % len(self._rows)]
 
     @property
     def around(self) -> tuple[Floats, Floats, Floats]:
         """Commands of the last frame, of this one and of the next, for a delay of at least 2 frames."""
-        before, acting, after = (self._rows[(self.place + step) % len(self._rows)] for step in range(3))
+        before, acting, after = (self._rows[(self.next_row + step) % len(self._rows)] for step in range(3))
         return before, acting, after
 
     @property
     def latest(self) -> Floats:
         """Last computed command, which may not act yet."""
-        return self._rows[self.place - 1]
+        return self._rows[self.next_row - 1]
 
     @property
     def spare(self) -> Floats:
@@ -55,7 +55,7 @@ class CommandDelayLine:
 
         Until then it holds what the mirror held during the last frame.
         """
-        return self._rows[self.place]
+        return self._rows[self.next_row]
 
     def put(self, command: Floats) -> None:
         """Send a command, clipped to the stroke, and advance by one frame.
@@ -84,12 +84,12 @@ class CommandDelayLine:
         """
         if not math.isfinite(total):
             raise ArithmeticError("its commands were not finite")
-        self.place = (self.place + 1) % len(self._rows)
+        self.next_row = (self.next_row + 1) % len(self._rows)
 
     def copy_from(self, other: CommandDelayLine, *, without_latest: bool = False) -> None:
         """Take the commands of a line of the same length, perhaps as they were before its latest."""
         self.rows[:] = other.rows
-        self.place = (other.place - without_latest) % len(self._rows)
+        self.next_row = (other.next_row - without_latest) % len(self._rows)
 
     def hold(self, command: Floats) -> None:
         """Restart with a mirror that holds a command, and no delayed commands."""

@@ -36,7 +36,7 @@ def true_slopes(
     slopes: Any,
     errors: Any,
     covariance: Any,
-    said: Any,
+    statistics: Any,
 ) -> None:
     """Write slopes [true px], all x, then all y, their errors and covariances; invalid: 0, infinite and 0.
 
@@ -49,7 +49,7 @@ def true_slopes(
     slopes, errors : (2 n,) float64 arrays
     covariance : (n,) float64 array
         Covariances of x and y.
-    said : (2,) float64 array
+    statistics : (2,) float64 array
         `INVALID_PART`, `MEAN_SQUARE`.
     """
     n, scale = x.shape[0], 1.0 / gain
@@ -66,8 +66,8 @@ def true_slopes(
             errors[s] = errors[n + s] = np.inf
             covariance[s] = 0.0
             invalid += 1
-    said[INVALID_PART] = invalid / n
-    said[MEAN_SQUARE] = square / (2 * max(n - invalid, 1))
+    statistics[INVALID_PART] = invalid / n
+    statistics[MEAN_SQUARE] = square / (2 * max(n - invalid, 1))
 
 
 FLUX, DISPLACEMENT, FLUX_TIMES_DISPLACEMENT = range(3)
@@ -75,7 +75,7 @@ FLUX, DISPLACEMENT, FLUX_TIMES_DISPLACEMENT = range(3)
 
 
 @_compiled
-def displaced_flux(commands: Any, flux: Any, columns: Any, work: Any, said: Any) -> None:
+def displaced_flux(commands: Any, flux: Any, columns: Any, work: Any, statistics: Any) -> None:
     """Write means of the flux, of the squared displacement by the mirror, and of their product.
 
     Parameters
@@ -88,7 +88,7 @@ def displaced_flux(commands: Any, flux: Any, columns: Any, work: Any, said: Any)
         The interaction matrix, transposed, see `add_products`.
     work : tuple of (1, commands) and (1, 2 n) float32 arrays
         Commands, and displacements: all x, then all y.
-    said : (3,) float64 array
+    statistics : (3,) float64 array
         `FLUX`, `DISPLACEMENT` (px^2), `FLUX_TIMES_DISPLACEMENT`.
     """
     n = flux.shape[0]
@@ -97,18 +97,18 @@ def displaced_flux(commands: Any, flux: Any, columns: Any, work: Any, said: Any)
         acting[0, c] = commands[c]
     displaced[:] = 0.0
     add_products(columns, acting, displaced)
-    said[:] = 0.0
+    statistics[:] = 0.0
     for s in range(n):
         square = displaced[0, s] * displaced[0, s] + displaced[0, n + s] * displaced[0, n + s]
-        seen = flux[s] if np.isfinite(flux[s]) else 0.0
-        said[FLUX] += seen / n
-        said[DISPLACEMENT] += square / n
-        said[FLUX_TIMES_DISPLACEMENT] += seen * square / n
+        flux_e = flux[s] if np.isfinite(flux[s]) else 0.0
+        statistics[FLUX] += flux_e / n
+        statistics[DISPLACEMENT] += square / n
+        statistics[FLUX_TIMES_DISPLACEMENT] += flux_e * square / n
 
 
 @_compiled
 def integrate(
-    slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, place: Any, memory: Any
+    slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, next_row: Any, memory: Any
 ) -> float:
     """Write the next command: `keep` times the latest minus `gain` times the wavefront, clipped.
 
@@ -123,18 +123,18 @@ def integrate(
     gain, keep, largest : float
     rows : (delay + 1, commands) float64 array
         Of a `CommandDelayLine`.
-    place : int
+    next_row : int
         Which row to write; the latest command is in the one before.
     memory : ProductMemory
         Of the wavefront.
     """
-    latest, out = rows[(place or rows.shape[0]) - 1], rows[place]
+    latest, out = rows[(next_row or rows.shape[0]) - 1], rows[next_row]
     finish_product(columns, slopes, memory)
     total = 0.0
     for c in range(out.shape[0]):
-        wanted = keep * latest[c] - gain * memory.result[c]
-        total += wanted
-        out[c] = min(max(wanted, -largest), largest)
+        command = keep * latest[c] - gain * memory.result[c]
+        total += command
+        out[c] = min(max(command, -largest), largest)
     return total
 
 
@@ -179,7 +179,7 @@ class CompiledIntegrator:
         """See `Controller`; invalid slopes are 0, and all count the same."""
         line, product = self._line, self._wavefront
         numbers = self.gain, self._keep, line.largest
-        total = _INTEGRATE(slopes_px, product.columns, *numbers, line.rows, line.place, product.memory)
+        total = _INTEGRATE(slopes_px, product.columns, *numbers, line.rows, line.next_row, product.memory)
         line.sent(total)
 
     def begin_product(self, threads: int, scale: float) -> Sequence[ProductPart]:

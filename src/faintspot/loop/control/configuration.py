@@ -26,9 +26,9 @@ from faintspot.loop.control.identification.model import (
     KALMAN,
     MODAL,
     POLC,
-    Learnt,
-    Model,
-    Plant,
+    ControlModel,
+    LearntControl,
+    LoopPlant,
 )
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.loop.control.removed_modes import REMOVED_MODES, TIP_TILT_FOCUS, RemovedModes
@@ -160,7 +160,7 @@ class Control:
         Reference slopes [px] from each sub-aperture's centre. Default: 0.
     options : ControlOptions
     model : path, optional
-        Learnt model of the controller, a file written by `Model.save`. The integrator ignores it.
+        Learnt model of the controller, a file written by `ControlModel.save`. The integrator ignores it.
     positions : (n, 2) array, optional
         x and y of the sub-apertures in any unit, if focus is removed from the slopes.
 
@@ -214,7 +214,9 @@ class Control:
             return self.model  # kept for `with_controller`
         if self.model is None:
             raise InputError(f"{MODEL}: expected a file with the learnt model of {CONTROLS[kind]}, got none")
-        model = self.model if isinstance(self.model, Model) else Model.load(self.model, self.plant)
+        model = self.model
+        if not isinstance(model, ControlModel):
+            model = ControlModel.load(model, self.plant)
         if model.kind != kind:
             raise InputError(f"{MODEL}: expected a model of controller {kind!r}, got one of {model.kind!r}")
         model.check(self.plant)
@@ -236,10 +238,10 @@ class Control:
         return make_reconstructor(self.controlled, self.options.largest_condition)
 
     @property
-    def plant(self) -> Plant:
+    def plant(self) -> LoopPlant:
         """Loop properties that controllers use."""
         options = self.options
-        return Plant(self.controlled, self.reconstructor, options.delay_frames, options.leak)
+        return LoopPlant(self.controlled, self.reconstructor, options.delay_frames, options.leak)
 
     @property
     def prediction(self) -> str:
@@ -259,7 +261,7 @@ class Control:
             return self
         return replace(self, options=self.options.replaced({"controller": kind}))
 
-    def with_model(self, model: Model) -> Control:
+    def with_model(self, model: ControlModel) -> Control:
         """Return the same configuration with a learnt controller.
 
         Raises
@@ -324,7 +326,7 @@ class Control:
             modes = self.reconstructor.modes
             matrix = (modes * self.model.arrays["gains"]) @ modes.T @ matrix
             return CompiledIntegrator(line, self.controlled, matrix, 1.0, options.leak)
-        return Learnt(self.plant, self.model).controller(line)
+        return LearntControl(self.plant, self.model).controller(line)
 
     def rehearse(self) -> None:
         """Compile the controller and run it on test frames, the last without a valid slope.
@@ -357,8 +359,8 @@ def prior_std_px(settings: Settings, layout: Layout) -> Floats | None:
     """Return the standard deviations of an estimator's prior, (2 n,); None without a prior."""
     if not settings.estimator.takes_prior or PRIOR not in settings.declared():
         return None
-    each = settings.values(PRIOR, len(layout), layout.pixels).astype(np.float64)
-    return np.tile(each, 2) if np.isfinite(each).all() else None
+    std_px = settings.values(PRIOR, len(layout), layout.pixels).astype(np.float64)
+    return np.tile(std_px, 2) if np.isfinite(std_px).all() else None
 
 
 def load_control(path: str | Path) -> Control | None:
@@ -385,9 +387,9 @@ def _of_table(path: Path, values: Mapping[str, Any]) -> Control:
     if model is not None and not isinstance(model, str):
         raise InputError(f"{MODEL}: expected the name of a file, found {model!r:.80}")
     options = ControlOptions(**{name: value for name, value in values.items() if name in declared})
-    places = Layout.load(path).centres if options.removed_modes == TIP_TILT_FOCUS else None
+    centres = Layout.load(path).centres if options.removed_modes == TIP_TILT_FOCUS else None
     file = None if model is None else path.parent / model
-    return Control(arrays[INTERACTION], arrays.get(REFERENCE), options, file, places)
+    return Control(arrays[INTERACTION], arrays.get(REFERENCE), options, file, centres)
 
 
 def _read(path: Path, name: str, location: Any) -> NDArray[Any]:

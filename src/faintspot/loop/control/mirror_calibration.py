@@ -94,7 +94,7 @@ def calibrate_mirror(
         are not valid, and when pokes saturate.
     """
     amplitude = number_between("amplitude", amplitude, 0, low_open=True)
-    wanted = number_between("relative_error", relative_error, 0, 1, low_open=True)
+    limit = number_between("relative_error", relative_error, 0, 1, low_open=True)
     most = int(number_between("most_rounds", most_rounds, FEWEST_ROUNDS, 100_000, integer=True))
     everyone = np.arange(mirror.commands)
     pokes = _Pokes(mirror, everyone, amplitude)
@@ -105,21 +105,21 @@ def calibrate_mirror(
             error = float(np.median(pokes.relative_error))
         if progress is not None:
             progress(pokes.rounds, error)
-        if error <= wanted:
+        if error <= limit:
             break
         pokes.refuse_hopeless(error, last=pokes.rounds >= most)
         if pokes.rounds >= most:
             raise InputError(
-                f"relative_error = {wanted:g}: after {most} rounds it is still {error:.2g}; poke more, give "
+                f"relative_error = {limit:g}: after {most} rounds it is still {error:.2g}; poke more, give "
                 "more flux, or allow more rounds"
             )
     pokes.refuse_saturated()
     pokes.refuse_unsettled()
     interaction, interaction_error = pokes.columns
-    found = pokes.relative_error
-    linearity = _linearity(mirror, pokes, interaction, found)
+    relative = pokes.relative_error
+    linearity = _linearity(mirror, pokes, interaction, relative)
     reference, reference_error = pokes.middle
-    interaction[:, found >= _ANSWERS] = 0.0
+    interaction[:, relative >= _ANSWERS] = 0.0
     return MirrorCalibration(
         interaction,
         interaction_error,
@@ -127,41 +127,41 @@ def calibrate_mirror(
         reference_error,
         amplitude,
         pokes.rounds,
-        found,
+        relative,
         linearity,
     )
 
 
-def centroid_gain(found: MirrorCalibration, former: Floats) -> tuple[float, float]:
+def centroid_gain(calibration: MirrorCalibration, former: Floats) -> tuple[float, float]:
     """Return the scale of the slopes relative to a former interaction matrix, and its error.
 
     Of a matrix in true pixels it is the estimator's centroid gain.
 
     Parameters
     ----------
-    found : MirrorCalibration
+    calibration : MirrorCalibration
     former : (2 n, commands) array
     """
-    power = np.square(former).sum(axis=0) * found.answers
-    each = (found.interaction * former).sum(axis=0)
-    gain = each.sum() / power.sum()
-    scatter = np.square(each - gain * power).sum() / power.sum() ** 2
+    power = np.square(former).sum(axis=0) * calibration.answers
+    responses = (calibration.interaction * former).sum(axis=0)
+    gain = responses.sum() / power.sum()
+    scatter = np.square(responses - gain * power).sum() / power.sum() ** 2
     return float(gain), float(np.sqrt(scatter))
 
 
-def _linearity(mirror: PokedMirror, pokes: _Pokes, interaction: Floats, found: Floats) -> float:
+def _linearity(mirror: PokedMirror, pokes: _Pokes, interaction: Floats, relative_error: Floats) -> float:
     """Check the linearity with pokes of half the amplitude for the strongest actuators."""
     strongest = np.argsort(np.abs(interaction).max(axis=0))[::-1][:_CHECKED]
     half = _Pokes(mirror, strongest, 0.5 * pokes.amplitude)
     for _ in range(max(FEWEST_ROUNDS, pokes.rounds)):
         half.round()
-    whole, (columns, errors) = interaction[:, strongest], half.columns
-    power = np.square(whole).sum()
-    share = float((columns * whole).sum() / power)
+    full, (columns, errors) = interaction[:, strongest], half.columns
+    power = np.square(full).sum()
+    share = float((columns * full).sum() / power)
     # Of the whole pokes, and of the half ones.
     error = np.hypot(
-        np.sqrt(np.square(np.where(whole, errors * whole, 0.0)).sum()) / power,
-        float(found[strongest].mean()) / np.sqrt(_CHECKED),
+        np.sqrt(np.square(np.where(full, errors * full, 0.0)).sum()) / power,
+        float(relative_error[strongest].mean()) / np.sqrt(_CHECKED),
     )
     if abs(share - 1) > _NOT_LINEAR + 3 * error:
         raise InputError(
@@ -193,12 +193,12 @@ class _Pokes:
         signs = (1.0, -1.0) if self.rounds % 2 == 0 else (-1.0, 1.0)
         differences, means = [], []
         for actuator in self._actuators:
-            seen = {sign: self._poked(actuator, sign * self.amplitude) for sign in signs}
-            differences.append((seen[1.0] - seen[-1.0]) / (2 * self.amplitude))
-            means.append(0.5 * (seen[1.0] + seen[-1.0])[_MEAN])
-        of_all = np.stack(differences, axis=-1)
-        self._differences.append(of_all[_MEAN])
-        ends = of_all[_MEAN + 1 :]
+            answers = {sign: self._poked(actuator, sign * self.amplitude) for sign in signs}
+            differences.append((answers[1.0] - answers[-1.0]) / (2 * self.amplitude))
+            means.append(0.5 * (answers[1.0] + answers[-1.0])[_MEAN])
+        stack = np.stack(differences, axis=-1)
+        self._differences.append(stack[_MEAN])
+        ends = stack[_MEAN + 1 :]
         self._ends += np.where(np.isfinite(ends).all(axis=0), ends, 0.0)
         self._means.append(_mean(means)[0])
 
@@ -283,10 +283,10 @@ def _mean(rounds: list[Floats]) -> tuple[Floats, Floats]:
     What was not measured twice is 0 with an infinite error.
     """
     stack = np.stack(rounds)
-    there = np.isfinite(stack)
-    count = there.sum(axis=0)
-    mean = np.where(there, stack, 0.0).sum(axis=0) / np.maximum(count, 1)
-    squares = np.square(np.where(there, stack - mean, 0.0)).sum(axis=0)
+    measured = np.isfinite(stack)
+    count = measured.sum(axis=0)
+    mean = np.where(measured, stack, 0.0).sum(axis=0) / np.maximum(count, 1)
+    squares = np.square(np.where(measured, stack - mean, 0.0)).sum(axis=0)
     error = np.sqrt(squares / np.maximum(count * (count - 1), 1))
-    known = count >= _FEWEST_MEASURED
-    return np.where(known, mean, 0.0), np.where(known, error, np.inf)
+    enough = count >= _FEWEST_MEASURED
+    return np.where(enough, mean, 0.0), np.where(enough, error, np.inf)

@@ -40,8 +40,8 @@ def weighted_slopes(slopes: Floats, variance_px2: Floats, covariance_xy_px2: Flo
     covariance_xy_px2 : (n,) array, optional
         As for `add_noise`; correlations above 0.99 count as 0.99.
     """
-    known = np.isfinite(variance_px2) & (variance_px2 > 0)
-    root = np.where(known, 1 / np.sqrt(np.where(known, variance_px2, 1.0)), 0.0)[:, None]
+    measured = np.isfinite(variance_px2) & (variance_px2 > 0)
+    root = np.where(measured, 1 / np.sqrt(np.where(measured, variance_px2, 1.0)), 0.0)[:, None]
     scaled = root * slopes
     if covariance_xy_px2 is not None:
         (of_x, of_y), (x, y) = np.split(root, 2), np.split(scaled, 2)

@@ -52,12 +52,12 @@ def phase_of_commands(interaction: Floats, cells: ArrayLike) -> Floats:
 def _corner_geometry(cells: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
     """Return slopes (2 n, corners) of the phase at corners, and matrix and weights of its square and mean."""
     n = len(cells)
-    places = cells[:, None] + _CORNERS
-    corners, which = np.unique(places.reshape(-1, 2), axis=0, return_inverse=True)
-    which = which.reshape(n, len(_CORNERS))
+    cell_corners = cells[:, None] + _CORNERS
+    corners, of_cell = np.unique(cell_corners.reshape(-1, 2), axis=0, return_inverse=True)
+    of_cell = of_cell.reshape(n, len(_CORNERS))
     slopes, mass = np.zeros((2 * n, len(corners))), np.zeros((len(corners),) * 2)
-    for number, own in enumerate(which):
-        slopes[number, own] = _CORNERS[:, 1] - 0.5
-        slopes[n + number, own] = _CORNERS[:, 0] - 0.5
-        mass[np.ix_(own, own)] += np.kron(_MASS, _MASS) / n
+    for number, corner in enumerate(of_cell):
+        slopes[number, corner] = _CORNERS[:, 1] - 0.5
+        slopes[n + number, corner] = _CORNERS[:, 0] - 0.5
+        mass[np.ix_(corner, corner)] += np.kron(_MASS, _MASS) / n
     return slopes, mass, mass.sum(axis=0)

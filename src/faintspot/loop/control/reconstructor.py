@@ -91,9 +91,9 @@ def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) 
         )
     left, size, right = np.linalg.svd(matrix, full_matrices=False)
     driven = size * limit >= size[0]
-    modes, seen = right[driven].T, left[:, driven] * size[driven]
-    plain, clean = (modes @ _estimator(seen, seen, ridge) for ridge in (_RIDGE, _RIDGE_CLEAN))
-    return Reconstructor(plain, modes, seen, clean)
+    modes, modal_slopes = right[driven].T, left[:, driven] * size[driven]
+    plain, clean = (modes @ _estimator(modal_slopes, modal_slopes, ridge) for ridge in (_RIDGE, _RIDGE_CLEAN))
+    return Reconstructor(plain, modes, modal_slopes, clean)
 
 
 def _estimator(slopes_of_modes: Floats, weighted: Floats, largest_ridge: float = _RIDGE) -> Floats:

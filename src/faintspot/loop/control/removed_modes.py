@@ -35,10 +35,10 @@ def _mean(values: Any, flags: Any) -> float:
 
 
 @_compiled
-def _remove(flags: Any, focus: Any, slopes: Any, said: Any) -> None:
+def _remove(flags: Any, focus: Any, slopes: Any, statistics: Any) -> None:
     """Subtract the modes, fitted to valid slopes by least squares; write the mean square that is left."""
     n = flags.shape[0]
-    product, square, left, valid = 0.0, 0.0, 0.0, 0
+    product, square, residual, valid = 0.0, 0.0, 0.0, 0
     for first in (0, n):
         middle = _mean(slopes[first : first + n], flags)
         curved = focus.shape[0] > 0
@@ -48,9 +48,9 @@ def _remove(flags: Any, focus: Any, slopes: Any, said: Any) -> None:
                 slopes[first + s] -= middle
                 valid += 1
                 if curved:
-                    place = focus[first + s] - centre
-                    product += place * slopes[first + s]
-                    square += place * place
+                    curvature = focus[first + s] - centre
+                    product += curvature * slopes[first + s]
+                    square += curvature * curvature
     amount = product / square if square > 0.0 else 0.0
     for first in (0, n):
         centre = _mean(focus[first : first + n], flags) if amount != 0.0 else 0.0
@@ -58,8 +58,8 @@ def _remove(flags: Any, focus: Any, slopes: Any, said: Any) -> None:
             if flags[s] & _UNMEASURED == 0:
                 if amount != 0.0:
                     slopes[first + s] -= amount * (focus[first + s] - centre)
-                left += slopes[first + s] * slopes[first + s]
-    said[MEAN_SQUARE] = left / max(valid, 1)
+                residual += slopes[first + s] * slopes[first + s]
+    statistics[MEAN_SQUARE] = residual / max(valid, 1)
 
 
 class RemovedModes:
@@ -100,7 +100,7 @@ class RemovedModes:
         """Return whether any mode is removed."""
         return self.name != NONE
 
-    def remove(self, flags: NDArray[np.uint8], slopes: Floats, said: Floats) -> None:
+    def remove(self, flags: NDArray[np.uint8], slopes: Floats, statistics: Floats) -> None:
         """Remove the modes from slopes of a frame, in place; those of invalid sub-apertures stay.
 
         Parameters
@@ -109,10 +109,10 @@ class RemovedModes:
             As in `faintspot.Slopes`.
         slopes : (2 n,) float64 array
             All x, then all y.
-        said : (2,) float64 array
+        statistics : (2,) float64 array
             Summary of `true_slopes`, whose mean square becomes that of the slopes that are left.
         """
-        self._kernel(flags, self._focus, slopes, said)
+        self._kernel(flags, self._focus, slopes, statistics)
 
     def removed(self, slopes: ArrayLike, flags: NDArray[np.uint8] | None = None) -> Floats:
         """Return slopes (2 n,), or a matrix (2 n, k) of them, without the modes.
@@ -126,23 +126,23 @@ class RemovedModes:
         rows = np.array(slopes, np.float64).T
         if not self:
             return rows.T
-        left = np.ascontiguousarray(np.atleast_2d(rows))
-        known = np.zeros(left.shape[1] // 2, np.uint8) if flags is None else flags
-        for row in left:
-            self.remove(known, row, np.zeros(2))
-        return left.reshape(rows.shape).T
+        residual = np.ascontiguousarray(np.atleast_2d(rows))
+        flags_ = np.zeros(residual.shape[1] // 2, np.uint8) if flags is None else flags
+        for row in residual:
+            self.remove(flags_, row, np.zeros(2))
+        return residual.reshape(rows.shape).T
 
 
 def _focus(positions: ArrayLike | None) -> Floats:
     """Return the slopes of focus (2 n,), in an arbitrary unit."""
     if positions is None:
         raise InputError("removed_modes: expected the positions of the sub-apertures, to remove focus")
-    places = finite_array("positions", positions).astype(np.float64)
-    if places.ndim != 2 or places.shape[1] != 2:
-        raise InputError(f"positions: expected shape (n, 2), got {places.shape}")
-    places = places - places.mean(axis=0)
-    size = float(np.abs(places).max(initial=0.0))
+    centred = finite_array("positions", positions).astype(np.float64)
+    if centred.ndim != 2 or centred.shape[1] != 2:
+        raise InputError(f"positions: expected shape (n, 2), got {centred.shape}")
+    centred = centred - centred.mean(axis=0)
+    size = float(np.abs(centred).max(initial=0.0))
     if not size > _LEAST_SPREAD:
         raise InputError("positions: expected sub-apertures at different places, to remove focus")
-    focus: Floats = (places / size).T.ravel()
+    focus: Floats = (centred / size).T.ravel()
     return focus

@@ -32,8 +32,8 @@ class SlopeProduct:
         self.columns = np.ascontiguousarray(matrix.T, np.float32)
         """(2 n, c): the matrix, transposed."""
         m, c = self.columns.shape
-        slopes, taken, result = (np.zeros(size, np.float32) for size in (m, m, c))
-        self.memory = ProductMemory(slopes, taken, np.zeros((1, c), np.float32), result)
+        slopes, subtracted, result = (np.zeros(size, np.float32) for size in (m, m, c))
+        self.memory = ProductMemory(slopes, subtracted, np.zeros((1, c), np.float32), result)
         self._expected = np.zeros(m)
 
     def __call__(self, vector: Floats) -> Floats:
@@ -66,8 +66,8 @@ class SlopeProduct:
             outs = np.zeros((threads, self.columns.shape[1]), np.float32)
             self.memory = self.memory._replace(outs=outs)
         self._expected[:] = 0.0 if expected is None else expected
-        slopes, taken, outs, _ = self.memory
-        return [ProductPart(self.columns, scale, self._expected, slopes, taken, out) for out in outs]
+        slopes, subtracted, outs, _ = self.memory
+        return [ProductPart(self.columns, scale, self._expected, slopes, subtracted, out) for out in outs]
 
 
 _ADD_PRODUCTS, _FINISH = Direct(add_products), Direct(finish_product)

@@ -36,8 +36,8 @@ class OpenLoopTelemetry:
 
     def part(self, start: int, stop: int | None) -> OpenLoopTelemetry:
         """Return a selection of frames."""
-        known = {name: each for name, each in vars(self).items() if each is not None}
-        return OpenLoopTelemetry(**{name: each[start:stop] for name, each in known.items()})
+        arrays = {name: array for name, array in vars(self).items() if array is not None}
+        return OpenLoopTelemetry(**{name: array[start:stop] for name, array in arrays.items()})
 
     @property
     def covariances_px2(self) -> Floats:
@@ -118,15 +118,15 @@ def usual_noise(telemetry: OpenLoopTelemetry) -> tuple[Floats, Floats]:
     """
     variance, covariance = telemetry.variance_px2, telemetry.covariances_px2
     x, y = np.split(variance, 2, axis=1)
-    seen = np.isfinite(x) & np.isfinite(y)
-    root = np.sqrt(np.where(seen, x, 1.0) * np.where(seen, y, 1.0))
-    rho = np.where(seen, np.clip(covariance / root, -LARGEST_CORRELATION, LARGEST_CORRELATION), 0.0)
+    measured = np.isfinite(x) & np.isfinite(y)
+    root = np.sqrt(np.where(measured, x, 1.0) * np.where(measured, y, 1.0))
+    rho = np.where(measured, np.clip(covariance / root, -LARGEST_CORRELATION, LARGEST_CORRELATION), 0.0)
     rest = 1 - np.square(rho)
     information = np.where(np.isfinite(variance), 1 / (variance * np.tile(rest, (1, 2))), 0.0).mean(axis=0)
     of_x, of_y = np.split(np.maximum(information, 1e-6), 2)
     shared = (rho / (root * rest)).mean(axis=0)
-    both = of_x * of_y - np.square(shared)
-    return np.concatenate([of_y / both, of_x / both]), shared / both
+    determinant = of_x * of_y - np.square(shared)
+    return np.concatenate([of_y / determinant, of_x / determinant]), shared / determinant
 
 
 def as_estimated(slopes_px: Floats, trust: Floats, controller: Controller) -> Floats:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.learning import INTEGRATOR, KALMAN, Learnt, Plant, learn
+from faintspot.loop.control.identification.learning import INTEGRATOR, KALMAN, LearntControl, LoopPlant, learn
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.telemetry import OpenLoopTelemetry, make_telemetry
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
@@ -39,7 +39,7 @@ def make_controller(
     configuration: LoopConfiguration,
     optics: LoopOptics,
     method: Method,
-    learnt: Learnt | None,
+    learnt: LearntControl | None,
     line: CommandDelayLine,
 ) -> Controller:
     """Return the controller of a method, which sends its commands to `line`."""
@@ -63,7 +63,7 @@ def learnt_control(
     seed: int,
     simulate: Simulate,
     learns_on: LoopConfiguration | None = None,
-) -> tuple[Method, Learnt | None]:
+) -> tuple[Method, LearntControl | None]:
     """Return the learnt controller of a method (None for the integrator), and the adapted method.
 
     The prior of an estimator that has one becomes as wide as the control is sure.
@@ -87,10 +87,10 @@ def learnt_control(
         return method, None
     if configuration.control.mode != CLOSED:
         raise InputError(f"method.control = {method.control!r}: expected {INTEGRATOR!r} in open loop")
-    on = configuration if learns_on is None else learns_on
+    site_loop = configuration if learns_on is None else learns_on
     learnt = _learnt(
-        replace(on, name="-", run=RunLength()),
-        _Known.of(method),
+        replace(site_loop, name="-", run=RunLength()),
+        _TelemetryMethod.of(method),
         method.control,
         method.noise_scale,
         seed,
@@ -106,8 +106,8 @@ def prior_std_px(method: Method, slopes: int) -> Floats | None:
     """Return the standard deviations of the estimator's prior around the prediction, (2 n,), or None."""
     if not _has_prior(method):
         return None
-    each = np.broadcast_to(getattr(method.settings, PRIOR), (slopes // 2,))
-    return np.tile(each, 2).astype(np.float64)
+    std_px = np.broadcast_to(getattr(method.settings, PRIOR), (slopes // 2,))
+    return np.tile(std_px, 2).astype(np.float64)
 
 
 def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64]) -> SlopeTurbulence:
@@ -127,14 +127,14 @@ def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64])
 
 
 @dataclass(frozen=True)
-class _Known:
+class _TelemetryMethod:
     """Method, equal to others that would leave the same telemetry."""
 
     method: Method = field(compare=False)
     same: tuple[Any, ...]
 
     @classmethod
-    def of(cls, method: Method) -> _Known:
+    def of(cls, method: Method) -> _TelemetryMethod:
         from faintspot.slopes.pipeline.configuration import to_text
 
         plain = replace(method, label="telemetry", control=INTEGRATOR, noise_scale=1.0)
@@ -152,49 +152,49 @@ class _Known:
 @lru_cache(maxsize=8)
 def _learnt(
     configuration: LoopConfiguration,
-    known: _Known,
+    method: _TelemetryMethod,
     kind: str,
     noise_scale: float,
     seed: int,
     simulate: Simulate,
-) -> Learnt:
+) -> LearntControl:
     from faintspot.loop.simulation.telescope.model import prepare
 
     if kind == KALMAN and noise_scale != 1.0:  # learning takes long
-        usual = _learnt(configuration, known, kind, 1.0, seed, simulate)
+        usual = _learnt(configuration, method, kind, 1.0, seed, simulate)
         return replace(usual, model=usual.model.with_noise(noise_scale))
     optics, control = prepare(configuration), configuration.control
-    telemetry = _telemetry(_without_assumed(configuration), known, seed, simulate)
+    telemetry = _telemetry(_without_assumed(configuration), method, seed, simulate)
     site = slope_turbulence(configuration, optics.sensor.layout.cells)
-    plant = Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
+    plant = LoopPlant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
     return learn(kind, plant, telemetry, site, control.frame_rate_hz, control.winds, noise_scale)
 
 
 @lru_cache(maxsize=8)
 def _telemetry(
-    configuration: LoopConfiguration, known: _Known, seed: int, simulate: Simulate
+    configuration: LoopConfiguration, method: _TelemetryMethod, seed: int, simulate: Simulate
 ) -> OpenLoopTelemetry:
     """Run the loop with an integrator in turbulence that is never scored."""
     frames = configuration.control.telemetry_frames
     run = configuration.replace("run", frames=frames, settle_frames=0)
-    record = simulate(run, [known.method], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)
-    return telemetry_of(record, known.method)
+    record = simulate(run, [method.method], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)
+    return telemetry_of(record, method.method)
 
 
 def telemetry_of(record: LoopRecord, method: Method) -> OpenLoopTelemetry:
     """Return the telemetry of a run of one method with the integrator."""
     divisor = float(record.centroid_gain[0]) if record.corrected[0] else 1.0
-    held = record.commands.astype(np.float64) @ record.interaction_matrix.T
-    expected = np.zeros_like(held)
+    mirror_px = record.commands.astype(np.float64) @ record.interaction_matrix.T
+    expected = np.zeros_like(mirror_px)
     if method.predict_prior:  # what acts less the latest command, which acts so many frames later
         later = record.delay_frames - 1
-        expected[: len(held) - later] = held[: len(held) - later] - held[later:]
+        expected[: len(mirror_px) - later] = mirror_px[: len(mirror_px) - later] - mirror_px[later:]
     telemetry = make_telemetry(
         record.slopes_px.astype(np.float64) / divisor,
         record.standard_error_px.astype(np.float64) / divisor,
-        held,
+        mirror_px,
         expected,
-        prior_std_px(method, held.shape[1]),
+        prior_std_px(method, mirror_px.shape[1]),
         record.covariance_xy_px2.astype(np.float64) / divisor**2,
     )
     return telemetry.part(_SETTLE_FRAMES, record.frames - record.delay_frames)

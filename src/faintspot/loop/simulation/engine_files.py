@@ -11,7 +11,7 @@ import numpy as np
 from faintspot.base.config.tables import read_tables
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
-from faintspot.loop.control import configuration as control_file
+from faintspot.loop.control.configuration import TABLE, save_control
 from faintspot.loop.control.identification.learning import INTEGRATOR, KALMAN
 from faintspot.loop.simulation.configuration.configuration import ARCSEC, LoopConfiguration
 from faintspot.loop.simulation.control import learnt_control
@@ -82,12 +82,12 @@ def write_engine_files(
     configuration_file.save(path, psf)
     if not configuration_file.has(path, "settings"):
         configuration_file.save(path, fixed_window(configuration))
-    known = configuration_file.load_all(path)
-    method = _method(known.settings, psf, known.score, control)
+    stored = configuration_file.load_all(path)
+    method = _method(stored.settings, psf, stored.score, control)
     reference = reference_slopes(configuration, optics.sensor, method)
     write_atomically(folder / INTERACTION, lambda stream: np.save(stream, optics.interaction))
     write_atomically(folder / REFERENCE, lambda stream: np.save(stream, reference))
-    loop, before = configuration.control, read_tables(path).get(control_file.TABLE, {})
+    loop, before = configuration.control, read_tables(path).get(TABLE, {})
     usual = {"gain": loop.gain, "leak": loop.leak, "delay_frames": loop.delay_frames}
     measured = {"interaction_matrix": INTERACTION, "reference_slopes": REFERENCE, "centroid_gain": 1.0}
     seed = configuration.run.seed
@@ -98,7 +98,7 @@ def write_engine_files(
     if learnt is not None:
         learnt.model.save(folder / MODEL)
         measured |= {"controller": control, "model": MODEL}
-    control_file.save_control(path, **{**usual, **before, **measured})
+    save_control(path, **{**usual, **before, **measured})
     return path
 
 

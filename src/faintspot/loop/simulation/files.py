@@ -53,8 +53,8 @@ class Stored:
             When it cannot be read, or is something else.
         """
         values = read_arrays(path, cls.WHAT)
-        found = values.pop("format", None)
-        if found != cls.FORMAT or set(values) != {item.name for item in fields(cls)}:
+        version = values.pop("format", None)
+        if version != cls.FORMAT or set(values) != {item.name for item in fields(cls)}:
             raise InputError(f"{path}: expected {cls.WHAT} of format {cls.FORMAT}, got something else")
         return cls(**{name: _restored(value) for name, value in values.items()})
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.learning import INTEGRATOR, Learnt
+from faintspot.loop.control.identification.learning import INTEGRATOR, LearntControl
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED, RunLength
 from faintspot.loop.simulation.control import learnt_control, make_controller
@@ -35,7 +35,7 @@ from faintspot.loop.simulation.telescope.model import (
 )
 from faintspot.loop.simulation.telescope.natural_star import LowOrders
 from faintspot.loop.simulation.telescope.sodium import FollowedSodium, learn_sodium, with_spots
-from faintspot.slopes.pipeline import configuration as configuration_file
+from faintspot.slopes.pipeline.configuration import to_text
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
@@ -84,8 +84,8 @@ class DisabledErrors:
 
     def settled(self, frames: int) -> NDArray[np.bool_]:
         """Return which frames directly follow the frame before, (frames,)."""
-        place = np.arange(frames) % self.stretch_frames
-        return (place >= self.stretch_settle_frames) | (self.faster == 1.0)
+        position = np.arange(frames) % self.stretch_frames
+        return (position >= self.stretch_settle_frames) | (self.faster == 1.0)
 
 
 def simulate_loop(
@@ -142,7 +142,7 @@ def simulate_loop(
     >>> record.strehl.shape, record.slopes_px.shape, bool(record.strehl[-1] > record.strehl[0])
     ((40,), (40, 72), True)
     """
-    which = _checked_schedule(configuration, methods, schedule)
+    numbers = _checked_schedule(configuration, methods, schedule)
     start = configuration.run.seed if seed is None else int(number_between("seed", seed, 0, integer=True))
     number = int(number_between("realisation", realisation, 0, integer=True))
     switches = DisabledErrors() if disabled_errors is None else disabled_errors
@@ -150,11 +150,11 @@ def simulate_loop(
         learnt_control(switches.configuration(configuration), method, start, simulate_loop, learns_on)
         for method in map(switches.method, methods)
     ]
-    what = configuration, ready, which, start, number, switches
+    arguments = configuration, ready, numbers, start, number, switches
     gains = None
     if switches.exact_gain:
-        gains = _Loop(*what).run(None).gains_in_run()
-    return _Loop(*what, gains).run(progress).record()
+        gains = _Loop(*arguments).run(None).gains_in_run()
+    return _Loop(*arguments, gains).run(progress).record()
 
 
 def measure_gains(
@@ -182,17 +182,17 @@ class _Loop:
     def __init__(
         self,
         configuration: LoopConfiguration,
-        ready: Sequence[tuple[Method, Learnt | None]],
-        which: NDArray[np.int64],
+        ready: Sequence[tuple[Method, LearntControl | None]],
+        schedule: NDArray[np.int64],
         seed: int,
         realisation: int,
         disabled_errors: DisabledErrors,
         gains: NDArray[np.float64] | None = None,
     ) -> None:
         self.configuration = configuration = disabled_errors.configuration(configuration)
-        self.known = _known_sodium(configuration, seed, realisation)
+        self.sodium = _known_sodium(configuration, seed, realisation)
         self.methods = methods = tuple(self._with_spots(method) for method, _ in ready)
-        self.which, self.disabled_errors = which, disabled_errors
+        self.schedule, self.disabled_errors = schedule, disabled_errors
         self.seed, self.realisation = seed, realisation
         self.telescope_model = TelescopeModel(
             configuration,
@@ -208,18 +208,18 @@ class _Loop:
             self._follow_flux(number)
         self.gains, self.divisors = self._gains_and_divisors(gains)
         self.line = CommandDelayLine(optics.mirror.commands, configuration.control.delay_frames)
-        self.controllers = [make_controller(configuration, optics, *each, self.line) for each in ready]
+        self.controllers = [make_controller(configuration, optics, *pair, self.line) for pair in ready]
         self.low_orders = None
         self.followed: list[FollowedSodium | None] = [None] * len(methods)
-        if self.known is not None:
+        if self.sodium is not None:
             self.low_orders = LowOrders(configuration, optics.sensor, seed, realisation)
             self.followed = [
-                FollowedSodium(configuration, optics.sensor.layout, self.known)
+                FollowedSodium(configuration, optics.sensor.layout, self.sodium)
                 if method.follows_profile
                 else None
                 for method in methods
             ]
-        frames, n = len(which), len(optics.sensor.layout)
+        frames, n = len(schedule), len(optics.sensor.layout)
         self.slopes = np.zeros((frames, 2 * n), np.float32)
         self.valid = np.zeros((frames, n), np.bool_)
         self.errors = np.zeros((frames, 2 * n), np.float32)
@@ -244,11 +244,11 @@ class _Loop:
             self.pipelines[number] = self.pipelines[number].with_flux(flux)
 
     def _gains_and_divisors(
-        self, known: NDArray[np.float64] | None
+        self, in_run: NDArray[np.float64] | None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return each method's centroid gain and the divisor of its slopes."""
-        if known is not None:
-            return known, known
+        if in_run is not None:
+            return in_run, in_run
         gains = measure_gains(
             self.configuration,
             self.pipelines,
@@ -261,7 +261,7 @@ class _Loop:
 
     def run(self, progress: Callable[[int, int], None] | None) -> _Loop:
         """Simulate all frames."""
-        frames = len(self.which)
+        frames = len(self.schedule)
         for frame in range(frames):
             self.step(frame)
             if progress is not None:
@@ -270,17 +270,17 @@ class _Loop:
 
     def step(self, frame: int) -> None:
         """Simulate one frame."""
-        number, commands = int(self.which[frame]), self.line.acting
+        number, commands = int(self.schedule[frame]), self.line.acting
         time = self.disabled_errors.time_s(frame, self.configuration.control.frame_rate_hz)
-        after, seen = self.telescope_model.wavefronts(time, commands)
+        after, wavefront = self.telescope_model.wavefronts(time, commands)
         self._observe(frame, time, after)
-        slopes = self._measure(frame, self.telescope_model.by_rows(time, seen, self.line.around))
+        slopes = self._measure(frame, self.telescope_model.by_rows(time, wavefront, self.line.around))
         error = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
         per_px = 1 / self.divisors[number]
-        vector, covariance = (each.astype(np.float64) for each in (slopes.vector, slopes.covariance_xy))
+        vector, covariance = (values.astype(np.float64) for values in (slopes.vector, slopes.covariance_xy))
         vector *= per_px
         if self.low_orders is not None:
-            vector = self.low_orders.merged(frame, seen, vector, slopes.flags)
+            vector = self.low_orders.merged(frame, wavefront, vector, slopes.flags)
         self.controllers[number].update(vector, error.astype(np.float64) * per_px, covariance * per_px**2)
         self.slopes[frame], self.errors[frame] = slopes.vector, error
         self.covariances[frame] = slopes.covariance_xy
@@ -294,7 +294,7 @@ class _Loop:
 
     def _measure(self, frame: int, wavefront: NDArray[np.float32]) -> Slopes:
         """Measure the slopes of the camera's frame."""
-        number, sensor = int(self.which[frame]), self.optics.sensor
+        number, sensor = int(self.schedule[frame]), self.optics.sensor
         if self.methods[number].true_slopes:
             return _true_slopes(sensor.mean_slopes_px(wavefront))
         prior = None
@@ -303,9 +303,9 @@ class _Loop:
         pixels = self.telescope_model.frame(frame, wavefront)
         slopes = self.pipelines[number](pixels, prior)
         self._follow_profile(number, pixels, slopes)
-        known = self.fluxes[number]
-        if known is not None:
-            self.fluxes[number] = known.updated(slopes.flux)
+        flux = self.fluxes[number]
+        if flux is not None:
+            self.fluxes[number] = flux.updated(slopes.flux)
             if frame % _FLUX_FRAMES == 0:
                 self._follow_flux(number)
         if self.disabled_errors.exact_gain and frame >= self.configuration.run.settle_frames:
@@ -315,16 +315,16 @@ class _Loop:
 
     def _with_spots(self, method: Method) -> Method:
         """Return a method that knows the spots of a laser guide star as they were before the run."""
-        if self.known is None or method.psf is not None:
+        if self.sodium is None or method.psf is not None:
             return method
-        return with_spots(self.known, self.configuration, method)
+        return with_spots(self.sodium, self.configuration, method)
 
     def _follow_profile(self, number: int, pixels: NDArray[np.generic], slopes: Slopes) -> None:
         """Take a frame for the sodium profile; make the method's pipeline anew when it changes."""
         followed = self.followed[number]
         if followed is None or not followed.take(pixels, slopes.vector.astype(np.float64)):
             return
-        method = with_spots(followed.known, self.configuration, self.methods[number])
+        method = with_spots(followed.sodium, self.configuration, self.methods[number])
         self.pipelines[number] = make_pipeline(self.configuration, self.optics.sensor, method)
         self._follow_flux(number)
 
@@ -346,12 +346,12 @@ class _Loop:
             residual,
             self.zernike,
             r0,
-            self.which.astype(np.int8),
+            self.schedule.astype(np.int8),
             self.optics.interaction,
             self.gains,
             np.array([method.correct_gain for method in self.methods]),
             tuple(method.label for method in self.methods),
-            tuple(configuration_file.to_text(method.settings) for method in self.methods),
+            tuple(to_text(method.settings) for method in self.methods),
             sensor.layout.cells,
             sensor.illumination,
             configuration.control.frame_rate_hz,
@@ -383,10 +383,10 @@ def _checked_schedule(
         raise InputError("methods: expected one, or several with the integrator alone")
     if schedule is None:
         return np.zeros(configuration.run.frames, np.int64)
-    which = numbers_between("schedule", schedule, 0, len(methods) - 1, integer=True)
-    if which.ndim != 1:
-        raise InputError(f"schedule: expected one method for each frame, got shape {which.shape}")
-    return which.astype(np.int64)
+    indices = numbers_between("schedule", schedule, 0, len(methods) - 1, integer=True)
+    if indices.ndim != 1:
+        raise InputError(f"schedule: expected one method for each frame, got shape {indices.shape}")
+    return indices.astype(np.int64)
 
 
 @lru_cache(maxsize=2)

@@ -1,1 +1,6 @@
-"""Measurements from the telemetry of running or recorded loops."""
+"""Measurements from the telemetry of loops. Read in this order.
+
+`recorded_loop` (a loop of any system from its file), `open_loop` (slopes without the mirror), `spectra`,
+`slope_discrepancy`, `measured` (values with errors), `choices` (other controllers by replay),
+`report`, `page`. `recording` prepares telemetry of this engine for learning.
+"""

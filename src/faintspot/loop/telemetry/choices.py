@@ -21,7 +21,7 @@ from faintspot.base.statistics import mean_by_blocks
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.learning import GAINS, KALMAN, MODAL, learn
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.model import SETTLE_FRAMES, Model, Plant
+from faintspot.loop.control.identification.model import SETTLE_FRAMES, ControlModel, LoopPlant
 from faintspot.loop.control.kalman.predictor import steady_covariance
 from faintspot.loop.control.phase import residual_phase
 from faintspot.loop.control.reconstructor import make_reconstructor
@@ -72,7 +72,7 @@ class Choice:
 
 def compared_choices(
     loop: RecordedLoop,
-    seen: OpenLoop,
+    open_loop: OpenLoop,
     delay: LoopDelay,
     site: SlopeTurbulence,
     r0: Measured,
@@ -88,56 +88,56 @@ def compared_choices(
     InputError
         When there are too few frames, or the mirror cannot be controlled by the slopes.
     """
-    frames = len(seen.telemetry)
+    frames = len(open_loop.telemetry)
     assert loop.interaction is not None
     if frames < FEWEST_FRAMES:
         raise InputError(f"{frames} frames, expected {FEWEST_FRAMES} for a replay")
     reconstructor = make_reconstructor(loop.interaction)
-    plant = Plant(loop.interaction, reconstructor, max(1, round(delay.delay_frames)), _LEAK)
+    plant = LoopPlant(loop.interaction, reconstructor, max(1, round(delay.delay_frames)), _LEAK)
     phase = residual_phase(reconstructor.clean, loop.interaction, loop.cells)
-    views = [_View.of(each, phase) for each in (seen, seen.scaled(delay.gain))]
-    relative = float(seen.variance_error.mean()) / math.sqrt(len(reconstructor.modes.T))
+    views = [_View.of(slopes, phase) for slopes in (open_loop, open_loop.scaled(delay.gain))]
+    relative = float(open_loop.variance_error.mean()) / math.sqrt(len(reconstructor.modes.T))
     scale = _Scale.of(loop, r0, delay, relative)
 
-    def learnt_left(model: Model) -> list[Floats]:
+    def learnt_left(model: ControlModel) -> list[Floats]:
         return [view.compared(model.replayed(plant, view.replayed, phase)) for view in views]
 
     def integrators(gains: Sequence[float]) -> list[list[Floats]]:
         of_views = [view.compared(plant.replayed_integrators(gains, view.replayed, phase)) for view in views]
-        return [list(each) for each in zip(*of_views, strict=True)]
+        return [list(values) for values in zip(*of_views, strict=True)]
 
     ran = None
     if loop.is_closed and loop.commands is not None:
         ran = [view.ran for view in views]
     noise = [view.noise for view in views]
     compare = partial(_choice, ran=ran, noise=noise, scale=scale)
-    found = [] if ran is None else [compare(AS_RUN, ran)]
-    first = seen.telemetry.part(0, frames // 2)
-    if len(seen.variance) <= _MOST_SLOPES:
+    choices = [] if ran is None else [compare(AS_RUN, ran)]
+    first = open_loop.telemetry.part(0, frames // 2)
+    if len(open_loop.variance) <= _MOST_SLOPES:
         modal, learnt = (
             learn(kind, plant, first, site, loop.frame_rate_hz).model for kind in (MODAL, KALMAN)
         )
-        found.append(compare(BEST, *integrators([learnt.plain_gain]), gain=learnt.plain_gain))
-        found.append(compare(MODES, learnt_left(modal)))
+        choices.append(compare(BEST, *integrators([learnt.plain_gain]), gain=learnt.plain_gain))
+        choices.append(compare(MODES, learnt_left(modal)))
         expected = math.nan
         if identified is not None:
-            expected = _expected_left(identified, plant, delay.gain**2 * seen.variance, phase)
-        found.append(compare(FILTER, learnt_left(learnt), expected=expected))
+            expected = _expected_left(identified, plant, delay.gain**2 * open_loop.variance, phase)
+        choices.append(compare(FILTER, learnt_left(learnt), expected=expected))
     else:
         best, _ = plant.best_gain(GAINS, first, phase)
-        found.append(compare(BEST, *integrators([best]), gain=best))
+        choices.append(compare(BEST, *integrators([best]), gain=best))
     uncorrected = float(np.square(views[0].replayed.open_loop_px @ phase.T).sum(axis=1).mean())
     for gain, values in zip(GAINS[1::2], integrators(GAINS[1::2]), strict=True):
         if values[0].max() < np.inf and values[0].mean() < uncorrected:  # else it is not stable
-            found.append(compare("integrator", values, gain=gain))
-    return [_at_gain(each, delay.gain) for each in found]
+            choices.append(compare("integrator", values, gain=gain))
+    return [_at_gain(choice, delay.gain) for choice in choices]
 
 
-def _expected_left(identified: Identified, plant: Plant, variance: Floats, phase: Floats) -> float:
+def _expected_left(identified: Identified, plant: LoopPlant, variance: Floats, phase: Floats) -> float:
     """Return the phase variance that the predictive filter leaves in the turbulence that was identified."""
     model = identified.slope_model()
     after = model.spread(steady_covariance(model, variance), plant.delay_frames - 1)
-    return float(np.einsum("pi,ij,pj->", phase, model.seen @ after @ model.seen.T, phase))
+    return float(np.einsum("pi,ij,pj->", phase, model.observation @ after @ model.observation.T, phase))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,15 +160,15 @@ class _View:
     """Phase variance of the noise."""
 
     @classmethod
-    def of(cls, seen: OpenLoop, phase: Floats) -> _View:
-        half = len(seen.telemetry) // 2
-        replayed = seen.telemetry.part(half - SETTLE_FRAMES, None)
+    def of(cls, open_loop: OpenLoop, phase: Floats) -> _View:
+        half = len(open_loop.telemetry) // 2
+        replayed = open_loop.telemetry.part(half - SETTLE_FRAMES, None)
         share = replayed.trust.mean(axis=1)
         least = np.quantile(share[SETTLE_FRAMES:], 1 - _LEAST_COMPARED)
         scored = SETTLE_FRAMES + np.flatnonzero(share[SETTLE_FRAMES:] >= max(float(least), 1e-9))
-        noise = float(seen.variance @ np.square(phase).sum(axis=0))
+        noise = float(open_loop.variance @ np.square(phase).sum(axis=0))
         view = cls(replayed, scored, share[scored], np.zeros(0), noise)
-        ran = np.square(seen.residual[half - SETTLE_FRAMES :] @ phase.T).sum(axis=1)
+        ran = np.square(open_loop.residual[half - SETTLE_FRAMES :] @ phase.T).sum(axis=1)
         return replace(view, ran=view.compared(ran))
 
     def compared(self, frames: Floats) -> Floats:
@@ -206,7 +206,7 @@ class _Scale:
 
 def _choice(
     name: str,
-    left: list[Floats],
+    squares: list[Floats],
     ran: list[Floats] | None,
     noise: list[float],
     scale: _Scale,
@@ -216,15 +216,15 @@ def _choice(
     """Return a choice from its squared phase in each view, or from the expected one."""
     unit = scale.factor**2
     spread = _SPREAD_AS_RUN if name == AS_RUN else _SPREAD_OF_OTHERS
-    without = [values - each for values, each in zip(left, noise, strict=True)]
+    without = [values - level for values, level in zip(squares, noise, strict=True)]
     square, error = _mean_of_views(without, unit, spread)
     error = math.hypot(error, unit * noise[0] * scale.noise_error, scale.gain_error * square)
     less = Measured("less than as it ran", scale.unit, remark="the loop was open")
     corrected = 0.0 if math.isnan(expected) else square - unit * expected
     square, error = square - corrected, math.hypot(error, corrected)
     if ran is not None:
-        saved = [before - after for before, after in zip(ran, left, strict=True)]
-        mean, spread_of_mean = _mean_of_views(saved, unit, spread)
+        less_by = [before - after for before, after in zip(ran, squares, strict=True)]
+        mean, spread_of_mean = _mean_of_views(less_by, unit, spread)
         less = _root(less.name, scale.unit, mean + corrected, math.hypot(spread_of_mean, corrected))
     total = square + scale.fitting_nm2
     total_error = math.hypot(error, scale.fitting_error_nm2)
@@ -244,10 +244,10 @@ def _choice(
 def _mean_of_views(values: list[Floats], unit: float, spread: float) -> tuple[float, float]:
     """Return the mean of all views and its standard error."""
     block = max(1, len(values[0]) // _BLOCKS)
-    means = [mean_by_blocks(each, block) for each in values]
-    found = [each.value for each in means]
-    error = math.hypot(means[0].standard_error, spread * (max(found) - min(found)))
-    return unit * float(np.mean(found)), unit * error
+    means = [mean_by_blocks(view, block) for view in values]
+    estimates = [mean.value for mean in means]
+    error = math.hypot(means[0].standard_error, spread * (max(estimates) - min(estimates)))
+    return unit * float(np.mean(estimates)), unit * error
 
 
 def _root(name: str, unit: str, square: float, error: float, remark: str = "") -> Measured:

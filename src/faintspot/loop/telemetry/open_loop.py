@@ -68,7 +68,7 @@ def open_loop_of(loop: RecordedLoop, delay: LoopDelay) -> OpenLoop:
     InputError
         When fewer than 200 frames have known commands, or are without a gap where many are lost.
     """
-    held, usable = _held(loop, delay)
+    mirror, usable = _held(loop, delay)
     usable &= np.isfinite(loop.slopes).any(axis=1)
     rows = np.flatnonzero(usable)
     if len(rows) and np.ptp(loop.frame[rows]) + 1 > (1 + _MOST_LOST) * len(rows):
@@ -76,10 +76,10 @@ def open_loop_of(loop: RecordedLoop, delay: LoopDelay) -> OpenLoop:
         rows = rows[runs == np.bincount(runs).argmax()]
     if len(rows) < FEWEST_FRAMES:
         raise InputError(f"{len(rows)} frames with known commands, expected {FEWEST_FRAMES}")
-    place = loop.frame[rows] - loop.frame[rows[0]]
-    grid = np.full((2, int(place[-1]) + 1, loop.slopes.shape[1]), np.nan)
-    grid[:, place] = loop.slopes[rows] / delay.gain
-    grid[1, place] -= held[rows]
+    frame = loop.frame[rows] - loop.frame[rows[0]]
+    grid = np.full((2, int(frame[-1]) + 1, loop.slopes.shape[1]), np.nan)
+    grid[:, frame] = loop.slopes[rows] / delay.gain
+    grid[1, frame] -= mirror[rows]
     with np.errstate(invalid="ignore"):
         grid -= np.nansum(grid, axis=1, keepdims=True) / np.isfinite(grid).sum(axis=1, keepdims=True)
     residual, atmosphere = grid
@@ -89,7 +89,7 @@ def open_loop_of(loop: RecordedLoop, delay: LoopDelay) -> OpenLoop:
     telemetry = OpenLoopTelemetry(
         np.where(measured, atmosphere, 0.0), np.where(measured, variance, np.inf), measured.astype(np.float64)
     )
-    runs = np.repeat(runs_of(place), np.diff(place, append=place[-1] + 1))
+    runs = np.repeat(runs_of(frame), np.diff(frame, append=frame[-1] + 1))
     # Products of Gaussian noise with its deviation from a parabola have this variance.
     error = np.sqrt(2.5 / np.maximum(count, 1))
     return OpenLoop(telemetry, np.where(measured, residual, 0.0), runs, error)
@@ -97,17 +97,17 @@ def open_loop_of(loop: RecordedLoop, delay: LoopDelay) -> OpenLoop:
 
 def _held(loop: RecordedLoop, delay: LoopDelay) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the slopes of the mirror in each frame, and whether they are known."""
-    held, known = np.zeros_like(loop.slopes), np.ones(len(loop.slopes), np.bool_)
+    mirror, is_known = np.zeros_like(loop.slopes), np.ones(len(loop.slopes), np.bool_)
     if loop.commands is None or loop.interaction is None or not loop.is_closed:
-        return held, known
-    whole, part = int(delay.delay_frames), delay.delay_frames % 1
+        return mirror, is_known
+    frames, part = int(delay.delay_frames), delay.delay_frames % 1
     caused = loop.commands @ loop.interaction.T
-    for lag, share in ((whole, 1 - part), (whole + 1, part)):
+    for lag, share in ((frames, 1 - part), (frames + 1, part)):
         if share > 0:
-            held[lag:] += share * caused[: len(caused) - lag]
-            known[:lag] = False
-            known[lag:] &= loop.frame[lag:] - loop.frame[: len(caused) - lag] == lag
-    return held, known
+            mirror[lag:] += share * caused[: len(caused) - lag]
+            is_known[:lag] = False
+            is_known[lag:] &= loop.frame[lag:] - loop.frame[: len(caused) - lag] == lag
+    return mirror, is_known
 
 
 def _noise_variance(slopes: Floats) -> tuple[Floats, Floats]:
@@ -119,13 +119,13 @@ def _noise_variance(slopes: Floats) -> tuple[Floats, Floats]:
     if n < FEWEST_SUBAPERTURES:
         return _deviation(slopes)
     axes = slopes.reshape(-1, 2, n)
-    known = np.isfinite(axes)
-    mean = np.nansum(axes, axis=2, keepdims=True) / np.maximum(known.sum(axis=2, keepdims=True), 1)
-    left, count = _deviation((axes - mean).reshape(slopes.shape))
-    left = left.reshape(2, n)
+    measured = np.isfinite(axes)
+    mean = np.nansum(axes, axis=2, keepdims=True) / np.maximum(measured.sum(axis=2, keepdims=True), 1)
+    variance, count = _deviation((axes - mean).reshape(slopes.shape))
+    variance = variance.reshape(2, n)
     # The mean takes some of each slope's noise away, and adds some of the others'.
-    total = left.sum(axis=1, keepdims=True) * n / (n - 1)
-    return ((left - total / n**2) / (1 - 2 / n)).ravel(), count
+    total = variance.sum(axis=1, keepdims=True) * n / (n - 1)
+    return ((variance - total / n**2) / (1 - 2 / n)).ravel(), count
 
 
 def _deviation(slopes: Floats) -> tuple[Floats, Floats]:

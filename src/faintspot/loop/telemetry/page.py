@@ -36,7 +36,7 @@ def page_of_loop(report: LoopReport) -> str:
     sections = []
     for name, part in report.parts.items():
         drawn = figures[name](report) if name in figures else None
-        tables = [_table(part)] if part.known else []
+        tables = [_table(part)] if part.values else []
         if name == "choices" and report.choices:
             tables.append(_choices_table(report))
         text = [_TEXT[f"{name}.about"]] if not part.missing or tables else []
@@ -49,7 +49,7 @@ def page_of_loop(report: LoopReport) -> str:
 
 
 def _table(part: Part) -> Table:
-    rows = [[each.name, _with_interval(each, each.unit), each.remark] for each in part.known]
+    rows = [[value.name, _with_interval(value, value.unit), value.remark] for value in part.values]
     return Table(["", "value (95 %)", "remark"], rows, words=True)
 
 
@@ -63,7 +63,7 @@ def _with_interval(measured: Measured, unit: str = "") -> str:
         return "not known"
     decimals = max(0, 1 - int(np.floor(np.log10(measured.error))))
     style = f".{decimals}f" if decimals <= _MOST_DECIMALS else ".1e"
-    value, low_text, high_text = (f"{each:{style}}" for each in (measured.value, *measured.interval))
+    value, low_text, high_text = (f"{number:{style}}" for number in (measured.value, *measured.interval))
     text = f"{value} {unit}".rstrip() + f" ({low_text} to {high_text})"
     return text.replace("-", "−")
 
@@ -71,20 +71,20 @@ def _with_interval(measured: Measured, unit: str = "") -> str:
 def _choices_table(report: LoopReport) -> Table:
     unit = report.choices[0].residual.unit
     columns = {
-        f"residual ({unit})": [each.residual for each in report.choices],
-        f"less than as run ({unit})": [each.less for each in report.choices],
-        f"with fitting and aliasing ({unit})": [each.total for each in report.choices],
-        _STREHL: [each.strehl for each in report.choices],
+        f"residual ({unit})": [choice.residual for choice in report.choices],
+        f"less than as run ({unit})": [choice.less for choice in report.choices],
+        f"with fitting and aliasing ({unit})": [choice.total for choice in report.choices],
+        _STREHL: [choice.strehl for choice in report.choices],
     }
-    known = {
-        name: values for name, values in columns.items() if any(np.isfinite(each.value) for each in values)
+    shown = {
+        name: values for name, values in columns.items() if any(np.isfinite(value.value) for value in values)
     }
     rows = []
-    for each, *values in zip(report.choices, *known.values(), strict=True):
-        gain = f"{each.gain:.2f}" if np.isfinite(each.gain) else "–"
-        rows.append([each.name, gain, *map(_with_interval, values)])
-    texts = ["choices.table", *(["choices.strehl"] if _STREHL in known else [])]
-    return Table(["control", "gain", *known], rows, " ".join(_TEXT[name] for name in texts))
+    for choice, *values in zip(report.choices, *shown.values(), strict=True):
+        gain = f"{choice.gain:.2f}" if np.isfinite(choice.gain) else "–"
+        rows.append([choice.name, gain, *map(_with_interval, values)])
+    texts = ["choices.table", *(["choices.strehl"] if _STREHL in shown else [])]
+    return Table(["control", "gain", *shown], rows, " ".join(_TEXT[name] for name in texts))
 
 
 @styled
@@ -108,13 +108,13 @@ def _noise_figure(report: LoopReport) -> FigureWithData | None:
 @styled
 def _wind_figure(report: LoopReport) -> FigureWithData | None:
     """Draw the wind of each layer, with errors."""
-    found = report.turbulence
-    if found is None or report.loop.subaperture_m is None or not found.is_layered:
+    identified = report.turbulence
+    if identified is None or report.loop.subaperture_m is None or not identified.is_layered:
         return None
     figure = new_figure(WIDTH * 0.5, 5.4)
     axes = figure.subplots()
-    winds, errors = found.turbulence.wind_m_per_s, wind_errors(found)
-    share = found.turbulence.fraction
+    winds, errors = identified.turbulence.wind_m_per_s, wind_errors(identified)
+    share = identified.turbulence.fraction
     reach = 1.25 * float(np.hypot(*winds.T).max())
     for radius in np.arange(5, reach, 5):
         angle = np.linspace(0, 2 * np.pi, 181)
@@ -122,8 +122,8 @@ def _wind_figure(report: LoopReport) -> FigureWithData | None:
     x, y = winds.T
     axes.errorbar(x, y, 1.96 * errors[:, 1], 1.96 * errors[:, 0], fmt="none", color=GREY, capsize=2)
     axes.scatter(x, y, 900 * share, color=METHOD_COLOURS[1], alpha=0.7)
-    for place, part in zip(winds, share, strict=True):
-        axes.annotate(f"{part:.0%}", place, textcoords="offset points", xytext=(12, 8))
+    for wind, part in zip(winds, share, strict=True):
+        axes.annotate(f"{part:.0%}", wind, textcoords="offset points", xytext=(12, 8))
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     axes.set(xlabel="wind along x (m/s)", ylabel="wind along y (m/s)")
     rows = [(*wind, *error, part) for wind, error, part in zip(winds, errors, share, strict=True)]
@@ -151,7 +151,7 @@ def _spectra_figure(report: LoopReport) -> FigureWithData | None:
             spectra.frequency_hz, model / spread, model * spread, color=METHOD_COLOURS[0], alpha=0.15, lw=0
         )
         panel.set(title=name, xlabel="frequency (Hz)", ylabel=f"slope² ({report.loop.slope_unit}²/Hz)")
-        rows += [(name, *each) for each in zip(spectra.frequency_hz, measured, model, strict=True)]
+        rows += [(name, *row) for row in zip(spectra.frequency_hz, measured, model, strict=True)]
         panel.legend(frameon=False)
     return _TEXT.figure("spectra", figure, rows, ("slopes", "frequency", "measured", "found"))
 
@@ -159,21 +159,21 @@ def _spectra_figure(report: LoopReport) -> FigureWithData | None:
 @styled
 def _gain_figure(report: LoopReport) -> FigureWithData | None:
     """Draw the residual of integrators against gain, and those of the loop and the filter."""
-    curve = [each for each in report.choices if np.isfinite(each.gain) and each.name != BEST]
-    curve = [each for each in curve if np.isfinite(each.residual.value)]
+    curve = [choice for choice in report.choices if np.isfinite(choice.gain) and choice.name != BEST]
+    curve = [choice for choice in curve if np.isfinite(choice.residual.value)]
     if not curve:
         return None
     figure = new_figure(WIDTH * 0.7, 4.4)
     axes = figure.subplots()
-    values = [(each.gain, each.residual.value, each.residual.error) for each in curve]
+    values = [(choice.gain, choice.residual.value, choice.residual.error) for choice in curve]
     gain, residual, error = np.array(values).T
     axes.errorbar(
         gain, residual, 1.96 * error, fmt="o-", color=METHOD_COLOURS[1], capsize=3, label="integrator"
     )
     for name, colour in ((AS_RUN, "black"), (FILTER, METHOD_COLOURS[0])):
-        for each in (one for one in report.choices if one.name == name):
-            axes.axhline(each.residual.value, color=colour, label=name)
-            axes.axhspan(*each.residual.interval, color=colour, alpha=0.12, lw=0)
+        for choice in (choice for choice in report.choices if choice.name == name):
+            axes.axhline(choice.residual.value, color=colour, label=name)
+            axes.axhspan(*choice.residual.interval, color=colour, alpha=0.12, lw=0)
     axes.set(xlabel="gain of an integrator", ylabel=f"residual ({curve[0].residual.unit})", ylim=(0, None))
     axes.legend(frameon=False)
     return _TEXT.figure("gains", figure, values, ("gain", "residual", "standard error"))

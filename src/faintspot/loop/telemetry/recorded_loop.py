@@ -150,7 +150,7 @@ def _of_table(path: Path) -> dict[str, Any]:
         return {"slopes": _array(str(path))}
     stored = read_arrays(path, "slopes of a loop")
     check_keys(f"{path}: ", stored, [*_ARRAYS, *_NUMBERS, *_WORDS])
-    return {name: each.item() if each.ndim == 0 else each for name, each in stored.items()}
+    return {name: array.item() if array.ndim == 0 else array for name, array in stored.items()}
 
 
 def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
@@ -257,16 +257,16 @@ def _loop(name: str, values: dict[str, Any]) -> RecordedLoop:
     return _with_sign(replace(loop, remarks=tuple(remarks)))
 
 
-def _cells(given: Any, n: int) -> NDArray[np.int64]:
+def _cells(stated: Any, n: int) -> NDArray[np.int64]:
     """Return row and column of n sub-apertures, from a list, a mask, or a full square."""
-    if given is None:
+    if stated is None:
         side = round(n**0.5)
         if side * side != n:
             raise InputError(
                 f"cells: expected row and column of the {n} sub-apertures; give them with --system"
             )
         return np.argwhere(np.ones((side, side)))
-    cells = finite_array("cells", given)
+    cells = finite_array("cells", stated)
     if cells.shape == (n, 2):
         return cells.astype(np.int64)
     if cells.ndim == 2 and np.count_nonzero(cells > 0) == n:  # a mask

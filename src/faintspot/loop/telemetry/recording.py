@@ -56,7 +56,11 @@ def telemetry_of_recording(
         When there are no commands, as many as the control has, or no stretch that is long enough; and where
         the estimator had a prior around what is not known any more.
     """
-    check_commands(recording, control, "recording")
+    found = recording.commands.shape[1]
+    if found != control.commands:
+        raise InputError(
+            f"recording: expected {control.commands} commands, as the interaction matrix has, got {found}"
+        )
     predicted = prior_std_px is not None and control.prediction != NONE
     unknown = control.options.controller not in (INTEGRATOR, MODAL) or control.prediction == STREAM
     in_turn = any(str(method).endswith(f"+{KALMAN}") for method in recording.attributes.get("methods", []))
@@ -73,24 +77,15 @@ def telemetry_of_recording(
             f"{stop - start}"
         )
     rows = np.arange(start + delay, stop)
-    slopes, error, held, expected = recorded_slopes(recording, control, rows, predicted, "recording")
+    slopes, error, mirror, expected = _recorded_slopes(recording, control, rows, predicted)
     times = recording.last_row_time_ns[start:stop]
     rate = (stop - start - 1) / max(float(times[-1] - times[0]) / 1e9, 1e-9)
     covariance = recording.covariance_xy[rows].astype(np.float64) / control.options.centroid_gain**2
-    return make_telemetry(slopes, error, held, expected, prior_std_px, covariance), rate
+    return make_telemetry(slopes, error, mirror, expected, prior_std_px, covariance), rate
 
 
-def check_commands(recording: Recording, control: Control, what: str) -> None:
-    """Refuse a recording with another number of commands than the control has; `what` is its name."""
-    found = recording.commands.shape[1]
-    if found != control.commands:
-        raise InputError(
-            f"{what}: expected {control.commands} commands, as the interaction matrix has, got {found}"
-        )
-
-
-def recorded_slopes(
-    recording: Recording, control: Control, rows: NDArray[np.int64], predicted: bool, what: str
+def _recorded_slopes(
+    recording: Recording, control: Control, rows: NDArray[np.int64], predicted: bool
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return slopes, their errors, the slopes of the mirror, and an integrator's predicted slopes.
 
@@ -103,12 +98,10 @@ def recorded_slopes(
         Of the recording; as many frames as the delay before each must be there.
     predicted : bool
         Whether the estimator had the prediction as its prior; else 0.
-    what : str
-        What errors call the recording.
 
     Returns
     -------
-    slopes, errors, held, expected : (frames, m) arrays
+    slopes, errors, mirror, expected : (frames, m) arrays
         In true pixels; infinite error: not measured.
 
     Raises
@@ -121,13 +114,13 @@ def recorded_slopes(
     error = np.hstack([recording.standard_error_x[rows], recording.standard_error_y[rows]]).astype(np.float64)
     error[invalid] = np.inf
     if not np.isfinite(error).any():
-        raise InputError(f"{what}: expected standard errors of slopes; give the calibration a read noise")
+        raise InputError("recording: expected standard errors of slopes; give the calibration a read noise")
     slopes = recording.slopes[rows].astype(np.float64) / gain
-    held, latest = (
+    mirror, latest = (
         recording.commands[rows - lag].astype(np.float64) @ control.interaction.T for lag in (delay, 1)
     )
-    expected = held - latest if predicted else np.zeros_like(held)  # what acts less the latest command
-    return slopes, error / gain, held, expected
+    expected = mirror - latest if predicted else np.zeros_like(mirror)  # what acts less the latest command
+    return slopes, error / gain, mirror, expected
 
 
 def site_of(layout: Layout, layers: Sequence[tuple[float, float, float]] = ()) -> SlopeTurbulence:

@@ -39,7 +39,7 @@ class Part:
     """A part of a report."""
 
     title: str
-    known: list[Measured] = field(default_factory=list)
+    values: list[Measured] = field(default_factory=list)
     missing: str = ""
     """Reason for missing values."""
 
@@ -62,7 +62,7 @@ class LoopReport:
         values: dict[str, Any] = {
             name: {
                 "title": part.title,
-                "known": [each.as_values() for each in part.known],
+                "known": [value.as_values() for value in part.values],
                 "missing": part.missing,
             }
             for name, part in self.parts.items()
@@ -70,7 +70,7 @@ class LoopReport:
         if self.noise_px is not None and self.noise_error_px is not None:
             values["noise"]["of_slopes"] = _plain(self.noise_px)
             values["noise"]["of_slopes_error"] = _plain(self.noise_error_px)
-        values["choices"]["compared"] = [each.as_values() for each in self.choices]
+        values["choices"]["compared"] = [choice.as_values() for choice in self.choices]
         return {"recording": self.loop.name, "slope_unit": self.loop.slope_unit, **values}
 
 
@@ -105,12 +105,12 @@ def report_of_loop(loop: RecordedLoop, progress: Callable[[str], None] = lambda 
     progress("delay")
     delay = _loop(report)
     progress("noise")
-    seen = _noise(report, delay)
-    if seen is not None:
+    open_loop = _noise(report, delay)
+    if open_loop is not None:
         progress("turbulence")
-        _turbulence(report, seen, delay)
+        _turbulence(report, open_loop, delay)
         progress("other choices")
-        _choices(report, seen, delay)
+        _choices(report, open_loop, delay)
     return report
 
 
@@ -118,7 +118,7 @@ def _frames(report: LoopReport) -> None:
     loop, part = report.loop, report.parts["frames"]
     lost = np.diff(loop.frame) - 1
     span = (loop.frame[-1] - loop.frame[0] + 1) / loop.frame_rate_hz
-    part.known = [
+    part.values = [
         Measured("frames", "", len(loop.frame), 0.0),
         Measured("duration", "s", float(span), 0.0),
         Measured("lost frames", "", float(lost.sum()), 0.0, f"in {np.count_nonzero(lost)} gaps"),
@@ -131,7 +131,7 @@ def _frames(report: LoopReport) -> None:
 def _loop(report: LoopReport) -> LoopDelay:
     """Return delay and gain; without commands those of an open loop."""
     loop, part = report.loop, report.parts["loop"]
-    part.known.append(_saturated(loop))
+    part.values.append(_saturated(loop))
     is_still = loop.commands is None or not np.ptp(loop.commands, axis=0).any()
     if not loop.is_closed or (is_still and loop.commands is not None):
         part.missing = "The loop was open: it has no delay and no gain to measure."
@@ -142,30 +142,30 @@ def _loop(report: LoopReport) -> LoopDelay:
         for name in ("loop", "turbulence", "vibrations", "spectra", "choices"):
             report.parts[name].missing = why
         return LoopDelay(1.0, 0.0, 1.0, 0.0)
-    known, found = _delay(loop)
-    part.known = [*known, *part.known]
-    return found
+    values, delay = _delay(loop)
+    part.values = [*values, *part.values]
+    return delay
 
 
 def _delay(loop: RecordedLoop) -> tuple[list[Measured], LoopDelay]:
     """Return delay and gain as reported and as used, the latter rounded to whole frames if consistent."""
     assert loop.commands is not None
     assert loop.interaction is not None
-    names, given = (("delay", "frames"), ("centroid gain", "")), loop.delay_frames
-    slopes, held = np.nan_to_num(loop.slopes), loop.commands @ loop.interaction.T
-    known = runs_of(loop.frame), site_of_loop(loop), loop.frame_rate_hz
+    names, assumed = (("delay", "frames"), ("centroid gain", "")), loop.delay_frames
+    slopes, mirror = np.nan_to_num(loop.slopes), loop.commands @ loop.interaction.T
+    context = runs_of(loop.frame), site_of_loop(loop), loop.frame_rate_hz
     try:
-        found = loop_delay(slopes, held, *known, given)
-        nearest = float(round(found.delay_frames))
-        remark, used = "given" if given is not None else "", found
-        if given is None and abs(found.delay_frames - nearest) < max(_WHOLE_FRAMES, 2 * found.delay_error):
-            remark, used = f"{nearest:g} is used", loop_delay(slopes, held, *known, nearest)
+        fit = loop_delay(slopes, mirror, *context, assumed)
+        nearest = float(round(fit.delay_frames))
+        remark, used = "given" if assumed is not None else "", fit
+        if assumed is None and abs(fit.delay_frames - nearest) < max(_WHOLE_FRAMES, 2 * fit.delay_error):
+            remark, used = f"{nearest:g} is used", loop_delay(slopes, mirror, *context, nearest)
     except InputError as error:
-        used = LoopDelay(given or 2.0, math.nan, 1.0, math.nan)
+        used = LoopDelay(assumed or 2.0, math.nan, 1.0, math.nan)
         remarks = f"{error}; {used.delay_frames:g} is used", f"{error}; 1 is used"
         return [Measured(*name, remark=text) for name, text in zip(names, remarks, strict=True)], used
     gain = Measured(*names[1], used.gain, used.gain_error, f"for a delay of {used.delay_frames:.3g} frames")
-    return [Measured(*names[0], found.delay_frames, found.delay_error, remark), gain], used
+    return [Measured(*names[0], fit.delay_frames, fit.delay_error, remark), gain], used
 
 
 def _saturated(loop: RecordedLoop) -> Measured:
@@ -191,68 +191,68 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
     """Return the open-loop slopes; None if they are unknown."""
     loop, part = report.loop, report.parts["noise"]
     try:
-        found = open_loop_of(loop, delay)
+        open_loop = open_loop_of(loop, delay)
     except InputError as error:
         for name in ("noise", "turbulence", "vibrations", "spectra", "choices"):
             report.parts[name].missing = report.parts[name].missing or f"{error}."
         return None
-    report.noise_px = delay.gain * np.sqrt(found.variance)
-    report.noise_error_px = 0.5 * report.noise_px * found.variance_error
+    report.noise_px = delay.gain * np.sqrt(open_loop.variance)
+    report.noise_error_px = 0.5 * report.noise_px * open_loop.variance_error
     rms = float(np.sqrt(np.square(report.noise_px).mean()))
-    spread = 0.5 * rms * float(found.variance_error.mean()) / math.sqrt(len(found.variance))
+    spread = 0.5 * rms * float(open_loop.variance_error.mean()) / math.sqrt(len(open_loop.variance))
     spread = math.hypot(spread, _PARABOLA_ERROR * rms)
-    over = "rms over the sub-apertures"
-    part.known.append(Measured("noise of a slope", loop.slope_unit, rms, spread, over))
+    remark = "rms over the sub-apertures"
+    part.values.append(Measured("noise of a slope", loop.slope_unit, rms, spread, remark))
     scale = loop.pixel_scale_arcsec
     if scale is None or loop.subaperture_m is None:
         part.missing = "Not in nm: pixel_scale_arcsec and subaperture_m are not known."
     else:
         to_nm = scale * ARCSEC * loop.subaperture_m * 1e9
-        part.known.append(Measured("tilt over a sub-aperture", "nm", rms * to_nm, spread * to_nm, over))
-    unmeasured = 1 - float(found.telemetry.trust[found.telemetry.trust.any(axis=1)].mean())
+        part.values.append(Measured("tilt over a sub-aperture", "nm", rms * to_nm, spread * to_nm, remark))
+    unmeasured = 1 - float(open_loop.telemetry.trust[open_loop.telemetry.trust.any(axis=1)].mean())
     if unmeasured > _MOST_UNMEASURED:
         why = f"{unmeasured:.0%} of the slopes were not measured, more than {_MOST_UNMEASURED:.0%}."
         for name in ("turbulence", "vibrations", "spectra", "choices"):
             report.parts[name].missing = report.parts[name].missing or why
-    return None if report.parts["turbulence"].missing else found
+    return None if report.parts["turbulence"].missing else open_loop
 
 
-def _turbulence(report: LoopReport, seen: OpenLoop, delay: LoopDelay) -> None:
+def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> None:
     loop = report.loop
     part, site = report.parts["turbulence"], site_of_loop(loop)
     try:
-        identified = Identification(seen.telemetry, site, loop.frame_rate_hz).layers()
+        identified = Identification(open_loop.telemetry, site, loop.frame_rate_hz).layers()
     except InputError as error:
         part.missing = report.parts["vibrations"].missing = report.parts["spectra"].missing = str(error)
         return
     report.turbulence = identified
-    report.spectra = modal_spectra(seen.telemetry, identified)
+    report.spectra = modal_spectra(open_loop.telemetry, identified)
     _vibrations(report, identified)
     if len(loop.cells) < FEWEST_SUBAPERTURES:
         part.missing = f"Fewer than {FEWEST_SUBAPERTURES} sub-apertures show neither winds nor r0."
         return
-    report.parts["noise"].known += recorded_discrepancy(loop, seen, identified)
+    report.parts["noise"].values += recorded_discrepancy(loop, open_loop, identified)
     if loop.subaperture_m is None:
         part.missing = "Without subaperture_m (or diameter_m) neither r0 nor winds are known."
         return
     r0 = Measured("r0 at 500 nm", "m", remark="pixel_scale_arcsec is unknown")
     if loop.pixel_scale_arcsec is not None:
-        rows = seen.telemetry.trust.any(axis=1)
-        slopes = seen.telemetry.open_loop_px[rows], seen.residual[rows], seen.run[rows]
+        rows = open_loop.telemetry.trust.any(axis=1)
+        slopes = open_loop.telemetry.open_loop_px[rows], open_loop.residual[rows], open_loop.run[rows]
         # A matrix of mean gradients makes of what the mirror corrects mean gradients, too.
         averaged = 0.5 * (1 + identified.turbulence.averaged)
-        found = turbulence_strength(
+        strength = turbulence_strength(
             *slopes,
             replace(site, averaged=averaged),
             gain_error=delay.gain_error / delay.gain,
             gain_spread=_GAIN_SPREAD * abs(1 - delay.gain),
             outer_scale_m=loop.outer_scale_m,
         )
-        part.known += outer_scale_and_r0(found, loop.outer_scale_m)
-        r0 = part.known[-1]
+        part.values += outer_scale_and_r0(strength, loop.outer_scale_m)
+        r0 = part.values[-1]
     else:
-        part.known.append(r0)
-    part.known += _winds(identified, r0)
+        part.values.append(r0)
+    part.values += _winds(identified, r0)
 
 
 def _winds(identified: Identified, r0: Measured) -> list[Measured]:
@@ -266,11 +266,11 @@ def _winds(identified: Identified, r0: Measured) -> list[Measured]:
     speeds = np.hypot(drawn[..., 0], drawn[..., 1])
     mean = ((weight * speeds ** (5 / 3)).sum(axis=1) / weight.sum(axis=1)) ** 0.6
     speed = float((share @ np.hypot(*winds.T) ** (5 / 3)) ** 0.6)
-    known = [Measured("wind speed, mean for the coherence time", "m/s", speed, float(mean.std()))]
+    values = [Measured("wind speed, mean for the coherence time", "m/s", speed, float(mean.std()))]
     if math.isfinite(r0.value):
         time_ms = 314 * r0.value / speed
         error = time_ms * math.hypot(r0.error / r0.value, float(mean.std()) / speed)
-        known.append(Measured("coherence time at 500 nm", "ms", time_ms, error))
+        values.append(Measured("coherence time at 500 nm", "ms", time_ms, error))
     for rank, number in enumerate(np.argsort(-share), 1):
         x, y = winds[number]
         speed = math.hypot(x, y)
@@ -279,12 +279,12 @@ def _winds(identified: Identified, r0: Measured) -> list[Measured]:
         degrees = math.degrees(across / max(speed, 1e-9))
         name = f"layer {rank}"
         direction = math.degrees(math.atan2(y, x)) % 360
-        known += [
+        values += [
             Measured(f"{name}: speed", "m/s", speed, along),
             Measured(f"{name}: direction", "degrees", direction, degrees, "towards, from +x to +y"),
             Measured(f"{name}: share", "", float(share[number]), float(identified.fraction_error[number])),
         ]
-    return known
+    return values
 
 
 def wind_errors(identified: Identified) -> Floats:
@@ -296,26 +296,26 @@ def _vibrations(report: LoopReport, identified: Identified) -> None:
     loop, part = report.loop, report.parts["vibrations"]
     diameter_m = subapertures_across(loop.cells) * (loop.subaperture_m or math.nan)
     to_nm = math.sqrt(2) * (loop.pixel_scale_arcsec or math.nan) * ARCSEC * diameter_m / 4 * 1e9
-    for each in identified.vibrations:
-        rms = each.rms_px, each.rms_error_px
-        shown = Measured(f"rms of {each.mode}", loop.slope_unit, *rms, "over all slopes")
-        if each.mode != "focus" and math.isfinite(to_nm):
+    for line in identified.vibrations:
+        rms = line.rms_px, line.rms_error_px
+        shown = Measured(f"rms of {line.mode}", loop.slope_unit, *rms, "over all slopes")
+        if line.mode != "focus" and math.isfinite(to_nm):
             shown = Measured(shown.name, "nm", to_nm * rms[0], to_nm * rms[1])
-        frequency = each.frequency_hz, each.frequency_error_hz
-        part.known += [Measured(f"frequency of {each.mode}", "Hz", *frequency), shown]
-    if not part.known:
+        frequency = line.frequency_hz, line.frequency_error_hz
+        part.values += [Measured(f"frequency of {line.mode}", "Hz", *frequency), shown]
+    if not part.values:
         part.missing = "No narrow line stands out of the spectra of tip, tilt and focus."
 
 
-def _choices(report: LoopReport, seen: OpenLoop, delay: LoopDelay) -> None:
+def _choices(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> None:
     loop, part = report.loop, report.parts["choices"]
     if loop.interaction is None:
         part.missing = "The recording has no interaction or control matrix: no mirror can be replayed."
         return
-    turbulence = report.parts["turbulence"].known
-    r0 = next((each for each in turbulence if each.name.startswith("r0")), Measured("r0", "m"))
+    turbulence = report.parts["turbulence"].values
+    r0 = next((value for value in turbulence if value.name.startswith("r0")), Measured("r0", "m"))
     try:
-        report.choices = compared_choices(loop, seen, delay, site_of_loop(loop), r0, report.turbulence)
+        report.choices = compared_choices(loop, open_loop, delay, site_of_loop(loop), r0, report.turbulence)
     except InputError as error:
         part.missing = str(error)
 

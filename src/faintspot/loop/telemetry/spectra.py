@@ -31,7 +31,7 @@ class ModalSpectra:
     """Number of averaged half-overlapping pieces."""
 
 
-def modal_spectra(telemetry: OpenLoopTelemetry, found: Identified) -> ModalSpectra:
+def modal_spectra(telemetry: OpenLoopTelemetry, identified: Identified) -> ModalSpectra:
     """Return measured and fitted spectra.
 
     Raises
@@ -39,7 +39,7 @@ def modal_spectra(telemetry: OpenLoopTelemetry, found: Identified) -> ModalSpect
     InputError
         When no sub-aperture was measured often enough.
     """
-    rate, records = found.rate_hz, SlopeRecords.of(telemetry, found.turbulence)
+    rate, records = identified.rate_hz, SlopeRecords.of(telemetry, identified.turbulence)
     length = min(_LONGEST, len(records.slopes) // 4 * 2)
     window = np.hanning(length + 2)[1:-1]
     window /= np.linalg.norm(window)
@@ -54,28 +54,28 @@ def modal_spectra(telemetry: OpenLoopTelemetry, found: Identified) -> ModalSpect
     )
     modes = np.square(np.abs(transformed @ shapes.T)).mean(axis=0).T
     total = np.square(np.abs(transformed)).sum(axis=2).mean(axis=0)
-    matrices = _model(records, found, window, bins)
+    matrices = _model(records, identified, window, bins)
     expected = np.einsum("ki,fij,kj->kf", shapes, matrices, shapes)
-    whole = np.trace(matrices, axis1=1, axis2=2)
+    total_model = np.trace(matrices, axis1=1, axis2=2)
     measured, model = dict(zip(MODES, modes, strict=True)), dict(zip(MODES, expected, strict=True))
     others = max(m - len(MODES), 1)
     measured[OTHERS], model[OTHERS] = (
         (total - modes.sum(axis=0)) / others,
-        (whole - expected.sum(axis=0)) / others,
+        (total_model - expected.sum(axis=0)) / others,
     )
-    seen = [name for name, values in measured.items() if (values > 0).all()]  # few slopes have no focus
+    shown = [name for name, values in measured.items() if (values > 0).all()]  # few slopes have no focus
     density = 2 / rate
     return ModalSpectra(
         bins * rate / length,
-        {name: density * measured[name] for name in seen},
-        {name: density * model[name] for name in seen},
+        {name: density * measured[name] for name in shown},
+        {name: density * model[name] for name in shown},
         len(starts),
     )
 
 
-def _model(records: SlopeRecords, found: Identified, window: Floats, bins: NDArray[np.int64]) -> Floats:
+def _model(records: SlopeRecords, identified: Identified, window: Floats, bins: NDArray[np.int64]) -> Floats:
     """Return the cross-spectra (frequencies, m, m) of turbulence, noise and vibrations."""
-    turbulence, rate, length = found.turbulence, found.rate_hz, len(window)
+    turbulence, rate, length = identified.turbulence, identified.rate_hz, len(window)
     shapes, m = mode_shapes(records.site.positions_m), records.slopes.shape[1]
     spectra = SlopeSpectra(records.site, 1 / rate, window, bins, _FASTEST_M_PER_S * length / rate)
     tables, _ = spectra.tables(turbulence.outer_scale_m)
@@ -86,9 +86,9 @@ def _model(records: SlopeRecords, found: Identified, window: Floats, bins: NDArr
     )
     matrices = spectra.matrices(np.asarray(distinct)).real
     diagonal = np.arange(m)
-    matrices[:, diagonal, diagonal] += found.noise_factor * records.noise_px2
-    for each in found.moving:
-        line = spectra.of_process(m * each.rms_px**2 * each.correlation(rate, length)).real
-        shape = shapes[MODES.index(each.mode)]
+    matrices[:, diagonal, diagonal] += identified.noise_factor * records.noise_px2
+    for oscillation in identified.moving:
+        line = spectra.of_process(m * oscillation.rms_px**2 * oscillation.correlation(rate, length)).real
+        shape = shapes[MODES.index(oscillation.mode)]
         matrices += np.maximum(line, 0.0)[:, None, None] * np.outer(shape, shape)
     return np.asarray(matrices)

@@ -73,25 +73,25 @@ class SlopeTurbulence:
     def _covariances_px2(self, later_s: Sequence[float]) -> Floats:
         """Return `covariance_px2` for each delay, (delays, 2 n, 2 n); equal shifts of layers count once."""
         part = np.asarray(self.fraction, np.float64) / np.sum(self.fraction)
-        (apart_m, which), wind = self._separations, np.asarray(self.wind_m_per_s, np.float64)
+        (apart_m, separation), wind = self._separations, np.asarray(self.wind_m_per_s, np.float64)
         shifts_m = np.asarray(later_s)[:, None, None] * wind
         distinct_m, of_layer = np.unique(shifts_m.reshape(-1, 2), axis=0, return_inverse=True)
         along, across = (apart_m - distinct_m[:, None]).transpose(2, 0, 1)
         side_m = self.averaged * self.subaperture_m
-        found = gradient_covariances(along, across, side_m, self.outer_scale_m)
-        found *= self.r0_m ** (-5 / 3) * self.px2_per_rad2_per_m2
+        covariances = gradient_covariances(along, across, side_m, self.outer_scale_m)
+        covariances *= self.r0_m ** (-5 / 3) * self.px2_per_rad2_per_m2
         blocks = [
-            np.tensordot(part, found[:, each], axes=([0], [1]))[:, which]
-            for each in of_layer.reshape(shifts_m.shape[:2])
+            np.tensordot(part, covariances[:, shifts], axes=([0], [1]))[:, separation]
+            for shifts in of_layer.reshape(shifts_m.shape[:2])
         ]
         return np.array([np.block([[xx, xy], [xy, yy]]) for xx, xy, yy in blocks])
 
     @cached_property
     def _separations(self) -> tuple[Floats, NDArray[np.int64]]:
         """Distinct separations of sub-apertures (distinct, 2) m, and which of them each pair has, (n, n)."""
-        apart = (self.positions_m[:, None] - self.positions_m).reshape(-1, 2)
-        distinct, which = np.unique(np.round(apart, 9), axis=0, return_inverse=True)
-        return distinct, which.reshape(len(self.positions_m), -1)
+        apart_m = (self.positions_m[:, None] - self.positions_m).reshape(-1, 2)
+        distinct, separation = np.unique(np.round(apart_m, 9), axis=0, return_inverse=True)
+        return distinct, separation.reshape(len(self.positions_m), -1)
 
     @property
     def px2_per_rad2_per_m2(self) -> float:
@@ -193,12 +193,12 @@ def _same_axis(along: Floats, across: Floats, side: float, structure: _Structure
     nodes, weights = np.polynomial.legendre.leggauss(2 * _POINTS)
     total = np.zeros(along.shape)
     for half in (-0.5, 0.5):  # the density of differences between points of two edges is a triangle
-        place = half * side * (1 + nodes * np.sign(half))
-        weight = 0.5 * weights * (1 - np.abs(place) / side)
-        for node, part in zip(place, weight, strict=True):
+        nodes_m = half * side * (1 + nodes * np.sign(half))
+        weight = 0.5 * weights * (1 - np.abs(nodes_m) / side)
+        for node, part in zip(nodes_m, weight, strict=True):
             square = (across + node) ** 2
-            apart = structure((along + side) ** 2 + square) + structure((along - side) ** 2 + square)
-            total += part * (0.5 * apart - structure(along**2 + square))
+            difference = structure((along + side) ** 2 + square) + structure((along - side) ** 2 + square)
+            total += part * (0.5 * difference - structure(along**2 + square))
     return total / side**2
 
 

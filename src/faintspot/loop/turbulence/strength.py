@@ -71,23 +71,23 @@ def turbulence_strength(
     """
     n = len(site.positions_m)
     kept = np.arange(n)[:: math.ceil(n / _MOST_SUBAPERTURES)]
-    both = np.concatenate([kept, kept + n])
+    columns = np.concatenate([kept, kept + n])
     site = replace(site, positions_m=site.positions_m[kept], r0_m=1.0)
     atmosphere, residual = (
-        each[:, both] - each[:, both].mean(axis=0) for each in (atmosphere_px, residual_px)
+        slopes[:, columns] - slopes[:, columns].mean(axis=0) for slopes in (atmosphere_px, residual_px)
     )
     degrees = [degree for degree in _degrees(site) if degree.shape[1]]
-    measured = [(each, _signal(atmosphere @ each, run)) for each in degrees]
-    usable = [(number, each, signal) for number, (each, signal) in enumerate(measured, 1) if signal > 0]
+    measured = [(basis, _signal(atmosphere @ basis, run)) for basis in degrees]
+    usable = [(number, basis, signal) for number, (basis, signal) in enumerate(measured, 1) if signal > 0]
     if not usable:
         return Strength(math.nan, math.nan, outer_scale_m or OUTER_SCALE_M, math.nan)
     number, modes, signal = zip(*usable, strict=True)
-    change = [_of_gain(atmosphere @ each, residual @ each, run) for each in modes]
-    sampling = [_sampling(atmosphere @ each, run, value) for each, value in zip(modes, signal, strict=True)]
+    change = [_of_gain(atmosphere @ basis, residual @ basis, run) for basis in modes]
+    sampling = [_sampling(atmosphere @ basis, run, value) for basis, value in zip(modes, signal, strict=True)]
     of_degree = _ERROR_OF_DEGREE / _TO_R0 * np.array(number)
     covariance = np.diag(sampling + np.square(gain_spread * np.array(change)) + np.square(of_degree))
     covariance += gain_error**2 * np.outer(change, change)
-    theory = np.array([_theory(site, each, list(modes)) for each in _SCALES_M])
+    theory = np.array([_theory(site, scale_m, list(modes)) for scale_m in _SCALES_M])
     return _fitted(np.log(signal), theory, covariance, outer_scale_m)
 
 
@@ -97,12 +97,12 @@ def _fitted(signal: Floats, theory: Floats, covariance: Floats, known_m: float |
     `signal` and `theory` (scales, degrees) are logarithms of variances, the latter for r0 = 1 m.
     """
     scales = _FINE_SCALES_M if known_m is None else np.array([known_m])
-    expected = np.array([np.interp(np.log(scales), np.log(_SCALES_M), each) for each in theory.T]).T
+    expected = np.array([np.interp(np.log(scales), np.log(_SCALES_M), values) for values in theory.T]).T
     inverse = np.linalg.inv(covariance)
     weight = inverse.sum(axis=0) / inverse.sum()
     strength = (signal - expected) @ weight
-    left = signal - expected - strength[:, None]
-    likelihood = -0.5 * np.einsum("si,ij,sj->s", left, inverse, left)
+    residual = signal - expected - strength[:, None]
+    likelihood = -0.5 * np.einsum("si,ij,sj->s", residual, inverse, residual)
     likelihood -= 0.5 * (np.log(scales / OUTER_SCALE_M) / OUTER_SCALE_SPREAD) ** 2
     part = np.exp(likelihood - likelihood.max())
     part /= part.sum()
@@ -124,21 +124,21 @@ def _degrees(site: SlopeTurbulence) -> list[Floats]:
     centred = site.positions_m - site.positions_m.mean(axis=0)
     x, y = (centred / np.abs(centred).max()).T
     across = round(float(np.ptp(centred, axis=0).max()) / site.subaperture_m) + 1
-    found, known = [], np.zeros((2 * n, 0))
+    degrees, basis = [], np.zeros((2 * n, 0))
     for degree in range((across + 1) // 2 + 1):
         terms = np.array([x**power * y ** (degree - power) for power in range(degree + 1)]).T
         new = np.kron(np.eye(2), terms)
         for _ in range(2):
-            new = new - known @ (known.T @ new)
-        left, size, _ = np.linalg.svd(new, full_matrices=False)
-        found.append(left[:, size > 1e-6])
-        known = np.hstack([known, found[-1]])
-    return found[1:]
+            new = new - basis @ (basis.T @ new)
+        vectors, size, _ = np.linalg.svd(new, full_matrices=False)
+        degrees.append(vectors[:, size > 1e-6])
+        basis = np.hstack([basis, degrees[-1]])
+    return degrees[1:]
 
 
 def _theory(site: SlopeTurbulence, outer_scale_m: float, degrees: list[Floats]) -> list[float]:
     covariance = replace(site, outer_scale_m=outer_scale_m).covariance_px2()
-    return [math.log(float(np.einsum("ik,ij,jk->", each, covariance, each))) for each in degrees]
+    return [math.log(float(np.einsum("ik,ij,jk->", modes, covariance, modes))) for modes in degrees]
 
 
 def _lagged(modes: Floats, run: NDArray[np.int64], lag: int) -> float:

@@ -1,1 +1,1 @@
-"""The camera: calibration, its measurement, and a simulated detector."""
+"""Camera: `calibration`; its measurement (`dark_frames`, `photon_transfer`, `hot_pixels`); `detector`."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import number_between, numbers_between, real_array
+from faintspot.base.checks import number_between, numbers_between, one_of, real_array, strings_of
 from faintspot.base.config.tables import (
     check_fields,
     chosen_fields,
@@ -27,6 +27,7 @@ from faintspot.base.npz import save_arrays
 from faintspot.io.frames import open_frames, read_array
 
 _BLOCK_PIXELS = 1 << 22  # processed at a time
+_ESTIMATED = ("dark", "gain_e_per_adu", "saturation_adu", "bad_pixels")
 _MAPS = ("dark", "flat", "bad_pixels", "read_noise_e")
 # Limit of values that the kernels square in float32, with a wide margin; no camera reaches it.
 _GAINS = 1e-9, 1e9
@@ -47,8 +48,9 @@ class Calibration:
     dark : float or (h, w) array, optional, ADU
         Frame without flux: bias and dark current. NaN marks a bad pixel. Default: unknown, and treated as
         0. A value of 0 states that there is none.
-    rough_dark : bool
-        Whether `dark` is only approximate, such as the background of frames with light in them.
+    estimated : tuple of str
+        Names of fields that were estimated from frames with light in them, such as a `dark` that is their
+        background. `faintspot layout` estimates them again; estimators may fit an estimated dark level.
     flat : (h, w) array, optional
         Relative response of each pixel, 1 on average. NaN, zero or negative marks a bad pixel.
     gain_e_per_adu : float
@@ -89,14 +91,15 @@ class Calibration:
     saturation_adu: float | None = None
     read_noise_e: Any = None
     background_e: float = 0.0
-    rough_dark: bool = False
+    estimated: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         put = object.__setattr__
         if self.dark is not None:
             put(self, "dark", _scalar_or_map("calibration.dark", self.dark))
-        if not isinstance(self.rough_dark, bool):
-            raise InputError(f"calibration.rough_dark = {self.rough_dark!r}: expected true or false")
+        put(self, "estimated", strings_of("calibration.estimated", self.estimated))
+        for name in self.estimated:
+            one_of("calibration.estimated", name, _ESTIMATED)
         if self.flat is not None:
             put(self, "flat", _map("calibration.flat", self.flat))
         for name in ("gain_e_per_adu", "em_gain"):
@@ -120,11 +123,11 @@ class Calibration:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Calibration):
             return NotImplemented
-        mine, theirs = vars(self), vars(other)
+        own, theirs = vars(self), vars(other)
         return all(
-            (mine[name] is None) == (theirs[name] is None)
-            and (mine[name] is None or np.array_equal(mine[name], theirs[name], equal_nan=True))
-            for name in mine
+            (own[name] is None) == (theirs[name] is None)
+            and (own[name] is None or np.array_equal(own[name], theirs[name], equal_nan=True))
+            for name in own
         )
 
     __hash__ = None  # type: ignore[assignment]
@@ -137,7 +140,7 @@ class Calibration:
     @property
     def vouches_for_dark(self) -> bool:
         """Whether the dark level is known accurately; otherwise estimators may fit it."""
-        return self.dark is not None and not self.rough_dark
+        return self.dark is not None and "dark" not in self.estimated
 
     @property
     def typical_read_noise_e(self) -> float | None:
@@ -168,12 +171,12 @@ class Calibration:
 
     def with_bad_pixels(self, rows_and_columns: NDArray[np.int64]) -> Calibration:
         """Return the same calibration with further bad pixels, (n, 2)."""
-        known = self.bad_pixels
-        if known is None:
-            known = np.empty((0, 2), np.int64)
-        elif known.dtype == np.bool_:
-            known = np.argwhere(known)
-        return replace(self, bad_pixels=np.unique(np.concatenate([known, rows_and_columns]), axis=0))
+        bad = self.bad_pixels
+        if bad is None:
+            bad = np.empty((0, 2), np.int64)
+        elif bad.dtype == np.bool_:
+            bad = np.argwhere(bad)
+        return replace(self, bad_pixels=np.unique(np.concatenate([bad, rows_and_columns]), axis=0))
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
@@ -255,8 +258,8 @@ class Calibration:
             return self.bad_pixels  # type: ignore[no-any-return]
         outside = np.any(self.bad_pixels >= np.array(frame_shape), axis=1)
         if outside.any():
-            place = tuple(int(i) for i in self.bad_pixels[np.argmax(outside)])
-            raise InputError(f"calibration.bad_pixels: (row, column) {place} is outside {frame_shape}")
+            pixel = tuple(int(i) for i in self.bad_pixels[np.argmax(outside)])
+            raise InputError(f"calibration.bad_pixels: (row, column) {pixel} is outside {frame_shape}")
         mask = np.zeros(frame_shape, bool)
         mask[self.bad_pixels[:, 0], self.bad_pixels[:, 1]] = True
         return mask
@@ -283,10 +286,10 @@ def _read_noise(value: Any) -> Any:
     if real_array(name, value).ndim == 0:
         return number_between(name, value, 0.0, _LARGEST_READ_NOISE_E)
     noise = _map(name, value)
-    known = noise[~np.isnan(noise)]
-    if known.size == 0:
+    finite = noise[~np.isnan(noise)]
+    if finite.size == 0:
         raise InputError(f"{name}: expected the noise of at least one pixel, every value is NaN")
-    numbers_between(name, known, 0.0, _LARGEST_READ_NOISE_E)
+    numbers_between(name, finite, 0.0, _LARGEST_READ_NOISE_E)
     return noise
 
 

@@ -81,16 +81,16 @@ def shrunk_variance(variance: Floats, degrees: int) -> tuple[Floats, float]:
     middle = np.median(logarithm)
     spread = _MAD_TO_STD * np.median(np.abs(logarithm - middle))
     logarithm = logarithm[np.abs(logarithm - middle) <= _OUTLYING * spread]
-    own = 0.5 * degrees
-    centre = float(logarithm.mean()) - float(digamma(own)) + math.log(own)
-    excess = float(logarithm.var()) - float(polygamma(1, own))
+    half_degrees = 0.5 * degrees
+    centre = float(logarithm.mean()) - float(digamma(half_degrees)) + math.log(half_degrees)
+    excess = float(logarithm.var()) - float(polygamma(1, half_degrees))
     limits = 0.05, 1e4  # half degrees of freedom
     if excess <= polygamma(1, limits[1]):
         typical = math.exp(centre)
         return np.full_like(variance, typical), typical
     half = brentq(lambda d: float(polygamma(1, d)) - min(excess, float(polygamma(1, limits[0]))), *limits)
     typical = math.exp(centre + float(digamma(half)) - math.log(half))
-    shrunk: Floats = (half * typical + own * variance) / (half + own)
+    shrunk: Floats = (half * typical + half_degrees * variance) / (half + half_degrees)
     return shrunk, typical
 
 
@@ -108,15 +108,15 @@ def two_level_fraction(residuals: Floats) -> Floats:
     flat = residuals.reshape(n, pixels)
     fewest = max(2, math.ceil(_FEWEST_IN_STATE * n))
     count = np.arange(fewest, n - fewest + 1)[:, None]
-    left = np.empty(pixels)
+    fraction = np.empty(pixels)
     for start in range(0, pixels, max(1, _BLOCK_NUMBERS // n)):
         part = slice(start, start + max(1, _BLOCK_NUMBERS // n))
         ordered = np.sort(flat[:, part] - flat[:, part].mean(axis=0), axis=0)
         below = np.cumsum(ordered, axis=0)[count[:, 0] - 1]  # the sum above is its negative
         between = (np.square(below) * (n / (count * (n - count)))).max(axis=0)
-        whole = np.square(ordered).sum(axis=0)
-        left[part] = 1.0 - between / np.maximum(whole, 1e-300)
-    return left.reshape(residuals.shape[1:])
+        total = np.square(ordered).sum(axis=0)
+        fraction[part] = 1.0 - between / np.maximum(total, 1e-300)
+    return fraction.reshape(residuals.shape[1:])
 
 
 @cache

@@ -314,8 +314,8 @@ class Detector:
         adu = self.offset_adu + self.relative_gain * electrons_out / self.gain_e_per_adu
         if self.bits is None:
             return adu.astype(np.float32)
-        whole = np.clip(np.rint(adu), 0, 2**self.bits - 1)
-        return whole.astype(np.uint16) if self.bits <= 16 else whole.astype(np.uint32)
+        counts = np.clip(np.rint(adu), 0, 2**self.bits - 1)
+        return counts.astype(np.uint16) if self.bits <= 16 else counts.astype(np.uint32)
 
 
 def _number_or_map(name: str, value: Any) -> float | NDArray[np.float64]:

@@ -42,12 +42,12 @@ def find_hot_pixels(frame: ArrayLike, *, threshold: float = 8.0) -> NDArray[np.i
     if image.ndim != 2:
         raise InputError(f"frame: expected shape (h, w), got {image.shape}")
     level = number_between("threshold", threshold, 0.0, low_open=True)
-    known = ~np.isfinite(image)
-    image[known] = np.median(image[~known]) if not known.all() else 0.0
+    not_finite = ~np.isfinite(image)
+    image[not_finite] = np.median(image[~not_finite]) if not not_finite.all() else 0.0
     ring = np.ones((3, 3), bool)
     ring[1, 1] = False
     excess = image - median_filter(image, footprint=ring, mode="mirror")
     noise = _MAD_TO_STD * np.median(np.abs(excess - np.median(excess)))
     second_largest = rank_filter(image, -2, footprint=ring, mode="mirror")
     spread = second_largest - minimum_filter(image, footprint=ring, mode="mirror")
-    return np.argwhere((excess > level * noise) & (excess > _SHARPNESS * spread) & ~known)
+    return np.argwhere((excess > level * noise) & (excess > _SHARPNESS * spread) & ~not_finite)

@@ -54,15 +54,15 @@ def photon_transfer(frames: Floats, dark_level: Any, layout: Layout | None, orde
     differences = np.diff(frames, axis=0)
     parts = []
     for tile in _tiles(mean.shape, layout):
-        here = flux[tile].ravel()
-        left, size, _ = np.linalg.svd(maps[tile].reshape(len(here), -1), full_matrices=False)
-        modes = left[:, size > 1e-9 * max(float(size[0]), 1e-300)]
+        tile_flux = flux[tile].ravel()
+        vectors, size, _ = np.linalg.svd(maps[tile].reshape(len(tile_flux), -1), full_matrices=False)
+        modes = vectors[:, size > 1e-9 * max(float(size[0]), 1e-300)]
         change = differences[(slice(None), *tile)].reshape(len(differences), -1)
         residual = change - (change @ modes) @ modes.T
         leverage = np.sum(np.square(modes), axis=1)
-        spread = np.sum((modes @ (modes.T @ (here[:, None] * modes))) * modes, axis=1)
+        spread = np.sum((modes @ (modes.T @ (tile_flux[:, None] * modes))) * modes, axis=1)
         variance = 0.5 * np.mean(np.square(residual), axis=0)
-        parts.append((variance, 1 - leverage, here * (1 - 2 * leverage) + spread, here))
+        parts.append((variance, 1 - leverage, tile_flux * (1 - 2 * leverage) + spread, tile_flux))
     n = len(differences)
     # Successive differences share a frame: their squares are correlated by 1/4.
     variance, share, weighted, plain = (np.concatenate(values) for values in zip(*parts, strict=True))
@@ -138,8 +138,8 @@ def fit_line(curve: Curve) -> Line | None:
         scale = np.maximum(solution[0] + solution[1] * typical, smallest)
     weighted = terms * weight[:, None]
     group = np.arange(n) * _GROUPS // n
-    others = [group != left_out for left_out in range(_GROUPS)]
-    without = np.array([_solve(weighted[k], terms[k], curve.variance[k]) for k in others])
+    subsets = [group != left_out for left_out in range(_GROUPS)]
+    without = np.array([_solve(weighted[k], terms[k], curve.variance[k]) for k in subsets])
     error = math.sqrt((_GROUPS - 1) * float(np.var(without[:, 1])))
     counted = good & (curve.mean >= bright)
     scatter = np.mean(np.square(curve.variance / model - 1)[counted]) if counted.any() else 0.0

@@ -117,7 +117,6 @@ class Estimator(Options):
     """Steps shown in figures, in order."""
     takes_prior: ClassVar[bool] = False
     """Whether slopes predicted by a control loop improve the estimate."""
-    runs_on_gpu: ClassVar[bool] = False
 
     # Description ---------------------------------------------------------------------------------------
 

@@ -33,15 +33,15 @@ def dataset_of(slopes: Variables, layout: Layout | None, unit: str) -> xarray.Da
     try:
         import xarray
     except ImportError:
-        raise MissingExtraError("xarray", "study", "Slopes.to_xarray") from None
+        raise MissingExtraError("xarray", "loop", "Slopes.to_xarray") from None
     variables, coordinates = _parts(slopes, layout, unit)
-    of = {"unit": unit}
+    attributes = {"unit": unit}
     return xarray.Dataset(
         {
             name: (
                 ("frame", "subaperture"),
                 values,
-                {"units": unit_of(name, of), "long_name": VARIABLES[name].long_name},
+                {"units": unit_of(name, attributes), "long_name": VARIABLES[name].long_name},
             )
             for name, values in variables.items()
         },
@@ -49,7 +49,7 @@ def dataset_of(slopes: Variables, layout: Layout | None, unit: str) -> xarray.Da
             name: ("subaperture", values, {"units": COORDINATE_UNITS.get(name, "1")})
             for name, values in coordinates.items()
         },
-        of,
+        attributes,
     )
 
 
@@ -58,7 +58,7 @@ def table_of_slopes(slopes: Variables, layout: Layout | None, unit: str) -> pand
     try:
         import pandas
     except ImportError:
-        raise MissingExtraError("pandas", "study", "Slopes.to_pandas") from None
+        raise MissingExtraError("pandas", "loop", "Slopes.to_pandas") from None
     variables, coordinates = _parts(slopes, layout, unit)
     n_frames, n = variables["x"].shape
     index = pandas.MultiIndex.from_product([range(n_frames), range(n)], names=["frame", "subaperture"])

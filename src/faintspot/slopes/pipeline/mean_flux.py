@@ -57,8 +57,8 @@ class MeanFlux:
         if flux.ndim not in (1, 2):
             raise InputError(f"flux_e: expected shape (n,) or (n_frames, n), got {flux.shape}")
         number_between("time_constant_frames", self.time_constant_frames, 1.0)
-        seen = 1 if flux.ndim == 1 else len(flux)
-        frames = number_between("frames", seen if self.frames is None else self.frames, 0.0, low_open=True)
+        count = 1 if flux.ndim == 1 else len(flux)
+        frames = number_between("frames", count if self.frames is None else self.frames, 0.0, low_open=True)
         mean = flux if flux.ndim == 1 else flux.mean(axis=0)
         mean.flags.writeable = False
         object.__setattr__(self, "flux_e", mean)

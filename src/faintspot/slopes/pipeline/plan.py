@@ -78,10 +78,10 @@ class Plan:
     ) -> None:
         n, pixels = len(layout), layout.pixels
 
-        def each(name: str) -> NDArray[Any]:
+        def per_subaperture(name: str) -> NDArray[Any]:
             return settings.values(name, n, pixels)
 
-        search = each("search_range_px").astype(np.float64)
+        search = per_subaperture("search_range_px").astype(np.float64)
         self.sensor = Sensor(
             layout,
             calibration,
@@ -89,14 +89,14 @@ class Plan:
             score,
             zero,
             np.where(np.isnan(search), np.inf, search),
-            each("flux_e").astype(np.float64),
+            per_subaperture("flux_e").astype(np.float64),
             spot_fwhm_px(settings, n, pixels),
             width,
         )
         self.estimator: Estimator = settings.estimator
         self.estimator.check(self.sensor)
-        own = self.estimator.prepared(self.sensor)
-        self.prepared: EstimatorPlan = PythonPlan(self.estimator, self.sensor) if own is None else own
+        plan = self.estimator.prepared(self.sensor)
+        self.prepared: EstimatorPlan = PythonPlan(self.estimator, self.sensor) if plan is None else plan
         self.variances: NDArray[np.float32] | None = None
         """Variance of each dark pixel for the kernel, if it differs: see `kernels.driver.groups.Task`."""
         if self.sensor.has_noise_map:
@@ -107,7 +107,7 @@ class Plan:
         """Expected range of the spot positions; spots outside are flagged."""
         self.no_prior = np.zeros((1, 2, n), np.float32)
         """Prior used without predicted slopes: 0."""
-        self._fixed = self._fixed_table(each)
+        self._fixed = self._fixed_table(per_subaperture)
         self._levels: list[NDArray[np.float32]] = []
         self._variants: dict[int, int] = {}
         self._kernels: dict[tuple[Any, str], Direct] = {}
@@ -215,15 +215,15 @@ class Plan:
             np.float32(np.inf if pitch is None else min(LEAST_DIFFERENCE * pitch, LEAST_DIFFERENCE_PX)),
         )
 
-    def _fixed_table(self, each: Any) -> NDArray[np.float32]:
+    def _fixed_table(self, per_subaperture: Any) -> NDArray[np.float32]:
         """Return the settings that do not depend on the flux."""
         sensor = self.sensor
         table = np.zeros((self.prepared.setting_rows, sensor.n), np.float32)
         table[groups.ZERO_X], table[groups.ZERO_Y] = sensor.zero.T
         table[groups.RANGE] = sensor.search_range_px
-        table[groups.MOST_BAD] = np.floor(each("max_bad_fraction") * sensor.pixels)
-        known = sensor.calibration.read_noise_e is not None
-        table[groups.VARIANCE] = self.prepared.variance if known else -1.0
-        table[groups.EXCESS], table[groups.ERROR_SCALE] = sensor.excess_noise, each("error_scale")
+        table[groups.MOST_BAD] = np.floor(per_subaperture("max_bad_fraction") * sensor.pixels)
+        has_noise = sensor.calibration.read_noise_e is not None
+        table[groups.VARIANCE] = self.prepared.variance if has_noise else -1.0
+        table[groups.EXCESS], table[groups.ERROR_SCALE] = sensor.excess_noise, per_subaperture("error_scale")
         self.prepared.fill(table)
         return table

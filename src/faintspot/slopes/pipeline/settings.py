@@ -95,17 +95,17 @@ class Settings:
                 raise InputError(
                     f"{foreign[0]}: give it to the estimator's own object, as option of its class"
                 )
-            made = estimator
+            chosen = estimator
         else:
             kind = estimator_named(estimator)
-            own = {key: value for key, value in options.items() if key not in self.SHARED}
-            for key in own:
+            specific = {key: value for key, value in options.items() if key not in self.SHARED}
+            for key in specific:
                 check_option(key, kind)
-            made = kind(**own)
+            chosen = kind(**specific)
         put = object.__setattr__
-        put(self, "estimator", made)
+        put(self, "estimator", chosen)
         put(self, "_shared", SharedOptions(**{k: v for k, v in options.items() if k in self.SHARED}))
-        check_lengths(made, self._shared)
+        check_lengths(chosen, self._shared)
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"Settings are immutable: use settings.replace({name}=...)")
@@ -160,18 +160,18 @@ class Settings:
         InputError
             If a key is unknown or belongs to another estimator, or a value is invalid.
         """
-        own, shared = dict(table_of(path, document, "estimator")), document.get("settings", {})
+        specific, shared = dict(table_of(path, document, "estimator")), document.get("settings", {})
         with errors_of_table(path, "estimator"):
-            name = own.pop("name", None)
+            name = specific.pop("name", None)
             if name is None:
                 raise InputError(f"estimator.name: expected one of {', '.join(estimators())}, found none")
-            for key in own:
+            for key in specific:
                 check_option(key, estimator_named(name), "estimator.")
         with errors_of_table(path, "settings"):
             for key in shared:
                 check_known("settings.", key, cls.SHARED)
         with errors_of_table(path, "estimator"):
-            kind = estimator_named(name)(**_plain_values("estimator", own))
+            kind = estimator_named(name)(**_plain_values("estimator", specific))
         with errors_of_table(path, "settings"):
             return cls(kind, **_plain_values("settings", shared))
 
@@ -207,20 +207,20 @@ class Settings:
         if where is None and "estimator" in changes:
             return self._with_estimator(**changes)
         shared = {name: value for name, value in changes.items() if name in self.SHARED}
-        own = {name: value for name, value in changes.items() if name not in self.SHARED}
-        for name in own:
+        specific = {name: value for name, value in changes.items() if name not in self.SHARED}
+        for name in specific:
             check_option(name, type(self.estimator))
-        return self._of(self.estimator.replaced(own, where), self._shared.replaced(shared, where))
+        return self._of(self.estimator.replaced(specific, where), self._shared.replaced(shared, where))
 
-    def _with_estimator(self, estimator: str | Estimator, **given: Any) -> Settings:
+    def _with_estimator(self, estimator: str | Estimator, **options: Any) -> Settings:
         if isinstance(estimator, Estimator):
-            return self._of(estimator, self._shared.replaced(given))
+            return self._of(estimator, self._shared.replaced(options))
         kept = {
             key: getattr(self.estimator, key)
             for key in estimator_named(estimator).declared()
             if key in self.estimator.declared()
         }
-        return Settings(estimator, **{**vars(self._shared), **kept, **given})
+        return Settings(estimator, **{**vars(self._shared), **kept, **options})
 
     @classmethod
     def _of(cls, estimator: Estimator, shared: SharedOptions) -> Settings:
@@ -248,7 +248,7 @@ def check_option(name: str, kind: type[Estimator], prefix: str = "") -> None:
     """
     if name in kind.declared():
         return
-    others = [other for other, each in estimators().items() if name in each.declared()]
+    others = [owner for owner, owner_kind in estimators().items() if name in owner_kind.declared()]
     if name in Settings.SHARED:
         raise InputError(f"{prefix}{name}: expected in the table [settings], where all estimators look")
     if others:
@@ -302,8 +302,8 @@ def with_preset(settings: Settings, preset: str) -> Settings:
 
 def option_names() -> list[str]:
     """Return the names of all options of all estimators, and the shared ones, preceded by "estimator"."""
-    own = (name for kind in estimators().values() for name in kind.declared())
-    return list(dict.fromkeys(["estimator", *own, *Settings.SHARED]))
+    specific = (name for kind in estimators().values() for name in kind.declared())
+    return list(dict.fromkeys(["estimator", *specific, *Settings.SHARED]))
 
 
 def spot_fwhm_px(settings: Settings, n_subapertures: int, pixels: int) -> NDArray[np.float64]:

@@ -9,12 +9,12 @@ import threading
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from faintspot.base.checks import number_between, numbers_between, one_of, real_array
+from faintspot.base.checks import number_between, numbers_between, real_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator
@@ -35,9 +35,6 @@ from faintspot.slopes.pipeline.small_frames import NO_STAGES, SmallFrames
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.score import Score
-
-if TYPE_CHECKING:
-    from faintspot.slopes.pipeline.device import DevicePipeline
 
 _KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
 _SMALL_TYPES = (np.dtype(np.uint8), *_KERNEL_TYPES)
@@ -66,16 +63,11 @@ class SlopePipeline:
         SIMD width in float32 numbers: 4, 8 or 16. Default: the width of the machine.
     threads : int, optional
         Maximum number of threads. Default: all available processors. Slopes do not depend on it.
-    device : {"cpu", "cuda"}, optional
-        Device on which frames are measured. "cuda" uses an NVIDIA GPU (see `kernels.cuda`), for the
-        estimators that support it; `explain` and real time always use the CPU.
 
     Raises
     ------
     InputError
-        If the parts are inconsistent, or for "cuda" without a GPU.
-    MissingExtraError
-        For "cuda" without the extra `gpu`.
+        If the parts are inconsistent.
 
     Examples
     --------
@@ -103,7 +95,6 @@ class SlopePipeline:
         score: Score | None = None,
         width: int | None = None,
         threads: int | None = None,
-        device: str = "cpu",
     ) -> None:
         self.layout = layout
         self.settings = Settings(settings) if isinstance(settings, Estimator) else settings
@@ -115,8 +106,6 @@ class SlopePipeline:
         self._parts = psf, score, layout.offsets + _reference_positions(reference, layout)
         self._prepare()
         self._identity = _identity(*self._parts)
-        self.device = one_of("device", device, ("cpu", "cuda"))
-        self.on_device = self._device_pipeline() if self.device == "cuda" else None
 
     @classmethod
     def from_file(cls, path: str | Path, **options: Any) -> SlopePipeline:
@@ -134,15 +123,6 @@ class SlopePipeline:
         self.light_test = light_test(self.layout, maps, self.plan.typical_fwhm_px)
         """Test for sub-apertures without flux."""
 
-    def _device_pipeline(self) -> DevicePipeline:
-        """Transfer the tables to the GPU."""
-        from faintspot.slopes.kernels.cuda.availability import check_cuda
-
-        check_cuda()
-        from faintspot.slopes.pipeline.device import DevicePipeline
-
-        return DevicePipeline(self.layout, self.calibration, self.plan)
-
     @property
     def width(self) -> int:
         """Number of sub-apertures measured at once."""
@@ -156,11 +136,10 @@ class SlopePipeline:
         InputError
             If the width is another one.
         """
-        other = copy.copy(self)
-        other._lanes = lanes_for(np.float32, width)
-        other._prepare()
-        other.on_device = None if self.on_device is None else other._device_pipeline()
-        return other
+        pipeline = copy.copy(self)
+        pipeline._lanes = lanes_for(np.float32, width)
+        pipeline._prepare()
+        return pipeline
 
     @property
     def spot(self) -> tuple[PSF | None, Score | None]:
@@ -185,7 +164,6 @@ class SlopePipeline:
             score=score,
             width=self.width,
             threads=self.threads,
-            device=self.device,
         )
 
     def with_flux(self, mean_flux: MeanFlux | ArrayLike) -> SlopePipeline:
@@ -212,13 +190,13 @@ class SlopePipeline:
                 f"mean_flux: expected one number or {len(self.layout)}, got shape {flux_e.shape}"
             )
         step = math.log(self.plan.prepared.flux_step)
-        known = self.plan.sensor.flux_e
+        planned_e = self.plan.sensor.flux_e
         with np.errstate(divide="ignore", invalid="ignore"):
-            steady = np.abs(np.log(flux_e / known)) <= step
+            steady = np.abs(np.log(flux_e / planned_e)) <= step
         if steady.all():
             return self
         rounded = np.exp(step * np.rint(np.log(flux_e) / step))
-        return self.with_settings(self.settings.replace(flux_e=np.broadcast_to(rounded, known.shape)))
+        return self.with_settings(self.settings.replace(flux_e=np.broadcast_to(rounded, planned_e.shape)))
 
     def with_dark(self, mean: NDArray[Any]) -> SlopePipeline:
         """Return the same pipeline for frames of this mean: what has no flux in it is dark in all of them.
@@ -240,19 +218,18 @@ class SlopePipeline:
     def for_images(self) -> SlopePipeline:
         """Return the same pipeline for calibrated images (n, ny, nx) [electrons], read as one tall frame."""
         layout, camera = self.layout, self.calibration
-        other = copy.copy(self)
-        other.layout = Layout.stacked(len(layout), layout.window, layout.offsets)
-        other.calibration = Calibration(
+        pipeline = copy.copy(self)
+        pipeline.layout = Layout.stacked(len(layout), layout.window, layout.offsets)
+        pipeline.calibration = Calibration(
             dark=None if camera.dark is None else 0.0,
-            rough_dark=camera.rough_dark,
+            estimated=camera.estimated,
             gain_e_per_adu=camera.em_gain,
             em_gain=camera.em_gain,
             read_noise_e=self._noise_of_images(),
             background_e=camera.background_e,
         )
-        other._prepare()
-        other.device, other.on_device = "cpu", None
-        return other
+        pipeline._prepare()
+        return pipeline
 
     def _noise_of_images(self) -> Any:
         """Return the read noise of `for_images`."""
@@ -312,8 +289,7 @@ class SlopePipeline:
         """Return the calling thread's own way to measure frames of a small sensor; None if it is not one."""
         plan, lanes, window = self.plan, self._lanes, self.layout.window
         groups = -(-len(self.layout) // lanes.width)
-        simple = dtype in _SMALL_TYPES and self.on_device is None
-        simple = simple and not (plan.needs_flux or plan.prepared.in_python)
+        simple = dtype in _SMALL_TYPES and not (plan.needs_flux or plan.prepared.in_python)
         if not simple or most_threads(groups, lanes, window, plan.estimator.cost) > 1:
             return None
         frames = np.empty((1, *self.layout.frame_shape), np.float32 if dtype.kind == "f" else np.uint16)
@@ -356,10 +332,6 @@ class SlopePipeline:
             stages = np.empty((STAGE_ROWS, n_frames, n, self.layout.pixels), np.float32)
         source = self.source(frames, dtype)
         variants = self._variants(source)
-        if self.on_device is not None and not explain:
-            measured = self.on_device.measure_from_host(frames, dtype, variants)
-            self.flag_doubtful(SlopeArrays(*measured), frames)
-            return Slopes(*(result.reshape(*array.shape[:-2], n) for result in measured)), stages
         predicted = None if prior is None else _prior_slopes(prior, n_frames, self.layout)
         task = self.plan.task(variants, predicted)
         kernel = self.plan.kernel(frames)
@@ -448,8 +420,8 @@ def _reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -
     n, side = len(layout), max(layout.frame_shape)
     if reference is None:
         return np.zeros((n, 2))
-    given = reference.vector if isinstance(reference, Slopes) else reference
-    array = numbers_between("reference", given, -side, side)
+    values = reference.vector if isinstance(reference, Slopes) else reference
+    array = numbers_between("reference", values, -side, side)
     if array.shape == (2 * n,):
         return np.stack([array[:n], array[n:]], axis=1)
     if array.shape != (n, 2):
@@ -486,6 +458,6 @@ def _identity(psf: PSF | None, score: Score | None, zero: NDArray[np.float64]) -
     for part in (psf, score):
         for field in fields(part) if part is not None else ():
             value = getattr(part, field.name)
-            whole = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
-            digest.update(f"{type(part).__name__}.{field.name}".encode() + whole)
+            content = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+            digest.update(f"{type(part).__name__}.{field.name}".encode() + content)
     return digest.digest()

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.flags import INVALID, NO_FLAG, UNMEASURED, SubapertureFlag
-from faintspot.base.notebook import table
 from faintspot.io.stored.slopes_format import VARIABLES
 
 if TYPE_CHECKING:
@@ -96,25 +95,20 @@ class Slopes:
         """Variables stored in files of slopes, by name."""
         return {name: getattr(self, name) for name in VARIABLES}
 
-    def _in_words(self) -> dict[str, str]:
-        """Return numbers of frames and sub-apertures, valid fraction, rms and flux as text, by name."""
+    def __repr__(self) -> str:
         valid = self.valid
-        found = {
-            "frames": f"{1 if self.x.ndim == 1 else len(self.x)}",
-            "sub-apertures": f"{self.x.shape[-1]}",
-            "valid": f"{100 * float(np.mean(valid)):.4g} %" if valid.size else "none",
-        }
+        words = [
+            f"frames {1 if self.x.ndim == 1 else len(self.x)}",
+            f"sub-apertures {self.x.shape[-1]}",
+            f"valid {100 * float(np.mean(valid)):.4g} %" if valid.size else "valid none",
+        ]
         if valid.any():
             x, y, flux = (values[valid].astype(np.float64) for values in (self.x, self.y, self.flux))
-            found["rms of x, y"] = f"{np.sqrt(np.mean(x**2)):.3g}, {np.sqrt(np.mean(y**2)):.3g} px"
-            found["median flux"] = f"{np.median(flux):.4g} e-"
-        return found
-
-    def __repr__(self) -> str:
-        return f"Slopes({', '.join(f'{name} {value}' for name, value in self._in_words().items())})"
-
-    def _repr_html_(self) -> str:
-        return table("Slopes", self._in_words())
+            words += [
+                f"rms of x, y {np.sqrt(np.mean(x**2)):.3g}, {np.sqrt(np.mean(y**2)):.3g} px",
+                f"median flux {np.median(flux):.4g} e-",
+            ]
+        return f"Slopes({', '.join(words)})"
 
     def to_xarray(self, layout: Layout | None = None, *, unit: str = "px") -> xarray.Dataset:
         """Return an xarray.Dataset with dimensions frame and subaperture, and units as attributes.

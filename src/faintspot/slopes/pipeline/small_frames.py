@@ -52,4 +52,4 @@ class SmallFrames:
         np.copyto(self._frame, frame)
         self._kernel(*self._arguments)
         self._flag_doubtful(self._results, self._frame[None])
-        return Slopes(*[each.copy() for each in self._slopes])
+        return Slopes(*[values.copy() for values in self._slopes])

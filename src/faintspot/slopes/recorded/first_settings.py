@@ -27,9 +27,11 @@ _LEAST_NOISE, _LARGEST_GAIN = 1e-6, 100.0  # noise over flux; of `Window.centroi
 ASSUMED_NOISE_E = 3.0  # of a dark pixel, which gives the gain of a single frame
 _WEIGHTS = (1.25, 1.6)  # width of the weight over the spot's: best where read noise, photon noise dominates
 _LEAST_DISPLACEMENT = 0.15  # rms over the spot's width: frames to come may move more than static ones
-_TIGHT, _WIDE, _WIDE_FWHM = 3.0, 4.0, 1.0  # search range over the rms displacement; what is added, in widths
+_TIGHT = 3.0  # search range over the rms displacement
 _LEAST_RANGE_PX = 1.0
-_BETTER = 0.95  # predicted error over that in a wide search range, to take a tight one
+# Predicted error with a tight search range over that in the whole window, to take the tight one: frames to
+# come may be aberrated where these are flat.
+_BETTER = 0.8
 _FAINT, _AS_GOOD = 0.8, 1.1  # response below which a fixed window is tried, and its error over the best one
 _SPOTS = 512
 
@@ -110,15 +112,15 @@ def _displacement(images: Floats, layout: Layout, spots: SeenSpots) -> float:
     mean = images.mean(axis=(0, 1))
     mean = mean - np.median(mean[[0, -1]])
     try:
-        seen = seen_spots(mean)
+        wide = seen_spots(mean)
     except InputError:
         return _WIDTH_OF_WINDOW * min(layout.window)
-    squares = np.square([seen.fwhm_x_px, seen.fwhm_y_px]) - np.square([spots.fwhm_x_px, spots.fwhm_y_px])
+    squares = np.square([wide.fwhm_x_px, wide.fwhm_y_px]) - np.square([spots.fwhm_x_px, spots.fwhm_y_px])
     v, u = (np.arange(side) - 0.5 * (side - 1) for side in layout.window)
     spot = np.maximum(mean - 0.5 * mean.max(), 0.0)
     middle = np.array([u @ spot.sum(axis=0), v @ spot.sum(axis=1)]) / spot.sum()
-    away = np.square(middle - layout.offsets.mean(axis=0)) - layout.offsets.var(axis=0)
-    return math.sqrt(max(float((squares * FWHM_TO_STD**2 + away).mean()), 0.0))
+    squares_away = np.square(middle - layout.offsets.mean(axis=0)) - layout.offsets.var(axis=0)
+    return math.sqrt(max(float((squares * FWHM_TO_STD**2 + squares_away).mean()), 0.0))
 
 
 def _photon_noise(images: Floats, noise: float, flux: float) -> float:
@@ -151,10 +153,9 @@ class _Trial:
             "spot_fwhm_y_px": _rounded(self._spots.fwhm_y_px),
         }
         tight = _reach(_TIGHT * self._displacement)
-        wide = _reach(_WIDE * self._displacement + _WIDE_FWHM * self._fwhm)
         following = [
             Settings("weighted", weight_fwhm_px=_rounded(factor * self._fwhm), search_range_px=reach, **width)
-            for reach in (wide, tight)
+            for reach in (None, tight)
             for factor in _WEIGHTS
         ]
         window = Settings("window", search_range_px=tight, flux_e=_rounded(self._spots.flux), **width)

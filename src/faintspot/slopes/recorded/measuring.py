@@ -31,6 +31,7 @@ from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.survey import survey
 from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.sensor.stated import reference_in_words
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
 
@@ -59,8 +60,12 @@ class Summary:
     """Error of the last of them."""
     origin: str = ""
     """Description of the values taken from a file of telemetry."""
+    reference: str = ""
+    """Description of the reference where it was fitted to a frame."""
     saturation_adu: float | None = None
     """Saturation level found in the frames, where the configuration states none."""
+    doubtful: bool = False
+    """Whether the layout has doubts that nobody has settled."""
 
     def add(self, slopes: Slopes) -> None:
         """Count the flags of a block."""
@@ -79,7 +84,6 @@ def measure_recorded(
     denoise: bool = True,
     preset: str | None = None,
     changes: Mapping[str, Any] | None = None,
-    device: str = "cpu",
     unit: str = "px",
     mean_flux: bool = False,
     keep: Sequence[str] = (),
@@ -92,7 +96,8 @@ def measure_recorded(
 ) -> Summary:
     """Measure the slopes of all frames in some files and write them to a file.
 
-    Interrupted and called again with the same arguments, it goes on where it stopped.
+    Interrupted and called again with the same arguments, it resumes where it stopped; without zarr, only a
+    complete output is kept.
 
     Parameters
     ----------
@@ -110,8 +115,6 @@ def measure_recorded(
         New values of settings by name, instead of those in the configuration; "estimator" is one.
     preset : str, optional
         "accurate" or "fast", instead of that in the configuration.
-    device : str
-        "cpu" or "cuda", see `SlopePipeline`.
     unit : {"px", "arcsec"}
         Of positions and standard errors in the output; arcsec needs the layout's `pixel_scale_arcsec`.
     mean_flux : bool
@@ -140,8 +143,8 @@ def measure_recorded(
         When a file cannot be read or written, or frames and configuration do not fit together.
     """
     kept = kept_flags(keep)
-    given, origin, in_file = _given(configuration_file, frames, key)
-    layout, settings, calibration, psf, score = given
+    parts, origin, stored_reference = _configured(configuration_file, frames, key)
+    layout, settings, calibration, psf, score = parts
     if changes:
         settings = settings.replace(**changes)
     if not denoise:
@@ -150,16 +153,14 @@ def measure_recorded(
         settings = with_preset(settings, preset)
     positions = read_reference(reference) if isinstance(reference, str | Path) else reference
     if positions is None:
-        positions = in_file
-    options: dict[str, Any] = {"psf": psf, "score": score, "threads": threads, "device": device}
+        positions = stored_reference
+    options: dict[str, Any] = {"psf": psf, "score": score, "threads": threads}
     try:
         pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
     except InputError as error:
-        if str(error).startswith("device"):
-            raise
         about_reference = positions is not None and str(error).startswith("reference")
-        where = reference if about_reference and isinstance(reference, str | Path) else configuration_file
-        raise InputError(f"{where}: {error}") from None
+        file = reference if about_reference and isinstance(reference, str | Path) else configuration_file
+        raise InputError(f"{file}: {error}") from None
     with open_frames(frames, key=key) as source:
         _check_output(output, frames)
         if source.shape != layout.frame_shape:
@@ -168,19 +169,23 @@ def measure_recorded(
                 f"{layout.frame_shape[0]} x {layout.frame_shape[1]} as in {configuration_file}"
             )
         seen = survey(source)
-        if calibration.saturation_adu is None and seen.saturation_adu is not None:
-            calibration = replace(calibration, saturation_adu=seen.saturation_adu)
+        saturation_adu = seen.saturation_adu if calibration.saturation_adu is None else None
+        if saturation_adu is not None:
+            calibration = replace(calibration, saturation_adu=saturation_adu)
             pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
         if mean_flux:
-            pipeline = _told_mean_flux(pipeline, source)
+            pipeline = _with_mean_flux(pipeline, source)
         attributes = _attributes(pipeline, source, frames, configuration_file, key, unit, keep)
         factor = pixels_in(one_of("unit", unit, UNITS), attributes)
         if positions is not None:
             attributes["reference"] = np.asarray(positions).tolist()
+            if isinstance(reference, str | Path):
+                attributes["reference_file"] = str(reference)
         pipeline = pipeline.with_dark(seen.mean)
-        summary = Summary(source.n_frames, len(layout), origin=origin)
-        if given.calibration.saturation_adu is None:
-            summary.saturation_adu = calibration.saturation_adu
+        summary = Summary(source.n_frames, len(layout), origin=origin, doubtful=bool(layout.doubts))
+        summary.saturation_adu = saturation_adu
+        if positions is None:
+            summary.reference = reference_in_words(layout.fitted)
         size = block_frames or max(1, _BLOCK_BYTES // (4 * source.shape[0] * source.shape[1]))
         with create_writer(
             output,
@@ -202,19 +207,19 @@ def measure_recorded(
     return summary
 
 
-def _given(
+def _configured(
     path: str | Path, frames: Sequence[str | Path], key: str | None
 ) -> tuple[configuration.Configuration, str, NDArray[Any] | None]:
     """Return the configuration, what of it is that of an AOT file, in words, and that file's references."""
     if isinstance(frames, str | Path) or not frames or configuration.has(path, "layout"):
         return configuration.load_all(path), "", None
     try:
-        first, own = split_location(frames[0])
+        first, key_in_name = split_location(frames[0])
     except InputError:  # whoever opens it says so, after what is wrong with the configuration
         return configuration.load_all(path), "", None
     if not is_aot(first):
         return configuration.load_all(path), "", None
-    sensor = read_aot(first, own or key)
+    sensor = read_aot(first, key_in_name or key)
     if sensor.layout is None:
         raise InputError(
             f"{first}: sensor {sensor.name!r}: expected its sub-apertures (subaperture_mask, mask_offsets, "
@@ -233,12 +238,12 @@ def _given(
         document = read_tables(path)
     else:
         words.append("settings")
-    where = Path(path)
+    file_path = Path(path)
     if "settings" in words and sensor.parts is not None:
-        settings = Settings.from_tables(where, document)
+        settings = Settings.from_tables(file_path, document)
         measuring = configuration.Parts(settings, *configuration.unpacked(sensor.parts))
     else:
-        measuring = configuration.Parts.from_tables(where, document)
+        measuring = configuration.Parts.from_tables(file_path, document)
     parts = configuration.Configuration(layout, *measuring)
     listed = " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
     return parts, f"{listed} of {first}", sensor.reference
@@ -248,13 +253,13 @@ def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str
     """Return the command that writes a configuration for a layout whose cells are on a grid."""
     rows, columns = np.ptp(layout.cells, axis=0) + 1
     (top, left), (bottom, right) = layout.corners.min(axis=0), layout.corners.max(axis=0) + layout.window
-    whole = (top, left, bottom, right) == (0, 0, *layout.frame_shape)
-    roi = [] if whole else ["--roi", f"{left},{top},{right},{bottom}"]
+    is_whole = (top, left, bottom, right) == (0, 0, *layout.frame_shape)
+    roi = [] if is_whole else ["--roi", f"{left},{top},{right},{bottom}"]
     words = ["faintspot", "layout", str(frames), "--grid", f"{rows}x{columns}", *roi, "-o", str(path)]
     return shlex.join(words)
 
 
-def _told_mean_flux(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeline:
+def _with_mean_flux(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeline:
     """Return the pipeline for the mean flux of frames from all over the recording."""
     estimator = pipeline.settings.estimator
     if not estimator.uses_flux:

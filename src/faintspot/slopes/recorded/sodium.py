@@ -28,8 +28,8 @@ MOST_FRAMES = 2000
 class SodiumOfFrames(NamedTuple):
     """Sodium profile of recorded frames, and where their spots are."""
 
-    known: KnownSodium
-    places_px: NDArray[np.float64]
+    sodium: KnownSodium
+    positions_px: NDArray[np.float64]
     """x and y of the spots' centres of gravity from the window centres, (n, 2)."""
 
     def lattice_of(self, layout: Layout) -> Layout:
@@ -39,8 +39,8 @@ class SodiumOfFrames(NamedTuple):
         profile with several peaks.
         """
         before = np.column_stack([layout.centres, np.ones(len(layout))])
-        lit = self.known.fit.flux_e > _LIT * np.median(self.known.fit.flux_e)
-        spots = layout.centres - layout.offsets + self.places_px
+        lit = self.sodium.fit.flux_e > _LIT * np.median(self.sodium.fit.flux_e)
+        spots = layout.centres - layout.offsets + self.positions_px
         moved = np.linalg.lstsq(before[lit], spots[lit], rcond=None)[0]
         return replace(layout, centres=before @ moved)
 
@@ -83,20 +83,20 @@ def sodium_of_frames(
         if progress is not None:
             progress(min(first + _BLOCK_FRAMES, count), count + _FITS)
     images_e, dark = total / count, dark_variance_e2(layout, calibration)
-    places, profile = _centres_of_gravity(images_e), star.focused(laser.profile)
+    positions, profile = _centres_of_gravity(images_e), star.focused(laser.profile)
     for fits in range(1, _FITS + 1):
-        mean = MeanImages(images_e, places, frames=count)
-        known = KnownSodium.learnt(mean, star, profile, dark)
+        mean = MeanImages(images_e, positions, frames=count)
+        sodium = KnownSodium.learnt(mean, star, profile, dark)
         located = measure_images(
             images_e.astype(np.float32),
             Settings("ml", search_range_px=_SEARCH_RANGE_PX),
             calibration=Calibration(read_noise_e=float(np.sqrt(np.median(dark))), dark=0.0),
-            psf=known.psf(layout.window),
+            psf=sodium.psf(layout.window),
         )
-        places, profile = np.stack([located.x, located.y], axis=1).astype(np.float64), known.fit.profile
+        positions, profile = np.stack([located.x, located.y], axis=1).astype(np.float64), sodium.fit.profile
         if progress is not None:
             progress(count + fits, count + _FITS)
-    return SodiumOfFrames(known, places)
+    return SodiumOfFrames(sodium, positions)
 
 
 def _centres_of_gravity(images: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -82,7 +82,7 @@ class MeasuredSlopes:
     @classmethod
     def of(cls, name: str, slopes: Any, **more: Any) -> MeasuredSlopes:
         """Make one of the `Slopes` of one frame or several."""
-        return cls(name, *(np.atleast_2d(getattr(slopes, of)) for of in ARRAYS), **more)
+        return cls(name, *(np.atleast_2d(getattr(slopes, array)) for array in ARRAYS), **more)
 
     @property
     def number(self) -> NDArray[np.int64]:
@@ -167,11 +167,11 @@ def summarise(method: MeasuredSlopes) -> SlopesSummary:
         for name in ("x", "y", "iterations"):
             parts[name].append(mean_over_valid(getattr(method, name)[:, block], kept))
     flux, x, y, iterations = (np.concatenate(part) for part in parts.values())
-    some = bool(valid.any())
+    any_valid = bool(valid.any())
     return SlopesSummary(
         valid_fraction=float(valid.mean()),
-        median_flux_e=float(np.median(method.flux[valid])) if some else np.nan,
-        median_iterations=float(np.median(method.iterations[valid])) if some else np.nan,
+        median_flux_e=float(np.median(method.flux[valid])) if any_valid else np.nan,
+        median_iterations=float(np.median(method.iterations[valid])) if any_valid else np.nan,
         valid_frames=valid.sum(axis=0),
         flux_e=flux,
         x_px=x,
@@ -201,11 +201,11 @@ def frame_to_frame_noise(method: MeasuredSlopes, valid: NDArray[np.bool_]) -> Fl
     """Return the noise per axis of each sub-aperture, px, from successive frames; NaN without any."""
     columns = []
     for block in column_blocks(method.n_frames, method.n_subapertures):
-        both = _successive(method, valid[:, block])
+        are_valid = _successive(method, valid[:, block])
         squares = sum(
             np.diff(axis[:, block].astype(np.float64), axis=0) ** 2 for axis in (method.x, method.y)
         )
-        columns.append(np.sqrt(mean_over_valid(np.asarray(squares) / 4, both)))
+        columns.append(np.sqrt(mean_over_valid(np.asarray(squares) / 4, are_valid)))
     return np.concatenate(columns)
 
 
@@ -219,29 +219,29 @@ def relative_gain(
     """
     if method is reference:
         return 1.0, 0.0
-    own, other = np.zeros(method.n_subapertures), np.zeros(method.n_subapertures)
+    motion, reference_motion = np.zeros(method.n_subapertures), np.zeros(method.n_subapertures)
     kept = np.maximum(np.count_nonzero(valid), 1)
     for axis in ("x", "y"):
-        pair = [getattr(each, axis) for each in (method, reference)]
+        pair = [getattr(measured, axis) for measured in (method, reference)]
         means = [float(np.sum(values, where=valid, dtype=np.float64)) / kept for values in pair]
         for block in column_blocks(method.n_frames, method.n_subapertures):
-            both = _successive(method, valid[:, block])
+            are_valid = _successive(method, valid[:, block])
             a, b = (values[:, block] - mean for values, mean in zip(pair, means, strict=True))
             common = a + b
-            for sums, values in ((own, a), (other, b)):
+            for sums, values in ((motion, a), (reference_motion, b)):
                 lagged = values[1:] * common[:-1] + values[:-1] * common[1:]
-                sums[block] += np.sum(lagged, axis=0, where=both, dtype=np.float64)
-    if other.sum() <= 0:
+                sums[block] += np.sum(lagged, axis=0, where=are_valid, dtype=np.float64)
+    if reference_motion.sum() <= 0:
         return np.nan, np.nan
-    ratio = float(own.sum() / other.sum())
-    n = max(len(own) - 1, 1)
-    return ratio, float(np.sqrt(np.sum((own - ratio * other) ** 2) * len(own) / n) / other.sum())
+    ratio = float(motion.sum() / reference_motion.sum())
+    spread = np.sum((motion - ratio * reference_motion) ** 2) * len(motion) / max(len(motion) - 1, 1)
+    return ratio, float(np.sqrt(spread) / reference_motion.sum())
 
 
 def _successive(method: MeasuredSlopes, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return where a measurement and that of the next frame are valid, (n_frames - 1, n)."""
-    both: NDArray[np.bool_] = valid[1:] & valid[:-1] & (np.diff(method.number) == 1)[:, None]
-    return both
+    are_valid: NDArray[np.bool_] = valid[1:] & valid[:-1] & (np.diff(method.number) == 1)[:, None]
+    return are_valid
 
 
 def rms(values: Floats) -> float:
@@ -260,21 +260,21 @@ def slope_error(method: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_])
     """Return the slope error R of the selected measurements [px], and their centroid gain."""
     if not valid.any():
         return Estimate(np.nan), np.nan
-    found = slope_statistics(method.x[valid], method.y[valid], truth[valid])
+    statistics = slope_statistics(method.x[valid], method.y[valid], truth[valid])
     error = standard_error(absolute_errors(method.x, method.y, truth), valid)
-    return Estimate(found.error.value, error), found.gain.value
+    return Estimate(statistics.error.value, error), statistics.gain.value
 
 
 def error_ratio(
     method: MeasuredSlopes, reference: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]
 ) -> tuple[float, float]:
     """Return R of `reference` over R of `method`, and its standard error, from paired measurements."""
-    own, other = (absolute_errors(each.x, each.y, truth) for each in (method, reference))
-    own_mean = own[valid].mean() if valid.any() else 0.0
+    own_errors, reference_errors = (absolute_errors(run.x, run.y, truth) for run in (method, reference))
+    own_mean = own_errors[valid].mean() if valid.any() else 0.0
     if own_mean == 0:
         return np.nan, np.nan
-    ratio = float(other[valid].mean() / own_mean)
-    return ratio, standard_error(other - ratio * own, valid) / float(own_mean)
+    ratio = float(reference_errors[valid].mean() / own_mean)
+    return ratio, standard_error(reference_errors - ratio * own_errors, valid) / float(own_mean)
 
 
 def flux_gain(ratio: float) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike
 from tomlkit.exceptions import TOMLKitError
 
 from faintspot.base.config.tables import read_tables
-from faintspot.base.errors import InputError
+from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.base.flags import SubapertureFlag, kept_flags
 from faintspot.io import StoredSlopes, read_slopes
 from faintspot.slopes.camera.calibration import Calibration
@@ -22,6 +23,7 @@ from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.sensor.stated import reference_in_words
 from faintspot.slopes.spots.laser_spots import LaserSpots, laser_of, load_laser
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.score import Score, load_score
@@ -53,8 +55,8 @@ class StoredRun:
     @property
     def sources(self) -> list[str]:
         """The files that the frames came from."""
-        found = self.stored.attributes.get("sources", [])
-        return [found] if isinstance(found, str) else [str(item) for item in found]
+        sources = self.stored.attributes.get("sources", [])
+        return [sources] if isinstance(sources, str) else [str(item) for item in sources]
 
     @property
     def keep(self) -> SubapertureFlag:
@@ -104,6 +106,12 @@ def open_run(path: Path) -> StoredRun:
         _rebuild(store)
     except InputError as error:
         store.notes.append(f"The configuration stored in {path.name} cannot be used: {error}.")
+    if store.layout is not None and store.layout.doubts:
+        doubts = "; ".join(store.layout.doubts)
+        store.notes.append(f"The layout of {path.name} was doubtful: {doubts}.")
+    if store.layout is not None and store.layout.fitted and "reference" not in stored.attributes:
+        text = reference_in_words(store.layout.fitted)
+        store.notes.append(f"{text[0].upper()}{text[1:]}.")
     n = stored.variables["x"].shape[1]
     if store.layout is not None and len(store.layout) != n:
         store.notes.append(
@@ -124,7 +132,9 @@ def _rebuild(store: StoredRun) -> None:
         copy = Path(folder) / "configuration"
         copy.write_text(tomlkit.dumps(tables), encoding="utf-8")
         try:
-            store.layout = configuration.load(copy, "layout")
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DoubtWarning)  # said as a note
+                store.layout = configuration.load(copy, "layout")
             store.settings = configuration.load(copy, "settings")
             mapless = not any(_is_map(value) for value in tables.get("calibration", {}).values())
             if mapless:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between, numbers_between, one_of
+from faintspot.base.checks import finite_array, number_between, numbers_between, one_of, strings_of
 from faintspot.base.config.tables import (
     check_fields,
     chosen_fields,
@@ -19,7 +20,7 @@ from faintspot.base.config.tables import (
     save_tables,
     table_of,
 )
-from faintspot.base.errors import InputError
+from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.base.sizes import check_size
 from faintspot.base.toml_files import check_keys, checked_table
 from faintspot.slopes.sensor.window_checks import check_centres, check_inside, check_overlap, chosen_index
@@ -64,7 +65,12 @@ class Layout:
     subaperture_m, diameter_m : float, optional
         Side of a sub-aperture (the pitch of the lenslets) and diameter of the telescope, in the entrance
         pupil. Either one is sufficient for wavefronts in nm: illuminated sub-apertures are then taken to
-        span the pupil.
+        span the pupil. With both, it is known where the pupil's edge cuts them.
+    fitted : tuple of {"centre", "pitch", "angle"}
+        Parameters of the lattice that were fitted to a frame: slopes lack that frame's tilt, defocus and
+        rotation.
+    doubts : tuple of str
+        What may be wrong with a layout found in a frame, one sentence each.
 
     Raises
     ------
@@ -91,6 +97,8 @@ class Layout:
     pixel_scale_arcsec: float | None = None
     subaperture_m: float | None = None
     diameter_m: float | None = None
+    fitted: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -115,6 +123,8 @@ class Layout:
         for name in ("pitch_px", *OPTICS):
             if (value := getattr(self, name)) is not None:
                 put(self, name, number_between(f"layout.{name}", value, 0.0, _LARGEST_PX, low_open=True))
+        for name in ("fitted", "doubts"):
+            put(self, name, strings_of(f"layout.{name}", getattr(self, name)))
         put(self, "angle_deg", number_between("layout.angle_deg", self.angle_deg, -360, 360))
         check_inside(corners, self.window, self.frame_shape)
         check_centres(centres - middle, self.window)
@@ -139,11 +149,6 @@ class Layout:
             f"<Layout: {len(self)} sub-apertures, frame_shape={self.frame_shape}, window={self.window}, "
             f"geometry={self.geometry!r}{pitch}>"
         )
-
-    def _repr_html_(self) -> str:
-        from faintspot.base.notebook import windows_picture
-
-        return windows_picture(self.corners, self.window, self.frame_shape)
 
     def __len__(self) -> int:
         """Return the number of sub-apertures."""
@@ -265,7 +270,6 @@ class Layout:
         frame: ArrayLike,
         *,
         geometry: str = "auto",
-        pitch_px: float | None = None,
         pixels: int | tuple[int, int] | None = None,
         bad_pixels: ArrayLike | None = None,
         move_windows: bool = False,
@@ -278,8 +282,8 @@ class Layout:
         frame : (h, w) or (n, h, w) array
             Frame with spots, or several of the same field, which are averaged.
         geometry : {"auto", "square", "hexagonal"}
-        pitch_px : float, optional
-            Distance between neighbouring lenslets, if known (to 20 %).
+        pitch_px, angle_deg, centre, fit
+            What is known of the lattice, and used as stated: see `faintspot.slopes.sensor.stated`.
         pixels : int or (int, int), optional
             Window, or its height and width. Default: the largest square windows that do not overlap; a
             pitch that is an integer within its error gives windows of that size.
@@ -289,7 +293,7 @@ class Layout:
             Whether all windows may be shifted together, by up to 0.35 of their side, to include spots at
             the edge of the frame. Centres of gravity are less accurate in such windows.
         **options
-            Passed on to `faintspot.slopes.sensor.detection.lenslets.find_lenslets`.
+            Passed on to `faintspot.slopes.sensor.windows.find_windows`.
 
         Returns
         -------
@@ -311,7 +315,6 @@ class Layout:
             pixels=pixels,
             move_windows=move_windows,
             geometry=geometry,
-            pitch_px=pitch_px,
             bad_pixels=bad_pixels,
             **options,
         )
@@ -330,6 +333,7 @@ class Layout:
             grid.geometry,
             grid.pitch_px,
             grid.angle_deg,
+            fitted=found.fitted,
         )
 
     @classmethod
@@ -339,10 +343,15 @@ class Layout:
 
     @classmethod
     def from_tables(cls, path: str | Path, document: Mapping[str, dict[str, Any]]) -> Layout:
-        """Return the layout in the tables of a configuration file."""
+        """Return the layout in the tables of a configuration file; warn of doubts that are not settled."""
         values = table_of(path, document, "layout")
         with errors_of_table(path, "layout"):
-            return cls.from_table(values)
+            layout = cls.from_table(values)
+        if layout.doubts:
+            settling = "look at its picture, then `faintspot layout --accept` or another layout settles it"
+            text = f"{path}: doubtful layout: {'; '.join(layout.doubts)} ({settling})"
+            warnings.warn(text, DoubtWarning, stacklevel=2)
+        return layout
 
     def save(self, path: str | Path) -> None:
         """Write the table [layout] of a configuration file (TOML); preserve other tables."""

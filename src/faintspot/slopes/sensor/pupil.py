@@ -12,6 +12,8 @@ from faintspot.slopes.sensor.layout import Layout
 
 Floats = NDArray[np.float64]
 
+_DISK_CORNERS = 256
+
 
 @dataclass(frozen=True)
 class Pupil:
@@ -25,6 +27,8 @@ class Pupil:
     """Radius in sub-aperture sides."""
     radius_m: float | None
     """Radius in the entrance pupil; None if the layout does not give its size."""
+    stated: bool = False
+    """Whether the layout states the disk's size in sub-apertures: it is known where it cuts them."""
 
 
 def pupil_of(layout: Layout) -> Pupil:
@@ -37,7 +41,7 @@ def pupil_of(layout: Layout) -> Pupil:
     Raises
     ------
     InputError
-        If these two give a disk that does not contain all centres of sub-apertures.
+        If these two give a disk outside which a sub-aperture lies as a whole.
     """
     pitch = lenslet_pitch(layout)
     angle = np.deg2rad(layout.angle_deg)
@@ -48,9 +52,10 @@ def pupil_of(layout: Layout) -> Pupil:
     farthest = float(np.hypot(*(layout.centres - (x, y)).T).max())
     radius = 0.5 * (float((high - low).max()) + pitch)
     side, diameter = layout.subaperture_m, layout.diameter_m
+    stated = side is not None and diameter is not None
     if side is not None and diameter is not None:
         radius = 0.5 * pitch * diameter / side
-        if farthest > radius:
+        if farthest > radius + pitch / np.sqrt(2):
             raise InputError(
                 f"layout.diameter_m = {diameter:g} and layout.subaperture_m = {side:g}: "
                 f"{diameter / side:.3g} sub-apertures across, but lit ones lie "
@@ -59,13 +64,59 @@ def pupil_of(layout: Layout) -> Pupil:
     elif side is not None:
         diameter = 2 * radius / pitch * side
     metres = None if diameter is None else diameter / 2
-    return Pupil((float(x), float(y)), radius, radius / pitch, metres)
+    return Pupil((float(x), float(y)), radius, radius / pitch, metres, stated)
 
 
 def inside_pupil(layout: Layout, pupil: Pupil) -> NDArray[np.bool_]:
     """Return which sub-apertures have their centre within the disk, (n,)."""
     away = np.hypot(*(layout.centres - pupil.centre_px).T)
     return np.asarray(away <= pupil.radius_px * (1 + 1e-9))
+
+
+def lit_outlines(layout: Layout, pupil: Pupil) -> tuple[Floats, Floats]:
+    """Return the part of each lenslet that lies within the disk, and its share of the lenslet's area.
+
+    Returns
+    -------
+    outlines : (n, corners, 2) array
+        Corners in frame pixels, ordered as by `lenslet_outlines`; the last is repeated where there are fewer.
+    share : (n,) array
+        From 0 (outside) to 1.
+    """
+    whole = lenslet_outlines(layout)
+    turns = 2 * np.pi * np.arange(_DISK_CORNERS) / _DISK_CORNERS
+    # A polygon of the disk's area, whose edges cut the lenslets one after the other (Sutherland-Hodgman).
+    radius = pupil.radius_px * np.sqrt(2 * np.pi / _DISK_CORNERS / np.sin(2 * np.pi / _DISK_CORNERS))
+    normals = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    distance = radius * np.cos(np.pi / _DISK_CORNERS)
+    parts = [_cut(outline - pupil.centre_px, normals, distance) for outline in whole]
+    longest = max(len(part) for part in parts)
+    outlines = np.stack([np.pad(part, ((0, longest - len(part)), (0, 0)), "edge") for part in parts])
+    return outlines + pupil.centre_px, _areas(outlines) / _areas(whole)
+
+
+def _cut(outline: Floats, normals: Floats, distance: float) -> Floats:
+    """Return the part of a convex polygon where points times each normal are at most the distance."""
+    for normal in normals[(outline @ normals.T > distance).any(axis=0)]:
+        depth = distance - outline @ normal
+        following, after = np.roll(outline, -1, axis=0), np.roll(depth, -1)
+        corners = []
+        for point, inside, next_point, next_inside in zip(outline, depth, following, after, strict=True):
+            if inside >= 0:
+                corners.append(point)
+            if inside * next_inside < 0:
+                corners.append(point + (next_point - point) * inside / (inside - next_inside))
+        if len(corners) < 3:
+            return np.zeros((3, 2))
+        outline = np.array(corners)
+    return outline
+
+
+def _areas(outlines: Floats) -> Floats:
+    """Return the areas of polygons (n, corners, 2)."""
+    x, y = outlines[..., 0], outlines[..., 1]
+    areas: Floats = 0.5 * (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
+    return areas
 
 
 def lenslet_pitch(layout: Layout) -> float:

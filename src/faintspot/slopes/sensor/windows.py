@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from scipy.spatial import cKDTree
 from faintspot.base.checks import real_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid, find_lenslets
+from faintspot.slopes.sensor.stated import with_stated
 from faintspot.slopes.sensor.window_size import LARGEST_WINDOW, window_size
 
 # Windows may be moved this far from their spots to be a pixel larger: no more than the rounding of their
@@ -40,6 +42,8 @@ class Windows:
     corners: NDArray[np.int64]
     within: NDArray[np.bool_]
     lenslets: LensletGrid
+    fitted: tuple[str, ...]
+    """Parameters of the lattice that were fitted to the frame: "centre", "pitch", "angle"."""
 
 
 def find_windows(
@@ -47,6 +51,10 @@ def find_windows(
     *,
     pixels: int | tuple[int, int] | None = None,
     move_windows: bool = False,
+    pitch_px: float | None = None,
+    angle_deg: float | None = None,
+    centre: Any = None,
+    fit: Sequence[str] = (),
     **options: Any,
 ) -> Windows:
     """Find the lenslets of a frame, and a window for each.
@@ -58,6 +66,8 @@ def find_windows(
         Window, see `faintspot.Layout.from_frame`.
     move_windows : bool
         Whether all windows may be shifted off the spots to include those at the edge of the frame.
+    pitch_px, angle_deg, centre, fit
+        What is known of the lattice, see `faintspot.slopes.sensor.stated.with_stated`.
     **options
         Passed on to `faintspot.slopes.sensor.detection.lenslets.find_lenslets`.
 
@@ -68,7 +78,8 @@ def find_windows(
     """
     array = _finite_or_masked("frame", frame)
     window = None if pixels is None else window_size("pixels", pixels)
-    grid = find_lenslets(array, **options)
+    found = find_lenslets(array, pitch_px=pitch_px, **options)
+    grid, fitted = with_stated(found, pitch_px=pitch_px, angle_deg=angle_deg, centre=centre, fit=fit)
     shape = (int(array.shape[-2]), int(array.shape[-1]))
     middles = (grid.centres + grid.drifts)[:, ::-1]
     if window is None:
@@ -84,7 +95,7 @@ def find_windows(
             f"frame: the windows of all {len(corners)} lenslets found leave the frame; "
             f"try pixels < {min(window)}"
         )
-    return Windows(shape, window, corners, within, grid)
+    return Windows(shape, window, corners, within, grid, fitted)
 
 
 def _finite_or_masked(name: str, value: ArrayLike) -> NDArray[Any]:

@@ -1,1 +1,5 @@
-"""Spot models, point-spread functions, trained scores and the Cramer-Rao bound."""
+"""Models of spots. Read in this order.
+
+`shapes` (noiseless spots), `speckled`, `psf`, `sodium` and `laser` (elongated spots), `score` and
+`fixed_weights` (linear estimators), `bounds` (Cramer-Rao bound).
+"""

@@ -136,7 +136,7 @@ def cramer_rao(
     prior = math.inf
     if prior_std_px is not None:
         prior = number_between("prior_std_px", prior_std_px, 0.0, low_open=True)
-    where = _positions(positions, position_range_px)
+    points = _positions(positions, position_range_px)
     if psf is None:
         form = {"profile": profile, "size": size, "elongation": elongation, "angle_deg": angle_deg}
         render = functools.partial(spots, shape=(ny, nx), **form)  # type: ignore[arg-type]
@@ -144,12 +144,12 @@ def cramer_rao(
     else:
         render = functools.partial(psf.images, shape=(ny, nx))
         step = STEP_PX
-    spot = _with_derivatives(render, where, step)
+    spot = _with_derivatives(render, points, step)
     blur = _noise(detector, (ny, nx), exact)
     bound = np.empty((*flux.shape, 2))
     for index in np.ndindex(flux.shape):
-        found = _covariances(float(flux[index]), spot, blur, unknown_flux, unknown_background, prior)
-        bound[index] = np.sqrt(np.diagonal(found, axis1=1, axis2=2)).mean(axis=0)
+        covariances = _covariances(float(flux[index]), spot, blur, unknown_flux, unknown_background, prior)
+        bound[index] = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).mean(axis=0)
     return bound
 
 
@@ -294,8 +294,8 @@ def _with_derivatives(render: Any, positions: Floats, step: float) -> _Spot:
     centred = float(np.sum(render(np.zeros((1, 2)))))
     if not centred > 0:
         raise InputError("psf: expected images with flux, got none")
-    found = images_with_derivatives(render, positions, step)
-    image, along_x, along_y = (np.reshape(each, (len(positions), -1)) / centred for each in found)
+    arrays = images_with_derivatives(render, positions, step)
+    image, along_x, along_y = (np.reshape(array, (len(positions), -1)) / centred for array in arrays)
     # The wings of a learnt PSF scatter around zero; their slope carries no information there.
     illuminated = image > 0
     return _Spot(np.where(illuminated, image, 0.0), along_x * illuminated, along_y * illuminated)

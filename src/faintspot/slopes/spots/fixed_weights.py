@@ -145,16 +145,16 @@ class FixedWeights(NpzFile):
             moved = self.flux * along
             # Best gain and offset of each kind, by least squares.
             parts = [(a * b).sum(axis=(1, 2)) for a, b in _pairs(moved, self.flux)]
-            seen = [(maps * part).sum(axis=(1, 2)) for part in (moved, self.flux)]
+            projections = [(maps * part).sum(axis=(1, 2)) for part in (moved, self.flux)]
             determinant = parts[0] * parts[2] - parts[1] ** 2
             with np.errstate(divide="ignore", invalid="ignore"):
-                gain = (parts[2] * seen[0] - parts[1] * seen[1]) / determinant
-                offset = (parts[0] * seen[1] - parts[1] * seen[0]) / determinant
-                rest = np.abs(maps - gain[:, None, None] * moved - offset[:, None, None] * self.flux)
+                gain = (parts[2] * projections[0] - parts[1] * projections[1]) / determinant
+                offset = (parts[0] * projections[1] - parts[1] * projections[0]) / determinant
+                misfit = np.abs(maps - gain[:, None, None] * moved - offset[:, None, None] * self.flux)
                 spot = (maps * self.mean_spot).sum(axis=(1, 2))
                 reference = (spot - offset) / gain
             if not (np.isfinite(gain) & np.isfinite(reference)).all() or not np.all(
-                rest <= _SAME * np.abs(maps).max()
+                misfit <= _SAME * np.abs(maps).max()
             ):
                 raise InputError(
                     "weights: expected x and y that follow from one map of weights, as those of a Gaussian "
@@ -319,8 +319,8 @@ class FixedWeights(NpzFile):
         """Combine three maps per kind so that x, y and flux of a spot that moves little are right."""
         n, ny, nx = spot.shape
         rows = np.moveaxis(maps, 0, 1).reshape(n, 3, -1)
-        seen = np.stack([along_x, along_y, spot], axis=1).reshape(n, 3, -1)
-        response = rows @ seen.swapaxes(1, 2)
+        changes = np.stack([along_x, along_y, spot], axis=1).reshape(n, 3, -1)
+        response = rows @ changes.swapaxes(1, 2)
         if not np.all(np.linalg.cond(response) < 1 / np.finfo(np.float32).eps):
             raise InputError("psf: expected spots whose motion shows in their windows, got others")
         x, y, flux = (np.linalg.inv(response) @ rows).reshape(n, 3, ny, nx).swapaxes(0, 1)
@@ -329,9 +329,9 @@ class FixedWeights(NpzFile):
 
 def _spot_and_gradients(psf: PSF, shape: tuple[int, int]) -> tuple[Floats, Floats, Floats]:
     """Return images (n_psfs, ny, nx) of spots at 0 and their derivatives in the position."""
-    which = np.arange(len(psf.samples))
-    render = partial(psf.images, shape=shape, which=which)
-    spot, along_x, along_y = images_with_derivatives(render, np.zeros((len(which), 2)))
+    psfs = np.arange(len(psf.samples))
+    render = partial(psf.images, shape=shape, which=psfs)
+    spot, along_x, along_y = images_with_derivatives(render, np.zeros((len(psfs), 2)))
     if not np.all(spot.max(axis=(1, 2)) > 0):
         raise InputError("psf: expected spots with flux in their windows, got none")
     return spot, along_x, along_y
@@ -345,10 +345,10 @@ def _pairs(first: Floats, second: Floats) -> tuple[tuple[Floats, Floats], ...]:
 def _flux_weights(values: dict[str, Any]) -> Floats:
     """Return 1 in pixels with a weight in x or y, divided by the part of the mean spot in them."""
     counted = ((values["x"] != 0) | (values["y"] != 0)).astype(np.float64)
-    there = (counted * values["mean_spot"]).sum(axis=(1, 2), keepdims=True)
-    if np.any(there <= 0):
+    flux_share = (counted * values["mean_spot"]).sum(axis=(1, 2), keepdims=True)
+    if np.any(flux_share <= 0):
         raise InputError("weights.mean_spot: expected flux in the pixels with weights, got none")
-    flux: Floats = counted / there
+    flux: Floats = counted / flux_share
     return flux
 
 

@@ -86,9 +86,9 @@ class LaserGuideStar:
     range_gate_m: Any = None
 
     def __post_init__(self) -> None:
-        places = numbers_between("star.subapertures_m", self.subapertures_m, -1e3, 1e3)
-        if places.ndim != 2 or places.shape[1] != 2:
-            raise InputError(f"star.subapertures_m: expected shape (n, 2), got {places.shape}")
+        positions = numbers_between("star.subapertures_m", self.subapertures_m, -1e3, 1e3)
+        if positions.ndim != 2 or positions.shape[1] != 2:
+            raise InputError(f"star.subapertures_m: expected shape (n, 2), got {positions.shape}")
         launch = numbers_between("star.launch_m", self.launch_m, -1e3, 1e3)
         if launch.shape != (2,):
             raise InputError(f"star.launch_m: expected x and y, got shape {launch.shape}")
@@ -98,7 +98,7 @@ class LaserGuideStar:
         number_between("star.focus_altitude_m", self.focus_altitude_m, site + 1e3, 1e6)
         if not isinstance(self.spot, PSF) or len(self.spot.samples) != 1:
             raise InputError("star.spot: expected one PSF for all sub-apertures")
-        for name, values in (("subapertures_m", places), ("launch_m", launch)):
+        for name, values in (("subapertures_m", positions), ("launch_m", launch)):
             values.flags.writeable = False
             object.__setattr__(self, name, values)
         if self.range_gate_m is not None:
@@ -188,17 +188,17 @@ class LaserGuideStar:
         InputError
             If a value is out of range, or positions have another shape.
         """
-        rows, columns, where = self._pixels(shape, positions)
+        rows, columns, positions_px = self._pixels(shape, positions)
         altitudes = self._altitudes(altitudes_m)
         check_size("responses", (len(self), len(rows), len(columns), len(altitudes)))
         points, parts = self._points(altitudes)
         offsets = self.offsets_px(points)
-        found = np.empty((len(self), len(rows), len(columns), len(altitudes)))
+        images = np.empty((len(self), len(rows), len(columns), len(altitudes)))
         for block in self._blocks(len(points) * len(rows) * len(columns)):
-            along, across = _profiles(self.spot, where[block, None] + offsets[block], columns, rows)
-            each = np.einsum("rskx,rsky->sxyk", along, across, optimize=True)
-            found[block] = (each @ parts).swapaxes(1, 2)
-        return found
+            along, across = _profiles(self.spot, positions_px[block, None] + offsets[block], columns, rows)
+            points_images = np.einsum("rskx,rsky->sxyk", along, across, optimize=True)
+            images[block] = (points_images @ parts).swapaxes(1, 2)
+        return images
 
     def images(
         self, profile: SodiumProfile, shape: tuple[int, int] = (16, 16), positions: ArrayLike | None = None
@@ -289,10 +289,10 @@ def _profiles(spot: PSF, centres: Floats, columns: Floats, rows: Floats) -> tupl
     """Return the separable terms of spots at centres (n, k, 2): (rank, n, k, columns or rows)."""
     from scipy.interpolate import CubicSpline  # imported here: it takes longer than the first slopes
 
-    found = []
-    for terms, places, axis in zip(spot.separable_terms, (columns, rows), (0, 1), strict=True):
+    profiles = []
+    for terms, pixels, axis in zip(spot.separable_terms, (columns, rows), (0, 1), strict=True):
         half = (terms.shape[2] - 1) / 2 / spot.oversampling
         spline = CubicSpline(np.linspace(-half, half, terms.shape[2]), terms[0], axis=1)
-        away = places - centres[..., axis, None]
-        found.append(np.where(np.abs(away) <= half, spline(np.clip(away, -half, half)), 0.0))
-    return found[0], found[1]
+        distance = pixels - centres[..., axis, None]
+        profiles.append(np.where(np.abs(distance) <= half, spline(np.clip(distance, -half, half)), 0.0))
+    return profiles[0], profiles[1]

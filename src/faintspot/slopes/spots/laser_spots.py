@@ -73,10 +73,10 @@ class LaserSpots:
         for name in ("launch_m", "at_m"):
             if getattr(self, name) is None and name not in _REQUIRED:
                 continue
-            place = numbers_between(f"laser.{name}", getattr(self, name), -_FARTHEST_M, _FARTHEST_M)
-            if place.shape != (2,):
-                raise InputError(f"laser.{name}: expected x and y, got shape {place.shape}")
-            object.__setattr__(self, name, place)
+            position = numbers_between(f"laser.{name}", getattr(self, name), -_FARTHEST_M, _FARTHEST_M)
+            if position.shape != (2,):
+                raise InputError(f"laser.{name}: expected x and y, got shape {position.shape}")
+            object.__setattr__(self, name, position)
         number_between("laser.spot_fwhm_arcsec", self.spot_fwhm_arcsec, 0.0, 60.0, low_open=True)
         if not isinstance(self.matched_filter, bool):
             raise InputError(f"laser.matched_filter = {self.matched_filter!r}: expected true or false")
@@ -103,11 +103,11 @@ class LaserSpots:
                 values["profile"] = SodiumProfile.load(Path(path).parent / values["profile"])
             return cls(**values)
 
-    def star(self, places_m: ArrayLike, pixel_arcsec: float) -> LaserGuideStar:
+    def star(self, positions_m: ArrayLike, pixel_arcsec: float) -> LaserGuideStar:
         """Return the star as sub-apertures at these places see it."""
         spot = gaussian_spot(self.spot_fwhm_arcsec / pixel_arcsec)
-        known = self.zenith_distance_deg, self.site_altitude_m
-        return LaserGuideStar(places_m, self.launch_m, pixel_arcsec, spot, *known)
+        geometry = self.zenith_distance_deg, self.site_altitude_m
+        return LaserGuideStar(positions_m, self.launch_m, pixel_arcsec, spot, *geometry)
 
     def star_of(self, layout: Layout) -> LaserGuideStar:
         """Return the star as the sub-apertures of a layout see it, around the middle of the pupil.
@@ -122,8 +122,8 @@ class LaserSpots:
             raise InputError(
                 "layout: expected pixel_scale_arcsec, and subaperture_m or diameter_m, with a laser"
             )
-        places = (layout.centres - pupil_of(layout).centre_px) / lenslet_pitch(layout)
-        return self.star(side * places, layout.pixel_scale_arcsec)
+        positions = (layout.centres - pupil_of(layout).centre_px) / lenslet_pitch(layout)
+        return self.star(side * positions, layout.pixel_scale_arcsec)
 
     def psf(self, star: LaserGuideStar, window: tuple[int, int]) -> PSF:
         """Return the PSF of the star's sub-apertures, with the layer at the focus."""
@@ -135,9 +135,9 @@ class LaserSpots:
         profile = star.focused(self.profile)
         x, y = star.elongation_px(profile)[0]
         lost = 1.0 - float(star.images(profile, window).sum())
-        place, angle = "{:g}, {:g} m".format(*self.at_m), math.degrees(math.atan2(y, x))
+        at, angle = "{:g}, {:g} m".format(*self.at_m), math.degrees(math.atan2(y, x))
         return (
-            f"laser guide star: spots of the sub-aperture at {place}, elongated by {math.hypot(x, y):.1f} px "
+            f"laser guide star: spots of the sub-aperture at {at}, elongated by {math.hypot(x, y):.1f} px "
             f"along {angle:.0f} deg; the window cuts off {100 * max(lost, 0.0):.0f} % of their flux"
         )
 
@@ -167,10 +167,10 @@ def matched_filter(psf: PSF, layout: Layout, calibration: Calibration, flux_e: A
     noise: Any = calibration.read_noise_photoelectrons
     if noise is None:
         raise InputError("laser.matched_filter: expected calibration.read_noise_e, got none")
-    each, own = calibration.read_noise_map(layout.frame_shape), len(psf.samples) == len(layout)
-    if each is not None and own:
-        noise = np.nan_to_num(layout.images(each), nan=noise)
-    flux_e = flux_e if own else float(np.mean(np.asarray(flux_e, np.float64)))
+    noise_map, per_window = calibration.read_noise_map(layout.frame_shape), len(psf.samples) == len(layout)
+    if noise_map is not None and per_window:
+        noise = np.nan_to_num(layout.images(noise_map), nan=noise)
+    flux_e = flux_e if per_window else float(np.mean(np.asarray(flux_e, np.float64)))
     excess = calibration.excess_noise
     return FixedWeights.matched(psf, layout.window, flux_e=flux_e, read_noise_e=noise, excess_noise=excess)
 

@@ -65,7 +65,7 @@ def _information_table(read_noise_e: float) -> Any:
     poisson = np.exp(electrons * log_mean[:, None] - mean[:, None] - gammaln(electrons + 1))
     normal = np.exp(-0.5 * np.square((values - electrons[:, None]) / read_noise_e))
     density = poisson @ normal / (read_noise_e * math.sqrt(2 * math.pi))
-    before, here = density[:, :-per_electron], density[:, per_electron:]
-    ratio = np.divide(before, here, out=np.zeros_like(before), where=here > 1e-280)
-    information = np.sum(np.square(ratio - 1) * here, axis=1) / per_electron
+    before, after = density[:, :-per_electron], density[:, per_electron:]
+    ratio = np.divide(before, after, out=np.zeros_like(before), where=after > 1e-280)
+    information = np.sum(np.square(ratio - 1) * after, axis=1) / per_electron
     return CubicSpline(log_mean, np.log(information))

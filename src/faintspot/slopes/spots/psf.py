@@ -112,14 +112,8 @@ class PSF(NpzFile):
         """Return the number of PSFs and their size instead of all samples."""
         n, rows, columns = self.samples.shape
         size = f"{rows / self.oversampling:.3g} x {columns / self.oversampling:.3g} px"
-        of = "" if self.index is None else f" for {len(self.index)} sub-apertures"
-        return f"PSF({n} of {size}{of}, oversampling {self.oversampling})"
-
-    def _repr_html_(self) -> str:
-        from faintspot.base.notebook import image_picture
-
-        side = min(max(self.samples.shape[1:]) // self.oversampling, 22) - 1 | 1  # odd
-        return image_picture(self.images([[0.0, 0.0]], (side, side), 1.0)[0], repr(self))
+        purpose = "" if self.index is None else f" for {len(self.index)} sub-apertures"
+        return f"PSF({n} of {size}{purpose}, oversampling {self.oversampling})"
 
     @classmethod
     def analytic(
@@ -197,9 +191,9 @@ class PSF(NpzFile):
         """
         from scipy.ndimage import map_coordinates
 
-        place = position_array(positions)
+        centres = position_array(positions)
         ny, nx = image_shape("shape", shape)
-        n = len(place)
+        n = len(centres)
         flux = per_spot("flux_e", flux_e, n)
         planes = np.broadcast_to(
             numbers_between("which", which, 0, len(self.samples) - 1, integer=True), (n,)
@@ -211,12 +205,12 @@ class PSF(NpzFile):
             chosen = np.flatnonzero(planes == plane)
             for start in range(0, len(chosen), block):
                 part = chosen[start : start + block]
-                dx = np.arange(nx) - (nx - 1) / 2 - place[part, 0, None]
-                dy = np.arange(ny) - (ny - 1) / 2 - place[part, 1, None]
+                dx = np.arange(nx) - (nx - 1) / 2 - centres[part, 0, None]
+                dy = np.arange(ny) - (ny - 1) / 2 - centres[part, 1, None]
                 columns, rows = middle_x + self.oversampling * dx, middle_y + self.oversampling * dy
-                where = np.broadcast_arrays(rows[:, :, None], columns[:, None, :])
+                nodes = np.broadcast_arrays(rows[:, :, None], columns[:, None, :])
                 values = map_coordinates(
-                    self._spline[plane], where, order=3, prefilter=False, mode="constant", cval=0.0
+                    self._spline[plane], nodes, order=3, prefilter=False, mode="constant", cval=0.0
                 )
                 images[part] = flux[part, None, None] * values
         return images
@@ -225,10 +219,10 @@ class PSF(NpzFile):
     def fwhm_px(self) -> Floats:
         """Full width at half maximum of the cuts through each PSF's peak along x and y, (n_psfs, 2) [px]."""
         widths = np.empty((len(self.samples), 2))
-        for plane, found in zip(self.samples, widths, strict=True):
+        for plane, width in zip(self.samples, widths, strict=True):
             row, column = np.unravel_index(np.argmax(plane), plane.shape)
-            found[0] = _half_maximum_width(plane[row], int(column)) / self.oversampling
-            found[1] = _half_maximum_width(plane[:, column], int(row)) / self.oversampling
+            width[0] = _half_maximum_width(plane[row], int(column)) / self.oversampling
+            width[1] = _half_maximum_width(plane[:, column], int(row)) / self.oversampling
         return widths
 
     def blurred(self, std_px: float) -> PSF:

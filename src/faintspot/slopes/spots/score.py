@@ -106,9 +106,9 @@ class TrainedScore(NpzFile):
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, TrainedScore):
             return NotImplemented
-        mine, theirs = vars(self), vars(other)
+        own, theirs = vars(self), vars(other)
         return all(
-            (mine[name] is None) == (theirs[name] is None) and np.array_equal(mine[name], theirs[name])
+            (own[name] is None) == (theirs[name] is None) and np.array_equal(own[name], theirs[name])
             for name in self.FIELDS
         )
 

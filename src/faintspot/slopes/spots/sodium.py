@@ -155,10 +155,10 @@ def integration_points(altitudes_m: Floats, steps: int) -> tuple[Floats, Floats]
         Flux, for a density that is linear between the altitudes [m].
     """
     widths = np.diff(altitudes_m)[:, None]
-    place = (np.arange(steps) + 0.5) / steps
-    points = altitudes_m[:-1, None] + widths * place
+    fraction = (np.arange(steps) + 0.5) / steps
+    points = altitudes_m[:-1, None] + widths * fraction
     parts = np.zeros((len(widths), steps, len(altitudes_m)))
     interval = np.arange(len(widths))
-    parts[interval, :, interval] = widths * (1.0 - place) / steps
-    parts[interval, :, interval + 1] = widths * place / steps
+    parts[interval, :, interval] = widths * (1.0 - fraction) / steps
+    parts[interval, :, interval + 1] = widths * fraction / steps
     return points.ravel(), parts.reshape(points.size, -1)

@@ -110,17 +110,17 @@ def speckled_spots(
     0.5
     """
     n = int(number_between("n", n, 1, integer=True))
-    which = one_of("truth", truth, _TRUTHS)
+    kind_of_truth = one_of("truth", truth, _TRUTHS)
     position_rng, phase_rng = spawn(rng, 2)
     half = number_between("position_range_px", position_range_px, 0)
     if positions is None:
-        where = position_rng.uniform(-half, half, (n, 2))
+        points = position_rng.uniform(-half, half, (n, 2))
     else:
-        where = finite_array("positions", positions).astype(np.float64)
-        if where.shape != (n, 2):
-            raise InputError(f"positions: expected shape ({n}, 2), got {where.shape}")
+        points = finite_array("positions", positions).astype(np.float64)
+        if points.shape != (n, 2):
+            raise InputError(f"positions: expected shape ({n}, 2), got {points.shape}")
     images, gradients = speckled_images(
-        where,
+        points,
         d_over_r0=d_over_r0,
         shape=shape,
         size=size,
@@ -129,7 +129,7 @@ def speckled_spots(
         natural_tilt=natural_tilt,
         rng=phase_rng,
     )
-    return images, gradients if which == "gradient" else _centres_of_gravity(images)
+    return images, gradients if kind_of_truth == "gradient" else _centres_of_gravity(images)
 
 
 def speckled_images(
@@ -182,8 +182,8 @@ def _outer_scale(value: Any) -> float:
 
 def _points(window_lambda_over_d: float, d_over_r0: float) -> int:
     """Return the points across the sub-aperture for which periodic images stay outside the window."""
-    wanted = max(1.25 * window_lambda_over_d, 4 * d_over_r0)
-    return int(np.clip(2 * math.ceil(wanted / 2), _FEWEST_POINTS, _MOST_POINTS))
+    least = max(1.25 * window_lambda_over_d, 4 * d_over_r0)
+    return int(np.clip(2 * math.ceil(least / 2), _FEWEST_POINTS, _MOST_POINTS))
 
 
 @functools.lru_cache(maxsize=8)

@@ -30,11 +30,11 @@ class CentroidGain:
     @property
     def mean(self) -> tuple[float, float]:
         """Mean over sub-apertures and axes, each counting by its error, and its standard error."""
-        known = np.isfinite(self.standard_error) & (self.standard_error > 0)
-        if not known.any():
+        usable = np.isfinite(self.standard_error) & (self.standard_error > 0)
+        if not usable.any():
             return float(self.gain.mean()), 0.0
-        weight = self.standard_error[known] ** -2.0
-        return float((weight * self.gain[known]).sum() / weight.sum()), float(weight.sum() ** -0.5)
+        weight = self.standard_error[usable] ** -2.0
+        return float((weight * self.gain[usable]).sum() / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def measure_centroid_gain(slopes: Slopes | ArrayLike, displacement_px: ArrayLike) -> CentroidGain:
@@ -93,7 +93,7 @@ def measure_centroid_gain(slopes: Slopes | ArrayLike, displacement_px: ArrayLike
         raise InputError("displacement_px: expected all spots to move along x and y, some stand still")
     slopes_about_mean = measured - measured.mean(axis=0)
     gain = (slopes_about_mean * moved).sum(axis=0) / square
-    left = (slopes_about_mean - gain * moved) * moved
-    parts = np.stack([part.sum(axis=0) for part in np.array_split(left, _BLOCKS)])
+    residual = (slopes_about_mean - gain * moved) * moved
+    parts = np.stack([part.sum(axis=0) for part in np.array_split(residual, _BLOCKS)])
     error = parts.std(axis=0, ddof=1) * math.sqrt(_BLOCKS) / square
     return CentroidGain(gain.reshape(2, n).T, error.reshape(2, n).T)

@@ -43,10 +43,10 @@ class Sample:
         names = [field.name for field in fields(cls) if getattr(parts[0], field.name) is not None]
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
-    def part(self, which: slice) -> Sample:
+    def part(self, selection: slice) -> Sample:
         """Return some of the images."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Sample(**{name: value[which] for name, value in values.items() if value is not None})
+        return Sample(**{name: value[selection] for name, value in values.items() if value is not None})
 
     def rms_errors(self, tables: NDArray[np.float32]) -> tuple[Floats, Floats]:
         """Return where the last pass puts its table (n, 2), and the rms error after each pass (passes, 2)."""

@@ -60,8 +60,8 @@ class KnownSodium:
         if len(altitudes) < _FEWEST_ALTITUDES:
             altitudes = np.linspace(altitudes[0], altitudes[-1], _ALTITUDES)
         narrow = replace(star, spot=gaussian_spot(_NARROWEST_PX))
-        found = fit_spot(mean, narrow, profile.at(altitudes), dark_variance_e2=dark_variance_e2)
-        return cls(*found, dark_variance_e2)
+        star_and_fit = fit_spot(mean, narrow, profile.at(altitudes), dark_variance_e2=dark_variance_e2)
+        return cls(*star_and_fit, dark_variance_e2)
 
     def updated(self, mean: MeanImages) -> KnownSodium:
         """Return it with the profile of newer mean images."""
@@ -75,8 +75,8 @@ class KnownSodium:
     @property
     def spot_fwhm_arcsec(self) -> float:
         """Full width at half maximum of the spot at a single altitude, without the pixel."""
-        seen = float(self.star.spot.fwhm_px.mean())  # exact for Gaussian spots
-        return math.sqrt(max(seen**2 - PIXEL_BLUR_PX2, 0.0)) * self.star.pixel_arcsec
+        width_px = float(self.star.spot.fwhm_px.mean())  # exact for Gaussian spots
+        return math.sqrt(max(width_px**2 - PIXEL_BLUR_PX2, 0.0)) * self.star.pixel_arcsec
 
 
 def calibrated_images(
@@ -108,8 +108,8 @@ def dark_variance_e2(layout: Layout, calibration: Calibration) -> Floats:
     """
     noise = calibration.read_noise_map(layout.frame_shape)
     if noise is None:
-        known = calibration.read_noise_photoelectrons
-        noise = np.full(layout.frame_shape, 1.0 if known is None else known)
+        noise_e = calibration.read_noise_photoelectrons
+        noise = np.full(layout.frame_shape, 1.0 if noise_e is None else noise_e)
     bad = ~np.isfinite(calibration.maps(layout.frame_shape)).all(axis=0)
     variance: Floats = layout.images(np.where(bad, _IGNORED_E2, np.nan_to_num(noise) ** 2))
     return variance

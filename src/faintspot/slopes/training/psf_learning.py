@@ -224,21 +224,21 @@ def fit_spots(
     stack = image_stack(images, Calibration() if calibration is None else calibration)
     n, shape = len(stack.images), (stack.images.shape[1], stack.images.shape[2])
     index = np.zeros(n, np.int64)
-    known = PSF(psf.samples[:1], psf.oversampling)
+    single = PSF(psf.samples[:1], psf.oversampling)
     options = _within(
         LearningOptions(max(shape) // 2 + 1, psf.oversampling, 0, min(shape) / 2), search_range_px
     )
     border = np.ones(shape, dtype=bool)
     border[1:-1, 1:-1] = False
-    state, wings = State(known, np.zeros(1)), np.zeros((n, *shape))
+    state, wings = State(single, np.zeros(1)), np.zeros((n, *shape))
     for _ in range(_BACKGROUND_ROUNDS):
         background = float(np.median(np.mean((stack.images - wings)[:, border], axis=1)))
         state = registered(stack, index, replace(state, background_e=np.array([background])), options)
-        assert state.found is not None
-        wings = known.images(state.found.positions, shape, state.found.flux_e)
-    found = state.found
-    assert found is not None
-    return LearntPSF(known, state.background_e, found.positions, found.flux_e, found.error_px)
+        assert state.spots is not None
+        wings = single.images(state.spots.positions, shape, state.spots.flux_e)
+    spots = state.spots
+    assert spots is not None
+    return LearntPSF(single, state.background_e, spots.positions, spots.flux_e, spots.error_px)
 
 
 def frame_stack(frames: ArrayLike, layout: Layout, calibration: Calibration) -> Stack:
@@ -270,10 +270,10 @@ def _stack(windows: NDArray[Any], maps: NDArray[Any], calibration: Calibration, 
     read_noise = calibration.read_noise_photoelectrons
     if read_noise is None:
         read_noise = pixel_noise(electrons.reshape(windows.shape))
-    whole = read_noise < _COUNTABLE_E and calibration.em_gain == 1 and calibration.background_e == 0
+    countable = read_noise < _COUNTABLE_E and calibration.em_gain == 1 and calibration.background_e == 0
     variance = max(read_noise, 1e-3) ** 2 + calibration.excess_noise * calibration.background_e
     return Stack(
-        np.rint(electrons) if whole else electrons,
+        np.rint(electrons) if countable else electrons,
         None if usable.all() else usable,
         variance,
         calibration.excess_noise,
@@ -347,27 +347,27 @@ def _learn(
 
 def _batch(state: State, batch: NDArray[np.int64], spots: NDArray[np.int64]) -> State:
     """The PSFs and spots of one batch; where there is one PSF so far, every one begins with it."""
-    which = batch if len(state.psf.samples) > 1 else np.zeros_like(batch)
-    found = None if state.found is None else state.found.part(spots)
-    psf = psf_of(state.psf.samples[which], state.psf.oversampling)
-    return State(psf, state.background_e[which], state.form, found)
+    first = batch if len(state.psf.samples) > 1 else np.zeros_like(batch)
+    batch_spots = None if state.spots is None else state.spots.part(spots)
+    psf = psf_of(state.psf.samples[first], state.psf.oversampling)
+    return State(psf, state.background_e[first], state.form, batch_spots)
 
 
 def _joined(
     learnt: list[tuple[NDArray[np.int64], State]], index: NDArray[np.int64], options: LearningOptions
 ) -> LearntPSF:
     """Put the batches together."""
-    spots = np.concatenate([spots for spots, _ in learnt])
-    order = np.argsort(spots)
-    found = Registered.joined([state.found for _, state in learnt if state.found is not None]).part(order)
-    check_phases(index, found)
+    order = np.argsort(np.concatenate([index for index, _ in learnt]))
+    measured = [state.spots for _, state in learnt if state.spots is not None]
+    spots = Registered.joined(measured).part(order)
+    check_phases(index, spots)
     samples = np.concatenate([state.psf.samples for _, state in learnt])
     return LearntPSF(
         psf_of(samples, options.oversampling),
         np.concatenate([state.background_e for _, state in learnt]),
-        found.positions,
-        found.flux_e,
-        found.error_px,
+        spots.positions,
+        spots.flux_e,
+        spots.error_px,
     )
 
 

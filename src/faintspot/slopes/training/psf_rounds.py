@@ -46,7 +46,7 @@ class State:
     psf: PSF
     background_e: Floats
     form: Form = FIRST_FORM
-    found: Registered | None = None
+    spots: Registered | None = None
 
 
 def gaussian_psf(fwhm_px: float, options: LearningOptions) -> PSF:
@@ -104,16 +104,16 @@ def registered(stack: Stack, index: NDArray[np.int64], state: State, options: Le
     """Return the state with the spots measured anew."""
     tables = Tables.of(state.psf, options.radius_px)
     images = stack.without(state.background_e[index])
-    found, steps = state.found, _LATER_STEPS
-    if found is None:
-        found, steps = start(images, tables, index, state.psf.fwhm_px, options.search_px), _START_STEPS
-    found = register(images, tables, index, found, options.search_px, steps)
-    return State(state.psf, state.background_e, state.form, found)
+    spots, steps = state.spots, _LATER_STEPS
+    if spots is None:
+        spots, steps = start(images, tables, index, state.psf.fwhm_px, options.search_px), _START_STEPS
+    spots = register(images, tables, index, spots, options.search_px, steps)
+    return State(state.psf, state.background_e, state.form, spots)
 
 
-def bright_enough(found: Registered) -> NDArray[np.bool_]:
+def bright_enough(spots: Registered) -> NDArray[np.bool_]:
     """Return which spots tell their position."""
-    return np.all(found.error_px < _LARGEST_ERROR_PX, axis=1)  # type: ignore[no-any-return]
+    return np.all(spots.error_px < _LARGEST_ERROR_PX, axis=1)  # type: ignore[no-any-return]
 
 
 def stacked(
@@ -126,14 +126,14 @@ def stacked(
     rng: np.random.Generator,
 ) -> tuple[list[tuple[Sums, Sums]], NDArray[np.int64]]:
     """Return the sums of both halves of each PSF's spots, and how many spots are in them."""
-    assert state.found is not None
-    good = bright_enough(state.found)
+    assert state.spots is not None
+    good = bright_enough(state.spots)
     count = np.bincount(index[good], minlength=len(state.psf.samples))
     sums = stack_spots(
         stack.part(good),
         Tables.of(state.psf, options.radius_px),
         index[good],
-        state.found.part(good),
+        state.spots.part(good),
         state.background_e,
         halves[good],
         draws,
@@ -151,20 +151,20 @@ def refitted(
     rng: np.random.Generator,
 ) -> State:
     """Return the state with the PSFs fitted to the sums; a PSF with too few spots stays unchanged."""
-    known = count >= FEWEST_SPOTS
+    enough = count >= FEWEST_SPOTS
     form = state.form
-    if choose and known.any():
-        compared = rng.permutation(np.flatnonzero(known))[:_PSFS_COMPARED]
+    if choose and enough.any():
+        compared = rng.permutation(np.flatnonzero(enough))[:_PSFS_COMPARED]
         form = choose_form([sums[i] for i in compared], float(count[compared].sum()), options.radius_px)
     before = Tables.of(state.psf, options.radius_px).value.astype(np.float64)
     samples, background = [], state.background_e.copy()
     for i, (first, second) in enumerate(sums):
         plane = before[i]
-        fit = fit_psf(first.combined(second), form, options.radius_px) if known[i] else None
+        fit = fit_psf(first.combined(second), form, options.radius_px) if enough[i] else None
         if fit is not None and fit.plane.sum() > 0:
             plane, background[i] = fit
         samples.append(samples_of(plane, options.radius_px, options.oversampling))
-    return State(psf_of(np.stack(samples), options.oversampling), background, form, state.found)
+    return State(psf_of(np.stack(samples), options.oversampling), background, form, state.spots)
 
 
 def psf_of(samples: Floats, oversampling: int) -> PSF:
@@ -172,7 +172,7 @@ def psf_of(samples: Floats, oversampling: int) -> PSF:
     return PSF(samples, oversampling, np.arange(len(samples)) if len(samples) > 1 else None)
 
 
-def check_phases(index: NDArray[np.int64], found: Registered) -> None:
+def check_phases(index: NDArray[np.int64], spots: Registered) -> None:
     """Warn when spots lie at too few sub-pixel phases for the PSF between the pixels to be seen.
 
     Their spread follows from the phases' mean resultant length, with the part of it taken out that errors of
@@ -183,24 +183,24 @@ def check_phases(index: NDArray[np.int64], found: Registered) -> None:
     InputError
         When all PSFs' spots lie at one phase.
     """
-    good = bright_enough(found)
+    good = bright_enough(spots)
     kinds, count = index[good], np.bincount(index[good])
     narrow, hopeless = np.zeros((2, len(count)), bool)
     used = np.maximum(count, 1)
     for axis in range(2):
-        turn = np.exp(2j * np.pi * found.positions[good, axis])
+        turn = np.exp(2j * np.pi * spots.positions[good, axis])
         length = np.abs(np.bincount(kinds, turn.real) + 1j * np.bincount(kinds, turn.imag)) / used
-        loss = np.bincount(kinds, np.exp(-2 * (np.pi * found.error_px[good, axis]) ** 2)) / used
+        loss = np.bincount(kinds, np.exp(-2 * (np.pi * spots.error_px[good, axis]) ** 2)) / used
         sure = length - 2 * (1 - length**2) / np.sqrt(2 * used)  # less two standard errors
         telling = (loss > _TELLING_ATTENUATION) & (count >= FEWEST_SPOTS)
         narrow |= telling & (sure > _NARROW * loss)
         hopeless |= telling & (sure > _HOPELESS * loss)
-    what = "move the spots by fractions of a pixel, or learn one PSF for many sub-apertures"
+    hint = "move the spots by fractions of a pixel, or learn one PSF for many sub-apertures"
     if hopeless[count > 0].all():
-        raise InputError(f"frames: expected spots at many sub-pixel positions, got one for each PSF; {what}")
+        raise InputError(f"frames: expected spots at many sub-pixel positions, got one for each PSF; {hint}")
     if narrow.any():
         warnings.warn(
             f"{np.count_nonzero(narrow)} of {len(count)} PSFs: spots differ by less than about 0.1 px in "
-            f"sub-pixel position, so the PSF between the pixels is a guess; {what}",
+            f"sub-pixel position, so the PSF between the pixels is a guess; {hint}",
             stacklevel=3,
         )

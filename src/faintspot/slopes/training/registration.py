@@ -152,19 +152,19 @@ def start(stack: Stack, tables: Tables, index: NDArray[Any], fwhm_px: Floats, se
 
 
 def register(
-    stack: Stack, tables: Tables, index: NDArray[Any], found: Registered, search_px: float, steps: int
+    stack: Stack, tables: Tables, index: NDArray[Any], spots: Registered, search_px: float, steps: int
 ) -> Registered:
-    """Return positions and fluxes after that many steps of Fisher scoring from those `found`.
+    """Return positions and fluxes after that many steps of Fisher scoring from those of `spots`.
 
     The PSF is read at the nearest node of the fine grid and the step taken from there: exact at convergence
     up to second order in a sixteenth of a pixel.
     """
     parts: list[Registered] = []
     for block in stack.blocks():
-        part, now = stack.part(block), found.part(block)
+        part, refined = stack.part(block), spots.part(block)
         for _ in range(steps):
-            now = _fisher_step(part, tables, index[block], now, search_px)
-        parts.append(now)
+            refined = _fisher_step(part, tables, index[block], refined, search_px)
+        parts.append(refined)
     return Registered.joined(parts)
 
 
@@ -176,10 +176,10 @@ def weights(stack: Stack, model: NDArray[Any], flux: Floats) -> NDArray[np.float
 
 
 def _fisher_step(
-    stack: Stack, tables: Tables, kinds: NDArray[Any], found: Registered, search_px: float
+    stack: Stack, tables: Tables, kinds: NDArray[Any], spots: Registered, search_px: float
 ) -> Registered:
     """One step in x, y and flux, each bounded; the covariance is that at the step's start."""
-    positions, flux = found.positions, found.flux_e
+    positions, flux = spots.positions, spots.flux_e
     rows, columns = tables.cells(stack.images.shape[1:], positions)
     node = np.rint(positions * FINE) / FINE
     side = tables.value.shape[1]

@@ -34,7 +34,7 @@ class SpotRange:
     Examples
     --------
     >>> from faintspot.slopes.training.search_range import SpotRange
-    >>> SpotRange(quantile_px=1.2, flux_scale=0.9, told=True).told
+    >>> SpotRange(quantile_px=1.2, flux_scale=0.9, is_measured=True).is_measured
     True
     """
 
@@ -42,7 +42,7 @@ class SpotRange:
     """99 % of the spots are nearer than this, on each axis."""
     flux_scale: float
     """Flux of the spots over that of the fit: below 1 where fits take noise for spots."""
-    told: bool
+    is_measured: bool
     """Whether the flux is enough to tell the range."""
 
 
@@ -60,9 +60,9 @@ class Images(NamedTuple):
 
     def some(self, count: int) -> Images:
         """Return at most so many of them, evenly spread."""
-        which = np.linspace(0, len(self.pixels_e) - 1, min(count, len(self.pixels_e))).astype(int)
+        index = np.linspace(0, len(self.pixels_e) - 1, min(count, len(self.pixels_e))).astype(int)
         return self._replace(
-            pixels_e=self.pixels_e[which], references=self.references[which], flux_e=self.flux_e[which]
+            pixels_e=self.pixels_e[index], references=self.references[index], flux_e=self.flux_e[index]
         )
 
 
@@ -99,10 +99,10 @@ def spot_range(images: Images, psf: PSF) -> SpotRange:
     scale = math.exp(float(best.x))
     evidence, offset = squares.evidence(images, scale)
     mixed = _mixed(evidence, offset)
-    places = np.linspace(0.0, squares.radii_px[-1], 1024)
-    within = np.minimum(places[:, None] / squares.radii_px, 1.0) @ mixed.weights
-    quantile = float(places[np.argmax(within >= 1 - _BEYOND)])
-    return SpotRange(quantile, scale, _told(evidence, mixed, quantile, squares.radii_px))
+    distances = np.linspace(0.0, squares.radii_px[-1], 1024)
+    within = np.minimum(distances[:, None] / squares.radii_px, 1.0) @ mixed.weights
+    quantile = float(distances[np.argmax(within >= 1 - _BEYOND)])
+    return SpotRange(quantile, scale, _is_measured(evidence, mixed, quantile, squares.radii_px))
 
 
 class _Mixed(NamedTuple):
@@ -120,16 +120,16 @@ def _mixed(evidence: Floats, offset: float) -> _Mixed:
     return _Mixed(weights, float(np.log(evidence @ weights).sum()) + offset)
 
 
-def _told(evidence: Floats, mixed: _Mixed, quantile: float, radii: Floats) -> bool:
+def _is_measured(evidence: Floats, mixed: _Mixed, quantile: float, radii: Floats) -> bool:
     """Tell whether the images exclude spots anywhere in the window, and spots within half the range."""
     best = evidence @ mixed.weights
-    wanted = min(_TOLD_NATS, -0.5 * len(best) * math.log1p(-_ELSEWHERE))
+    evidence_needed = min(_TOLD_NATS, -0.5 * len(best) * math.log1p(-_ELSEWHERE))
     wider = (1 - _ELSEWHERE) * best + _ELSEWHERE * evidence[:, -1]
-    if quantile < _NEARLY_ALL * radii[-1] and np.log(best / wider).sum() < wanted:
+    if quantile < _NEARLY_ALL * radii[-1] and np.log(best / wider).sum() < evidence_needed:
         return False
     nearer = np.where(radii <= quantile / 2, evidence, 0.0).max(axis=1)
     with np.errstate(divide="ignore"):
-        return bool(quantile <= 1.0 or np.log(best / nearer).sum() >= wanted)
+        return bool(quantile <= 1.0 or np.log(best / nearer).sum() >= evidence_needed)
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class _Squares:
 
     spots: Floats
     """(m, pixels) of 1 e-."""
-    places: Floats
+    positions: Floats
     """(m, 2), px."""
     step_px: float
     radii_px: Floats
@@ -151,11 +151,11 @@ class _Squares:
         count = int(half / step)
         beyond = count + math.ceil(0.5 / step)  # references lie up to half a pixel off the window's centre
         axis = step * np.arange(-beyond, beyond + 1)
-        places = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        positions = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
         only = replace(psf, samples=psf.samples[:1], index=None)
-        spots = np.maximum(only.images(places, (shape[0], shape[1])), 0.0).reshape(len(places), -1)
+        spots = np.maximum(only.images(positions, (shape[0], shape[1])), 0.0).reshape(len(positions), -1)
         radii = np.asarray(step * (np.arange(count + 1) + 0.5), np.float64)
-        return cls(spots, places, step, radii)
+        return cls(spots, positions, step, radii)
 
     def evidence(self, images: Images, scale: float) -> tuple[Floats, float]:
         """Return the likelihood (n, k) of every image averaged over every square, and what to add to logs.
@@ -166,14 +166,14 @@ class _Squares:
         flux = np.maximum(images.flux_e, max(_FAINTEST * images.flux_e.mean(), 1e-3))
         level = np.rint(np.log(flux) / math.log(_FLUX_CLASS))
         middle = np.rint(images.references / self.step_px)
-        groups, which = np.unique(np.column_stack([level, middle]), axis=0, return_inverse=True)
+        groups, group_of = np.unique(np.column_stack([level, middle]), axis=0, return_inverse=True)
         pixels = images.pixels_e.reshape(len(flux), -1) / images.excess_noise
         evidence, offset = np.empty((len(flux), len(self.radii_px))), 0.0
         for number, (_, *reference) in enumerate(groups):
-            rows = np.flatnonzero(which == number)
+            rows = np.flatnonzero(group_of == number)
             electrons = scale * flux[rows].mean() / images.excess_noise
             floor = images.dark_variance_e2 / images.excess_noise + _WEIGHT_FLOOR * electrons
-            ring = np.rint(np.abs(self.places / self.step_px - reference).max(axis=1)).astype(int)
+            ring = np.rint(np.abs(self.positions / self.step_px - reference).max(axis=1)).astype(int)
             order = np.argsort(ring, kind="stable")[: np.count_nonzero(ring < len(self.radii_px))]
             counts = np.bincount(ring[order])
             spots = electrons * self.spots[order]

@@ -75,8 +75,8 @@ class MeanImages:
                 f"got {images.shape} and {slopes.shape}"
             )
         number_between("time_constant_frames", self.time_constant_frames, 1.0)
-        seen = 1 if images.ndim == 3 else len(images)
-        frames = number_between("frames", seen if self.frames is None else self.frames, 0.0, low_open=True)
+        count = 1 if images.ndim == 3 else len(images)
+        frames = number_between("frames", count if self.frames is None else self.frames, 0.0, low_open=True)
         for name, values, usual in (("images_e", images, 3), ("slopes_px", slopes, 2)):
             mean = (
                 values.astype(np.float64) if values.ndim == usual else values.mean(axis=0, dtype=np.float64)
@@ -175,15 +175,15 @@ def fit_sodium_profile(
         flux = np.maximum(
             _ratio((weights * shapes * measured).sum(axis=1), (weights * shapes**2).sum(axis=1)), 0.0
         )
-        known = flux[:, None, None] * flat
-        weighted = (weights[:, :, None] * known).reshape(-1, known.shape[-1])
-        normal = weighted.T @ known.reshape(weighted.shape)
+        per_density = flux[:, None, None] * flat
+        weighted = (weights[:, :, None] * per_density).reshape(-1, per_density.shape[-1])
+        normal = weighted.T @ per_density.reshape(weighted.shape)
         right = weighted.T @ measured.ravel()
         density = _solved(normal, right, centred, expected * density.max())
         density = SodiumProfile(profile.altitudes_m, density).density
     shapes = flat @ density
-    away = measured - flux[:, None] * shapes
-    chi_square = float((_weights(flux, shapes, variance, measured, mean.frames) * away**2).sum())
+    residual = measured - flux[:, None] * shapes
+    chi_square = float((_weights(flux, shapes, variance, measured, mean.frames) * residual**2).sum())
     return SodiumFit(SodiumProfile(profile.altitudes_m, density), flux, chi_square)
 
 
@@ -225,8 +225,8 @@ def fit_spot(
         return replace(star, spot=star.spot.blurred(blur_px))
 
     def fitted(blur_px: float) -> SodiumFit:
-        known: dict[str, Any] = {"dark_variance_e2": dark_variance_e2, "smoothness": smoothness}
-        return fit_sodium_profile(mean, blurred(blur_px), profile, **known)
+        options: dict[str, Any] = {"dark_variance_e2": dark_variance_e2, "smoothness": smoothness}
+        return fit_sodium_profile(mean, blurred(blur_px), profile, **options)
 
     widest = _LARGEST_BLUR_FWHM * float(star.spot.fwhm_px.mean())
     best = minimize_scalar(

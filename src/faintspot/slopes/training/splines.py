@@ -91,8 +91,8 @@ class SplineTables:
 
         def table(weights: Floats) -> Floats:
             parts = weights.reshape(-1, self.n_nodes, self.n_nodes + 1)
-            own: Floats = even @ parts[0].T @ odd.T
-            return own if len(parts) == 1 else own + odd @ parts[1] @ even.T
+            sums: Floats = even @ parts[0].T @ odd.T
+            return sums if len(parts) == 1 else sums + odd @ parts[1] @ even.T
 
         return np.stack([table(weights_x), table(weights_y).T]).astype(np.float32)
 

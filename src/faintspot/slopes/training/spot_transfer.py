@@ -54,7 +54,7 @@ class _Noise:
 class _Residuals:
     """Residuals of fits to the images, (n, ny, nx) each."""
 
-    left: Floats
+    scaled: Floats
     """Residuals, divided by the root of `share`."""
     share: Floats
     """Fraction of a pixel's variance that the fit leaves."""
@@ -145,31 +145,31 @@ def _residuals(images: Floats, psf: PSF, positions: Floats, flux: Floats, noise:
     terms /= size
     weighted = terms / noise.of(model)[..., None]
     inverse = np.linalg.pinv(np.einsum("npa,npb->nab", weighted, terms), hermitian=True)
-    left = images.reshape(n, -1) - model
-    left -= np.einsum("npa,nab,nqb,nq->np", terms, inverse, weighted, left, optimize=True)
+    residual = images.reshape(n, -1) - model
+    residual -= np.einsum("npa,nab,nqb,nq->np", terms, inverse, weighted, residual, optimize=True)
     share = 1 - np.einsum("npa,nab,npb->np", terms, inverse, weighted, optimize=True)
     share = np.maximum(share, 1e-3)
     significance = size[:, 0, 2] / np.sqrt(np.maximum(inverse[:, 2, 2], 1e-300))
-    left, share, model = (part.reshape(n, *shape) for part in (left / np.sqrt(share), share, model))
+    residual, share, model = (part.reshape(n, *shape) for part in (residual / np.sqrt(share), share, model))
     terms = (terms / np.sqrt(share).reshape(n, -1, 1)).reshape(n, *shape, -1)
     expected = -np.einsum("nyxa,nab,nyxb->nyx", terms[:, :, 1:], inverse, terms[:, :, :-1], optimize=True)
-    neighbours = left[:, :, 1:] * left[:, :, :-1] - expected
-    return _Residuals(left, share, model, neighbours, significance)
+    neighbours = residual[:, :, 1:] * residual[:, :, :-1] - expected
+    return _Residuals(residual, share, model, neighbours, significance)
 
 
 def _line(residuals: _Residuals, noise: _Noise) -> _Noise:
     """Fit variance = dark + slope * flux; pixels count by what the fit has left of them."""
-    variance, flux = np.square(residuals.left), residuals.flux
+    variance, flux = np.square(residuals.scaled), residuals.flux
     for _ in range(_ITERATIONS):
         expected = noise.of(flux)
         weight = residuals.share * (variance < _LARGEST_EXCESS * expected) / np.square(expected)
-        ones, first, second = (float(np.sum(weight * flux**power)) for power in range(3))
+        total, first, second = (float(np.sum(weight * flux**power)) for power in range(3))
         zeroth, moment = float(np.sum(weight * variance)), float(np.sum(weight * variance * flux))
-        spread = ones * second - first**2
+        spread = total * second - first**2
         if spread <= 0:
             break
-        slope = (ones * moment - first * zeroth) / spread
-        dark = (zeroth - slope * first) / ones
+        slope = (total * moment - first * zeroth) / spread
+        dark = (zeroth - slope * first) / total
         noise = _Noise(max(dark, 1e-6 * noise.dark), max(slope, 1e-6 * noise.slope))
     return noise
 
@@ -213,6 +213,6 @@ def variance_over_expected(
     noise = _Noise(max(dark_variance_e2, 1e-6), excess_noise)
     images = np.asarray(images_e, np.float64) - fitted.background_e[0]
     residuals = _residuals(images, fitted.psf, fitted.positions, fitted.flux_e, noise)
-    ratio = np.square(residuals.left) / noise.of(residuals.flux)
+    ratio = np.square(residuals.scaled) / noise.of(residuals.flux)
     usual = (ratio < _LARGEST_EXCESS) & _illuminated(residuals.flux)
     return float(np.sum((ratio * residuals.share)[usual]) / np.sum(residuals.share[usual]))

@@ -72,10 +72,10 @@ def stack_spots(
     level = np.maximum(background_e, 0)[index, None, None]
     for block in stack.blocks():
         part, flux = stack.part(block), registered.flux_e[block]
-        found = registered.part(block)
+        spots = registered.part(block)
         group = 2 * index[block] + halves[block]
         for _ in range(draws):
-            rows, columns = tables.cells(part.images.shape[1:], found.draw(rng))
+            rows, columns = tables.cells(part.images.shape[1:], spots.draw(rng))
             cell = rows[:, :, None] * side + columns[:, None, :]
             model = tables.value.take(index[block][:, None, None] * side**2 + cell) * flux[:, None, None]
             weight = weights(part, model + level[block], flux) / draws
@@ -87,8 +87,8 @@ def stack_spots(
                 scalars[row] += np.bincount(group, values.sum(axis=(1, 2)), 2 * n_psfs)
     planes = sums.reshape(3, 2 * n_psfs, side, side)
     planes[:, :, [0, -1], :] = planes[:, :, :, [0, -1]] = 0  # pixels outside the grid
-    each = [Sums(*planes[:, i], *scalars[:, i]) for i in range(2 * n_psfs)]
-    return list(zip(each[::2], each[1::2], strict=True))
+    halves_of = [Sums(*planes[:, i], *scalars[:, i]) for i in range(2 * n_psfs)]
+    return list(zip(halves_of[::2], halves_of[1::2], strict=True))
 
 
 def offsets(side: int) -> Floats:

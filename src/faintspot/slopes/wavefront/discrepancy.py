@@ -75,21 +75,21 @@ def slope_discrepancy(slopes: Slopes, layout: Layout) -> Discrepancy:
         n = vector.shape[1] // 2
         raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {n}")
     used = np.tile(valid.all(axis=0), 2)
-    others = not_gradients(layout.cells, used)
-    if not others.shape[1]:
+    basis = not_gradients(layout.cells, used)
+    if not basis.shape[1]:
         raise InputError("slopes: expected more valid sub-apertures; these cannot show a discrepancy")
     errors = np.concatenate(
         [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
     )[:, used].astype(np.float64)
     covariance = np.atleast_2d(slopes.covariance_xy)[:, used[: len(used) // 2]].astype(np.float64)
-    degrees = others.shape[1]
+    degrees = basis.shape[1]
     with np.errstate(invalid="ignore"):
-        squares = (errors**2) @ (others**2).sum(axis=1)
-        x, y = np.split(others, 2)
+        squares = (errors**2) @ (basis**2).sum(axis=1)
+        x, y = np.split(basis, 2)
         squares += 2 * covariance @ (x * y).sum(axis=1)
         expected = np.sqrt(squares / degrees)
-    found = vector[:, used] @ others
-    rms = np.sqrt((found**2).sum(axis=1) / degrees)
+    parts = vector[:, used] @ basis
+    rms = np.sqrt((parts**2).sum(axis=1) / degrees)
     return Discrepancy(rms, np.where(np.isfinite(expected), expected, np.nan), degrees)
 
 
@@ -106,27 +106,27 @@ def not_gradients(cells: NDArray[np.int64], used: NDArray[np.bool_]) -> Floats:
     gradients = _corner_gradients(cells)[used]
     if not len(gradients):
         return np.zeros((0, 0))
-    left, size, _ = np.linalg.svd(gradients, full_matrices=True)
+    vectors, size, _ = np.linalg.svd(gradients, full_matrices=True)
     rank = int(np.count_nonzero(size > _NEGLIGIBLE * size[0]))
-    basis: Floats = left[:, rank:]
+    basis: Floats = vectors[:, rank:]
     return basis
 
 
 def _corner_gradients(cells: NDArray[np.int64]) -> Floats:
     """Return the slopes (2 n, corners) of a phase of 1 at each corner of the illuminated sub-apertures."""
     rows, columns = cells.T
-    places = np.stack([[rows + down, columns + right] for down in (0, 1) for right in (0, 1)])
-    corners, index = np.unique(places.transpose(0, 2, 1).reshape(-1, 2), axis=0, return_inverse=True)
+    cell_corners = np.stack([[rows + down, columns + right] for down in (0, 1) for right in (0, 1)])
+    corners, index = np.unique(cell_corners.transpose(0, 2, 1).reshape(-1, 2), axis=0, return_inverse=True)
     top_left, top_right, bottom_left, bottom_right = index.reshape(4, -1)
     n = len(cells)
     gradients = np.zeros((2 * n, len(corners)))
-    which = np.arange(n)
+    indices = np.arange(n)
     for corner, x, y in (
         (top_left, -0.5, -0.5),
         (top_right, 0.5, -0.5),
         (bottom_left, -0.5, 0.5),
         (bottom_right, 0.5, 0.5),
     ):
-        gradients[which, corner] += x
-        gradients[n + which, corner] += y
+        gradients[indices, corner] += x
+        gradients[n + indices, corner] += y
     return gradients

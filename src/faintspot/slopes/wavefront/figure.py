@@ -28,15 +28,15 @@ def wavefront_figure(
     several = int(np.count_nonzero(wavefront.fitted)) > 1
     figure = new_figure(WIDTH, 9.6)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(5.6, 4))[:, 0]
-    what = "mean wavefront" if several else "wavefront"
+    subject = "mean wavefront" if several else "wavefront"
     for axes, tilt in zip(above.subplots(1, 2), (True, False), strict=True):
         rms = float(total(wavefront.mean, tilt=tilt))
-        title = what if tilt else f"{what} without tip and tilt"
+        title = subject if tilt else f"{subject} without tip and tilt"
         _map(axes, wavefront, layout, tilt=tilt)
         axes.set_title(f"{title}: {rms:.3g} {wavefront.unit} rms", fontsize=12)
-    rest = len(wavefront.modes) > 2
-    widths = {"width_ratios": (1, max(3, min(len(wavefront.modes) / 2, 9)))} if rest else {}
-    panels = below.subplots(1, 2 if rest else 1, squeeze=False, **widths)[0]
+    has_higher = len(wavefront.modes) > 2
+    widths = {"width_ratios": (1, max(3, min(len(wavefront.modes) / 2, 9)))} if has_higher else {}
+    panels = below.subplots(1, 2 if has_higher else 1, squeeze=False, **widths)[0]
     for axes, part in zip(panels, (slice(0, 2), slice(2, None)), strict=False):
         _bars(axes, wavefront, part, several)
     panels[0].set_ylabel(f"coefficient ({wavefront.unit})")
@@ -45,7 +45,7 @@ def wavefront_figure(
         below.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
     above.suptitle(name, fontsize=14)
     caption = (
-        f"{what.capitalize()} over the disk of the pupil, in the frame's directions, with the "
+        f"{subject.capitalize()} over the disk of the pupil, in the frame's directions, with the "
         "illuminated sub-apertures outlined; it increases in the direction in which spots "
         "are displaced. Below: its coefficients in "
         "Noll's order ± standard error"

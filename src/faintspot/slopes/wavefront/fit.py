@@ -11,7 +11,7 @@ from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, pupil_of
+from faintspot.slopes.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, lit_outlines, pupil_of
 from faintspot.slopes.wavefront.zernike import mean_gradients, zernike
 
 Floats = NDArray[np.float64]
@@ -20,6 +20,7 @@ LARGEST_CONDITION = 100.0
 """Largest condition number of the modes' gradients, each scaled to 1: the noise amplification allowed."""
 _HIGHEST_ORDER, _USUAL_CONDITION = 8, 20.0  # defaults; higher orders are rarely needed
 _TILTS = 2
+_LEAST_SHARE = 0.1  # of a sub-aperture's area in the pupil, below which its slope tells too little
 _NM_PER_ARCSEC_M = 1e9 * np.pi / (180 * 3600)
 
 
@@ -111,11 +112,15 @@ def total(coefficients: Floats, *, tilt: bool = True) -> Floats:
 
 
 def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -> Wavefront:
-    """Fit Zernike modes to slopes, each frame by least squares over its valid sub-apertures.
+    """Fit Zernike modes to slopes, each frame by weighted least squares over its valid sub-apertures.
 
     The model of a slope is the mean gradient of a mode over the lenslet's square or hexagon, integrated
-    exactly. A sub-aperture cut by the pupil's edge counts as whole. One whose centre is outside is left out,
-    because modes have no meaning outside their disk.
+    exactly. Where the layout has `subaperture_m` and `diameter_m`, the pupil's edge is known: a sub-aperture
+    that it cuts counts with the part inside, and by the area of that part. Otherwise each one whose centre is
+    within the disk around all counts as whole.
+
+    A slope's weight is the inverse of its variance: that of its mean standard error over the frames, and of
+    the scatter that modes which are not fitted leave.
 
     Parameters
     ----------
@@ -152,25 +157,28 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     if x.ndim != 2 or x.shape[1] != len(layout):
         raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {x.shape[-1]}")
     pupil = pupil_of(layout)
-    valid = valid & inside_pupil(layout, pupil)
+    outlines, share = _in_pupil(layout, pupil)
+    valid = valid & (share >= _LEAST_SHARE)
     illuminated = np.asarray(valid.any(axis=0))
     if not illuminated.any():
         raise InputError("slopes: expected valid sub-apertures to fit a wavefront, found none")
-    gradients, condition = _chosen_gradients(modes, layout, pupil, illuminated)
+    gradients, condition = _chosen_gradients(modes, outlines, illuminated)
     unit, scale = _unit(layout, pupil)
     errors = np.concatenate(
         [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
     )
     used = np.tile(valid, 2)
-    known = bool(np.isfinite(errors[used]).all())
+    has_errors = bool(np.isfinite(errors[used]).all())
     noise = np.square(errors, dtype=np.float64), np.atleast_2d(slopes.covariance_xy).astype(np.float64)
     measured = np.concatenate([x, y], axis=1).astype(np.float64)
-    coefficients, standard_errors, residual = _fit(measured, used, gradients, noise if known else None)
+    coefficients, standard_errors, residual = _fit(
+        measured, used, gradients, share, noise if has_errors else None
+    )
     return Wavefront(
         np.arange(2, 2 + gradients.shape[1]),
         scale * coefficients,
         scale * standard_errors,
-        "slopes" if known else "residuals",
+        "slopes" if has_errors else "residuals",
         residual,
         unit,
         pupil,
@@ -178,8 +186,17 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     )
 
 
+def _in_pupil(layout: Layout, pupil: Pupil) -> tuple[Floats, Floats]:
+    """Return the outlines of the sub-apertures, in radii from the pupil's centre, and their shares in it."""
+    if pupil.stated:
+        outlines, share = lit_outlines(layout, pupil)
+    else:
+        outlines, share = lenslet_outlines(layout), inside_pupil(layout, pupil).astype(np.float64)
+    return (outlines - pupil.centre_px) / pupil.radius_px, share
+
+
 def _chosen_gradients(
-    modes: int | None, layout: Layout, pupil: Pupil, illuminated: NDArray[np.bool_]
+    modes: int | None, outlines: Floats, illuminated: NDArray[np.bool_]
 ) -> tuple[Floats, float]:
     """Return the mean gradients (2 n, k) of the modes to fit (all x, then all y) and their condition."""
     n = int(np.count_nonzero(illuminated))
@@ -189,8 +206,9 @@ def _chosen_gradients(
     else:
         counts = [int(number_between("modes", modes, _TILTS, 2 * n, integer=True))]
         limit = LARGEST_CONDITION
-    outlines = (lenslet_outlines(layout) - pupil.centre_px) / pupil.radius_px
-    gradients = np.concatenate(mean_gradients(np.arange(2, 2 + counts[0]), outlines))
+    gradients = np.zeros((2, len(outlines), counts[0]))
+    gradients[:, illuminated] = mean_gradients(np.arange(2, 2 + counts[0]), outlines[illuminated])
+    gradients = np.concatenate(gradients)
     for count in counts:
         condition = _condition(gradients[np.tile(illuminated, 2), :count])
         if condition <= limit:
@@ -217,38 +235,62 @@ def _condition(gradients: Floats) -> float:
 
 
 def _fit(
-    slopes: Floats, valid: NDArray[np.bool_], gradients: Floats, noise: tuple[Floats, Floats] | None
+    slopes: Floats,
+    valid: NDArray[np.bool_],
+    gradients: Floats,
+    share: Floats,
+    noise: tuple[Floats, Floats] | None,
 ) -> tuple[Floats, Floats, Floats]:
     """Return coefficients, their standard errors and the residuals' rms, for a radius and px of 1.
 
-    Frames with the same valid sub-apertures share one pseudo-inverse. `noise` are the slopes' variances, all
-    x, then all y, and the covariances of x and y; without it, it is estimated from the residuals.
+    Frames with the same valid sub-apertures share one inverse. `noise` are the slopes' variances, all x, then
+    all y, and the covariances of x and y; without it, it is estimated from the residuals.
     """
+    weights = np.tile(share, 2)
+    coefficients, errors, residual = _weighted_fit(slopes, valid, gradients, weights, noise)
+    if noise is None or not np.isfinite(residual).any():
+        return coefficients, errors, residual
+    variance = np.where(valid, noise[0], 0.0).sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
+    seen = valid.any(axis=0)
+    unfitted = max(float(np.nanmean(residual**2) - variance[seen].mean()), 0.0)
+    weights[seen] /= variance[seen] + unfitted if unfitted > 0 else np.maximum(variance[seen], 1e-30)
+    return _weighted_fit(slopes, valid, gradients, weights, noise)
+
+
+def _weighted_fit(
+    slopes: Floats,
+    valid: NDArray[np.bool_],
+    gradients: Floats,
+    weights: Floats,
+    noise: tuple[Floats, Floats] | None,
+) -> tuple[Floats, Floats, Floats]:
+    """Return what `_fit` does for the given weights of the slopes, (2 n,)."""
     frames, k = len(slopes), gradients.shape[1]
     coefficients, standard_errors = np.full((frames, k), np.nan), np.full((frames, k), np.nan)
     residual = np.full(frames, np.nan)
     patterns, of_frame = np.unique(np.packbits(valid, axis=1), axis=0, return_inverse=True)
     for number in range(len(patterns)):
-        which = np.flatnonzero(of_frame.ravel() == number)
-        used = valid[which[0]]
+        rows = np.flatnonzero(of_frame.ravel() == number)
+        used = valid[rows[0]]
         if not _condition(gradients[used]) <= LARGEST_CONDITION:
             continue
-        inverse = np.linalg.pinv(gradients[used])
-        measured = slopes[np.ix_(which, used)]
+        root = np.sqrt(weights[used] / weights[used].mean())
+        inverse = np.linalg.pinv(root[:, None] * gradients[used]) * root
+        measured = slopes[np.ix_(rows, used)]
         fitted = measured @ inverse.T
-        left = measured - fitted @ gradients[used].T
-        coefficients[which] = fitted
-        residual[which] = np.sqrt(np.mean(left**2, axis=1))
+        residuals = measured - fitted @ gradients[used].T
+        coefficients[rows] = fitted
+        residual[rows] = np.sqrt(np.mean(residuals**2, axis=1))
         freedom = measured.shape[1] - k
         if noise is not None:
             along, across = np.split(inverse, 2, axis=1)
-            variance = noise[0][np.ix_(which, used)] @ (inverse**2).T
-            both = noise[1][np.ix_(which, used[: len(used) // 2])]
-            variance = variance + 2 * both @ (along * across).T
+            variance = noise[0][np.ix_(rows, used)] @ (inverse**2).T
+            covariance = noise[1][np.ix_(rows, used[: len(used) // 2])]
+            variance = variance + 2 * covariance @ (along * across).T
         elif freedom > 0:
-            of_slopes = np.sum(left**2, axis=1, keepdims=True) / freedom
-            variance = of_slopes * np.sum(inverse**2, axis=1)
+            of_slopes = np.sum((root * residuals) ** 2, axis=1, keepdims=True) / freedom
+            variance = of_slopes * np.sum((inverse / root) ** 2, axis=1)
         else:
             continue
-        standard_errors[which] = np.sqrt(variance)
+        standard_errors[rows] = np.sqrt(variance)
     return coefficients, standard_errors, residual

@@ -38,8 +38,8 @@ def rms_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
         "mean wavefront" if several else "wavefront": (wavefront.mean, wavefront.mean_standard_error)
     }
     if several:
-        each = wavefront.rms_of_frames
-        coefficients["frames, quadratic mean"] = (each, np.sqrt(np.mean(noise**2, axis=0)))
+        rms = wavefront.rms_of_frames
+        coefficients["frames, quadratic mean"] = (rms, np.sqrt(np.mean(noise**2, axis=0)))
     all_values = [total(pair[0]) for pair in coefficients.values()]
     digits = _decimals(np.array(all_values))
     rows = [
@@ -84,8 +84,8 @@ def remarks(wavefront: Wavefront) -> list[str]:
         lines.append(
             f"{frames - fitted} of {frames} frames have too few valid sub-apertures and were left out."
         )
-    left = float(np.sqrt(np.mean(wavefront.residual_px[wavefront.fitted] ** 2)))
-    lines.append(f"The slopes scatter about the fitted modes by {left:.3g} px rms per axis.")
+    scatter = float(np.sqrt(np.mean(wavefront.residual_px[wavefront.fitted] ** 2)))
+    lines.append(f"The slopes scatter about the fitted modes by {scatter:.3g} px rms per axis.")
     return lines
 
 

@@ -31,8 +31,8 @@ def noll_to_nm(j: int) -> tuple[int, int]:
     n = 0
     while (n + 1) * (n + 2) // 2 < j:
         n += 1
-    place = j - 1 - n * (n + 1) // 2
-    m = 2 * (place // 2) + 1 if n % 2 else 2 * ((place + 1) // 2)
+    index = j - 1 - n * (n + 1) // 2
+    m = 2 * (index // 2) + 1 if n % 2 else 2 * ((index + 1) // 2)
     return n, m if j % 2 == 0 else -m
 
 
@@ -86,7 +86,7 @@ def mean_gradients(modes: ArrayLike, outlines: Floats) -> Floats:
     cross = outlines[..., 0] * edges[..., 1] - outlines[..., 1] * edges[..., 0]
     areas = 0.5 * cross.sum(axis=1)
     gradients = np.empty((2, len(outlines), len(numbers)))
-    for place, j in enumerate(numbers):
+    for column, j in enumerate(numbers):
         along_edges = zernike(j, points[..., 0], points[..., 1]) @ (0.5 * weights)
-        gradients[..., place] = (normals * along_edges).sum(axis=-1) / areas
+        gradients[..., column] = (normals * along_edges).sum(axis=-1) / areas
     return gradients

@@ -53,6 +53,7 @@ def test_two_layers_are_found() -> None:
     assert found.slope_model().layers == len(found.turbulence.fraction)
 
 
+@pytest.mark.slow
 def test_gradients_of_smaller_squares_are_found() -> None:
     """Slopes of bright stars that follow the least-squares tilt, with unequal centroid gains."""
     telemetry = observed(replace(AIR, averaged=0.7), noise_px=0.1)
@@ -66,6 +67,7 @@ def test_gradients_of_smaller_squares_are_found() -> None:
         assert found.turbulence.fraction[order] == pytest.approx(AIR.fraction, abs=0.1)
 
 
+@pytest.mark.slow
 def test_gaps_and_missing_subapertures() -> None:
     """A twentieth of the slopes, sixty frames and three sub-apertures were not measured."""
     telemetry = observed()
@@ -80,6 +82,7 @@ def test_gaps_and_missing_subapertures() -> None:
     expect_winds(Identification(lost, UNKNOWN, RATE_HZ).layers(), 1.0)
 
 
+@pytest.mark.slow
 def test_slopes_that_tell_little_do_not_count() -> None:
     """A fifth of the slopes is mostly an estimator's prior, with three times the stated error."""
     telemetry = observed()
@@ -97,6 +100,7 @@ def test_slopes_that_tell_little_do_not_count() -> None:
     assert found.noise_factor == pytest.approx(1.2**-2, rel=0.2)
 
 
+@pytest.mark.slow
 def test_turbulence_that_stands_still() -> None:
     """In windows of half a second winds below 2 m/s look alike: no layer is faster than that by much."""
     still = replace(AIR, fraction=np.ones(1), wind_m_per_s=np.array([[0.4, 0.0]]))
@@ -113,6 +117,7 @@ def test_known_winds_have_their_strengths() -> None:
     assert identification.anywhere().covariances_px2().shape == (1, 3, 50, 50)
 
 
+@pytest.mark.slow
 def test_a_vibration_is_found_and_part_of_the_model() -> None:
     """A tilt of 45 Hz on top of turbulence: the winds stay what they are."""
     telemetry = observed()

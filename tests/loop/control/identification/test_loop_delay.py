@@ -19,6 +19,7 @@ def found(delay: int, gain: float, given: float | None = None, frames: int | Non
     return loop_delay(loop.slopes[:frames], held[:frames], run[:frames], AIR, RATE_HZ, given)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [2, 3])
 def test_delay(delay: int) -> None:
     """Within three of its errors, which ten seconds at this noise make 0.1 frames."""
@@ -27,6 +28,7 @@ def test_delay(delay: int) -> None:
     assert abs(seen.delay_frames - delay) < 3 * seen.delay_error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.8, 1.0])
 def test_gain_for_a_known_delay(gain: float) -> None:
     seen = found(2, gain, given=2.0)

@@ -13,7 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.configuration import Control, ControlOptions
 from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, learn
-from faintspot.loop.control.identification.model import Learnt, Model
+from faintspot.loop.control.identification.model import ControlModel, LearntControl
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.slopes.camera.calibration import Calibration
 
@@ -22,7 +22,7 @@ FRAMES = telemetry(600, 0.3)
 
 
 @pytest.fixture(scope="module")
-def learnt() -> dict[str, Learnt]:
+def learnt() -> dict[str, LearntControl]:
     return {kind: learn(kind, PLANT, FRAMES, TURBULENCE, 1 / FRAME_S) for kind in KINDS}
 
 
@@ -34,12 +34,13 @@ def commands(controller: Any, line: CommandDelayLine, frames: int = 60) -> np.nd
     return np.array(sent)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, Learnt], tmp_path: Path) -> None:
+def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, LearntControl], tmp_path: Path) -> None:
     path = tmp_path / "model.npz"
     learnt[kind].model.save(path)
     lines = [CommandDelayLine(12, 2) for _ in range(2)]
-    again = Learnt(PLANT, Model.load(path, PLANT))
+    again = LearntControl(PLANT, ControlModel.load(path, PLANT))
     sent = [
         commands(each.controller(line), line) for each, line in zip((learnt[kind], again), lines, strict=True)
     ]
@@ -58,7 +59,7 @@ def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, Learnt], tmp_pa
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, Learnt]) -> None:
+def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, LearntControl]) -> None:
     """Slopes of a mirror that takes off all there is: the next command is nearly the same."""
     line = CommandDelayLine(12, 2)
     controller = learnt[kind].controller(line)
@@ -70,7 +71,7 @@ def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, Lear
     assert np.linalg.norm(line.latest - held) < 0.35 * np.linalg.norm(held)
 
 
-def test_another_controller_of_the_same_loop(learnt: dict[str, Learnt]) -> None:
+def test_another_controller_of_the_same_loop(learnt: dict[str, LearntControl]) -> None:
     """The integrator needs no model; only the filter tells estimators what it expects, if nothing is said."""
     control = Control(INTERACTION, None, ControlOptions(gain=0.3), learnt["kalman"].model)
     filtered = control.with_controller("kalman")
@@ -82,7 +83,7 @@ def test_another_controller_of_the_same_loop(learnt: dict[str, Learnt]) -> None:
         control.with_controller("modal")
 
 
-def test_what_is_refused(learnt: dict[str, Learnt], tmp_path: Path) -> None:
+def test_what_is_refused(learnt: dict[str, LearntControl], tmp_path: Path) -> None:
     path = tmp_path / "model.npz"
     model = learnt["kalman"].model
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tests.loop.control.driven import driven, oscillator
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.learning import GAINS, KALMAN, Plant, learn
+from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn
 from faintspot.loop.control.identification.loop_delay import loop_delay
 from faintspot.loop.control.identification.oscillators import fitted_oscillators
 from faintspot.loop.control.reconstructor import make_reconstructor
@@ -37,6 +37,7 @@ def _seen(seed: int) -> NDArray[np.float64]:
     return np.array(moving).T + _NOISE * rng.standard_normal((_FRAMES, 2))
 
 
+@pytest.mark.slow
 def test_oscillators_and_noise_are_found() -> None:
     found, noise = fitted_oscillators(_seen(1), _RATE_HZ, 2)
     assert noise == pytest.approx(np.full(2, _NOISE**2), rel=0.1)
@@ -48,17 +49,18 @@ def test_oscillators_and_noise_are_found() -> None:
         assert narrow.rms_px == pytest.approx(_VIBRATION.rms_px, rel=0.4)
 
 
+@pytest.mark.slow
 def test_the_learnt_filter_beats_the_best_integrator() -> None:
-    plant = Plant(np.eye(2), make_reconstructor(np.eye(2)), 2, 0.01)
+    plant = LoopPlant(np.eye(2), make_reconstructor(np.eye(2)), 2, 0.01)
     learning, scoring = (
         OpenLoopTelemetry(slopes, np.full(slopes.shape, _NOISE**2), np.ones(slopes.shape))
         for slopes in map(_seen, (2, 3))
     )
     learnt = learn(KALMAN, plant, learning, _SITE, _RATE_HZ)
-    assert learnt.found is not None
-    assert learnt.found.oscillators
+    assert learnt.identified is not None
+    assert learnt.identified.oscillators
     gain, plain = plant.best_gain(GAINS, scoring, np.eye(2))
-    left = plant.left(partial(learnt.model.controller, plant), scoring, np.eye(2))
+    left = plant.residual(partial(learnt.model.controller, plant), scoring, np.eye(2))
     # Noise is 0.5 of either, whatever the control; of the rest, the filter leaves at most three quarters.
     assert left - 2 * _NOISE**2 < 0.75 * (plain - 2 * _NOISE**2), gain
 

@@ -10,7 +10,7 @@ from tests.loop.control.control_cases import FRAME_S, LAYERS, PLANT, TURBULENCE,
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import ASSUMED
 from faintspot.loop.control.identification.learning import KALMAN, learn
-from faintspot.loop.control.identification.model import Learnt
+from faintspot.loop.control.identification.model import LearntControl
 from faintspot.loop.control.identification.relearning import relearn
 
 RATE_HZ = 1 / FRAME_S
@@ -18,28 +18,30 @@ FRAMES = telemetry(1200, 0.3, model=LAYERS)
 
 
 @pytest.fixture(scope="module")
-def now() -> Learnt:
+def now() -> LearntControl:
     """Return a filter for the present turbulence, from other frames."""
     return learn(KALMAN, PLANT, telemetry(800, 0.3, seed=9, model=LAYERS), TURBULENCE, RATE_HZ, ASSUMED)
 
 
-def test_a_filter_for_other_turbulence_is_replaced(now: Learnt) -> None:
+@pytest.mark.slow
+def test_a_filter_for_other_turbulence_is_replaced(now: LearntControl) -> None:
     """The running filter takes slopes for nearly constant."""
     arrays = now.model.arrays
     slow = {**arrays, "first": 0.1 * arrays["first"], "second": 0.0 * arrays["second"]}
     running = replace(now.model, arrays=slow)
-    found = relearn(PLANT, running, FRAMES, TURBULENCE, RATE_HZ, now.found)
+    found = relearn(PLANT, running, FRAMES, TURBULENCE, RATE_HZ, now.identified)
     assert found.is_better
-    assert found.left < 0.9 * found.left_by_running
-    assert found.left < found.left_by_integrator
+    assert found.residual < 0.9 * found.by_running
+    assert found.residual < found.by_integrator
 
 
-def test_a_filter_that_is_as_good_stays(now: Learnt) -> None:
-    found = relearn(PLANT, now.model, FRAMES, TURBULENCE, RATE_HZ, now.found)
+@pytest.mark.slow
+def test_a_filter_that_is_as_good_stays(now: LearntControl) -> None:
+    found = relearn(PLANT, now.model, FRAMES, TURBULENCE, RATE_HZ, now.identified)
     assert not found.is_better
-    assert found.left == pytest.approx(found.left_by_running, rel=0.05)
+    assert found.residual == pytest.approx(found.by_running, rel=0.05)
 
 
-def test_too_few_frames_are_refused(now: Learnt) -> None:
+def test_too_few_frames_are_refused(now: LearntControl) -> None:
     with pytest.raises(InputError, match="frames to judge a filter, got 300"):
         relearn(PLANT, now.model, FRAMES.part(0, 300), TURBULENCE, RATE_HZ)

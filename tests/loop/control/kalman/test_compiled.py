@@ -17,8 +17,6 @@ from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 from faintspot.loop.control.kalman.slope_model import SlopeModel
 
-pytestmark = pytest.mark.portable
-
 M, COMMANDS = INTERACTION.shape
 USUAL_PX2, GAIN, FRAMES = 0.25, 0.4, telemetry(500)
 Both = list[tuple[Any, CommandDelayLine]]
@@ -57,6 +55,7 @@ def shared(rng: np.random.Generator, error: np.ndarray) -> np.ndarray:
     return covariance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prior", [None, np.full(M, 0.5)])
 @pytest.mark.parametrize(("steps", "tolerance"), [(STEPS, 3e-3), (30, 1e-7)])
 @pytest.mark.parametrize("model", [MODEL, LAYERS], ids=["one layer", "two layers"])

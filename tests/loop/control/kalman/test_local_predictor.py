@@ -14,8 +14,8 @@ from tests.loop.control.frozen_flow import frozen_slopes
 from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification import learning
-from faintspot.loop.control.identification.learning import KALMAN, Learnt, learn
-from faintspot.loop.control.identification.model import Model
+from faintspot.loop.control.identification.learning import KALMAN, LearntControl, learn
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.kalman import local_covariance, local_model
 from faintspot.loop.control.kalman import local_predictor as local_kalman
 from faintspot.loop.control.kalman.local_model import LocalModel, at_most, neighbours_within, solve_locally
@@ -130,6 +130,7 @@ def test_a_step_of_the_covariance_is_the_textbooks(reach: float, monkeypatch: py
     np.testing.assert_allclose(found, expected, atol=1e-5 * before.max())
 
 
+@pytest.mark.slow
 def test_errors_die_away() -> None:
     """Without measurements to follow, any error shrinks with all gains: no frame of noise stays.
 
@@ -152,7 +153,7 @@ def test_errors_die_away() -> None:
 def test_the_error_is_nearly_that_of_the_riccati_equation(arrays: dict[str, Any]) -> None:
     """Steps of eight frames are coarse: within a third of the variance."""
     covariance = dense_covariance(LAYERS, NOISE_PX2)
-    expected = np.diag(LAYERS.seen @ covariance @ LAYERS.seen.T)
+    expected = np.diag(LAYERS.observation @ covariance @ LAYERS.observation.T)
     np.testing.assert_allclose(arrays["predicted_px2"], expected, rtol=0.35)
 
 
@@ -251,12 +252,12 @@ def test_large_sensors_learn_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     assert learnt.model.left[0] < learnt.model.left[1]
     path = tmp_path / "model.npz"
     learnt.model.save(path)
-    again = Model.load(path, PLANT)
+    again = ControlModel.load(path, PLANT)
     assert again.is_local
     sent = []
     for model in (learnt.model, again):
         line = CommandDelayLine(12, 2)
-        controller = Learnt(PLANT, model).controller(line)
+        controller = LearntControl(PLANT, model).controller(line)
         for slopes in frames.open_loop_px[:40]:
             controller.update(slopes + PLANT.interaction @ line.acting, np.full(18, 0.3))
         sent.append(line.latest.copy())

@@ -39,6 +39,7 @@ def test_structure_function_is_von_karmans() -> None:
     np.testing.assert_allclose(np.mean(measured, axis=0), expected, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_variance_over_the_pupil_is_nolls_with_an_outer_scale() -> None:
     """The mean of 8 realisations, 12 places in each: within 20 %, as large structures are few."""
     pupil = make_pupil(quiet())

@@ -66,6 +66,7 @@ def mean_error_at_every_k(estimator: Any, blocks: list[Any]) -> Any:
     return sum(errors) / REALISATIONS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cell", CELLS, ids=lambda c: f"{c.profile}-{c.flux_e:g}-{c.read_noise_e:g}")
 def test_near_the_best_of_a_search(cell: Cell) -> None:
     """Within 10 % of the smallest R of a search over strength (or width) and k on the same images.

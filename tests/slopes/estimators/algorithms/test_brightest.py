@@ -12,8 +12,6 @@ from tests.slopes.estimators.algorithms.image_cases import BAD_IMAGES, images
 
 import faintspot as fs
 
-pytestmark = pytest.mark.portable
-
 RULES = ("subtract_next", "threshold", "subtract_kth")
 every_rule = pytest.mark.parametrize("rule", RULES)
 every_dtype = pytest.mark.parametrize("dtype", [np.float32, np.float64])

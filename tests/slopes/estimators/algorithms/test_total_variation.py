@@ -43,7 +43,7 @@ def strengths_of(stack: Any, fraction: float) -> Any:
 
 
 class TestAgainstOracle:
-    @pytest.mark.portable
+    @pytest.mark.slow
     @every_dtype
     @every_algorithm
     @given(images(), fractions, st.sampled_from([1, 2, 7, 40]))
@@ -88,6 +88,7 @@ class TestAgainstOracle:
         assert result.iterations.tolist() == [e.iterations for e in expected]
         assert result.converged.tolist() == [e.converged for e in expected]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("width", ["4", "8", "16"])
     def test_any_simd_width(self, width: str, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("FAINTSPOT_SIMD_WIDTH", width)
@@ -171,7 +172,6 @@ class TestSolution:
             competitor = g + direction * radius / np.linalg.norm(direction)
             assert naive.total_variation(competitor) >= smallest * (1 - 1e-6)
 
-    @pytest.mark.portable
     @every_algorithm
     def test_reference_cases(self, algorithm: str) -> None:
         cases = np.load(shared_file("reference/tv_cases.npz"))

@@ -14,8 +14,6 @@ from faintspot.base.errors import CacheWarning
 from faintspot.slopes.kernels.compilation import cached
 from faintspot.slopes.kernels.compilation.cached import cache_folder, kernel_cache
 
-pytestmark = pytest.mark.portable
-
 
 @pytest.fixture(autouse=True)
 def _nothing_said_yet() -> None:

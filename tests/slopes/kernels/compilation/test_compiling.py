@@ -11,10 +11,9 @@ import pytest
 from numba.core.caching import NullCache
 
 from faintspot.slopes.kernels.compilation import compiling
-from faintspot.slopes.kernels.compilation.compiling import Direct, allocating, compiled, inlined
+from faintspot.slopes.kernels.compilation.compiling import Direct, compiled, inlined
 
 pytestmark = [
-    pytest.mark.portable,
     pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
 ]
 
@@ -35,14 +34,6 @@ def total_twice(values: Any) -> Any:
 @compiled
 def with_next(values: Any, following: Any) -> Any:
     return total_twice(values) + total_twice(following)
-
-
-@allocating
-def doubled(values: Any) -> Any:
-    result = np.empty_like(values)
-    for i in range(values.size):
-        result[i] = twice(values[i])
-    return result
 
 
 @compiled
@@ -85,7 +76,6 @@ def test_what_is_a_part_can_be_called_from_python_as_well() -> None:
     assert with_next(VALUES, VALUES) == 40.0
     assert total_twice(VALUES) == 20.0
     assert twice(1.5) == 3.0
-    np.testing.assert_array_equal(doubled(VALUES), 2 * VALUES)
 
 
 def test_a_part_is_compiled_once_for_all_who_call_it() -> None:

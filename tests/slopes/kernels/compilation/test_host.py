@@ -8,8 +8,6 @@ from tests.refusals import refused
 
 from faintspot.slopes.kernels.compilation.host import WIDTHS, aligned_zeros, lanes_for
 
-pytestmark = pytest.mark.portable
-
 
 def test_float64_has_half_the_lanes() -> None:
     for width in WIDTHS:

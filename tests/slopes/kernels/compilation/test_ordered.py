@@ -16,8 +16,6 @@ from faintspot.slopes.kernels.compilation import ordered
 from faintspot.slopes.kernels.compilation.ordered import fence, load, store
 from faintspot.slopes.kernels.driver import streaming
 
-pytestmark = pytest.mark.portable
-
 CELLS = types.Array(types.int64, 1, "C")
 WHOLE = types.int64
 

@@ -22,10 +22,9 @@ from faintspot.slopes.kernels.compilation.simd import (
     splat,
     square_root,
     store,
+    store_all,
     width_of,
 )
-
-pytestmark = pytest.mark.portable
 
 
 @njit(error_model="numpy")
@@ -44,10 +43,13 @@ def _apply_all(lanes: Any, a: Any, b: Any, results: Any) -> Any:
     store(results, 7 * width, absolute(x))
     store(results, 8 * width, maximum(x, y))
     store(results, 9 * width, minimum(x, y))
-    store(results, 10 * width, select(x > y, x, zero))
-    store(results, 11 * width, select(x < y, x, zero))
-    store(results, 12 * width, select(x >= y, x, zero))
-    store(results, 13 * width, select(x <= y, x, zero))
+    selected = (
+        select(x > y, x, zero),
+        select(x < y, x, zero),
+        select(x >= y, x, zero),
+        select(x <= y, x, zero),
+    )
+    store_all(results, 10 * width, selected)
     put(results, 14 * width, get(a, 1))
     return any_lane(x > y), any_lane(x > x)
 

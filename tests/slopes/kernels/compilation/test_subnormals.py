@@ -12,8 +12,6 @@ import faintspot as fs
 from faintspot.slopes.kernels.compilation.compiling import compiled
 from faintspot.slopes.kernels.compilation.subnormals import flush_subnormals, restore_control
 
-pytestmark = pytest.mark.portable
-
 TINY = np.float32(1e-39)
 
 

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from tests.shared_data import ROOT
 
 from faintspot import Layout, Settings, SlopePipeline
@@ -18,7 +19,7 @@ LAYOUT = Layout.grid((2, 2), pixels=8)
 SETTINGS = Settings("tv", noise_std=3.0, keep_brightest=20)
 _MEASURE = """
 import json
-from tests.kernels import test_target as here
+from tests.slopes.kernels.compilation import test_target as here
 from faintspot.slopes.kernels.compilation.host import lanes_for
 from faintspot.slopes.kernels.compilation.target import vector_registers
 target, width = here.compile_target(), lanes_for("float32").width
@@ -41,6 +42,7 @@ def test_target_of_this_process() -> None:
     assert all(name and name[0] not in "+-" for name in target.features)
 
 
+@pytest.mark.slow
 def test_generic_processor(tmp_path: Path) -> None:
     """As on clusters whose nodes differ; code for more than the target has would end the process."""
     environment = {

@@ -36,14 +36,14 @@ def some_dark(flux_e: float) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
 
 
 def no_flux(slopes: fs.Slopes) -> NDArray[np.bool_]:
-    return (slopes.flags & Flag.NO_FLUX) != 0
+    return np.asarray((slopes.flags & Flag.NO_FLUX) != 0)
 
 
 class TestAgainstOracle:
     @given(seed=st.integers(0, 2**32 - 1))
     def test_random_and_hostile_frames(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
-        window = tuple(int(side) for side in rng.integers(3, 21, 2))
+        window = int(rng.integers(3, 21)), int(rng.integers(3, 21))
         rows, columns = (int(n) for n in rng.integers(1, 9, 2))
         layout = fs.Layout.grid((rows, columns), pixels=window, frame_shape=(170, 170))
         n, fwhm = len(layout), float(rng.choice([1.5, 2.5, 5.0]))

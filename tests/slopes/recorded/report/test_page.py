@@ -40,6 +40,7 @@ def plain_page(methods: list[MeasuredSlopes], layout: Layout | None) -> Page:
     )
 
 
+@pytest.mark.slow
 def test_page_has_all_sections_and_pictures_and_needs_nothing_else() -> None:
     layout = sensor()
     page = page_of(layout, *simulated(layout, 6))
@@ -95,6 +96,7 @@ def test_one_frame_says_that_there_is_no_jitter() -> None:
     assert page.ids == [name for name in SECTIONS if name != "jitter"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_frames", [1, 3])
 def test_one_subaperture(n_frames: int) -> None:
     layout = sensor((1, 1))
@@ -171,5 +173,5 @@ def test_parts_that_do_not_fit_are_refused_in_one_line() -> None:
 def test_missing_jinja2_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "jinja2", None)
     layout = sensor((1, 1))
-    with pytest.raises(MissingExtraError, match=r"faintspot\[web\]"):
+    with pytest.raises(MissingExtraError, match=r"faintspot\[report\]"):
         page_of(layout, simulated(layout, 1)[0])

@@ -82,6 +82,7 @@ def test_two_stores_are_two_methods(tmp_path: Path) -> None:
     assert page.ids[-2:] == ["configuration-of-tv-denoising", "configuration-of-brightest-pixels"]
 
 
+@pytest.mark.slow
 def test_standard_errors_are_shown_where_they_are_known(tmp_path: Path) -> None:
     x, y = np.full((2, 5, 9), np.inf)
     unknown = store(tmp_path / "a.npz", sensor(), errors={"standard_error_x": x, "standard_error_y": y})

@@ -337,9 +337,6 @@ function showStatus() {
   const { values } = known.status;
   say("estimator", values.estimator || "");
   controls.status(values);
-  const advice = values.advice || [];
-  byId("advice-section").hidden = !advice.length;
-  say("advice", advice.join("\n"));
   showSodium(values.sodium);
   const counters = { ...values.counters };
   if (values.subapertures && counters.processed) {

@@ -86,19 +86,19 @@ class LayerLikelihood:
         """Return the cross-spectra of vibrations."""
         m = len(self._noise_px2)
         shapes, total = mode_shapes(self._site.positions_m), np.zeros((len(self._bins), m, m), np.complex128)
-        for each in vibrations:
-            correlation = each.correlation(rate_hz, every * length)[::every]
-            spectrum = self._spectra.of_process(m * each.rms_px**2 * correlation)
-            shape = shapes[MODES.index(each.mode)]
+        for vibration in vibrations:
+            correlation = vibration.correlation(rate_hz, every * length)[::every]
+            spectrum = self._spectra.of_process(m * vibration.rms_px**2 * correlation)
+            shape = shapes[MODES.index(vibration.mode)]
             total += spectrum.real[:, None, None] * np.outer(shape, shape)
         return total
 
     def averaging(self, averaged: float) -> LayerLikelihood:
         """Return the likelihood with another `SlopeTurbulence.averaged`."""
-        other = copy.copy(self)
-        other.averaged, other._spectra = averaged, self._spectra.averaging(averaged)
-        other._tables, _ = other._spectra.tables(self._site.outer_scale_m)
-        return other
+        likelihood = copy.copy(self)
+        likelihood.averaged, likelihood._spectra = averaged, self._spectra.averaging(averaged)
+        likelihood._tables, _ = likelihood._spectra.tables(self._site.outer_scale_m)
+        return likelihood
 
     def _matrices(self, distinct: Complex, unmodelled: float) -> Complex:
         """Return the cross-spectra of turbulence with what is not modelled of it."""
@@ -128,9 +128,9 @@ class LayerLikelihood:
         _, logarithm = np.linalg.slogdet(model)
         value = self._weight * float(logarithm.sum() + np.trace(explained, axis1=1, axis2=2).real.sum())
         gradient = self._weight * (inverse - explained @ inverse)
-        own, air = (np.diagonal(each, axis1=1, axis2=2).real for each in (gradient, turbulence))
-        of_others = np.array([(own @ self._noise_px2).sum(), (own * air).sum() / (1 + unmodelled)])
-        return value, self._summed(gradient, unmodelled), of_others
+        of_slopes, power = (np.diagonal(matrix, axis1=1, axis2=2).real for matrix in (gradient, turbulence))
+        of_noise = [(of_slopes @ self._noise_px2).sum(), (of_slopes * power).sum() / (1 + unmodelled)]
+        return value, self._summed(gradient, unmodelled), np.array(of_noise)
 
     def strengths(self, spectra: Complex, start: float, noise: float = 1.0) -> tuple[Floats, float]:
         """Return strengths of given spectra (components, frequencies, distinct), and the noise.
@@ -145,16 +145,16 @@ class LayerLikelihood:
             distinct = (strength.astype(np.float32) @ flat).reshape(spectra.shape[1:]).astype(np.complex128)
             _, inverse = self._residual(self._matrices(distinct, _UNMODELLED), noise)
             explained = inverse @ self._measured @ inverse
-            seen, expected = (
-                (flat @ self._summed(each, _UNMODELLED).ravel().astype(np.complex64)).real.astype(np.float64)
-                for each in (explained, inverse)
+            measured, expected = (
+                (flat @ self._summed(part, _UNMODELLED).ravel().astype(np.complex64)).real.astype(np.float64)
+                for part in (explained, inverse)
             )
-            strength *= (np.maximum(seen, 0.0) / np.maximum(expected, 1e-30)) ** power
-            seen_noise, expected_noise = (
-                (np.diagonal(each, axis1=1, axis2=2).real @ self._noise_px2).sum()
-                for each in (explained, inverse)
+            strength *= (np.maximum(measured, 0.0) / np.maximum(expected, 1e-30)) ** power
+            measured_noise, expected_noise = (
+                (np.diagonal(matrices, axis1=1, axis2=2).real @ self._noise_px2).sum()
+                for matrices in (explained, inverse)
             )
-            noise = float(np.clip(noise * (seen_noise / expected_noise) ** power, *_NOISE))
+            noise = float(np.clip(noise * (measured_noise / expected_noise) ** power, *_NOISE))
         return strength, noise
 
     def of_winds(self, winds_m_per_s: Floats) -> Layers:
@@ -167,12 +167,12 @@ class LayerLikelihood:
         )
         strength, noise = self.strengths(spectra, self._start())
         value, _, _ = self._value(np.tensordot(strength, spectra, 1), noise, _UNMODELLED)
-        known, each = self._site.outer_scale_m, winds_m_per_s.shape[1]
+        outer_scale_m, n_winds = self._site.outer_scale_m, winds_m_per_s.shape[1]
         return Layers(
             winds_m_per_s.reshape(-1, 2),
-            np.repeat(strength / each, each),
+            np.repeat(strength / n_winds, n_winds),
             noise,
-            known,
+            outer_scale_m,
             criterion=value + self._penalty(len(strength) + 1),
         )
 
@@ -181,17 +181,17 @@ class LayerLikelihood:
         winds = _grid()
         spectra = np.array([self._spectra.of_wind(wind, self._tables) for wind in winds])
         strength, noise = self.strengths(spectra, self._start())
-        left, found = strength.copy(), []
+        remaining, peaks = strength.copy(), []
         near = np.hypot(*(winds[:, None] - winds).transpose(2, 0, 1)) < _near(winds)[:, None]
         for _ in range(_MOST_LAYERS):
-            together = (near @ left) * (left > 0)
-            best = int(np.argmax(together))
-            if together[best] < _LEAST_SHARE * strength.sum():
+            around = (near @ remaining) * (remaining > 0)
+            best = int(np.argmax(around))
+            if around[best] < _LEAST_SHARE * strength.sum():
                 break
-            part = left * near[best]
-            found.append([*(part @ winds / part.sum()), part.sum()])
-            left[near[best]] = 0.0
-        x, y, peak = np.array(found).T
+            part = remaining * near[best]
+            peaks.append([*(part @ winds / part.sum()), part.sum()])
+            remaining[near[best]] = 0.0
+        x, y, peak = np.array(peaks).T
         return Layers(np.column_stack([x, y]), peak, noise, self._site.outer_scale_m)
 
     def selected(self, start: Layers) -> tuple[Layers, Floats]:
@@ -201,13 +201,13 @@ class LayerLikelihood:
         while len(best.strength) > 1:
             is_weak = best.strength.min() < _LEAST_SHARE * best.strength.sum()
             is_clear = (_rises(best, errors) > _CLEAR * self._penalty(3)) & (not is_weak)
-            fewer = [each for each, clear in zip(_with_one_less(best), is_clear, strict=True) if not clear]
+            fewer = [model for model, clear in zip(_with_one_less(best), is_clear, strict=True) if not clear]
             if not fewer:
                 break
-            other = min(map(self.refined, fewer), key=lambda each: each.criterion)
-            if other.criterion > best.criterion and not is_weak:
+            simpler = min(map(self.refined, fewer), key=lambda layers: layers.criterion)
+            if simpler.criterion > best.criterion and not is_weak:
                 break
-            best, errors = other, self.errors(other)
+            best, errors = simpler, self.errors(simpler)
         return best, errors
 
     def refined(self, start: Layers) -> Layers:
@@ -221,7 +221,7 @@ class LayerLikelihood:
             gradient[-1] += prior / OUTER_SCALE_SPREAD
             return (value + 0.5 * prior**2) / scale, gradient / scale
 
-        found = minimize(
+        fit = minimize(
             misfit,
             _packed(start),
             jac=True,
@@ -230,16 +230,16 @@ class LayerLikelihood:
             options={"maxiter": _REFINEMENTS, "ftol": 2e-7},
         )
         return replace(
-            _unpacked(found.x, count), criterion=scale * float(found.fun) + self._penalty(3 * count + 3)
+            _unpacked(fit.x, count), criterion=scale * float(fit.fun) + self._penalty(3 * count + 3)
         )
 
     def _of_layers(self, layers: Layers) -> tuple[float, Floats]:
         """Return the misfit of layers, and its derivatives with respect to the packed parameters."""
         derivatives, total = self._derivatives(layers)
-        others = np.array([layers.noise, layers.unmodelled])
-        value, gradient, of_others = self._value(total, *others)
-        of_spectra = [float((gradient * each).sum().real) for each in derivatives]
-        return value, np.array([*of_spectra[:-1], *(of_others * others), of_spectra[-1]])
+        noise = np.array([layers.noise, layers.unmodelled])
+        value, gradient, of_others = self._value(total, *noise)
+        of_spectra = [float((gradient * derivative).sum().real) for derivative in derivatives]
+        return value, np.array([*of_spectra[:-1], *(of_others * noise), of_spectra[-1]])
 
     def _derivatives(self, layers: Layers) -> tuple[list[Complex], Complex]:
         """Return the derivatives of the distinct spectra with winds, strengths and outer scale, and them."""
@@ -247,10 +247,10 @@ class LayerLikelihood:
         of_winds, of_strengths = [], []
         total, of_scale = 0.0, 0.0
         for wind, strength in zip(layers.wind_m_per_s, layers.strength, strict=True):
-            here, *along, scale = strength * self._spectra.changes(wind, tables, slopes)
-            of_winds += [_SPEED_UNIT * each for each in along]
-            of_strengths.append(here)
-            total, of_scale = total + here, of_scale + scale
+            unshifted, *along, scale = strength * self._spectra.changes(wind, tables, slopes)
+            of_winds += [_SPEED_UNIT * derivative for derivative in along]
+            of_strengths.append(unshifted)
+            total, of_scale = total + unshifted, of_scale + scale
         return [*of_winds, *of_strengths, np.asarray(of_scale)], np.asarray(total)
 
     def errors(self, layers: Layers) -> Floats:
@@ -258,13 +258,13 @@ class LayerLikelihood:
         derivatives, total = self._derivatives(layers)
         turbulence = self._matrices(total, layers.unmodelled)
         _, inverse = self._residual(turbulence, layers.noise)
-        others = np.zeros((2, *inverse.shape), np.complex128)
+        of_noise = np.zeros((2, *inverse.shape), np.complex128)
         diagonal = np.arange(len(self._noise_px2))
-        others[0][:, diagonal, diagonal] = layers.noise * self._noise_px2
+        of_noise[0][:, diagonal, diagonal] = layers.noise * self._noise_px2
         part = layers.unmodelled / (1 + layers.unmodelled)
-        others[1][:, diagonal, diagonal] = part * turbulence[:, diagonal, diagonal]
-        of_spectra = (self._matrices(each, layers.unmodelled) for each in derivatives)
-        changes = np.array([inverse @ each for each in (*of_spectra, *others)])
+        of_noise[1][:, diagonal, diagonal] = part * turbulence[:, diagonal, diagonal]
+        of_spectra = (self._matrices(derivative, layers.unmodelled) for derivative in derivatives)
+        changes = np.array([inverse @ change for change in (*of_spectra, *of_noise)])
         flat = changes.reshape(len(changes), -1)
         information = self._weight * (flat @ changes.swapaxes(2, 3).reshape(len(changes), -1).T).real
         information[-3, -3] += OUTER_SCALE_SPREAD**-2
@@ -278,9 +278,10 @@ class LayerLikelihood:
 
     def _start(self) -> float:
         """Return a strength r0^(-5/3) from the total variance."""
-        air = self._spectra.of_wind(np.array([10.0, 0.0]), self._tables)
-        still = self._matrices(air, _UNMODELLED)
-        measured, theory = (np.trace(each, axis1=1, axis2=2).real.sum() for each in (self._measured, still))
+        spectra = self._spectra.of_wind(np.array([10.0, 0.0]), self._tables)
+        turbulence = self._matrices(spectra, _UNMODELLED)
+        both = self._measured, turbulence
+        measured, theory = (np.trace(matrices, axis1=1, axis2=2).real.sum() for matrices in both)
         return float(0.5 * measured / theory)
 
 
@@ -305,8 +306,8 @@ def _doubtful(layers: Layers) -> tuple[int, int, int]:
     apart = np.hypot(*(winds[:, None] - winds).transpose(2, 0, 1)) / np.minimum(
         *np.meshgrid(*[_near(winds)] * 2)
     )
-    one, other = np.unravel_index(np.argmin(apart + np.diag(np.full(len(winds), np.inf))), apart.shape)
-    return int(np.argmin(layers.strength)), int(one), int(other)
+    first, second = np.unravel_index(np.argmin(apart + np.diag(np.full(len(winds), np.inf))), apart.shape)
+    return int(np.argmin(layers.strength)), int(first), int(second)
 
 
 def _rises(layers: Layers, errors: Floats) -> Floats:
@@ -314,27 +315,27 @@ def _rises(layers: Layers, errors: Floats) -> Floats:
 
     They are those of a parabola with the curvature that the errors tell (Wald's test); 0 if not known.
     """
-    weakest, one, other = _doubtful(layers)
-    apart = layers.wind_m_per_s[one] - layers.wind_m_per_s[other]
+    weakest, first, second = _doubtful(layers)
+    difference = layers.wind_m_per_s[first] - layers.wind_m_per_s[second]
     variance = np.square(errors)
-    of_winds = variance[[one, other], :2].sum(axis=0)
+    of_winds = variance[[first, second], :2].sum(axis=0)
     if min(variance[weakest, 2], *of_winds) == 0:
         return np.zeros(2)
-    return 0.5 * np.array([1 / variance[weakest, 2], (apart**2 / of_winds).sum()])
+    return 0.5 * np.array([1 / variance[weakest, 2], (difference**2 / of_winds).sum()])
 
 
 def _with_one_less(layers: Layers) -> list[Layers]:
     """Return the layers without the weakest, and with the nearest two merged."""
     strength, winds = layers.strength, layers.wind_m_per_s
-    weakest, one, other = _doubtful(layers)
-    merged, pair = winds.copy(), strength[[one, other]]
-    merged[one] = pair @ winds[[one, other]] / pair.sum()
+    weakest, first, second = _doubtful(layers)
+    merged, pair = winds.copy(), strength[[first, second]]
+    merged[first] = pair @ winds[[first, second]] / pair.sum()
     sums = strength.copy()
-    sums[one] = pair.sum()
+    sums[first] = pair.sum()
     left_out = replace(
         layers, wind_m_per_s=np.delete(winds, weakest, 0), strength=np.delete(strength, weakest)
     )
-    joined = replace(layers, wind_m_per_s=np.delete(merged, other, 0), strength=np.delete(sums, other))
+    joined = replace(layers, wind_m_per_s=np.delete(merged, second, 0), strength=np.delete(sums, second))
     return [left_out, joined]
 
 

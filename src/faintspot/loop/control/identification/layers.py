@@ -76,13 +76,13 @@ class Identified:
     def summary(self) -> str:
         """Return a summary of one line."""
         if self.oscillators:
-            return ", ".join(f"{each.mode} at {each.frequency_hz:.1f} Hz" for each in self.oscillators)
+            return ", ".join(f"{mode.mode} at {mode.frequency_hz:.1f} Hz" for mode in self.oscillators)
         winds, shares = self.turbulence.wind_m_per_s, self.turbulence.fraction
         layers = [
             f"{math.hypot(x, y):.1f} m/s to {math.degrees(math.atan2(y, x)) % 360:.0f} degrees ({part:.0%})"
-            for (x, y), part in sorted(zip(winds, shares, strict=True), key=lambda each: -each[1])
+            for (x, y), part in sorted(zip(winds, shares, strict=True), key=lambda layer: -layer[1])
         ]
-        shaking = [f"{each.mode} shakes at {each.frequency_hz:.1f} Hz" for each in self.vibrations]
+        shaking = [f"{line.mode} shakes at {line.frequency_hz:.1f} Hz" for line in self.vibrations]
         air = ", ".join(layers) if self.is_layered else "winds from anywhere"
         return ", ".join([air, *shaking])
 
@@ -116,7 +116,7 @@ class Identification:
         self._site, self._rate_hz, self._averaged = site, rate_hz, tuple(averaged)
         records = SlopeRecords.of(telemetry, site)
         self._vibrations = find_vibrations(records.modes(), rate_hz, records.slopes.shape[1])
-        self._given = LayerLikelihood(records, rate_hz, self._vibrations)
+        self._likelihood = LayerLikelihood(records, rate_hz, self._vibrations)
         self._records = records
 
     def layers(self, start: Identified | None = None) -> Identified:
@@ -127,18 +127,18 @@ class Identification:
         if len(self._site.positions_m) == 1:
             return self._oscillating()
         if start is not None:
-            likelihood = self._given.averaging(start.turbulence.averaged)
+            likelihood = self._likelihood.averaging(start.turbulence.averaged)
             return self._identified(likelihood, *likelihood.selected(start.parameters()))
         likelihood, _ = self._best
-        found, errors = likelihood.selected(likelihood.peaks())
+        layers, errors = likelihood.selected(likelihood.peaks())
         # Winds from anywhere are not quite the turbulence, so neighbouring values are tried with layers, too.
-        place = self._averaged.index(likelihood.averaged)
-        for averaged in (*self._averaged[max(place - 1, 0) : place], *self._averaged[place + 1 : place + 2]):
-            other = self._given.averaging(averaged)
-            refined = other.refined(found)
-            if refined.criterion < found.criterion:
-                likelihood, found, errors = other, refined, other.errors(refined)
-        return self._identified(likelihood, found, errors)
+        index = self._averaged.index(likelihood.averaged)
+        for averaged in (*self._averaged[max(index - 1, 0) : index], *self._averaged[index + 1 : index + 2]):
+            candidate = self._likelihood.averaging(averaged)
+            refined = candidate.refined(layers)
+            if refined.criterion < layers.criterion:
+                likelihood, layers, errors = candidate, refined, candidate.errors(refined)
+        return self._identified(likelihood, layers, errors)
 
     def of_winds(self, winds_m_per_s: Floats) -> Identified:
         """Return layers with given winds, (layers, 2), and fitted strengths."""
@@ -156,17 +156,17 @@ class Identification:
         speeds = np.array(_SPEEDS_M_PER_S)
         still = replace(self._site, fraction=np.ones(len(speeds)), wind_m_per_s=np.outer(speeds, [1.0, 0.0]))
         winds = still.from_anywhere().wind_m_per_s
-        tried = [self._given.averaging(each) for each in self._averaged]
-        found = [(each, each.of_winds(winds[None])) for each in tried]
-        return min(found, key=lambda each: each[1].criterion)
+        likelihoods = [self._likelihood.averaging(averaged) for averaged in self._averaged]
+        fits = [(likelihood, likelihood.of_winds(winds[None])) for likelihood in likelihoods]
+        return min(fits, key=lambda fit: fit[1].criterion)
 
     def _oscillating(self) -> Identified:
         records, none = self._records, np.full((1, 2), np.nan)
-        found, noise_px2 = fitted_oscillators(records.modes()[:, :2], self._rate_hz, records.slopes.shape[1])
+        fitted, noise_px2 = fitted_oscillators(records.modes()[:, :2], self._rate_hz, records.slopes.shape[1])
         still = replace(self._site, r0_m=math.inf, fraction=np.ones(1), wind_m_per_s=np.zeros((1, 2)))
         factor = float((noise_px2 / records.noise_px2).mean())
-        known = factor, self._vibrations, self._rate_hz, False, none, none[0, :1], math.nan
-        return Identified(still, *known, found)
+        rest = factor, self._vibrations, self._rate_hz, False, none, none[0, :1], math.nan
+        return Identified(still, *rest, fitted)
 
     def _identified(
         self,

@@ -19,9 +19,9 @@ from faintspot.loop.control.identification.model import (
     KALMAN,
     MODAL,
     POLC,
-    Learnt,
-    Model,
-    Plant,
+    ControlModel,
+    LearntControl,
+    LoopPlant,
 )
 from faintspot.loop.control.kalman.local_covariance import STEPS
 from faintspot.loop.control.kalman.local_predictor import local_filter
@@ -30,9 +30,10 @@ from faintspot.loop.control.phase import phase_of_commands
 from faintspot.loop.control.telemetry import OpenLoopTelemetry, usual_noise
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 
-__all__ = ["CONTROLS", "INTEGRATOR", "KALMAN", "MODAL", "POLC", "Learnt", "Plant", "learn"]
+__all__ = ["CONTROLS", "INTEGRATOR", "KALMAN", "MODAL", "POLC", "LearntControl", "LoopPlant", "learn"]
 
 Floats = NDArray[np.float64]
+Advance = Callable[[], None]
 
 
 GAINS = (0.03, 0.05, 0.07, 0.1, 0.13, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5, 0.6, 0.7, 0.8)
@@ -45,7 +46,7 @@ _LARGEST_PART = 0.85  # of the gain at which a mode would be unstable where slop
 
 def learn(
     kind: str,
-    plant: Plant,
+    plant: LoopPlant,
     telemetry: OpenLoopTelemetry,
     site: SlopeTurbulence,
     rate_hz: float,
@@ -53,7 +54,7 @@ def learn(
     noise_scale: float = 1.0,
     start: Identified | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Learnt:
+) -> LearntControl:
     """Return a controller of the given kind, learnt from telemetry.
 
     Parameters
@@ -79,20 +80,20 @@ def learn(
     of_commands = phase_of_commands(plant.interaction, cells)
     frames = max(_FEWEST_REPLAYED, _MOST_REPLAYED // len(site.positions_m) // 2)
     whole, telemetry = telemetry, telemetry.part(-frames, None)
-    gain, plain_left = plant.best_gain(GAINS, telemetry, of_commands @ plant.reconstructor.matrix)
-    plain = Model(kind, {}, gain, 1.0, (math.inf, plain_left), of_commands)
+    gain, plain_residual = plant.best_gain(GAINS, telemetry, of_commands @ plant.reconstructor.matrix)
+    plain = ControlModel(kind, {}, gain, 1.0, (math.inf, plain_residual), of_commands)
     if kind == MODAL:
-        return Learnt(plant, _modal(plain, plant, telemetry))
+        return LearntControl(plant, _modal(plain, plant, telemetry))
     identification = Identification(whole, site, rate_hz, AVERAGED[:1])
     tried = []
-    known = start if start is not None and start.is_layered and winds == LEARNT else None
-    if known is None:  # else the comparison was made before
+    earlier = start if start is not None and start.is_layered and winds == LEARNT else None
+    if earlier is None:  # else the comparison was made before
         tried.append(identification.anywhere())
     if winds == LEARNT:
-        tried.append(identification.layers(known))
+        tried.append(identification.layers(earlier))
     elif winds == ASSUMED:
         tried.append(identification.of_winds(site.wind_m_per_s))
-    made = []
+    models = []
     total = len(tried) * sum(steps for _, steps in STEPS)
     done = itertools.count(1)
 
@@ -101,23 +102,23 @@ def learn(
             progress(next(done), total)
 
     make = _pseudo_open_loop if kind == POLC else partial(_kalman, advance)
-    for found in tried:
-        text = f"{found.summary()}, noise variance x {found.noise_factor:.2f}"
-        model = replace(plain, noise_factor=found.noise_factor, description=text)
-        made.append((make(model, plant, telemetry, found), found))
-    model, found = min(made, key=lambda each: each[0].left[0])
-    return Learnt(plant, model.with_noise(noise_scale) if kind == KALMAN else model, found)
+    for identified in tried:
+        text = f"{identified.summary()}, noise variance x {identified.noise_factor:.2f}"
+        model = replace(plain, noise_factor=identified.noise_factor, description=text)
+        models.append((make(model, plant, telemetry, identified), identified))
+    model, identified = min(models, key=lambda pair: pair[0].left[0])
+    return LearntControl(plant, model.with_noise(noise_scale) if kind == KALMAN else model, identified)
 
 
 def _kalman(
-    advance: Callable[[], None], model: Model, plant: Plant, telemetry: OpenLoopTelemetry, found: Identified
-) -> Model:
+    advance: Advance, model: ControlModel, plant: LoopPlant, telemetry: OpenLoopTelemetry, fit: Identified
+) -> ControlModel:
     """Return the model with its Kalman filter and residual."""
-    variance, covariance = usual_noise(telemetry.scaled(found.noise_factor))
+    variance, covariance = usual_noise(telemetry.scaled(fit.noise_factor))
     if len(variance) > _MOST_SLOPES:
-        arrays = local_filter(found.layers, 1 / found.rate_hz, variance, advance, covariance)
+        arrays = local_filter(fit.layers, 1 / fit.rate_hz, variance, advance, covariance)
     else:
-        slopes = found.slope_model()
+        slopes = fit.slope_model()
         arrays = {
             "first": slopes.first,
             "second": slopes.second,
@@ -128,7 +129,7 @@ def _kalman(
     return replace(model, arrays=arrays).scored(plant, telemetry)
 
 
-def _modal(model: Model, plant: Plant, telemetry: OpenLoopTelemetry) -> Model:
+def _modal(model: ControlModel, plant: LoopPlant, telemetry: OpenLoopTelemetry) -> ControlModel:
     """Return the model with one gain per mode."""
     trust = max(float(telemetry.trust.mean()), 1e-6)  # by which slopes are smaller than they should be
     weighted = telemetry.trust * telemetry.open_loop_px / trust
@@ -139,12 +140,14 @@ def _modal(model: Model, plant: Plant, telemetry: OpenLoopTelemetry) -> Model:
     return replace(model, arrays={"gains": gains}, description=text).scored(plant, telemetry)
 
 
-def _pseudo_open_loop(model: Model, plant: Plant, telemetry: OpenLoopTelemetry, found: Identified) -> Model:
+def _pseudo_open_loop(
+    model: ControlModel, plant: LoopPlant, telemetry: OpenLoopTelemetry, turbulence: Identified
+) -> ControlModel:
     """Return the model with pseudo-open-loop control for the time at which the command acts."""
-    covariances = found.covariances_px2().sum(axis=0)
+    covariances = turbulence.covariances_px2().sum(axis=0)
     arrays = {"now_px2": covariances[0], "ahead_px2": covariances[min(plant.delay_frames, 2)]}
-    made = [
+    models = [
         replace(model, arrays={**arrays, "gain": np.array(gain)}).scored(plant, telemetry)
         for gain in _POLC_GAINS
     ]
-    return min(made, key=lambda each: each.left[0])
+    return min(models, key=lambda scored: scored.left[0])

@@ -49,7 +49,7 @@ class LoopDelay:
 
 def loop_delay(
     slopes_px: Floats,
-    held_px: Floats,
+    sent_px: Floats,
     run: NDArray[np.int64],
     site: SlopeTurbulence,
     rate_hz: float,
@@ -61,7 +61,7 @@ def loop_delay(
     ----------
     slopes_px : (frames, 2 n) array
         Residual slopes.
-    held_px : (frames, 2 n) array
+    sent_px : (frames, 2 n) array
         Slopes of the command computed from each frame, by the interaction matrix.
     run : (frames,) array of int
         Frames with the same number are consecutive.
@@ -84,11 +84,12 @@ def loop_delay(
             f"and tilt, got {n}"
         )
     kept = np.arange(n)[:: math.ceil(n / _MOST_SUBAPERTURES)]
-    both = np.concatenate([kept, kept + n])
+    columns = np.concatenate([kept, kept + n])
     site = replace(site, positions_m=site.positions_m[kept])
     window = np.hanning(_WINDOW + 2)[1:-1]
     window /= np.linalg.norm(window)
-    products = _products(_without_tilt(slopes_px[:, both]), _without_tilt(held_px[:, both]), run, window)
+    slopes, sent = (_without_tilt(values[:, columns]) for values in (slopes_px, sent_px))
+    products = _products(slopes, sent, run, window)
     delays, gains = (_DELAYS, _GAINS) if delay_frames is None else (np.array([delay_frames]), _FINE_GAINS)
     spectra = np.array([_spectra(products, delay, gains) for delay in delays]).reshape(-1, len(products))
     misfit = _misfit(spectra[:, 1:-1], _turbulence(site, rate_hz, window)[:, 1:-1])
@@ -120,7 +121,7 @@ def _without_tilt(slopes: Floats) -> Floats:
     return np.asarray(axes.reshape(slopes.shape))
 
 
-def _products(slopes: Floats, held: Floats, run: NDArray[np.int64], window: Floats) -> Floats:
+def _products(slopes: Floats, commands_px: Floats, run: NDArray[np.int64], window: Floats) -> Floats:
     """Return mean products (frequencies, 1 + lags, 1 + lags) of transforms of slopes and earlier commands."""
     lags = _MOST_DELAY + 1
     length, total, pieces = len(window), 0.0, 0
@@ -128,7 +129,7 @@ def _products(slopes: Floats, held: Floats, run: NDArray[np.int64], window: Floa
         if run[start - lags] != run[start + length - 1]:
             continue
         parts = [slopes[start : start + length]]
-        parts += [held[start - lag : start - lag + length] for lag in range(1, lags + 1)]
+        parts += [commands_px[start - lag : start - lag + length] for lag in range(1, lags + 1)]
         transformed = np.fft.rfft(np.array(parts) * window[:, None], axis=1)
         total = total + np.einsum("lfm,kfm->flk", transformed, transformed.conj()).real / slopes.shape[1]
         pieces += 1
@@ -141,11 +142,11 @@ def _products(slopes: Floats, held: Floats, run: NDArray[np.int64], window: Floa
 
 def _spectra(products: Floats, delay: float, gains: Floats) -> Floats:
     """Return mean spectra (gains, frequencies) of open-loop slopes."""
-    whole = min(int(delay), _MOST_DELAY)
+    whole_frames = min(int(delay), _MOST_DELAY)
     weight = np.zeros((len(gains), products.shape[1]))
     weight[:, 0] = 1.0
-    weight[:, whole] -= gains * (1 - (delay - whole))
-    weight[:, whole + 1] -= gains * (delay - whole)
+    weight[:, whole_frames] -= gains * (1 - (delay - whole_frames))
+    weight[:, whole_frames + 1] -= gains * (delay - whole_frames)
     return np.asarray(np.einsum("gl,flk,gk->gf", weight, products, weight, optimize=True))
 
 
@@ -157,13 +158,13 @@ def _turbulence(site: SlopeTurbulence, rate_hz: float, window: Floats) -> Floats
     tables, _ = spectra.tables(site.outer_scale_m)
     within = np.eye(n) - 1 / n
     angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-    found = [np.ones(len(bins))]
+    levels = [np.ones(len(bins))]
     for speed in _SPEEDS_M_PER_S:
         winds = speed * np.column_stack([np.cos(angles), np.sin(angles)])
         full = spectra.matrices(np.mean([spectra.of_wind(wind, tables) for wind in winds], axis=0)).real
         axes = full[:, :n, :n] + full[:, n:, n:]
-        found.insert(-1, np.einsum("fij,ji->f", axes, within))
-    return np.array(found)
+        levels.insert(-1, np.einsum("fij,ji->f", axes, within))
+    return np.array(levels)
 
 
 def _misfit(spectra: Floats, parts: Floats) -> Floats:

@@ -17,7 +17,7 @@ from faintspot.base.npz import read_arrays, save_arrays
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.replay import mean_left, replayed_frames, replayed_integrators
+from faintspot.loop.control.identification.replay import mean_residual, replayed_frames, replayed_integrators
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.guarded import Guarded
@@ -81,8 +81,8 @@ def settled(telemetry: OpenLoopTelemetry) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Plant:
-    """Loop properties that a controller needs."""
+class LoopPlant:
+    """Properties of the loop that a controller needs: matrices, delay, leak."""
 
     interaction: Floats
     """(m, commands): slopes [px] per unit of each command."""
@@ -109,19 +109,19 @@ class Plant:
         self, gains: Sequence[float], telemetry: OpenLoopTelemetry, phase: Floats
     ) -> tuple[float, float]:
         """Return the gain of the integrator that leaves the least phase variance, and that variance."""
-        found = self.replayed_integrators(gains, telemetry, phase)
-        left = [mean_left(each, telemetry, settled(telemetry)) for each in found]
-        best = int(np.argmin(left))
-        return gains[best], left[best]
+        residuals = self.replayed_integrators(gains, telemetry, phase)
+        variances = [mean_residual(residual, telemetry, settled(telemetry)) for residual in residuals]
+        best = int(np.argmin(variances))
+        return gains[best], variances[best]
 
-    def left(self, make: Make, telemetry: OpenLoopTelemetry, phase: Floats) -> float:
-        """Return the phase variance that a controller would have left; see `mean_left`."""
-        return mean_left(self.replayed(make, telemetry, phase), telemetry, settled(telemetry))
+    def residual(self, make: Make, telemetry: OpenLoopTelemetry, phase: Floats) -> float:
+        """Return the phase variance that a controller would have left; see `mean_residual`."""
+        return mean_residual(self.replayed(make, telemetry, phase), telemetry, settled(telemetry))
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
-    """Learnt model of a controller."""
+class ControlModel:
+    """Model of a controller, learnt from telemetry."""
 
     kind: str
     arrays: Mapping[str, Floats]
@@ -140,7 +140,7 @@ class Model:
     covariance: Floats | None = None
     """(states, states) px^2: as from `steady_covariance`, where it is known already."""
 
-    def controller(self, plant: Plant, line: CommandDelayLine) -> Controller:
+    def controller(self, plant: LoopPlant, line: CommandDelayLine) -> Controller:
         """Return the learnt controller."""
         arrays = self.arrays
         if self.kind == MODAL:
@@ -151,7 +151,9 @@ class Model:
             return PseudoOpenLoop(line, plant.interaction, *covariances, clean, float(arrays["gain"]))
         return Predictive(line, plant.interaction, self.predictor(), clean, from_latest=self.is_local)
 
-    def compiled(self, plant: Plant, line: CommandDelayLine, phase: Floats, **options: Any) -> CompiledKalman:
+    def compiled(
+        self, plant: LoopPlant, line: CommandDelayLine, phase: Floats, **options: Any
+    ) -> CompiledKalman:
         """Return the Kalman filter of a small sensor with its fallback, see `CompiledKalman`."""
         predictor, reconstructor = self.predictor(), plant.reconstructor
         assert isinstance(predictor, SlopePredictor)
@@ -169,7 +171,7 @@ class Model:
             **options,
         )
 
-    def replayed(self, plant: Plant, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
+    def replayed(self, plant: LoopPlant, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
         """Return the squared residual that the learnt controller would have left; see `replayed_frames`."""
         if self.kind != KALMAN or self.is_local:
             scaled = telemetry.scaled(self.noise_factor)
@@ -177,15 +179,16 @@ class Model:
         line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames)
         return self.compiled(plant, line, phase).replayed(telemetry)
 
-    def phase(self, plant: Plant) -> Floats:
+    def phase(self, plant: LoopPlant) -> Floats:
         """Return the matrix (commands, m) from slopes to what is compared."""
         return np.asarray(self.phase_of_commands @ plant.reconstructor.matrix)
 
-    def scored(self, plant: Plant, telemetry: OpenLoopTelemetry) -> Model:
+    def scored(self, plant: LoopPlant, telemetry: OpenLoopTelemetry) -> ControlModel:
         """Return the model with its residual on telemetry."""
-        left = mean_left(self.replayed(plant, telemetry, self.phase(plant)), telemetry, settled(telemetry))
+        squares = self.replayed(plant, telemetry, self.phase(plant))
+        residual = mean_residual(squares, telemetry, settled(telemetry))
         is_dense = self.kind == KALMAN and not self.is_local
-        return replace(self, left=(left, self.left[1]), covariance=self._covariance if is_dense else None)
+        return replace(self, left=(residual, self.left[1]), covariance=self._covariance if is_dense else None)
 
     @property
     def is_local(self) -> bool:
@@ -203,7 +206,7 @@ class Model:
             return LocalPredictor(self.arrays)
         return SlopePredictor(self._slopes, *self._noise, covariance=self._covariance)
 
-    def with_noise(self, scale: float) -> Model:
+    def with_noise(self, scale: float) -> ControlModel:
         """Return the model of "kalman" with the noise variances scaled by a factor."""
         if scale == 1.0:
             return self
@@ -242,7 +245,7 @@ class Model:
         save_arrays(path, {"kind": np.array(kind), **numbers, **self.arrays})
 
     @classmethod
-    def load(cls, path: str | Path, plant: Plant) -> Model:
+    def load(cls, path: str | Path, plant: LoopPlant) -> ControlModel:
         """Read a model for a loop.
 
         Raises
@@ -250,9 +253,9 @@ class Model:
         InputError
             When it cannot be read, is for another loop, or has numbers out of range.
         """
-        what = "what control has learnt"
-        kind = one_of("kind", str(read_arrays(path, what, ("kind",))["kind"]), list(_OF_KIND))
-        numbers = _checked(read_arrays(path, what, (*_OF_ALL, *_OF_KIND[kind])), plant)
+        contents = "what control has learnt"
+        kind = one_of("kind", str(read_arrays(path, contents, ("kind",))["kind"]), list(_OF_KIND))
+        numbers = _checked(read_arrays(path, contents, (*_OF_ALL, *_OF_KIND[kind])), plant)
         learnt, plain = numbers["left"]
         return cls(
             KALMAN if kind == _LOCAL else kind,
@@ -263,7 +266,7 @@ class Model:
             numbers["phase_of_commands"],
         )
 
-    def check(self, plant: Plant) -> None:
+    def check(self, plant: LoopPlant) -> None:
         """Refuse a model of another loop, or with numbers out of range.
 
         Raises
@@ -275,11 +278,11 @@ class Model:
         _checked({**self.arrays, **numbers}, plant)
 
 
-def _checked(found: Mapping[str, Any], plant: Plant) -> dict[str, Floats]:
+def _checked(arrays: Mapping[str, Any], plant: LoopPlant) -> dict[str, Floats]:
     """Return a model's arrays as float64, with checked shapes and ranges."""
     (slopes, commands), modes = plant.interaction.shape, plant.reconstructor.modes.shape[1]
     ranges = {**_RANGES, "near": (0, slopes // 2), "around": (0, slopes // 2)}
-    numbers = {name: numbers_between(name, value, *ranges.get(name, ())) for name, value in found.items()}
+    numbers = {name: numbers_between(name, value, *ranges.get(name, ())) for name, value in arrays.items()}
     shapes: dict[str, tuple[int, ...]] = {"gains": (modes,), "variance_px2": (slopes,), "left": (2,)}
     shapes["phase_of_commands"] = commands, commands
     shapes["covariance_xy_px2"] = (slopes // 2,)
@@ -295,12 +298,12 @@ def _checked(found: Mapping[str, Any], plant: Plant) -> dict[str, Floats]:
 
 
 @dataclass(frozen=True, eq=False)
-class Learnt:
-    """Learnt controller of a loop, from which controllers are made."""
+class LearntControl:
+    """Learnt model with its loop, from which controllers are made."""
 
-    plant: Plant
-    model: Model
-    found: Identified | None = None
+    plant: LoopPlant
+    model: ControlModel
+    identified: Identified | None = None
     """Turbulence that the model follows from; None for modal gains and models read from a file."""
 
     @property

@@ -41,15 +41,15 @@ def fitted_oscillators(
         Number of slopes that the modes were taken from.
 
     """
-    spectra, found, noise = mode_spectra(amplitudes, rate_hz), [], []
+    spectra, oscillators, noise = mode_spectra(amplitudes, rate_hz), [], []
     for mode, spectrum, values in zip(MODES, spectra.power, amplitudes.T, strict=False):
         x = _Fit(spectrum, spectra, float(values.var())).best()
         noise.append(math.exp(x[0]))
         for frequency, damping, power in x[1:].reshape(-1, 3):
-            each = _vibration(frequency, damping)
+            line = _vibration(frequency, damping)
             rms = math.sqrt(math.exp(power) / slopes)
-            found.append(replace(each, mode=mode, frequency_hz=each.frequency_hz * rate_hz, rms_px=rms))
-    return tuple(found), np.array(noise)
+            oscillators.append(replace(line, mode=mode, frequency_hz=line.frequency_hz * rate_hz, rms_px=rms))
+    return tuple(oscillators), np.array(noise)
 
 
 def _vibration(log_frequency: float, log_damping: float) -> Vibration:
@@ -71,12 +71,12 @@ class _Fit:
     Parameters are logarithms: variance of the noise; frequency, damping and variance of each oscillator.
     """
 
-    def __init__(self, spectrum: Floats, of: ModeSpectra, variance: float) -> None:
+    def __init__(self, spectrum: Floats, modes: ModeSpectra, variance: float) -> None:
         bins = np.arange(_FIRST_BIN, len(spectrum) - 1)
         self._spectrum, self._variance = spectrum[bins], variance
-        self._length, self._segments = of.length, of.segments
-        self._frequency, self._bins = bins / of.length, bins
-        self._correlation = np.correlate(of.window, of.window, "full")[of.length - 1 :]
+        self._length, self._segments = modes.length, modes.segments
+        self._frequency, self._bins = bins / modes.length, bins
+        self._correlation = np.correlate(modes.window, modes.window, "full")[modes.length - 1 :]
 
     def best(self) -> Floats:
         """Return the parameters that the information criterion selects."""
@@ -85,8 +85,8 @@ class _Fit:
         penalty = 1.5 * math.log(len(self._spectrum) * self._segments / 2)
         widths = [width for width in _WIDTHS if 2 * width < len(self._spectrum)]
         while widths and len(x) < 3 * _MOST:
-            tried = [self._refined(np.append(x, self._start(x, width))) for width in widths]
-            more, smaller = min(tried, key=lambda each: each[1])
+            fits = [self._refined(np.append(x, self._start(x, width))) for width in widths]
+            more, smaller = min(fits, key=lambda fit: fit[1])
             if misfit - smaller < penalty:
                 break
             x, misfit = more, smaller
@@ -103,8 +103,8 @@ class _Fit:
         return np.log([frequency, damping, max(power, 1e-9 * self._variance)])
 
     def _refined(self, start: Floats) -> tuple[Floats, float]:
-        found = minimize(self._misfit, start, method="L-BFGS-B")
-        return found.x, float(found.fun)
+        fit = minimize(self._misfit, start, method="L-BFGS-B")
+        return fit.x, float(fit.fun)
 
     def _misfit(self, x: Floats) -> float:
         expected = self._expected(x)

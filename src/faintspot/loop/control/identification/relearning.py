@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learning import learn
-from faintspot.loop.control.identification.model import KALMAN, SETTLE_FRAMES, Learnt, Model, Plant
+from faintspot.loop.control.identification.learning import KALMAN, LearntControl, LoopPlant, learn
+from faintspot.loop.control.identification.model import SETTLE_FRAMES, ControlModel
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 
@@ -27,26 +27,26 @@ FEWEST_FRAMES = math.ceil(_FEWEST_BLOCKS * _BLOCK_FRAMES / JUDGED_PART) + 1
 
 
 @dataclass(frozen=True, eq=False)
-class Relearnt:
+class RelearntControl:
     """New filter, and the residual phase variance that it and others would have left on the same frames."""
 
-    learnt: Learnt
-    left: float
-    left_by_running: float
-    left_by_integrator: float
+    learnt: LearntControl
+    residual: float
+    by_running: float
+    by_integrator: float
     error: float
-    """Standard error of `left_by_running` minus `left`."""
+    """Standard error of `by_running` minus `residual`."""
 
     @property
     def is_better(self) -> bool:
         """Whether the new filter leaves less than the running one, beyond the error, and the integrator."""
-        gain = self.left_by_running - self.left
-        return gain > STANDARD_ERRORS * self.error and self.left < self.left_by_integrator
+        gain = self.by_running - self.residual
+        return gain > STANDARD_ERRORS * self.error and self.residual < self.by_integrator
 
     def summary(self) -> str:
         """Return a summary of one line."""
-        part, error = self.left / self.left_by_running, self.error / self.left_by_running
-        of_integrator = self.left / self.left_by_integrator
+        part, error = self.residual / self.by_running, self.error / self.by_running
+        of_integrator = self.residual / self.by_integrator
         return (
             f"{self.learnt.model.description}; phase variance {part:.3f} +- {error:.3f} of the running "
             f"filter's, {of_integrator:.2f} of the integrator's"
@@ -54,13 +54,13 @@ class Relearnt:
 
 
 def relearn(
-    plant: Plant,
-    running: Model,
+    plant: LoopPlant,
+    running: ControlModel,
     telemetry: OpenLoopTelemetry,
     site: SlopeTurbulence,
     rate_hz: float,
     start: Identified | None = None,
-) -> Relearnt:
+) -> RelearntControl:
     """Learn from the first part of telemetry, and judge on the rest by replay; nothing else is changed.
 
     All filters are replayed on the same open-loop slopes, each with its own commands, so that nothing is
@@ -93,11 +93,11 @@ def relearn(
     replayed = telemetry.part(begin, None)  # all have settled when the part begins that they are judged on
     phase = new.phase(plant)
     by_integrator = plant.replayed_integrators([new.plain_gain], replayed, phase)[0]
-    found = *(model.replayed(plant, replayed, phase) for model in (new, running)), by_integrator
-    left, by_running, by_integrator = (each[first - begin :] for each in found)
-    means = float(left.mean()), float(by_running.mean()), float(by_integrator.mean())
+    residuals = *(model.replayed(plant, replayed, phase) for model in (new, running)), by_integrator
+    by_new, by_running, by_integrator = (squares[first - begin :] for squares in residuals)
+    means = float(by_new.mean()), float(by_running.mean()), float(by_integrator.mean())
     scored = replace(new, left=(means[0], means[2]))  # by which the engine chooses what begins
-    return Relearnt(replace(learnt, model=scored), *means, _error_of_mean(by_running - left))
+    return RelearntControl(replace(learnt, model=scored), *means, _error_of_mean(by_running - by_new))
 
 
 def _error_of_mean(values: Floats) -> float:

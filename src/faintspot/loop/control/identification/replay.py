@@ -43,18 +43,18 @@ def replayed_frames(
     line = CommandDelayLine(interaction.shape[1], delay_frames)
     controller = make(line)
     error, covariance = np.sqrt(telemetry.variance_px2), telemetry.covariances_px2
-    left = np.zeros_like(telemetry.open_loop_px)
+    residuals = np.zeros_like(telemetry.open_loop_px)
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable loop leaves more than can be told
         for frame, slopes in enumerate(telemetry.open_loop_px):
             residual = slopes + interaction @ line.acting
             trust = telemetry.trust[frame]
-            left[frame] = trust * residual
+            residuals[frame] = trust * residual
             try:
                 estimated = as_estimated(residual, trust, controller)
                 controller.update(estimated, error[frame], covariance[frame])
             except ArithmeticError:  # its commands are not finite
-                return np.full(len(left), np.inf)
-        return np.asarray(np.square(left @ phase.T).sum(axis=1))
+                return np.full(len(residuals), np.inf)
+        return np.asarray(np.square(residuals @ phase.T).sum(axis=1))
 
 
 def replayed_integrators(
@@ -73,20 +73,20 @@ def replayed_integrators(
     gain = np.asarray(gains, np.float64)
     commands = np.zeros((interaction.shape[1], len(gain)))
     caused = [np.zeros((len(interaction), len(gain))) for _ in range(delay_frames)]  # by the latest commands
-    left = np.zeros((len(telemetry), len(gain)))
+    squares = np.zeros((len(telemetry), len(gain)))
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable loop leaves more than can be told
         for frame, (slopes, trust) in enumerate(zip(telemetry.open_loop_px, telemetry.trust, strict=True)):
             acting, latest = caused[frame % delay_frames], caused[(frame - 1) % delay_frames]
-            seen = trust[:, None] * (slopes[:, None] + acting)
-            left[frame] = np.square(phase @ seen).sum(axis=0)
-            seen += (1 - trust)[:, None] * (acting - latest)  # as an estimator with a prior would have
-            commands = (1 - leak) * commands - gain * (reconstructor.matrix @ seen)
+            slopes_px = trust[:, None] * (slopes[:, None] + acting)
+            squares[frame] = np.square(phase @ slopes_px).sum(axis=0)
+            slopes_px += (1 - trust)[:, None] * (acting - latest)  # as an estimator with a prior would have
+            commands = (1 - leak) * commands - gain * (reconstructor.matrix @ slopes_px)
             caused[frame % delay_frames] = interaction @ commands
-        left[:, ~np.isfinite(commands.sum(axis=0))] = np.inf
-    return left.T
+        squares[:, ~np.isfinite(commands.sum(axis=0))] = np.inf
+    return squares.T
 
 
-def mean_left(frames: Floats, telemetry: OpenLoopTelemetry, settle_frames: int) -> float:
+def mean_residual(frames: Floats, telemetry: OpenLoopTelemetry, settle_frames: int) -> float:
     """Return the mean square residual of fully trusted slopes, once the loop has settled; or infinity.
 
     Parameters
@@ -98,6 +98,6 @@ def mean_left(frames: Floats, telemetry: OpenLoopTelemetry, settle_frames: int) 
         Frames at the start that are not scored.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        seen = float(frames[settle_frames:].mean())
+        mean = float(frames[settle_frames:].mean())
     share = np.square(telemetry.trust[settle_frames:]).mean()
-    return float(seen / share) if np.isfinite(seen) and share > 0 else math.inf
+    return float(mean / share) if np.isfinite(mean) and share > 0 else math.inf

@@ -50,14 +50,14 @@ class SlopeRecords:
         if not enough.any():
             raise InputError("telemetry: expected slopes that were measured in half of the frames, got none")
         kept = np.flatnonzero(enough)[:: math.ceil(np.count_nonzero(enough) / _MOST_SUBAPERTURES)]
-        both = np.concatenate([kept, kept + n])
-        slopes = interpolated(telemetry.open_loop_px[:, both], measured[:, both])
-        counted = np.where(measured[:, both], variance[:, both], np.nan)
+        columns = np.concatenate([kept, kept + n])
+        slopes = interpolated(telemetry.open_loop_px[:, columns], measured[:, columns])
+        counted = np.where(measured[:, columns], variance[:, columns], np.nan)
         return cls(
             replace(site, positions_m=site.positions_m[kept]),
             slopes - slopes.mean(axis=0),
             np.nanmean(counted, axis=0),
-            measured[:, both].mean(axis=1) >= _LEAST_MEASURED,
+            measured[:, columns].mean(axis=1) >= _LEAST_MEASURED,
         )
 
     def modes(self) -> Floats:
@@ -66,19 +66,19 @@ class SlopeRecords:
 
     def segments(self, every: int, length: int) -> Floats:
         """Return half-overlapping pieces (pieces, length, m) of every n-th frame."""
-        found = []
+        pieces = []
         for first in range(every):
             slopes, measured = self.slopes[first::every], self.measured[first::every]
             for start in range(0, len(slopes) - length + 1, length // 2):
                 piece = slice(start, start + length)
                 if measured[piece].mean() >= _LEAST_MEASURED_OF_WINDOW:
-                    found.append(slopes[piece])
-        if not found:
+                    pieces.append(slopes[piece])
+        if not pieces:
             raise InputError(
                 f"telemetry: expected {every * length} frames without a gap for its spectra, got "
                 f"{len(self.slopes)} frames, {np.count_nonzero(self.measured)} of them measured"
             )
-        return np.array(found)
+        return np.array(pieces)
 
 
 def interpolated(values: Floats, measured: NDArray[np.bool_]) -> Floats:
@@ -86,6 +86,6 @@ def interpolated(values: Floats, measured: NDArray[np.bool_]) -> Floats:
     if measured.all():
         return values
     frames, result = np.arange(len(values)), values.copy()
-    for slope, seen in enumerate(measured.T):
-        result[~seen, slope] = np.interp(frames[~seen], frames[seen], values[seen, slope])
+    for slope, usable in enumerate(measured.T):
+        result[~usable, slope] = np.interp(frames[~usable], frames[usable], values[usable, slope])
     return result

@@ -59,20 +59,20 @@ class SlopeSpectra:
         self._transform *= np.correlate(window, window, "full")
         self._site, self._side = site, site.subaperture_m
         self._averaged_m = site.averaged * site.subaperture_m
-        apart = np.round((site.positions_m[:, None] - site.positions_m).reshape(-1, 2), 6)
-        is_opposite = (apart[:, 0] < 0) | ((apart[:, 0] == 0) & (apart[:, 1] < 0))
-        self._apart_m, which = np.unique(
-            np.where(is_opposite[:, None], -apart, apart), axis=0, return_inverse=True
+        apart_m = np.round((site.positions_m[:, None] - site.positions_m).reshape(-1, 2), 6)
+        is_opposite = (apart_m[:, 0] < 0) | ((apart_m[:, 0] == 0) & (apart_m[:, 1] < 0))
+        self._apart_m, separation = np.unique(
+            np.where(is_opposite[:, None], -apart_m, apart_m), axis=0, return_inverse=True
         )
-        self._index(which.reshape(-1), is_opposite)
+        self._index(separation.reshape(-1), is_opposite)
         largest = float(np.abs(self._apart_m).max(initial=0.0)) + reach_m
         self._nodes = math.ceil(math.asinh(largest / self._side) / _SPACING) + 2
 
-    def _index(self, which: NDArray[np.int64], is_opposite: NDArray[np.bool_]) -> None:
+    def _index(self, separation: NDArray[np.int64], is_opposite: NDArray[np.bool_]) -> None:
         n, distinct = len(self._site.positions_m), len(self._apart_m)
-        which = which.reshape(n, n)
-        cross = which + distinct
-        self._which = np.block([[which, cross], [cross, which + 2 * distinct]])
+        separation = separation.reshape(n, n)
+        cross = separation + distinct
+        self._which = np.block([[separation, cross], [cross, separation + 2 * distinct]])
         self._opposite = np.tile(is_opposite.reshape(n, n), (2, 2))
         entries = 4 * n * n
         self._sum = sparse.csr_matrix(
@@ -81,20 +81,20 @@ class SlopeSpectra:
 
     def averaging(self, averaged: float) -> SlopeSpectra:
         """Return the spectra of other `SlopeTurbulence.averaged`."""
-        other = copy.copy(self)
-        other._averaged_m = averaged * self._side
-        return other
+        spectra = copy.copy(self)
+        spectra._averaged_m = averaged * self._side
+        return spectra
 
     def tables(self, outer_scale_m: float) -> tuple[Floats, Floats]:
         """Return tables of the covariances xx, xy and yy of turbulence with r0 = 1 m, and their derivatives.
 
         The derivative is with respect to the logarithm of the outer scale.
         """
-        place = (math.log(outer_scale_m) - _FIRST_LOG_SCALE) / _LOG_SCALE_STEP
-        node = int(min(max(math.floor(place), 0), _SCALES - 2))
+        position = (math.log(outer_scale_m) - _FIRST_LOG_SCALE) / _LOG_SCALE_STEP
+        node = int(min(max(math.floor(position), 0), _SCALES - 2))
         of_sensor = self._side, self._averaged_m, self._nodes
-        low, high = (self._site.px2_per_rad2_per_m2 * _table(*of_sensor, each) for each in (node, node + 1))
-        return low + (place - node) * (high - low), (high - low) / _LOG_SCALE_STEP
+        low, high = (self._site.px2_per_rad2_per_m2 * _table(*of_sensor, index) for index in (node, node + 1))
+        return low + (position - node) * (high - low), (high - low) / _LOG_SCALE_STEP
 
     def of_wind(self, wind_m_per_s: Floats, tables: Floats) -> Complex:
         """Return the distinct spectra (frequencies, 3 distinct) px^2 of a layer of r0 = 1 m."""
@@ -126,8 +126,8 @@ class SlopeSpectra:
 
     def of_process(self, covariance_px2: Floats) -> Complex:
         """Return the spectrum (frequencies,) of one record with covariances for lags of 0, 1, ... steps."""
-        both = np.concatenate([covariance_px2[:0:-1], covariance_px2])
-        return np.asarray(self._transform @ both)
+        symmetric = np.concatenate([covariance_px2[:0:-1], covariance_px2])
+        return np.asarray(self._transform @ symmetric)
 
     def matrices(self, distinct: Complex) -> Complex:
         """Return the cross-spectra (frequencies, 2 n, 2 n) from the distinct ones."""
@@ -145,12 +145,12 @@ class SlopeSpectra:
 @lru_cache(maxsize=2 * _SCALES)
 def _table(side_m: float, averaged_m: float, nodes: int, scale: int) -> Floats:
     """Return spline coefficients (3, places, places), rad^2 m^-2, for one of the outer scales."""
-    place = side_m * np.sinh(_SPACING * np.arange(nodes))
-    x, y = (each.ravel() for each in np.meshgrid(place, place, indexing="ij"))
+    positions_m = side_m * np.sinh(_SPACING * np.arange(nodes))
+    x, y = (coordinate.ravel() for coordinate in np.meshgrid(positions_m, positions_m, indexing="ij"))
     tables = gradient_covariances(x, y, averaged_m, math.exp(_FIRST_LOG_SCALE + scale * _LOG_SCALE_STEP))
-    even, odd = (each.reshape(nodes, -1) for each in tables[:2])
+    even, odd = (table.reshape(nodes, -1) for table in tables[:2])
     quarters = (even, 1), (odd, -1), (even.T, 1)
-    return np.array([spline_filter(_four_quarters(*each), order=3) for each in quarters])
+    return np.array([spline_filter(_four_quarters(*quarter), order=3) for quarter in quarters])
 
 
 def _four_quarters(quarter: Floats, sign: int) -> Floats:
@@ -180,21 +180,21 @@ def _interpolate(
     out : (lags, k + 2 derived, distinct) array
     """
     side, spacing, origin = scale
-    count, places = tables.shape[0], tables.shape[1]
+    count, nodes = tables.shape[0], tables.shape[1]
     for lag in range(shift_m.shape[0]):
         for s in range(apart_m.shape[0]):
-            row = _spline(apart_m[s, 0] - shift_m[lag, 0], side, spacing, origin, places, weights[0])
-            column = _spline(apart_m[s, 1] - shift_m[lag, 1], side, spacing, origin, places, weights[1])
+            row = _spline(apart_m[s, 0] - shift_m[lag, 0], side, spacing, origin, nodes, weights[0])
+            column = _spline(apart_m[s, 1] - shift_m[lag, 1], side, spacing, origin, nodes, weights[1])
             of_x, of_y = weights[0], weights[1]
             for k in range(count):
                 value, along, across = 0.0, 0.0, 0.0
                 for i in range(_POINTS):
-                    near, slope = 0.0, 0.0
+                    row_value, slope = 0.0, 0.0
                     for j in range(_POINTS):
-                        near += of_y[0, j] * tables[k, row + i, column + j]
+                        row_value += of_y[0, j] * tables[k, row + i, column + j]
                         slope += of_y[1, j] * tables[k, row + i, column + j]
-                    value += of_x[0, i] * near
-                    along += of_x[1, i] * near
+                    value += of_x[0, i] * row_value
+                    along += of_x[1, i] * row_value
                     across += of_x[0, i] * slope
                 out[lag, k, s] = value
                 if k < derived:
@@ -203,19 +203,19 @@ def _interpolate(
 
 
 @_compiled
-def _spline(apart: Any, side: Any, spacing: Any, origin: Any, places: Any, weights: Any) -> int:
+def _spline(apart_m: Any, side: Any, spacing: Any, origin: Any, nodes: Any, weights: Any) -> int:
     """Write weights and derivatives (2, 4) of coefficients at a separation; return the first one's place."""
-    ratio = apart / side
+    ratio = apart_m / side
     root = math.sqrt(1.0 + ratio * ratio)
-    place = math.copysign(math.log(abs(ratio) + root), ratio) / spacing + origin
-    place = min(max(place, 1.0), places - 2.001)
-    first = int(place)
-    t, per_m = place - first, 1.0 / (root * side * spacing)
-    rest = 1.0 - t
-    weights[0, 0], weights[0, 3] = rest * rest * rest / 6.0, t * t * t / 6.0
-    weights[0, 1] = (4.0 - 3.0 * t * t * (1.0 + rest)) / 6.0
-    weights[0, 2] = (4.0 - 3.0 * rest * rest * (1.0 + t)) / 6.0
-    weights[1, 0], weights[1, 3] = -0.5 * rest * rest * per_m, 0.5 * t * t * per_m
+    position = math.copysign(math.log(abs(ratio) + root), ratio) / spacing + origin
+    position = min(max(position, 1.0), nodes - 2.001)
+    first = int(position)
+    t, per_m = position - first, 1.0 / (root * side * spacing)
+    complement = 1.0 - t
+    weights[0, 0], weights[0, 3] = complement * complement * complement / 6.0, t * t * t / 6.0
+    weights[0, 1] = (4.0 - 3.0 * t * t * (1.0 + complement)) / 6.0
+    weights[0, 2] = (4.0 - 3.0 * complement * complement * (1.0 + t)) / 6.0
+    weights[1, 0], weights[1, 3] = -0.5 * complement * complement * per_m, 0.5 * t * t * per_m
     weights[1, 1] = t * (1.5 * t - 2.0) * per_m
-    weights[1, 2] = -rest * (1.5 * rest - 2.0) * per_m
+    weights[1, 2] = -complement * (1.5 * complement - 2.0) * per_m
     return first - 1

@@ -54,16 +54,16 @@ class Vibration:
 
     def driving_variance(self, rate_hz: float) -> float:
         """Return the driving variance of the recursion for an oscillation of variance 1."""
-        one, two = self.recursion(rate_hz)
-        return (1 + two) * ((1 - two) ** 2 - one**2) / (1 - two)
+        first, second = self.recursion(rate_hz)
+        return (1 + second) * ((1 - second) ** 2 - first**2) / (1 - second)
 
     def correlation(self, rate_hz: float, frames: int) -> Floats:
         """Return the autocorrelation at lags of 0, 1, ... frames."""
-        one, two = self.recursion(rate_hz)
-        radius, lags = math.sqrt(-two), np.arange(frames)
-        cosine = one / (2 * radius)
+        first, second = self.recursion(rate_hz)
+        radius, lags = math.sqrt(-second), np.arange(frames)
+        cosine = first / (2 * radius)
         angle, sine = math.acos(cosine), math.sqrt(1 - cosine**2)
-        later = (one / (radius * (1 - two)) - cosine) / sine
+        later = (first / (radius * (1 - second)) - cosine) / sine
         return np.asarray(radius**lags * (np.cos(angle * lags) + later * np.sin(angle * lags)))
 
 
@@ -89,11 +89,11 @@ def find_vibrations(amplitudes: Floats, rate_hz: float, slopes: int) -> tuple[Vi
     """
     if _segment_length(len(amplitudes), rate_hz) < 2 * _BACKGROUND_BINS:
         return ()
-    spectra, found = mode_spectra(amplitudes, rate_hz), []
+    spectra, vibrations = mode_spectra(amplitudes, rate_hz), []
     for mode, spectrum in zip(MODES, spectra.power, strict=True):
         lines = _Lines(spectrum, spectra, rate_hz, slopes)
-        found += list(itertools.islice(lines.found(mode), _MOST_PER_MODE))
-    return tuple(found)
+        vibrations += list(itertools.islice(lines.significant(mode), _MOST_PER_MODE))
+    return tuple(vibrations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,38 +135,36 @@ def with_vibrations(
 
     They are layers of their own, each with at most one vibration of each mode: these are orthogonal.
     """
-    shapes, layers = (
-        mode_shapes(positions_m),
-        [list(each) for each in (model.first, model.second, model.driving)],
-    )
-    left = list(vibrations)
-    while left:
-        together = {each.mode: each for each in reversed(left)}
-        left = [each for each in left if each is not together[each.mode]]
+    shapes = mode_shapes(positions_m)
+    layers = [list(matrices) for matrices in (model.first, model.second, model.driving)]
+    remaining = list(vibrations)
+    while remaining:
+        group = {vibration.mode: vibration for vibration in reversed(remaining)}
+        remaining = [vibration for vibration in remaining if vibration is not group[vibration.mode]]
         added = np.zeros((3, model.slopes, model.slopes))
-        for each in together.values():
-            each = replace(each, damping=max(each.damping, _LEAST_DAMPING))
-            shape = shapes[MODES.index(each.mode)]
-            driving = model.slopes * each.rms_px**2 * each.driving_variance(rate_hz)
-            numbers = np.array([*each.recursion(rate_hz), driving])
+        for vibration in group.values():
+            vibration = replace(vibration, damping=max(vibration.damping, _LEAST_DAMPING))
+            shape = shapes[MODES.index(vibration.mode)]
+            driving = model.slopes * vibration.rms_px**2 * vibration.driving_variance(rate_hz)
+            numbers = np.array([*vibration.recursion(rate_hz), driving])
             added += numbers[:, None, None] * np.outer(shape, shape)
-        for known, new in zip(layers, added, strict=True):
-            known.append(new)
-    return SlopeModel(*(np.array(each) for each in layers))
+        for matrices, new in zip(layers, added, strict=True):
+            matrices.append(new)
+    return SlopeModel(*(np.array(matrices) for matrices in layers))
 
 
 class _Lines:
     """Spectrum of a mode that is searched for lines."""
 
-    def __init__(self, spectrum: Floats, of: ModeSpectra, rate_hz: float, slopes: int) -> None:
-        self._spectrum, self._segments, self._rate_hz, self._slopes = spectrum, of.segments, rate_hz, slopes
-        self._bin_hz, window = rate_hz / of.length, of.window
-        middle = gamma(of.segments, scale=1 / of.segments).median()
+    def __init__(self, spectrum: Floats, spectra: ModeSpectra, rate_hz: float, slopes: int) -> None:
+        self._spectrum, self._rate_hz, self._slopes = spectrum, rate_hz, slopes
+        self._segments, self._bin_hz, window = spectra.segments, rate_hz / spectra.length, spectra.window
+        middle = gamma(self._segments, scale=1 / self._segments).median()
         background = median_filter(spectrum, _BACKGROUND_BINS, mode="nearest") / middle
         self._background = np.maximum(background, 1e-12 * spectrum.max() + 1e-300)
         self._correlation = np.correlate(window, window, "full")[len(window) - 1 :]
 
-    def found(self, mode: str) -> Iterator[Vibration]:
+    def significant(self, mode: str) -> Iterator[Vibration]:
         """Yield the significant lines, that of the highest peak first."""
         yield from filter(None, (self._fitted(mode, peak) for peak in self._peaks()))
 
@@ -190,7 +188,7 @@ class _Lines:
         Turbulence has broad maxima, for example where the sub-apertures' grid passes over it.
         """
         bins = np.arange(max(1, peak - _LINE_BINS), min(len(self._spectrum), peak + _LINE_BINS + 1))
-        near, lags = self._spectrum[bins], np.arange(len(self._correlation))
+        power, lags = self._spectrum[bins], np.arange(len(self._correlation))
         transform = np.cos(2 * np.pi / len(lags) * np.outer(bins, lags)) * self._correlation
         transform[:, 1:] *= 2
         powers = ((bins - peak) / _LINE_BINS)[:, None] ** np.arange(_SMOOTH_ORDER + 1)
@@ -204,7 +202,7 @@ class _Lines:
         def misfit(smooth: Floats, of_line: Floats | float = 0.0) -> float:
             logarithm = np.clip(powers[:, : len(smooth)] @ smooth, -60, 60)
             expected = self._background[peak] * np.exp(logarithm) + of_line
-            return self._segments * float(np.sum(np.log(expected) + near / expected)) / 2
+            return self._segments * float(np.sum(np.log(expected) + power / expected)) / 2
 
         def misfit_with(x: Floats) -> float:
             vibration = line(x)
@@ -212,19 +210,19 @@ class _Lines:
             return misfit(x[3:], vibration.rms_px**2 * self._slopes * np.maximum(shape, 0.0))
 
         without = minimize(misfit, np.zeros(_SMOOTH_ORDER + 1)).fun
-        strength = 4 * max(near.sum() - len(near) * self._background[peak], 1e-30) / len(lags)
+        strength = 4 * max(power.sum() - len(power) * self._background[peak], 1e-30) / len(lags)
         best = np.array([0.0, math.log(_START_DAMPING), math.log(strength)])
-        for more in (1, _SMOOTH_ORDER):
-            start, options = np.append(best, np.zeros(more)), {"maxiter": 2000, "xatol": 1e-3, "fatol": 1e-3}
+        for order in (1, _SMOOTH_ORDER):
+            start, options = np.append(best, np.zeros(order)), {"maxiter": 2000, "xatol": 1e-3, "fatol": 1e-3}
             fit = minimize(misfit_with, start, method="Nelder-Mead", options=options)
             best = fit.x
         if without - fit.fun < chi2(3).isf(_FALSE_ALARM / len(self._spectrum)) / 2:
             return None
-        errors, found = _errors(misfit_with, best), line(best)
-        frequency, rms = errors[0] * self._bin_hz, 0.5 * errors[2] * found.rms_px
-        if found.damping > _MOST_DAMPING or not math.isfinite(frequency + rms):
+        errors, vibration = _errors(misfit_with, best), line(best)
+        frequency, rms = errors[0] * self._bin_hz, 0.5 * errors[2] * vibration.rms_px
+        if vibration.damping > _MOST_DAMPING or not math.isfinite(frequency + rms):
             return None
-        return replace(found, frequency_error_hz=float(frequency), rms_error_px=float(rms))
+        return replace(vibration, frequency_error_hz=float(frequency), rms_error_px=float(rms))
 
 
 def _errors(misfit: Callable[[Floats], float], best: Floats, step: float = 0.05) -> Floats:

@@ -143,8 +143,8 @@ class CompiledKalman:
     def begin(self) -> None:
         """See `Controller`; open-loop slopes are assumed to equal the mirror's correction."""
         latest = self._line.latest
-        for own in (self._learnt, self._plain):
-            own.hold(latest)
+        for line in (self._learnt, self._plain):
+            line.hold(latest)
         open_loop = -(self._interaction @ latest)
         self._memory.state[:] = self._shares[:, None, None] * open_loop
         self._memory.slopes[PREDICTED] = open_loop
@@ -177,7 +177,7 @@ class CompiledKalman:
             self._numbers,
             self._matrices,
             self._lines,
-            self._places(),
+            self._next_rows(),
             self._memory,
         )
         self._line.sent(total)
@@ -194,20 +194,20 @@ class CompiledKalman:
         covariance = self._noise_factor * telemetry.covariances_px2
         self._memory.state[:], self._memory.slopes[PREDICTED] = 0.0, 0.0
         line = np.zeros_like(self._lines.learnt)
-        what = slopes, variance, covariance, trust
-        replay(*what, self._numbers[-1], self._matrices, line, self._memory, squares)
+        recorded = slopes, variance, covariance, trust
+        replay(*recorded, self._numbers[-1], self._matrices, line, self._memory, squares)
         return squares
 
     def _catch_up(self) -> None:
         """Complete the previous frame."""
         if self._is_behind:
             self._is_behind, self._held_at = False, -1
-            total = GO_ON(self._numbers, self._matrices, self._lines, self._places(), self._memory)
+            total = GO_ON(self._numbers, self._matrices, self._lines, self._next_rows(), self._memory)
             self._learnt.sent(total)
             self._plain.sent(total)
-        if self._held_at != self._line.place:
-            HOLD(self._matrices, self._lines, self._places(), self._memory)
-            self._held_at = self._line.place
+        if self._held_at != self._line.next_row:
+            HOLD(self._matrices, self._lines, self._next_rows(), self._memory)
+            self._held_at = self._line.next_row
 
-    def _places(self) -> tuple[int, int, int]:
-        return self._line.place, self._learnt.place, self._plain.place
+    def _next_rows(self) -> tuple[int, int, int]:
+        return self._line.next_row, self._learnt.next_row, self._plain.next_row

@@ -61,10 +61,10 @@ class Guarded:
         prefers_plain: bool = False,
     ) -> None:
         self._line, self._interaction, self._phase = line, interaction, phase
-        of_both = interaction.shape[1], line.delay_frames, line.largest
-        self._lines = [CommandDelayLine(*of_both) for _ in range(2)]
+        sizes = interaction.shape[1], line.delay_frames, line.largest
+        self._lines = [CommandDelayLine(*sizes) for _ in range(2)]
         makers = (learnt, plain)
-        self.controllers = [make(own) for make, own in zip(makers, self._lines, strict=True)]
+        self.controllers = [make(own_line) for make, own_line in zip(makers, self._lines, strict=True)]
         self.prior_std_px, self._noise_factor = prior_std_px, noise_factor
         self.chosen = int(prefers_plain)
         """0: the learnt controller; 1: the plain one."""
@@ -76,8 +76,8 @@ class Guarded:
     def expected(self) -> Expected:
         """See `Controller`."""
         mean, std = self.controllers[self.chosen].expected()
-        other = self._line.acting - self._lines[self.chosen].acting
-        return Expected(mean + self._interaction @ other, std)
+        offset = self._line.acting - self._lines[self.chosen].acting
+        return Expected(mean + self._interaction @ offset, std)
 
     def fall_back(self) -> None:
         """Let the plain controller drive the mirror until the learnt one leaves less."""
@@ -100,28 +100,28 @@ class Guarded:
     ) -> None:
         """See `Controller`."""
         expected = self.expected().mean_px
-        alone, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
-        open_loop = alone - self._interaction @ self._line.acting
+        slopes, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
+        open_loop = slopes - self._interaction @ self._line.acting
         error = np.sqrt(self._noise_factor * variance)
         covariance = None  # of an estimator with a prior, that of the frame alone is not known
         if covariance_xy_px2 is not None and self.prior_std_px is None:
             covariance = self._noise_factor * covariance_xy_px2
-        left = []
+        variances = []
         for controller, line in zip(self.controllers, self._lines, strict=True):
             residual = open_loop + self._interaction @ line.acting
-            left.append(float(np.square(self._phase @ (trust * residual)).sum()))
+            variances.append(float(np.square(self._phase @ (trust * residual)).sum()))
             controller.update(as_estimated(residual, trust, controller), error, covariance)
         self._send()
-        self._choose((left[0] - left[1]) / max(left[0] + left[1], 1e-30))
+        self._choose((variances[0] - variances[1]) / max(variances[0] + variances[1], 1e-30))
 
     def _send(self) -> None:
         """Send the chosen controller's command, with what is left of the offset."""
-        own = self._lines[self.chosen].latest
+        command = self._lines[self.chosen].latest
         if self._sent != self.chosen:
             self._sent, self._blended = self.chosen, HANDOVER_FRAMES
-            self._offset = self._line.latest - own
+            self._offset = self._line.latest - command
         self._blended = max(0, self._blended - 1)
-        self._line.put(own + self._blended / HANDOVER_FRAMES * self._offset)
+        self._line.put(command + self._blended / HANDOVER_FRAMES * self._offset)
 
     def _choose(self, difference: float) -> None:
         """Switch from the next frame on if the recent mean difference exceeds its error."""

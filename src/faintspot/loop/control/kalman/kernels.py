@@ -89,19 +89,19 @@ def _take(
 ) -> None:
     """Write the inputs of both controllers; see `Guarded.update` and `telemetry.without_prior`."""
     for s in range(slopes.shape[0]):
-        held, of_learnt, of_plain = rows[HELD, s], rows[HELD_LEARNT, s], rows[HELD_PLAIN, s]
+        caused, of_learnt, of_plain = rows[HELD, s], rows[HELD_LEARNT, s], rows[HELD_PLAIN, s]
         latest = rows[LATEST_PLAIN, s]
         measured = errors[s] < math.inf
         variance = max(errors[s] * errors[s], LEAST_VARIANCE_PX2)
-        alone, trust = slopes[s], 1.0 if measured else 0.0
+        slope, trust = slopes[s], 1.0 if measured else 0.0
         if prior_std.shape[0] > 0:
-            expected = held - latest if chosen else held + rows[PREDICTED, s]
+            expected = caused - latest if chosen else caused + rows[PREDICTED, s]
             prior = prior_std[s] * prior_std[s]
             share = max(prior / variance - 1.0, LEAST_SHARE)
-            alone = expected + (slopes[s] - expected) * (1.0 + share) / share
+            slope = expected + (slopes[s] - expected) * (1.0 + share) / share
             variance = prior / share
             trust = trust * share / (1.0 + share)
-        open_loop = alone - held
+        open_loop = slope - caused
         rows[_LEFT_LEARNT, s] = trust * (open_loop + of_learnt)
         residual, expects = open_loop + of_plain, of_plain - latest
         rows[_LEFT_PLAIN, s] = trust * residual
@@ -119,8 +119,8 @@ def _correlate(covariance: Any, factor: Any, rows: Any) -> None:
     """Write the covariances of x and y, 0 where one was not measured."""
     n = covariance.shape[0]
     for s in range(n):
-        both = rows[_VARIANCE, s] < math.inf and rows[_VARIANCE, n + s] < math.inf
-        rows[_COVARIANCE, s] = factor * covariance[s] if both else 0.0
+        measured = rows[_VARIANCE, s] < math.inf and rows[_VARIANCE, n + s] < math.inf
+        rows[_COVARIANCE, s] = factor * covariance[s] if measured else 0.0
 
 
 @_compiled
@@ -132,28 +132,28 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
     than usual.
     """
     m, n = rows.shape[1], rows.shape[1] // 2
-    variance, covariance, scale, left = rows[_VARIANCE], rows[_COVARIANCE], rows[_SCALE], rows[_SURPRISE]
+    variance, covariance, scale, residual = rows[_VARIANCE], rows[_COVARIANCE], rows[_SCALE], rows[_SURPRISE]
     solution, direction = rows[_SOLUTION], rows[_DIRECTION]
     for s in range(m):
-        own = matrices.uncertainty[s, s]
-        scale[s] = math.sqrt(matrices.usual_variance[s] / (own + variance[s]))  # 0: not measured
+        predicted = matrices.uncertainty[s, s]
+        scale[s] = math.sqrt(matrices.usual_variance[s] / (predicted + variance[s]))  # 0: not measured
         solution[s] = direction[s] = 0.0
     before = 0.0
     for _ in range(steps):
         for s in range(m):
-            rows[_SPARE, s] = scale[s] * left[s]
+            rows[_SPARE, s] = scale[s] * residual[s]
             rows[_IMAGE, s] = 0.0
         add_products(matrices.usual_inverse, rows[_SPARE : _SPARE + 1], rows[_IMAGE : _IMAGE + 1])
         descent = 0.0
         for s in range(m):
             rows[_IMAGE, s] *= scale[s]
-            descent += rows[_IMAGE, s] * left[s]
+            descent += rows[_IMAGE, s] * residual[s]
         if not descent > 0.0:
             return
-        more = descent / before if before > 0.0 else 0.0
+        share = descent / before if before > 0.0 else 0.0
         before = descent
         for s in range(m):
-            direction[s] = rows[_IMAGE, s] + more * direction[s]
+            direction[s] = rows[_IMAGE, s] + share * direction[s]
         for s in range(n):
             rows[_IMAGE, s] = covariance[s] * direction[n + s]
             rows[_IMAGE, n + s] = covariance[s] * direction[s]
@@ -167,51 +167,51 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
         for s in range(m):
             if scale[s] > 0.0:
                 solution[s] += step * direction[s]
-                left[s] -= step * rows[_IMAGE, s]
+                residual[s] -= step * rows[_IMAGE, s]
 
 
 @_compiled
 def _filter(matrices: Any, memory: Any, steps: Any, largest: Any, command: Any) -> float:
     """Correct the state and write the filter's command; return its sum before clipping."""
     rows = memory.slopes
-    whole = memory.state.reshape(1, memory.state.size)
+    state = memory.state.reshape(1, memory.state.size)
     _solve(matrices, rows, steps)
-    add_products(matrices.covariance, rows[_SOLUTION : _SOLUTION + 1], whole)
-    made, total = memory.commands[_MADE : _MADE + 1], 0.0
-    made[:] = 0.0
-    add_products(matrices.command, whole, made)
+    add_products(matrices.covariance, rows[_SOLUTION : _SOLUTION + 1], state)
+    product, total = memory.commands[_MADE : _MADE + 1], 0.0
+    product[:] = 0.0
+    add_products(matrices.command, state, product)
     for c in range(command.shape[0]):
-        total += made[0, c]
-        command[c] = min(max(made[0, c], -largest), largest)
+        total += product[0, c]
+        command[c] = min(max(product[0, c], -largest), largest)
     return total
 
 
 @_compiled
 def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, command: Any) -> float:
     """Write the integrator's command; return its sum before clipping."""
-    made = memory.commands[_MADE : _MADE + 1]
-    made[:] = 0.0
-    add_products(matrices.reconstruct, memory.slopes[_FOR_PLAIN : _FOR_PLAIN + 1], made)
+    product = memory.commands[_MADE : _MADE + 1]
+    product[:] = 0.0
+    add_products(matrices.reconstruct, memory.slopes[_FOR_PLAIN : _FOR_PLAIN + 1], product)
     total = 0.0
     for c in range(command.shape[0]):
-        wanted = keep * memory.commands[LATEST_PLAIN, c] - gain * made[0, c]
-        total += wanted
-        command[c] = min(max(wanted, -largest), largest)
+        value = keep * memory.commands[LATEST_PLAIN, c] - gain * product[0, c]
+        total += value
+        command[c] = min(max(value, -largest), largest)
     return total
 
 
 @_compiled
-def _send(own: Any, true: Any, here: Any, memory: Any, largest: Any) -> None:
+def _send(command: Any, true: Any, row: Any, memory: Any, largest: Any) -> None:
     """Write the mirror's command; see `Guarded`."""
     guard, offset = memory.guard, memory.commands[_OFFSET]
     if guard[SENT] != guard[CHOSEN]:
         guard[SENT], guard[_BLENDED] = guard[CHOSEN], HANDOVER_FRAMES
-        for c in range(own.shape[0]):
-            offset[c] = true[here - 1, c] - own[c]
+        for c in range(command.shape[0]):
+            offset[c] = true[row - 1, c] - command[c]
     guard[_BLENDED] = max(0.0, guard[_BLENDED] - 1.0)
     share = guard[_BLENDED] / HANDOVER_FRAMES
-    for c in range(own.shape[0]):
-        true[here, c] = min(max(own[c] + share * offset[c], -largest), largest)
+    for c in range(command.shape[0]):
+        true[row, c] = min(max(command[c] + share * offset[c], -largest), largest)
 
 
 @_compiled
@@ -246,21 +246,21 @@ def _choose(guard: Any, learnt: Any, plain: Any) -> None:
 
 
 @_compiled
-def hold(matrices: Any, lines: Any, places: Any, memory: Any) -> None:
+def hold(matrices: Any, lines: Any, next_rows: Any, memory: Any) -> None:
     """Write the slopes caused by the commands that act in the next frame.
 
     Parameters
     ----------
     matrices : Matrices
     lines : Lines
-    places : (int, int, int)
+    next_rows : (int, int, int)
         Where the lines' next commands go.
     memory : Memory
     """
     rows, commands, length = memory.slopes, memory.commands, lines.true.shape[0]
-    here, of_learnt, of_plain = places
+    row, of_learnt, of_plain = next_rows
     for c in range(commands.shape[1]):
-        commands[HELD, c] = lines.true[(here + 1) % length, c]
+        commands[HELD, c] = lines.true[(row + 1) % length, c]
         commands[HELD_LEARNT, c] = lines.learnt[(of_learnt + 1) % length, c]
         commands[HELD_PLAIN, c] = lines.plain[(of_plain + 1) % length, c]
         commands[LATEST_PLAIN, c] = lines.plain[(of_plain + length - 1) % length, c]
@@ -278,7 +278,7 @@ def follow(
     numbers: Any,
     matrices: Any,
     lines: Any,
-    places: Any,
+    next_rows: Any,
     memory: Any,
 ) -> float:
     """Write the selected controller's command for the mirror; return its sum before clipping.
@@ -295,10 +295,10 @@ def follow(
         Of the errors' variances.
     numbers : (float, float, float, int)
         The integrator's gain, what it keeps of its command, stroke, steps of conjugate gradients.
-    matrices, lines, places, memory
+    matrices, lines, next_rows, memory
         As for `hold`, which was called before.
     """
-    here, of_learnt, of_plain = places
+    row, of_learnt, of_plain = next_rows
     gain, keep, largest, steps = numbers
     plainly = memory.guard[CHOSEN] > 0.0
     _take(slopes, errors, covariance, prior_std, noise_factor, memory.slopes, plainly)
@@ -306,29 +306,29 @@ def follow(
         total: float = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
     else:
         total = _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
-    _send(lines.plain[of_plain] if plainly else lines.learnt[of_learnt], lines.true, here, memory, largest)
+    _send(lines.plain[of_plain] if plainly else lines.learnt[of_learnt], lines.true, row, memory, largest)
     return total
 
 
 @_compiled
-def go_on(numbers: Any, matrices: Any, lines: Any, places: Any, memory: Any) -> float:
+def go_on(numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) -> float:
     """Complete a frame after its command was sent: the other controller, the guard, the state.
 
     Return the sum of the other controller's command before it is cut.
     """
-    _, of_learnt, of_plain = places
+    _, of_learnt, of_plain = next_rows
     gain, keep, largest, steps = numbers
     if memory.guard[CHOSEN] > 0.0:
         total: float = _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
     else:
         total = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
-    left = memory.commands[_LEFT : _LEFT + 2]
-    left[:] = 0.0
-    add_products(matrices.phase, memory.slopes[_LEFT_LEARNT : _LEFT_PLAIN + 1], left)
+    wavefronts = memory.commands[_LEFT : _LEFT + 2]
+    wavefronts[:] = 0.0
+    add_products(matrices.phase, memory.slopes[_LEFT_LEARNT : _LEFT_PLAIN + 1], wavefronts)
     learnt, plain = 0.0, 0.0
-    for c in range(left.shape[1]):
-        learnt += left[0, c] * left[0, c]
-        plain += left[1, c] * left[1, c]
+    for c in range(wavefronts.shape[1]):
+        learnt += wavefronts[0, c] * wavefronts[0, c]
+        plain += wavefronts[1, c] * wavefronts[1, c]
     _choose(memory.guard, learnt, plain)
     _advance(matrices, memory)
     return total
@@ -365,8 +365,8 @@ def replay(
     rows, delay = memory.slopes, line.shape[0] - 1
     squares[:] = math.inf
     for frame in range(open_loop.shape[0]):
-        place = frame % (delay + 1)
-        acting = (place + 1) % (delay + 1)
+        row = frame % (delay + 1)
+        acting = (row + 1) % (delay + 1)
         rows[HELD] = 0.0
         add_products(matrices.interaction, line[acting : acting + 1], rows[HELD : HELD + 1])
         for s in range(rows.shape[1]):
@@ -375,12 +375,12 @@ def replay(
             rows[_VARIANCE, s] = variance[frame, s] if measured else math.inf
             rows[_SURPRISE, s] = open_loop[frame, s] - rows[PREDICTED, s] if measured else 0.0
         _correlate(covariance[frame], 1.0, rows)
-        left, square = memory.commands[_LEFT : _LEFT + 1], 0.0
-        left[:] = 0.0
-        add_products(matrices.phase, rows[_LEFT_LEARNT : _LEFT_LEARNT + 1], left)
-        for c in range(left.shape[1]):
-            square += left[0, c] * left[0, c]
-        if not np.isfinite(_filter(matrices, memory, steps, math.inf, line[place])):
+        wavefront, square = memory.commands[_LEFT : _LEFT + 1], 0.0
+        wavefront[:] = 0.0
+        add_products(matrices.phase, rows[_LEFT_LEARNT : _LEFT_LEARNT + 1], wavefront)
+        for c in range(wavefront.shape[1]):
+            square += wavefront[0, c] * wavefront[0, c]
+        if not np.isfinite(_filter(matrices, memory, steps, math.inf, line[row])):
             return
         squares[frame] = square
         _advance(matrices, memory)

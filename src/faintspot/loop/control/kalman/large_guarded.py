@@ -38,7 +38,7 @@ class _Frame(NamedTuple):
     by_latest_plain: Floats
 
     @property
-    def left(self) -> tuple[Floats, Floats]:
+    def residuals(self) -> tuple[Floats, Floats]:
         """Residual slopes that both controllers leave."""
         return self.trust * (self.open_loop + self.by_learnt), self.trust * (self.open_loop + self.by_plain)
 
@@ -95,8 +95,8 @@ class LargeGuarded(Guarded):
         self._predictor, self._gain, self._keep = predictor, plain_gain, 1.0 - leak
         self._product, self._reconstruct = SlopeProduct(interaction), SlopeProduct(reconstructor.matrix)
         self._clean, self._compare = SlopeProduct(reconstructor.clean), SlopeProduct(phase_of_commands)
-        found = replies(arrays, line.delay_frames)
-        self._replies = [SlopeProduct((each.T @ reconstructor.clean.T).T) for each in found]
+        matrices = replies(arrays, line.delay_frames)
+        self._replies = [SlopeProduct((matrix.T @ reconstructor.clean.T).T) for matrix in matrices]
         self._caused = np.zeros((2, len(line.rows), len(interaction)))
         """Slopes that the commands of both lines cause, row by row."""
         self._held, self._held_at = np.zeros(len(interaction)), -1
@@ -133,15 +133,15 @@ class LargeGuarded(Guarded):
     ) -> None:
         """See `Controller`; the gains have the usual covariances of x and y."""
         expected = self.expected().mean_px
-        alone, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
+        slopes, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
         caused = self._of_line(_LEARNT, 1), self._of_line(_PLAIN, 1), self._of_line(_PLAIN, 0)
-        open_loop, surprise = alone - self._held, alone - self._predicted
+        open_loop, surprise = slopes - self._held, slopes - self._predicted
         self._frame = frame = _Frame(open_loop, surprise, self._noise_factor * variance, trust, *caused)
         if self.chosen == _LEARNT:
             self._predict(frame)
         else:
-            left = trust * (alone - (self._held - frame.by_plain))
-            self._integrate(self._reconstruct(left + frame.missing))
+            residual = trust * (slopes - (self._held - frame.by_plain))
+            self._integrate(self._reconstruct(residual + frame.missing))
         self._send()
 
     def begin_product(self, threads: int, scale: float) -> Sequence[ProductPart]:
@@ -149,7 +149,7 @@ class LargeGuarded(Guarded):
 
         There are none before everything is known of the frame before, and of estimators with a prior.
         """
-        if self._frame is not None or self._held_at != self._line.place or self.prior_std_px is not None:
+        if self._frame is not None or self._held_at != self._line.next_row or self.prior_std_px is not None:
             return ()
         if self.chosen == _PLAIN:
             return self._reconstruct.parts(threads, scale, self._held - self._of_line(_PLAIN, 1))
@@ -172,24 +172,24 @@ class LargeGuarded(Guarded):
             learnt, plain = self._compare.several(*self._follow_up(frame))
             self._predictor.correct(frame.open_loop, frame.variance)
             self._predictor.advance()
-            left, by_plain = float(learnt @ learnt), float(plain @ plain)
-            self._choose((left - by_plain) / max(left + by_plain, 1e-30))
-        if frame is not None or self._restarted or self._held_at != self._line.place:
+            by_learnt, by_plain = float(learnt @ learnt), float(plain @ plain)
+            self._choose((by_learnt - by_plain) / max(by_learnt + by_plain, 1e-30))
+        if frame is not None or self._restarted or self._held_at != self._line.next_row:
             self._follow_mirror(is_new=frame is not None or self._restarted)
 
     def _follow_up(self, frame: _Frame) -> Floats:
         """Compute the command that was not sent; return the wavefronts that both leave, as commands."""
-        left, missing = frame.left, frame.missing
+        residuals, missing = frame.residuals, frame.missing
         if self.chosen == _PLAIN:
             self._predict(frame)
-            return self._reconstruct.several(*left)
+            return self._reconstruct.several(*residuals)
         if not missing.any():
-            found = self._reconstruct.several(*left)
-            self._integrate(found[_PLAIN])
-            return found
-        found = self._reconstruct.several(*left, missing)
-        self._integrate(found[_PLAIN] + found[-1])
-        return found[:-1]
+            wavefronts = self._reconstruct.several(*residuals)
+            self._integrate(wavefronts[_PLAIN])
+            return wavefronts
+        wavefronts = self._reconstruct.several(*residuals, missing)
+        self._integrate(wavefronts[_PLAIN] + wavefronts[-1])
+        return wavefronts[:-1]
 
     def _follow_mirror(self, *, is_new: bool) -> None:
         """Compute the slopes that commands cause and, if the latest are new, the prediction."""
@@ -198,19 +198,19 @@ class LargeGuarded(Guarded):
         same = [np.array_equal(line.acting, mirror.acting) for line in lines]
         if not any(same):
             commands.append(mirror.acting)
-        found = self._product.several(*commands) if commands else np.zeros((0, 0))
+        all_caused = self._product.several(*commands) if commands else np.zeros((0, 0))
         if is_new:
-            for caused, line, slopes in zip(self._caused, lines, found, strict=False):
-                caused[slice(None) if self._restarted else line.place - 1] = slopes
+            for caused, line, newest in zip(self._caused, lines, all_caused, strict=False):
+                caused[slice(None) if self._restarted else line.next_row - 1] = newest
             self._restarted = False
             self._mean = self._predictor.mean_px
-            left = self._predictor.ahead(lines[_LEARNT].delay_frames) + self._of_line(_LEARNT, 0)
-            self._if_as_predicted = lines[_LEARNT].latest - self._clean(left)
-        self._held = self._of_line(same.index(True), 1) if any(same) else found[-1]
-        self._held_at, self._predicted = mirror.place, self._held + self._mean
+            open_loop = self._predictor.ahead(lines[_LEARNT].delay_frames) + self._of_line(_LEARNT, 0)
+            self._if_as_predicted = lines[_LEARNT].latest - self._clean(open_loop)
+        self._held = self._of_line(same.index(True), 1) if any(same) else all_caused[-1]
+        self._held_at, self._predicted = mirror.next_row, self._held + self._mean
 
-    def _of_line(self, which: int, acting: int) -> Floats:
+    def _of_line(self, line: int, acting: int) -> Floats:
         """Return the slopes that the latest command of a line causes, or the one that acts in this frame."""
-        rows = self._caused[which]
-        slopes: Floats = rows[(self._lines[which].place + (2 * acting - 1)) % len(rows)]
+        rows = self._caused[line]
+        slopes: Floats = rows[(self._lines[line].next_row + (2 * acting - 1)) % len(rows)]
         return slopes

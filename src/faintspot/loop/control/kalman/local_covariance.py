@@ -72,9 +72,9 @@ def of_slopes(covariance: Singles, layers: int) -> tuple[Floats, Floats]:
     """Return the covariance of the errors of state and slopes, (states, m), and of the slopes, (m, m)."""
     half = len(covariance) // 2
     m = half // layers
-    seen = covariance[:, :half].reshape(2 * half, layers, m).sum(axis=1, dtype=np.float64)
-    slopes = seen[:half].reshape(layers, m, m).sum(axis=0)
-    return seen, 0.5 * (slopes + slopes.T)
+    with_slopes = covariance[:, :half].reshape(2 * half, layers, m).sum(axis=1, dtype=np.float64)
+    slopes = with_slopes[:half].reshape(layers, m, m).sum(axis=0)
+    return with_slopes, 0.5 * (slopes + slopes.T)
 
 
 def local_gains(with_slopes: Floats, measured_px2: Floats, neighbours: Indices) -> Floats:
@@ -93,8 +93,8 @@ def local_gains(with_slopes: Floats, measured_px2: Floats, neighbours: Indices) 
         As from `neighbours_within`.
     """
     n = len(neighbours)
-    own = with_slopes.reshape(-1, n, 2 * n).swapaxes(0, 1)
-    return solve_locally(measured_px2, own, both_axes(neighbours, n))
+    rows = with_slopes.reshape(-1, n, 2 * n).swapaxes(0, 1)
+    return solve_locally(measured_px2, rows, both_axes(neighbours, n))
 
 
 def replies(arrays: Mapping[str, Any], frames: int) -> Iterator[sparse.csr_matrix]:
@@ -121,9 +121,9 @@ def _prior(layers: Sequence[SlopeTurbulence], step_s: float) -> Singles:
     m = 2 * len(layers[0].positions_m)
     prior = np.zeros((2, len(layers), m, 2, len(layers), m), np.float32)
     for number, layer in enumerate(layers):
-        same, one = layer.covariance_px2(), layer.covariance_px2(step_s)
+        same, next_step = layer.covariance_px2(), layer.covariance_px2(step_s)
         prior[0, number, :, 0, number] = prior[1, number, :, 1, number] = same
-        prior[0, number, :, 1, number], prior[1, number, :, 0, number] = one, one.T
+        prior[0, number, :, 1, number], prior[1, number, :, 0, number] = next_step, next_step.T
     return prior.reshape(2 * len(layers) * m, -1)
 
 
@@ -131,12 +131,12 @@ def _transition(neighbours: Indices, weights: Floats) -> sparse.csr_matrix:
     """Return the matrix (states / 2, states) from the state to y[k + 1]; for arguments see `LocalModel`."""
     n = len(neighbours)
     m, half = 2 * n, 2 * n * len(weights)
-    there = np.broadcast_to((neighbours < n)[:, None, None, None], weights.shape)
-    layer, own, axis, time, other, place = np.nonzero(there)
-    seen = neighbours[own, place]
-    rows = layer * m + axis * n + own
-    columns = time * half + layer * m + other * n + seen
-    values = weights.astype(np.float32)[there]
+    exists = np.broadcast_to((neighbours < n)[:, None, None, None], weights.shape)
+    layer, subaperture, axis, time, other_axis, index = np.nonzero(exists)
+    neighbour = neighbours[subaperture, index]
+    rows = layer * m + axis * n + subaperture
+    columns = time * half + layer * m + other_axis * n + neighbour
+    values = weights.astype(np.float32)[exists]
     return sparse.csr_matrix((values, (rows, columns)), shape=(half, 2 * half))
 
 
@@ -144,10 +144,10 @@ def _corrections(gains: Floats, neighbours: Indices) -> sparse.csr_matrix:
     """Return the matrix (states, m) from surprises to the state."""
     n, rows, _ = gains.shape
     columns = both_axes(neighbours, n)
-    there = np.broadcast_to((columns < 2 * n)[:, None], gains.shape)
-    own, row, place = np.nonzero(there)
+    exists = np.broadcast_to((columns < 2 * n)[:, None], gains.shape)
+    cell, row, index = np.nonzero(exists)
     return sparse.csr_matrix(
-        (gains.astype(np.float32)[there], (row * n + own, columns[own, place])), shape=(rows * n, 2 * n)
+        (gains.astype(np.float32)[exists], (row * n + cell, columns[cell, index])), shape=(rows * n, 2 * n)
     )
 
 
@@ -157,19 +157,19 @@ def _next(
     """Return the covariance one step later: a measurement, then the prediction; the first is overwritten."""
     layers, m, _ = driving.shape
     half = layers * m
-    seen, slopes = of_slopes(covariance, layers)
+    with_slopes, slopes = of_slopes(covariance, layers)
     add_noise(slopes, *noise)
-    gain = _corrections(local_gains(seen, slopes, neighbours), neighbours)
-    rest = np.ascontiguousarray((0.5 * (gain @ slopes) - seen).T, np.float32)
-    _add_symmetric(covariance, gain, rest)
+    gain = _corrections(local_gains(with_slopes, slopes, neighbours), neighbours)
+    change = np.ascontiguousarray((0.5 * (gain @ slopes) - with_slopes).T, np.float32)
+    _add_symmetric(covariance, gain, change)
     across = _product(onward, covariance)
-    now = _product(onward, np.ascontiguousarray(across.T))
-    now = 0.5 * (now + now.T)  # rounding errors that are not symmetric would grow
-    blocks = now.reshape(layers, m, layers, m)
+    predicted = _product(onward, np.ascontiguousarray(across.T))
+    predicted = 0.5 * (predicted + predicted.T)  # rounding errors that are not symmetric would grow
+    blocks = predicted.reshape(layers, m, layers, m)
     for layer in range(layers):
         blocks[layer, :, layer] += driving[layer]
     after = np.empty_like(covariance)
-    after[:half, :half], after[half:, half:] = now, covariance[:half, :half]
+    after[:half, :half], after[half:, half:] = predicted, covariance[:half, :half]
     after[:half, half:], after[half:, :half] = across[:, :half], across[:, :half].T
     return after
 

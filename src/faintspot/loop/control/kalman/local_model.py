@@ -44,8 +44,8 @@ class LocalModel:
         """Return the model of frozen layers for frames `step_s` apart (Yule-Walker)."""
         positions = layers[0].positions_m
         near = neighbours_within(positions, _REACH * layers[0].subaperture_m)
-        made = [_regression(each.lagged_px2(step_s), near) for each in layers]
-        return cls(near, *(np.array(each) for each in zip(*made, strict=True)))
+        regressions = [_regression(layer.lagged_px2(step_s), near) for layer in layers]
+        return cls(near, *(np.array(values) for values in zip(*regressions, strict=True)))
 
     @property
     def layers(self) -> int:
@@ -62,10 +62,10 @@ def at_most(layers: Sequence[SlopeTurbulence], count: int) -> list[SlopeTurbulen
     """Return as many layers or fewer: the weakest joins that with the nearest wind, until they are few."""
     kept = list(layers)
     while len(kept) > count:
-        weakest = kept.pop(int(np.argmax([each.r0_m for each in kept])))
-        apart = [np.hypot(*(each.wind_m_per_s - weakest.wind_m_per_s)[0]) for each in kept]
-        nearest = int(np.argmin(apart))
-        strength = np.array([each.r0_m ** (-5 / 3) for each in (kept[nearest], weakest)])
+        weakest = kept.pop(int(np.argmax([layer.r0_m for layer in kept])))
+        distances = [np.hypot(*(layer.wind_m_per_s - weakest.wind_m_per_s)[0]) for layer in kept]
+        nearest = int(np.argmin(distances))
+        strength = np.array([layer.r0_m ** (-5 / 3) for layer in (kept[nearest], weakest)])
         winds = np.concatenate([kept[nearest].wind_m_per_s, weakest.wind_m_per_s])
         kept[nearest] = replace(
             kept[nearest],
@@ -86,8 +86,8 @@ def neighbours_within(positions_m: Floats, distance_m: float) -> Indices:
 
 def both_axes(neighbours: Indices, n: int) -> Indices:
     """Return the indices of x and y slopes of neighbours, (n, 2 k), 2 n where there is none."""
-    there = neighbours < n
-    return np.concatenate([np.where(there, neighbours + shift, 2 * n) for shift in (0, n)], axis=1)
+    exists = neighbours < n
+    return np.concatenate([np.where(exists, neighbours + shift, 2 * n) for shift in (0, n)], axis=1)
 
 
 def solve_locally(matrix: Floats, right: Floats, chosen: Indices, ridge: float = 0.0) -> Floats:
@@ -103,32 +103,32 @@ def solve_locally(matrix: Floats, right: Floats, chosen: Indices, ridge: float =
         Added to the diagonal.
     """
     m, (n, k) = len(matrix), chosen.shape
-    diagonal, found = np.arange(k), np.empty((n, right.shape[1], k))
+    diagonal, solution = np.arange(k), np.empty((n, right.shape[1], k))
     for part in (slice(start, start + _AT_ONCE) for start in range(0, n, _AT_ONCE)):
-        there = chosen[part] < m
-        index = np.where(there, chosen[part], 0)
-        pairs = there[:, :, None] & there[:, None, :]
+        exists = chosen[part] < m
+        index = np.where(exists, chosen[part], 0)
+        pairs = exists[:, :, None] & exists[:, None, :]
         local = np.where(pairs, matrix[index[:, :, None], index[:, None, :]], 0.0)
-        local[:, diagonal, diagonal] += np.where(there, ridge, 1.0)
-        seen = np.take_along_axis(right[part], index[:, None, :], axis=2)
-        wanted = np.where(there[:, None, :], seen, 0.0)
-        found[part] = np.linalg.solve(local, wanted.swapaxes(1, 2)).swapaxes(1, 2)
-    return found
+        local[:, diagonal, diagonal] += np.where(exists, ridge, 1.0)
+        values = np.take_along_axis(right[part], index[:, None, :], axis=2)
+        right_ = np.where(exists[:, None, :], values, 0.0)
+        solution[part] = np.linalg.solve(local, right_.swapaxes(1, 2)).swapaxes(1, 2)
+    return solution
 
 
 def _regression(covariances_px2: Floats, near: Indices) -> tuple[Floats, Floats, float]:
     """Return weights (n, 2, 2, 2, k), driving noise and mean variance for lags of 0, 1 and 2 frames."""
-    same, one, two = covariances_px2
+    same, next_step, second_step = covariances_px2
     m, n = len(same), len(near)
     variance = float(np.trace(same)) / m
-    past, onward = np.block([[same, one], [one.T, same]]), np.hstack([one, two])
+    past, onward = np.block([[same, next_step], [next_step.T, same]]), np.hstack([next_step, second_step])
     axes = both_axes(near, n)
     chosen = np.concatenate([np.where(axes < m, axes, 2 * m), np.where(axes < m, axes + m, 2 * m)], axis=1)
-    both = np.stack([onward[:n], onward[n:]], axis=1)
-    weights = (1 - _FADING) * solve_locally(past, both, chosen.astype(np.int32), _RIDGE * variance)
-    left = same - _explained(weights, chosen, past, onward)
-    left[np.diag_indices(m)] += _LEAST_DRIVING * variance
-    return weights.reshape(n, 2, 2, 2, -1), 0.5 * (left + left.T), variance
+    targets = np.stack([onward[:n], onward[n:]], axis=1)
+    weights = (1 - _FADING) * solve_locally(past, targets, chosen.astype(np.int32), _RIDGE * variance)
+    driving = same - _explained(weights, chosen, past, onward)
+    driving[np.diag_indices(m)] += _LEAST_DRIVING * variance
+    return weights.reshape(n, 2, 2, 2, -1), 0.5 * (driving + driving.T), variance
 
 
 def _explained(weights: Floats, chosen: Indices, past: Floats, onward: Floats) -> Floats:

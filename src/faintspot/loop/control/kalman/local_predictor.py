@@ -233,12 +233,12 @@ def _correct(state: Any, gains: Any, around: Any, surprise: Any) -> None:
     """
     flat = state.reshape(state.shape[0], gains.shape[3])
     for i in range(around.shape[0]):
-        own = flat[i]
+        values = flat[i]
         for j in range(around.shape[1]):
             x, y = surprise[around[i, j], 0], surprise[around[i, j], 1]
             of_x, of_y = gains[i, j, 0], gains[i, j, 1]
-            for s in range(own.shape[0]):
-                own[s] += of_x[s] * x + of_y[s] * y
+            for s in range(values.shape[0]):
+                values[s] += of_x[s] * x + of_y[s] * y
 
 
 @_compiled
@@ -258,8 +258,8 @@ def _advance(state: Any, weights: Any, near: Any, later: Any) -> None:
             x = y = np.float32(0.0)
             for j in range(near.shape[1]):
                 for time in range(2):
-                    w, other = weights[i, j, time, layer], state[near[i, j], time, layer]
-                    from_x, from_y = other[0], other[1]
+                    w, slopes = weights[i, j, time, layer], state[near[i, j], time, layer]
+                    from_x, from_y = slopes[0], slopes[1]
                     x += w[0, 0] * from_x + w[0, 1] * from_y
                     y += w[1, 0] * from_x + w[1, 1] * from_y
             later[i, 1, layer, 0], later[i, 1, layer, 1] = state[i, 0, layer, 0], state[i, 0, layer, 1]

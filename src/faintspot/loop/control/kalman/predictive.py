@@ -114,6 +114,6 @@ class Predictive:
         open_loop = slopes_px - self._interaction @ self._line.acting
         self.predictor.correct(open_loop, np.square(standard_error_px), covariance_xy_px2)
         start = self._line.latest if self._from_latest else np.zeros_like(self._line.latest)
-        left = self.predictor.ahead(self._line.delay_frames) + self._interaction @ start
-        self._line.put(start - self._reconstruct @ left)
+        open_loop_ = self.predictor.ahead(self._line.delay_frames) + self._interaction @ start
+        self._line.put(start - self._reconstruct @ open_loop_)
         self.predictor.advance()

@@ -49,9 +49,9 @@ class SlopePredictor:
             covariance = steady_covariance(model, variance_px2, covariance_xy_px2)
         self.covariance = covariance
         """(states, states): covariance of the state's error before a measurement."""
-        self.with_slopes = self.covariance @ model.seen.T
+        self.with_slopes = self.covariance @ model.observation.T
         """(states, m): covariance of the errors of state and slopes."""
-        self.predicted_px2 = model.seen @ self.with_slopes
+        self.predicted_px2 = model.observation @ self.with_slopes
         """(m, m): covariance of the predicted slopes' error."""
         self.usual_px2 = self.predicted_px2.copy()
         add_noise(self.usual_px2, np.minimum(variance_px2, LARGEST_VARIANCE_PX2), covariance_xy_px2)
@@ -108,9 +108,9 @@ class SlopePredictor:
     def advance(self) -> None:
         """Predict the next frame."""
         layers = self._of_layers
-        now = np.matmul(self.model.both, self.state.reshape(len(layers), -1, 1))[:, :, 0]
+        predicted = np.matmul(self.model.both, self.state.reshape(len(layers), -1, 1))[:, :, 0]
         layers[:, 1] = layers[:, 0]
-        layers[:, 0] = now
+        layers[:, 0] = predicted
 
 
 def shares(model: SlopeModel) -> Floats:
@@ -128,20 +128,20 @@ def steady_covariance(
     twice as many frames with each step.
     """
     n, m = model.states, model.slopes
-    seen, variance = model.seen, np.minimum(variance_px2, LARGEST_VARIANCE_PX2)
+    observation, variance = model.observation, np.minimum(variance_px2, LARGEST_VARIANCE_PX2)
     step = model.onward.T  # transposed: of the dual problem
-    informed = seen.T @ weighted_slopes(seen, variance, covariance_xy_px2)
+    informed = observation.T @ weighted_slopes(observation, variance, covariance_xy_px2)
     error = np.zeros((n, n))
     for layer, driving in enumerate(model.driving):
-        now = slice(2 * m * layer, 2 * m * layer + m)
-        error[now, now] = driving
+        rows = slice(2 * m * layer, 2 * m * layer + m)
+        error[rows, rows] = driving
     identity = np.eye(n)
     for _ in range(_MOST_DOUBLINGS):
         solved = np.linalg.solve(identity + informed @ error, np.hstack([step, informed]))
-        more = step.T @ error @ solved[:, :n]
+        change = step.T @ error @ solved[:, :n]
         informed = informed + step @ solved[:, n:] @ step.T
         step = step @ solved[:, :n]
-        error = error + 0.5 * (more + more.T)
-        if np.abs(more).max() <= _CONVERGED * np.abs(error).max():
+        error = error + 0.5 * (change + change.T)
+        if np.abs(change).max() <= _CONVERGED * np.abs(error).max():
             break
     return np.asarray(error)

@@ -44,8 +44,8 @@ class SlopeModel:
             E[y[k + lag] y[k]^T] of each layer for lags of 0, 1 and 2 frames.
         """
         lags = covariances_px2.shape[-3:]
-        layers = [_regression(_joint_moments(each)) for each in covariances_px2.reshape(-1, *lags)]
-        return cls(*(np.array(each) for each in zip(*layers, strict=True)))
+        layers = [_regression(_joint_moments(moments)) for moments in covariances_px2.reshape(-1, *lags)]
+        return cls(*(np.array(matrices) for matrices in zip(*layers, strict=True)))
 
     @property
     def layers(self) -> int:
@@ -76,16 +76,16 @@ class SlopeModel:
         return np.asarray(block_diag(*blocks))
 
     @cached_property
-    def seen(self) -> Floats:
+    def observation(self) -> Floats:
         """(m, states): matrix from the state to z[k]."""
         return np.tile(np.eye(self.slopes, 2 * self.slopes), self.layers)
 
     def ahead(self, frames: int) -> Floats:
         """Return (m, states): matrix from the state to z a number of frames later."""
-        seen = self.seen
+        matrix = self.observation
         for _ in range(frames):
-            seen = seen @ self.onward
-        return seen
+            matrix = matrix @ self.onward
+        return matrix
 
     def spread(self, covariance: Floats, frames: int) -> Floats:
         """Return the covariance (states, states) of the state's error a number of frames later."""
@@ -102,9 +102,9 @@ def _regression(moments_px2: Floats) -> tuple[Floats, Floats, Floats]:
     m = len(moments_px2) // 3
     variance = np.trace(moments_px2) / (3 * m)
     past, onward = moments_px2[m:, m:], moments_px2[:m, m:]
-    both = np.linalg.solve(past + _RIDGE * variance * np.eye(2 * m), onward.T).T
-    left = moments_px2[:m, :m] - both @ onward.T - onward @ both.T + both @ past @ both.T
-    return both[:, :m], both[:, m:], _positive(left, _LEAST_DRIVING * variance)
+    weights = np.linalg.solve(past + _RIDGE * variance * np.eye(2 * m), onward.T).T
+    driving = moments_px2[:m, :m] - weights @ onward.T - onward @ weights.T + weights @ past @ weights.T
+    return weights[:, :m], weights[:, m:], _positive(driving, _LEAST_DRIVING * variance)
 
 
 def _joint_moments(covariances_px2: Floats) -> Floats:

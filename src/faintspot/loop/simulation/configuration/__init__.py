@@ -1,1 +1,1 @@
-"""The configuration of a simulated telescope, and those that are built in."""
+"""Configuration of a simulated telescope: its sections, their limits, and the built-in files (`presets`)."""

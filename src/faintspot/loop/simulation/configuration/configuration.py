@@ -110,15 +110,15 @@ class LoopConfiguration:
             For a rate or winds out of range.
         """
         part = rate_hz / self.control.frame_rate_hz
-        winds = tuple(part * each for each in self.atmosphere.wind_speed_m_per_s)
+        winds = tuple(part * speed for speed in self.atmosphere.wind_speed_m_per_s)
         slower = self.replace("control", frame_rate_hz=rate_hz)
         return slower.replace("atmosphere", wind_speed_m_per_s=winds)
 
     @property
     def subaperture_m(self) -> float:
         """Side of a sub-aperture."""
-        given = self.sensor.subaperture_m
-        return self.telescope.diameter_m / self.sensor.subapertures if given is None else given
+        side_m = self.sensor.subaperture_m
+        return self.telescope.diameter_m / self.sensor.subapertures if side_m is None else side_m
 
     @property
     def width_m(self) -> float:
@@ -313,8 +313,8 @@ def _check_layers(atmosphere: Atmosphere) -> None:
     names = ("altitude_m", "fraction", "wind_speed_m_per_s", "wind_direction_deg")
     lengths = {name: len(getattr(atmosphere, name)) for name in names}
     if len(set(lengths.values())) > 1 or not atmosphere.fraction:
-        found = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        raise InputError(f"atmosphere: expected lists with one value for each layer, got {found}")
+        lengths_text = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise InputError(f"atmosphere: expected lists with one value for each layer, got {lengths_text}")
     if sum(atmosphere.fraction) <= 0:
         raise InputError("atmosphere.fraction: expected at least one layer with a strength above 0")
     if isinstance(atmosphere.r0_m, tuple) and (
@@ -331,62 +331,61 @@ def _check_flux(camera: Camera) -> None:
     one_of("camera.band", camera.band, list(ZERO_POINTS))
 
 
-def _check_sampling(whole: LoopConfiguration) -> None:
+def _check_sampling(loop: LoopConfiguration) -> None:
     """Refuse a sensor that is sampled too coarsely, and inconsistent control."""
-    if whole.natural_star is not None and whole.laser is None:
+    if loop.natural_star is not None and loop.laser is None:
         raise InputError("natural_star: expected a table laser beside it, got none")
-    if whole.laser is not None and whole.sensor.spot_elongation > 1:
+    if loop.laser is not None and loop.sensor.spot_elongation > 1:
         raise InputError("sensor.spot_elongation: expected 1 with a laser, which elongates the spots itself")
-    one_of("control.mode", whole.control.mode, (CLOSED, OPEN))
-    one_of("control.winds", whole.control.winds, WINDS)
-    if not isinstance(whole.mirror.tip_tilt, bool):
-        raise InputError(f"mirror.tip_tilt = {whole.mirror.tip_tilt!r}: expected true or false")
-    if whole.camera.rolling_shutter and whole.control.delay_frames < _ROLLING_DELAY:
+    one_of("control.mode", loop.control.mode, (CLOSED, OPEN))
+    one_of("control.winds", loop.control.winds, WINDS)
+    if not isinstance(loop.mirror.tip_tilt, bool):
+        raise InputError(f"mirror.tip_tilt = {loop.mirror.tip_tilt!r}: expected true or false")
+    if loop.camera.rolling_shutter and loop.control.delay_frames < _ROLLING_DELAY:
         raise InputError(
-            f"camera.rolling_shutter = {whole.camera.rolling_shutter:g}: expected control.delay_frames >= "
+            f"camera.rolling_shutter = {loop.camera.rolling_shutter:g}: expected control.delay_frames >= "
             f"{_ROLLING_DELAY}, as the last rows see the mirror's next commands"
         )
-    sensor = whole.sensor
+    sensor = loop.sensor
     check_size(
         "sensor: (subapertures x samples)^2", [(sensor.subapertures * sensor.samples) ** 2], _MOST_POINTS
     )
     check_size(
         "sensor: (subapertures x pixels)^2", [(sensor.subapertures * sensor.pixels) ** 2], what="pixels"
     )
-    actuators = whole.mirror.actuators or sensor.subapertures + 1
+    actuators = loop.mirror.actuators or sensor.subapertures + 1
     check_size("interaction matrix (slopes, actuators)", (2 * sensor.subapertures**2, actuators**2))
-    diameter, side = whole.telescope.diameter_m, whole.subaperture_m
+    diameter, side = loop.telescope.diameter_m, loop.subaperture_m
     if side > diameter:
         raise InputError(
             f"telescope.diameter_m = {diameter:g}: expected at least one sub-aperture, "
             f"sensor.subaperture_m = {side:g}"
         )
-    if whole.width_m < diameter * (1 - 1e-9):
+    if loop.width_m < diameter * (1 - 1e-9):
         raise InputError(
             f"sensor.subapertures = {sensor.subapertures} of {side:g} m: expected enough to cover the "
             f"{diameter:g} m of the telescope"
         )
-    needed = math.ceil(field_of_view(whole) / whole.spot_width_px)
-    if sensor.samples < needed:
+    samples = math.ceil(field_of_view(loop) / loop.spot_width_px)
+    if sensor.samples < samples:
         raise InputError(
-            f"sensor.samples = {sensor.samples}: expected at least {needed} for a field of "
-            f"{field_of_view(whole):.3g} px with lambda / d = {whole.spot_width_px:.3g} px"
+            f"sensor.samples = {sensor.samples}: expected at least {samples} for a field of "
+            f"{field_of_view(loop):.3g} px with lambda / d = {loop.spot_width_px:.3g} px"
         )
-    if whole.run.settle_frames >= whole.run.frames:
+    if loop.run.settle_frames >= loop.run.frames:
         raise InputError(
-            f"run.settle_frames = {whole.run.settle_frames}: expected fewer than the {whole.run.frames} "
-            "frames"
+            f"run.settle_frames = {loop.run.settle_frames}: expected fewer than the {loop.run.frames} frames"
         )
 
 
-def field_of_view(whole: LoopConfiguration) -> float:
+def field_of_view(loop: LoopConfiguration) -> float:
     """Return the width of the lenslet images that must not alias [px]."""
-    if whole.laser is not None:  # images of a point; the sodium layer is added afterwards
-        return whole.sensor.pixels * _POINT_FIELD
-    return whole.sensor.pixels * 1.125 + 2 * 3 * blur_px(whole)
+    if loop.laser is not None:  # images of a point; the sodium layer is added afterwards
+        return loop.sensor.pixels * _POINT_FIELD
+    return loop.sensor.pixels * 1.125 + 2 * 3 * blur_px(loop)
 
 
-def blur_px(whole: LoopConfiguration) -> float:
+def blur_px(loop: LoopConfiguration) -> float:
     """Return the standard deviation along x of the source that elongates the spots, px."""
-    width = SPOT_FWHM * whole.spot_width_px
-    return width * math.sqrt(whole.sensor.spot_elongation**2 - 1) / 2.3548
+    width = SPOT_FWHM * loop.spot_width_px
+    return width * math.sqrt(loop.sensor.spot_elongation**2 - 1) / 2.3548

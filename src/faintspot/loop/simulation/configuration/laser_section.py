@@ -52,8 +52,8 @@ class Laser:
             raise InputError(f"laser.launch_m: expected x and y, got {list(self.launch_m)}")
         rows = tuple(np.ravel(row) for row in self.density) if np.ndim(self.density) else ()
         if len(rows) != len(self.time_s) or not rows or {len(row) for row in rows} != {len(self.altitude_m)}:
-            wanted, found = (len(self.time_s), len(self.altitude_m)), [len(row) for row in rows]
-            raise InputError(f"laser.density: expected (times, altitudes) = {wanted}, got rows of {found}")
+            shape, lengths = (len(self.time_s), len(self.altitude_m)), [len(row) for row in rows]
+            raise InputError(f"laser.density: expected (times, altitudes) = {shape}, got rows of {lengths}")
         values = numbers_between("laser.density", rows, 0.0)
         if np.any(np.diff(self.time_s) <= 0):
             raise InputError(f"laser.time_s: expected increasing times, got {list(self.time_s)}")

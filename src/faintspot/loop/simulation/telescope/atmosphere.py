@@ -67,15 +67,15 @@ class MovingLayers:
     def shifted(self, screen: Floats, corner: NDArray[np.float64]) -> Floats:
         """Return the (points, points) of a periodic screen whose first one is at a fractional place."""
         points, size = self.points, len(screen)
-        whole = np.floor(corner)
-        row, column = (int(place) - 1 for place in whole)  # one point before: four enter each value
+        first_point = np.floor(corner)
+        row, column = (int(value) - 1 for value in first_point)  # one point before: four enter each value
         rows, columns = (first + np.arange(points + 3) for first in (row, column))
         first = column % size
         if first + points + 3 <= size:  # the usual case, without copying by columns
             part = screen[rows % size, first : first + points + 3]
         else:
             part = screen[np.ix_(rows % size, columns % size)]
-        along_rows, along_columns = (_keys(place) for place in corner - whole)
+        along_rows, along_columns = (_keys(fraction) for fraction in corner - first_point)
         mixed = sum(weight * part[i : i + points] for i, weight in enumerate(along_rows))
         result: Floats = sum(weight * mixed[:, i : i + points] for i, weight in enumerate(along_columns))
         return result
@@ -119,8 +119,8 @@ def make_atmosphere(configuration: LoopConfiguration, seed: int, realisation: in
 
 def _screen_points(outer_scale_m: float, width_m: float, spacing_m: float) -> int:
     """Return the points across a screen, a power of two."""
-    wanted = max(_OUTER_SCALES * outer_scale_m, 4 * width_m) / spacing_m
-    size = 1 << math.ceil(math.log2(wanted * 0.999))
+    points = max(_OUTER_SCALES * outer_scale_m, 4 * width_m) / spacing_m
+    size = 1 << math.ceil(math.log2(points * 0.999))
     if size > _MOST_POINTS:
         raise InputError(
             f"atmosphere.outer_scale_m = {outer_scale_m:g}: expected at most "

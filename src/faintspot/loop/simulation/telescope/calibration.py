@@ -85,8 +85,8 @@ def reference_slopes(
     )
     if configuration.laser is not None and method.psf is not None:  # the true spots change with time
         n = len(sensor.layout)
-        known = method.psf.images(np.zeros((n, 2)), sensor.layout.window, which=method.psf.index_of(n))
-        flat = known.astype(np.float32)
+        images = method.psf.images(np.zeros((n, 2)), sensor.layout.window, which=method.psf.index_of(n))
+        flat = images.astype(np.float32)
     else:
         flat = sensor.spots(np.zeros((sensor.points, sensor.points), np.float32))
     return bright(sensor.frame(flat) * _BRIGHT_E).vector
@@ -178,9 +178,9 @@ def mean_flux(
 ) -> MeanFlux:
     """Return the mean flux of every sub-aperture, from frames of `typical_spots` at the run's own flux."""
     frames = []
-    for number, each in enumerate(spots[0]):
+    for number, image in enumerate(spots[0]):
         rng = np.random.default_rng([seed, number, 5])
-        frames.append(detector.expose(sensor.frame(each) * photons, rng))
+        frames.append(detector.expose(sensor.frame(image) * photons, rng))
     return MeanFlux(pipeline(np.stack(frames)).flux)
 
 
@@ -199,8 +199,8 @@ def centroid_gain(
     """
     total = 0.0
     for displaced, sign in zip(spots, (1.0, -1.0), strict=True):
-        for number, each in enumerate(displaced):
+        for number, image in enumerate(displaced):
             rng = np.random.default_rng([seed, number, 3])
-            frame = detector.expose(sensor.frame(each) * photons, rng)
+            frame = detector.expose(sensor.frame(image) * photons, rng)
             total += sign * float(pipeline(frame).vector.mean(dtype=np.float64))
     return max(_SMALLEST_GAIN, total / (2 * _DITHER_PX * len(spots[0])))

@@ -83,13 +83,13 @@ class LaserSource:
         self._laser, self._rate_hz = laser, configuration.control.frame_rate_hz
         self._fine = _with_nodes(configuration, sensor)
         star = laser_guide_star(configuration, sensor.layout.cells, laser.spot_fwhm_arcsec)
-        where = _node_places(configuration)
-        radius = float(np.abs(where).max()) + 0.5 * configuration.sensor.pixels
+        nodes = _node_places(configuration)
+        radius = float(np.abs(nodes).max()) + 0.5 * configuration.sensor.pixels
         self._terms = [
-            _terms(star.psf(profile, radius_px=radius, oversampling=_NODES), configuration, where)
+            _terms(star.psf(profile, radius_px=radius, oversampling=_NODES), configuration, nodes)
             for profile in laser.profiles()
         ]
-        self._known: tuple[tuple[tuple[int, float], ...], ElongatedShackHartmann] | None = None
+        self._cached: tuple[tuple[tuple[int, float], ...], ElongatedShackHartmann] | None = None
         line = (np.arange(sensor.points) + 0.5) / sensor.amplitude.shape[-1]
         pixel_arcsec = configuration.pixel_scale_rad / ARCSEC
         self._tilt_nm = (line - line.mean()) * (laser.jitter_arcsec / pixel_arcsec / sensor.px_per_nm)
@@ -97,19 +97,19 @@ class LaserSource:
     def sensor(self, frame: int) -> ElongatedShackHartmann:
         """Return the sensor with the sodium layer of a frame."""
         shares = tuple(self._laser.shares(frame / self._rate_hz))
-        if self._known is None or self._known[0] != shares:
+        if self._cached is None or self._cached[0] != shares:
             blocks = [(share, *self._terms[number]) for number, share in shares]
             along_y = np.concatenate([np.float32(share) * y for share, y, _ in blocks], axis=2)
             along_x = np.concatenate([x for *_, x in blocks], axis=1)
             n, pixels, rank, nodes = along_y.shape
             parts = {item.name: getattr(self._fine, item.name) for item in fields(ShackHartmann)}
-            made = ElongatedShackHartmann(
+            sensor = ElongatedShackHartmann(
                 **parts,
                 along_y=along_y.reshape(n, pixels * rank, nodes),
                 along_x=along_x.reshape(n, rank * nodes, pixels),
             )
-            self._known = shares, made
-        return self._known[1]
+            self._cached = shares, sensor
+        return self._cached[1]
 
     def jittered(self, wavefront_nm: NDArray[np.floating], seed: tuple[int, ...]) -> NDArray[np.floating]:
         """Return the wavefront with the tilt by which the beam moves all spots."""
@@ -147,7 +147,7 @@ def _with_nodes(configuration: LoopConfiguration, sensor: ShackHartmann) -> Shac
 
 
 def _terms(
-    psf: PSF, configuration: LoopConfiguration, where: NDArray[np.float64]
+    psf: PSF, configuration: LoopConfiguration, nodes_px: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the convolution with each PSF as separable terms from nodes to pixels.
 
@@ -157,13 +157,13 @@ def _terms(
     along_x : (n, rank, nodes, pixels) array
     """
     pixels = configuration.sensor.pixels
-    place = np.arange(pixels) - 0.5 * (pixels - 1)
-    steps = (place[:, None] - where) * psf.oversampling
-    made = []
+    pixels_px = np.arange(pixels) - 0.5 * (pixels - 1)
+    steps = (pixels_px[:, None] - nodes_px) * psf.oversampling
+    terms = []
     for profile in psf.separable_terms[::-1]:  # y, then x: (n, rank, samples)
         half = (profile.shape[2] - 1) // 2
         index = np.rint(steps).astype(np.int64) + half
         inside = (index >= 0) & (index < profile.shape[2])
-        made.append(np.where(inside, profile[:, :, np.clip(index, 0, profile.shape[2] - 1)], 0.0))
-    y, x = (each.astype(np.float32) for each in made)  # (n, rank, pixels, nodes)
+        terms.append(np.where(inside, profile[:, :, np.clip(index, 0, profile.shape[2] - 1)], 0.0))
+    y, x = (term.astype(np.float32) for term in terms)  # (n, rank, pixels, nodes)
     return np.ascontiguousarray(y.swapaxes(1, 2)), np.ascontiguousarray(x.swapaxes(2, 3))

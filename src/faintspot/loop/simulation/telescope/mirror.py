@@ -64,23 +64,23 @@ class BestFit:
         weight = np.sqrt(pupil.amplitude.ravel())
         flat = np.ones((len(weight), int(piston)), np.float32)
         columns = np.hstack([mirror.matrix(), flat]) * weight[:, None]
-        left, size, _ = np.linalg.svd(columns, full_matrices=False)
-        return cls(left[:, : np.count_nonzero(size > 1e-6 * size[0])], weight)
+        vectors, size, _ = np.linalg.svd(columns, full_matrices=False)
+        return cls(vectors[:, : np.count_nonzero(size > 1e-6 * size[0])], weight)
 
     def fitted(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the mirror's best fit to a wavefront (points, points); 0 outside the pupil."""
         inside = self.weight > 0
         inverse = np.where(inside, 1 / np.where(inside, self.weight, 1), 0)
-        seen = self.basis.T @ (self.weight * wavefront.ravel())
-        fitted: NDArray[np.float32] = (inverse * (self.basis @ seen)).reshape(wavefront.shape)
+        modes = self.basis.T @ (self.weight * wavefront.ravel())
+        fitted: NDArray[np.float32] = (inverse * (self.basis @ modes)).reshape(wavefront.shape)
         return fitted.astype(np.float32)
 
     def residual(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return a wavefront (points, points) minus the mirror's best fit; 0 outside the pupil."""
-        left: NDArray[np.float32] = np.where(
+        residual: NDArray[np.float32] = np.where(
             self.weight.reshape(wavefront.shape) > 0, wavefront - self.fitted(wavefront), 0
         )
-        return left.astype(np.float32)
+        return residual.astype(np.float32)
 
 
 def make_mirror(configuration: LoopConfiguration, pupil: PupilAmplitude) -> DeformableMirror:

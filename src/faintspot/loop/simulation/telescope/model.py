@@ -138,11 +138,11 @@ class TelescopeModel:
             return seen_nm
         before, acting, after = commands
         ends = []
-        for side, other in ((-0.5, before), (0.5, after)):
-            mixed = acting + 0.5 * self._rolling * (other - acting)
+        for side, commands_then in ((-0.5, before), (0.5, after)):
+            mixed = acting + 0.5 * self._rolling * (commands_then - acting)
             ends.append(self.wavefronts(time_s + side * self._rolling / self._rate_hz, mixed)[1])
-        place = (2.0 * np.arange(len(seen_nm)) + 1.0) / len(seen_nm) - 1.0  # -1 to 1
-        first, last = (np.maximum(side * place, 0.0).astype(np.float32)[:, None] for side in (-1.0, 1.0))
+        height = (2.0 * np.arange(len(seen_nm)) + 1.0) / len(seen_nm) - 1.0  # -1 to 1
+        first, last = (np.maximum(side * height, 0.0).astype(np.float32)[:, None] for side in (-1.0, 1.0))
         rows: NDArray[np.float32] = (1.0 - first - last) * seen_nm + first * ends[0] + last * ends[1]
         return rows
 
@@ -154,12 +154,12 @@ class TelescopeModel:
 
     def frame(self, number: int, wavefront_nm: NDArray[np.float32]) -> NDArray[np.generic]:
         """Return the camera frame [ADU] of a wavefront; the number seeds its noise."""
-        sensor, known = self.optics.sensor, (self._seed, self._realisation, number)
+        sensor, seeds = self.optics.sensor, (self._seed, self._realisation, number)
         if self._laser is not None:
             sensor = self._laser.sensor(number)
-            wavefront_nm = self._laser.jittered(wavefront_nm, known)
+            wavefront_nm = self._laser.jittered(wavefront_nm, seeds)
         flux = sensor.frame(sensor.spots(wavefront_nm)) * self.photons
-        rng = np.random.default_rng([*known, 2])
+        rng = np.random.default_rng([*seeds, 2])
         return self.detector.expose(flux, rng)
 
 

@@ -40,10 +40,10 @@ class LowOrders:
         self._star, self._sensor = configuration.natural_star, sensor
         self._seed = seed, realisation
         self._tip_tilt = RemovedModes(TIP_TILT)
-        places = subaperture_centres_m(configuration, sensor.layout.cells)
-        sides = places > 0
+        centres_m = subaperture_centres_m(configuration, sensor.layout.cells)
+        sides = centres_m > 0
         self._quadrant = sides[:, 0] + 2 * sides[:, 1]
-        self._focus = places.T.ravel()
+        self._focus = centres_m.T.ravel()
         self._of_quadrants = self._means(self._focus)
         self._tilts = np.zeros(2)
         self._curved, self._offset = 0.0, 0.0
@@ -68,26 +68,26 @@ class LowOrders:
         flags : (n,) array
             As in `faintspot.Slopes`.
         """
-        left = self._tip_tilt.removed(slopes_px, flags)
+        merged = self._tip_tilt.removed(slopes_px, flags)
         if self._star is None:
-            return left
+            return merged
         rng = np.random.default_rng([*self._seed, frame, _OF_NOISE])
-        seen = self._means(self._sensor.mean_slopes_px(wavefront_nm))
-        seen = seen + rng.normal(0.0, self._noise_px, seen.shape)
-        self._tilts += seen.mean(axis=1)
+        means = self._means(self._sensor.mean_slopes_px(wavefront_nm))
+        means = means + rng.normal(0.0, self._noise_px, means.shape)
+        self._tilts += means.mean(axis=1)
         centred = self._of_quadrants - self._of_quadrants.mean(axis=1, keepdims=True)
-        self._curved += float((centred * seen).sum() / np.square(centred).sum())
+        self._curved += float((centred * means).sum() / np.square(centred).sum())
         if (frame + 1) % self._star.focus_frames == 0:
             self._offset += self._star.focus_gain * self._curved / self._star.focus_frames
             self._curved = 0.0
-        left = left + self._offset * self._focus
+        merged = merged + self._offset * self._focus
         if (frame + 1) % self._star.tip_tilt_frames == 0:
-            left = left + np.repeat(self._tilts / self._star.tip_tilt_frames, len(flags))
+            merged = merged + np.repeat(self._tilts / self._star.tip_tilt_frames, len(flags))
             self._tilts = np.zeros(2)
-        return left
+        return merged
 
     def _means(self, slopes_px: Floats) -> Floats:
         """Return mean slopes of the quadrants, (2, 4)."""
         counts = np.bincount(self._quadrant, minlength=4)
-        sums = [np.bincount(self._quadrant, each, 4) for each in slopes_px.reshape(2, -1)]
+        sums = [np.bincount(self._quadrant, slopes, 4) for slopes in slopes_px.reshape(2, -1)]
         return np.asarray(np.stack(sums) / np.maximum(counts, 1))

@@ -43,15 +43,15 @@ class PupilAmplitude:
 
     def zernike(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return Zernike modes 2 to 11 (Noll) of a wavefront (n, n) over the pupil, in its unit: (10,)."""
-        found: NDArray[np.float32] = self._to_zernike @ wavefront.ravel()
-        return found
+        modes: NDArray[np.float32] = self._to_zernike @ wavefront.ravel()
+        return modes
 
     @cached_property
     def _to_zernike(self) -> NDArray[np.float32]:
         """Weighted least-squares fit of piston and the modes, without the row of piston."""
         line = (np.arange(self.points) + 0.5) / self.points - 0.5
         lit = self.amplitude.ravel() > 0.5
-        x, y = (each.ravel() for each in np.meshgrid(line, line))
+        x, y = (coordinate.ravel() for coordinate in np.meshgrid(line, line))
         radius = float(np.hypot(x, y)[lit].max())
         modes = np.stack([zernike(mode, x / radius, y / radius) for mode in range(1, 12)])
         weighted = modes * self.amplitude.ravel()

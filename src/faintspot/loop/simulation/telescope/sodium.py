@@ -23,16 +23,16 @@ _FIRST_FWHM = 0.35  # of the range of altitudes: single layer from which the fit
 _OF_LEARNING = 8  # random numbers
 
 
-def with_spots(known: KnownSodium, configuration: LoopConfiguration, method: Method) -> Method:
+def with_spots(sodium: KnownSodium, configuration: LoopConfiguration, method: Method) -> Method:
     """Return a method that knows the spots."""
     pixels = method.window_pixels or configuration.sensor.pixels
-    psf, scene = known.psf((pixels, pixels)), configuration.scene
+    psf, scene = sodium.psf((pixels, pixels)), configuration.scene
     if not method.matched_weights:
         return replace(method, psf=psf)
     weights = FixedWeights.matched(
         psf,
         (pixels, pixels),
-        flux_e=np.maximum(known.fit.flux_e, 1.0),
+        flux_e=np.maximum(sodium.fit.flux_e, 1.0),
         read_noise_e=scene.read_noise_e,
         excess_noise=scene.excess_noise,
         background_e=scene.background_e,
@@ -82,7 +82,7 @@ class FollowedSodium:
         Known before the run.
     """
 
-    def __init__(self, configuration: LoopConfiguration, layout: Layout, known: KnownSodium) -> None:
+    def __init__(self, configuration: LoopConfiguration, layout: Layout, sodium: KnownSodium) -> None:
         assert configuration.laser is not None
         self._laser, self._layout = configuration.laser, layout
         camera = configuration.camera
@@ -91,18 +91,18 @@ class FollowedSodium:
         self._dark_adu = camera.offset_adu + background / self._scale
         self._mean: MeanImages | None = None
         self._frames = 0
-        self.known = known
+        self.sodium = sodium
 
     def take(self, frame_adu: NDArray[np.generic], slopes_px: Floats) -> bool:
         """Take a frame and its slopes (2 n,) from the window centres; return whether the profile is new."""
         images = self._layout.images((frame_adu.astype(np.float64) - self._dark_adu) * self._scale)
-        places = slopes_px.reshape(2, -1).T
+        positions = slopes_px.reshape(2, -1).T
         if self._mean is None:
-            self._mean = MeanImages(images, places, self._laser.follow_time_constant_frames)
+            self._mean = MeanImages(images, positions, self._laser.follow_time_constant_frames)
         else:
-            self._mean = self._mean.updated(images, places)
+            self._mean = self._mean.updated(images, positions)
         self._frames += 1
         if self._frames % self._laser.follow_every_frames:
             return False
-        self.known = self.known.updated(self._mean)
+        self.sodium = self.sodium.updated(self._mean)
         return True

@@ -146,21 +146,21 @@ def _image_axis(
     """
     nodes, weights = np.polynomial.legendre.leggauss(1 + math.ceil(2 / width_px))
     margin = math.ceil(3 * blur_px)
-    place = np.arange(-margin, pixels + margin) - (pixels - 1) / 2
-    where = (place[:, None] + nodes / 2).ravel()
-    angle = where / width_px  # in lambda / d
+    centres = np.arange(-margin, pixels + margin) - (pixels - 1) / 2
+    samples_px = (centres[:, None] + nodes / 2).ravel()
+    angle = samples_px / width_px  # in lambda / d
     line = (np.arange(samples) + 0.5) / samples - 0.5
     square = np.sinc(angle / samples) / samples  # each point is a square of constant phase
     transform = np.exp(-2j * np.pi * np.outer(angle, line)) * square[:, None]
-    weight = np.tile(weights / 2, len(place)) / width_px
-    inner = np.arange(pixels) - (pixels - 1) / 2
+    weight = np.tile(weights / 2, len(centres)) / width_px
+    window = np.arange(pixels) - (pixels - 1) / 2
     if blur_px:
         from scipy.special import ndtr
 
-        edges = (np.concatenate([inner - 0.5, inner[-1:] + 0.5])[:, None] - where) / blur_px
+        edges = (np.concatenate([window - 0.5, window[-1:] + 0.5])[:, None] - samples_px) / blur_px
         to_pixels = np.diff(ndtr(edges), axis=0) * weight
     else:
-        to_pixels = np.where(np.abs(where - inner[:, None]) < 0.5, weight, 0.0)
+        to_pixels = np.where(np.abs(samples_px - window[:, None]) < 0.5, weight, 0.0)
     return transform.astype(np.complex64), to_pixels.astype(np.float32)
 
 

@@ -41,7 +41,6 @@ class Centroid(Estimator):
         high=1.0,
     )
 
-    runs_on_gpu = True
     steps_shown: ClassVar[tuple[Step, ...]] = (RAW, CALIBRATED, BACKGROUND)
 
 
@@ -132,21 +131,9 @@ class GravityPlan(EstimatorPlan):
     # Tables of the kernels ------------------------------------------------------------------------------
 
     @cached_property
-    def first_step(self) -> gravity.GravityTables:
+    def tables(self) -> Any:
         """Tables of the step before the background subtraction."""
         return gravity.GravityTables()
-
-    @property
-    def before(self) -> int:
-        """First step: NOTHING, SMOOTH or DENOISE of `faintspot.slopes.kernels.gravity.gravity`."""
-        if self.first_step.flat_start is not None:
-            return gravity.DENOISE
-        return gravity.NOTHING if self.first_step.taps is None else gravity.SMOOTH
-
-    @property
-    def tables(self) -> Any:
-        """See `EstimatorPlan`."""
-        return self.first_step
 
     @property
     def own_scratch(self) -> Any:

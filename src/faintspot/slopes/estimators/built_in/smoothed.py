@@ -87,7 +87,7 @@ class _Plan(GravityPlan):
     """Tables of a smoothing followed by a centre of gravity."""
 
     @cached_property
-    def first_step(self) -> gravity.GravityTables:
+    def tables(self) -> gravity.GravityTables:
         """See `GravityPlan`."""
         std = np.repeat(self.each("smoothing_px")[:, None], 2, axis=1)
         return gravity.GravityTables(taps=gaussian_taps(std, self.sensor.window))

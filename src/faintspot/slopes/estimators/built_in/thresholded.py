@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,9 +16,7 @@ from faintspot.slopes.estimators.built_in.gravity import Centroid, Floats, Gravi
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.estimators.sensor import Sensor
-from faintspot.slopes.kernels.compilation.host import WIDTHS, lanes_for
 from faintspot.slopes.kernels.gravity import gravity
-from faintspot.slopes.kernels.gravity.thresholded import RowTables, thresholded_in_rows
 
 _OF_NOISE = (3.0, 1.5, 2.0, 2.5, 4.0, 5.0)  # multiples of the noise of a dark pixel
 _OF_PEAK = (0.05, 0.1, 0.2, 0.3)  # for bright spots
@@ -68,31 +65,7 @@ class Thresholded(Centroid):
 
 
 class _Plan(GravityPlan):
-    """Thresholds, and the tables of the kernel that reads pixels in rows, if it can be used."""
-
-    def __init__(self, estimator: Thresholded, sensor: Sensor) -> None:
-        super().__init__(estimator, sensor)
-        columns = sensor.window[1]
-        # Width of the machine, not of the pipeline: the order of a sum depends on it.
-        widest = lanes_for(np.float32).width
-        self._widths = [width for width in WIDTHS if columns % width == 0 and width <= widest]
-        if self._widths:
-            self.kernel = thresholded_in_rows
-
-    @cached_property
-    def tables(self) -> Any:
-        """See `EstimatorPlan`."""
-        tables = super().tables
-        if not self._widths:
-            return tables
-        maps = np.ascontiguousarray(self.sensor.calibration.maps(self.sensor.layout.frame_shape), np.float32)
-        columns = self.sensor.window[1]
-        ramp = np.arange(columns, dtype=np.float32) - np.float32(0.5 * (columns - 1))
-        variances = None
-        noise = self.sensor.calibration.read_noise_map(self.sensor.layout.frame_shape)
-        if noise is not None:
-            variances = (np.square(noise) + self.sensor.background_variance).astype(np.float32)
-        return RowTables(lanes_for(np.float32, max(self._widths)), maps, ramp, tables, variances)
+    """Thresholds of a centre of gravity."""
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
         """See `EstimatorPlan`."""

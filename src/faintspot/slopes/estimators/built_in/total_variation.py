@@ -158,7 +158,7 @@ class _Plan(GravityPlan):
     estimator: TotalVariation
 
     @cached_property
-    def first_step(self) -> gravity.GravityTables:
+    def tables(self) -> gravity.GravityTables:
         """See `GravityPlan`."""
         return gravity.GravityTables(
             flat_start_table(*self.sensor.window), ALGORITHMS[self.estimator.algorithm]

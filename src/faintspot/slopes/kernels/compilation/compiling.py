@@ -42,7 +42,7 @@ def inlined(function: Callable[..., Any]) -> Any:
     Constant arguments become constants in the machine code, but not to Numba's typing: inlining by Numba
     would type the function's body anew at every call, which takes several times longer to compile.
     """
-    return _kernel(function, forceinline=True, _nrt=False)
+    return _kernel(function, forceinline=True)
 
 
 def compiled(function: Callable[..., Any]) -> Any:
@@ -50,20 +50,15 @@ def compiled(function: Callable[..., Any]) -> Any:
 
     Nor does it count references to arrays: who calls a kernel keeps its arrays alive, and counting them, with
     atomic instructions at every call of one kernel by another, took half of the time of a plain centre of
-    gravity. So it cannot make arrays: see `allocating`.
+    gravity. So it cannot make arrays.
     """
-    return _kernel(function, _nrt=False)
+    return _kernel(function)
 
 
 def compiled_with(function: Callable[..., Any], source: str) -> Any:
     """Compile like `compiled` a function that calls one of another package, whose source file is given."""
     inside = Path(source).is_relative_to(_KERNELS)
-    return _kernel(function, () if inside else (Path(source),), _nrt=False)
-
-
-def allocating(function: Callable[..., Any]) -> Any:
-    """Compile like `compiled` a function that allocates arrays."""
-    return _kernel(function)
+    return _kernel(function, () if inside else (Path(source),))
 
 
 def at_once(function: Callable[..., Any], *kinds: Any) -> Any:
@@ -71,7 +66,7 @@ def at_once(function: Callable[..., Any], *kinds: Any) -> Any:
 
     It keeps the GIL: given up for a moment, it may come back to a real-time thread milliseconds later.
     """
-    whole = _kernel(function, nogil=False, _nrt=False).whole
+    whole = _kernel(function, nogil=False).whole
     whole.compile(kinds)
     return whole.overloads[kinds].entry_point
 
@@ -88,7 +83,7 @@ class _Kernel(CPUDispatcher):
         self, function: Callable[..., Any], sources: tuple[Path, ...], options: dict[str, Any]
     ) -> None:
         self._sources = sources
-        self._options = {"nogil": True, "error_model": "numpy", **options}
+        self._options = {"nogil": True, "error_model": "numpy", "_nrt": False, **options}
         wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
         every = {"nopython": True, "boundscheck": None, **self._options, **wrappers}
         super().__init__(function, targetoptions=every, pipeline_class=_PartCompiler)

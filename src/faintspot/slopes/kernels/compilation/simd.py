@@ -228,6 +228,22 @@ def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
 
 
 @intrinsic
+def store_all(typing_context: Any, array: Any, offset: Any, values: Any) -> Any:
+    """Store a tuple of vectors, one after the other, from element `offset`."""
+    vector = values.dtype
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        place = context.cast(builder, args[1], sig.args[1], types.intp)
+        pointer = _element_pointer(context, builder, sig.args[0], args[0], place, vector)
+        for i in range(values.count):
+            value, to = builder.extract_value(args[2], i), builder.gep(pointer, [ir.IntType(64)(i)])
+            builder.store(value, to, align=vector.scalar.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, offset, values), emit
+
+
+@intrinsic
 def get(typing_context: Any, array: Any, offset: Any) -> Any:
     """One element of a contiguous array of any number of dimensions, by its flat offset."""
 
@@ -386,18 +402,6 @@ def sum_of(typing_context: Any, a: Any) -> Any:
         name = f"llvm.vector.reduce.fadd.v{a.width}f{a.scalar.bitwidth}"
         function = cgutils.get_or_insert_function(builder.module, kind, name)
         return builder.call(function, [ir.Constant(scalar, -0.0), args[0]], fastmath=("reassoc",))
-
-    return a.scalar(a), emit
-
-
-@intrinsic
-def largest_of(typing_context: Any, a: Any) -> Any:
-    """The largest of all lanes; NaN only where all are."""
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        kind = ir.FunctionType(_llvm_scalar(a.scalar), [_llvm_vector(a)])
-        name = f"llvm.vector.reduce.fmax.v{a.width}f{a.scalar.bitwidth}"
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [args[0]])
 
     return a.scalar(a), emit
 

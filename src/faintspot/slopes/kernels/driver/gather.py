@@ -119,16 +119,20 @@ def fill_bad_pixels(width: Any, lane: Any, ny: Any, nx: Any, image: Any, origina
 
 
 @compiled
-def gather_image(width: Any, images: Any, index: Any, lane: Any, image: Any) -> None:
-    """Copy one image of a stack (n, pixels) into a lane."""
-    pixels = images.shape[1]
-    for i in range(pixels):
-        put(image, i * width + lane, get(images, index * pixels + i))
+def gather_images(width: Any, images: Any, first: Any, image: Any) -> None:
+    """Copy W images of a stack (n, pixels) into the lanes; the last one fills those that are left."""
+    n, pixels = images.shape
+    for lane in range(width):
+        start = min(first + lane, n - 1) * pixels
+        for i in range(pixels):
+            put(image, i * width + lane, get(images, start + i))
 
 
 @compiled
-def scatter_image(width: Any, image: Any, lane: Any, images: Any, index: Any) -> None:
-    """Copy a lane into one image of a stack (n, pixels)."""
-    pixels = images.shape[1]
-    for i in range(pixels):
-        put(images, index * pixels + i, get(image, i * width + lane))
+def scatter_images(width: Any, image: Any, first: Any, images: Any) -> None:
+    """Copy the lanes into a stack (n, pixels), as far as it has images."""
+    n, pixels = images.shape
+    for lane in range(min(width, n - first)):
+        start = (first + lane) * pixels
+        for i in range(pixels):
+            put(images, start + i, get(image, i * width + lane))

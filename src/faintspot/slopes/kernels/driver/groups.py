@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from faintspot.base.flags import SubapertureFlag
-from faintspot.slopes.kernels.compilation.compiling import compiled, compiled_with
+from faintspot.slopes.kernels.compilation.compiling import compiled, compiled_with, inlined
 from faintspot.slopes.kernels.compilation.host import aligned_zeros
 from faintspot.slopes.kernels.compilation.simd import Lanes, load, maximum, select, splat, store, width_of
 from faintspot.slopes.kernels.compilation.subnormals import flush_subnormals, restore_control
-from faintspot.slopes.kernels.driver.gather import calibrate, fill_bad_pixels, gather_raw, scatter_image
+from faintspot.slopes.kernels.driver.gather import calibrate, fill_bad_pixels, gather_raw, scatter_images
 
 NO_FLUX = int(SubapertureFlag.NO_FLUX)
 TOO_MANY_BAD_PIXELS = int(SubapertureFlag.TOO_MANY_BAD_PIXELS)
@@ -175,31 +175,46 @@ def prepare_group(source: Any, f: Any, first: Any, settings: Any, scratch: Any) 
             scratch.flags[lane] |= TOO_MANY_BAD_PIXELS if bad > settings[MOST_BAD, s] else 0
 
 
-@compiled
-def store_stage(width: Any, image: Any, stage: Any, first: Any) -> None:
-    """Copy the images of a group into the stages of `explain`."""
-    for lane in range(min(width, stage.shape[0] - first)):
-        scatter_image(width, image, lane, stage, first + lane)
+@inlined
+def place_of(source: Any, item: Any) -> Any:
+    """Return the frame of a group, and its first sub-aperture."""
+    width = width_of(source.lanes)
+    n_groups = (source.corners.shape[0] + width - 1) // width
+    return item // n_groups, item % n_groups * width
 
 
 @compiled
-def within(slope: Any, reach: Any) -> Any:
+def _within(slope: Any, reach: Any) -> Any:
     """Clip a slope to the allowed range."""
     return min(max(slope, -reach), reach)
 
 
 @compiled
 def store_slope(
-    f: Any, s: Any, settings: Any, x: Any, y: Any, error_x: Any, error_y: Any, bits: Any, slopes: Any
+    f: Any,
+    s: Any,
+    settings: Any,
+    x: Any,
+    y: Any,
+    flux: Any,
+    error_x: Any,
+    error_y: Any,
+    bits: Any,
+    iterations: Any,
+    bad_pixels: Any,
+    slopes: Any,
 ) -> None:
-    """Write position, flags and standard errors of one sub-aperture; the reference where it is invalid."""
+    """Write all of one sub-aperture but the covariance; its position is the reference where it is invalid."""
+    slopes.flux[f, s] = flux
+    slopes.iterations[f, s] = iterations
+    slopes.bad_pixels[f, s] = bad_pixels
     if settings[ERROR_SCALE, s] < 0.0 and bits & TOO_MANY_BAD_PIXELS == 0:
         bits |= NO_FLUX
     valid = bits & (NO_FLUX | TOO_MANY_BAD_PIXELS) == 0
     reach = settings[RANGE, s]
     away_x, away_y = x - settings[ZERO_X, s], y - settings[ZERO_Y, s]
-    slopes.x[f, s] = within(away_x, reach) if valid else 0.0
-    slopes.y[f, s] = within(away_y, reach) if valid else 0.0
+    slopes.x[f, s] = _within(away_x, reach) if valid else 0.0
+    slopes.y[f, s] = _within(away_y, reach) if valid else 0.0
     if valid and max(abs(away_x), abs(away_y)) >= reach - LIMIT_ROUNDING_PX:
         bits |= AT_SEARCH_LIMIT
     known = valid and settings[VARIANCE, s] >= 0.0
@@ -224,18 +239,18 @@ def _store_group(width: Any, n: Any, group: Any, scratch: Any, slopes: Any) -> N
     f, found = group.frame, scratch.results
     for lane in range(min(width, n - group.first)):
         s = group.first + lane
-        slopes.flux[f, s] = found[FLUX * width + lane]
-        slopes.iterations[f, s] = scratch.iterations[lane]
-        slopes.bad_pixels[f, s] = scratch.bad_counts[lane]
         store_slope(
             f,
             s,
             group.settings,
             found[X * width + lane],
             found[Y * width + lane],
+            found[FLUX * width + lane],
             found[ERROR_X * width + lane],
             found[ERROR_Y * width + lane],
             scratch.flags[lane],
+            scratch.iterations[lane],
+            scratch.bad_counts[lane],
             slopes,
         )
     # A loop of its own: together, they store too many arrays to be compiled to vectors.
@@ -269,16 +284,14 @@ def measure_groups(
         Written where it has rows.
     """
     lanes = source.lanes
-    width = width_of(lanes)
-    n = source.corners.shape[0]
-    n_groups = (n + width - 1) // width
+    width, n = width_of(lanes), source.corners.shape[0]
     control = flush_subnormals()
     for item in range(start, stop):
-        f, first = item // n_groups, item % n_groups * width
+        f, first = place_of(source, item)
         settings = task.settings[task.variants[f]]
         prepare_group(source, f, first, settings, scratch)
         for stage in range(stages.shape[0]):
-            store_stage(width, scratch.image, stages[stage, f], first)
+            scatter_images(width, scratch.image, first, stages[stage, f])
         predicted = task.prior[min(f, task.prior.shape[0] - 1)]
         group = Group(lanes, source.ny, source.nx, f, first, settings, predicted, task.variances)
         locate(group, task.tables, scratch, stages)
@@ -308,43 +321,41 @@ def copied(template: Any, kernel: Any, **replaced: Any) -> Any:
 @compiled
 def flux_of_groups(source: Any, start: Any, stop: Any, scratch: Any, flux: Any) -> None:
     """Sum the pixels of every sub-aperture, electrons, bad ones as 0, into (n_frames, n_subapertures)."""
-    lanes = source.lanes
-    width = width_of(lanes)
-    n = source.corners.shape[0]
-    n_groups = (n + width - 1) // width
     for item in range(start, stop):
-        f, first = item // n_groups, item % n_groups * width
+        f, first = place_of(source, item)
         gather_group(source, f, first, scratch)
-        total, zero = splat(lanes, 0.0), splat(lanes, 0.0)
+        total, zero = splat(source.lanes, 0.0), splat(source.lanes, 0.0)
         for i in range(source.ny * source.nx):
-            g = load(lanes, scratch.image, i * width)
+            g = load(source.lanes, scratch.image, i * width_of(source.lanes))
             total = total + select(g >= g, g, zero)
-        store(scratch.results, 0, total)
-        for lane in range(min(width, n - first)):
-            flux[f, first + lane] = scratch.results[lane]
+        _store_flux(source.lanes, total, f, first, scratch, flux)
 
 
 @compiled
 def flux_above_edges(source: Any, start: Any, stop: Any, scratch: Any, flux: Any) -> None:
     """Sum the pixels of each sub-aperture like `flux_of_groups`, above the mean of its outermost pixels."""
     lanes, ny, nx = source.lanes, source.ny, source.nx
-    width = width_of(lanes)
-    n = source.corners.shape[0]
-    n_groups = (n + width - 1) // width
     zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
     for item in range(start, stop):
-        f, first = item // n_groups, item % n_groups * width
+        f, first = place_of(source, item)
         gather_group(source, f, first, scratch)
         inner, inner_count, edge, edge_count = zero, zero, zero, zero
         for y in range(ny):
             for x in range(nx):
-                g = load(lanes, scratch.image, (y * nx + x) * width)
+                g = load(lanes, scratch.image, (y * nx + x) * width_of(lanes))
                 good = g >= g
                 value, count = select(good, g, zero), select(good, one, zero)
                 if y == 0 or y == ny - 1 or x == 0 or x == nx - 1:
                     edge, edge_count = edge + value, edge_count + count
                 else:
                     inner, inner_count = inner + value, inner_count + count
-        store(scratch.results, 0, inner - inner_count * (edge / maximum(edge_count, one)))
-        for lane in range(min(width, n - first)):
-            flux[f, first + lane] = scratch.results[lane]
+        above = inner - inner_count * (edge / maximum(edge_count, one))
+        _store_flux(lanes, above, f, first, scratch, flux)
+
+
+@inlined
+def _store_flux(lanes: Any, total: Any, f: Any, first: Any, scratch: Any, flux: Any) -> None:
+    """Write the flux of a group."""
+    store(scratch.results, 0, total)
+    for lane in range(min(width_of(lanes), flux.shape[1] - first)):
+        flux[f, first + lane] = scratch.results[lane]

@@ -26,9 +26,10 @@ RANK = 0  # in: the threshold is the RANK-th largest pixel
 SUBTRACT = 1  # in: 1 to take the threshold off the pixels that stay, 0 to keep them as they are
 THRESHOLD = 2  # out
 LARGEST = 3  # out: largest magnitude of the image
-SUM, X, Y = 4, 5, 6  # out: flux of what stays and its centre of gravity, px from the centre
-VARIANCE, EXCESS = 7, 8  # in: variance of a pixel that collects m electrons, VARIANCE + EXCESS m
-ERROR_X, ERROR_Y, COVARIANCE = 9, 10, 11  # out: standard errors of X and Y, px, and covariance, px^2
+# Out, in the order of a group's results: centre of gravity of what stays, px from the centre, and its flux;
+# standard errors, px, and covariance, px^2.
+X, Y, SUM, ERROR_X, ERROR_Y, COVARIANCE = range(4, 10)
+VARIANCE, EXCESS = 10, 11  # in: variance of a pixel that collects m electrons, VARIANCE + EXCESS m
 LANE_ROWS = 12
 
 _COUNTING_PASSES = 24  # usually 5 to 8 are enough; outliers go on to the exact passes

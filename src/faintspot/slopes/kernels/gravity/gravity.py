@@ -10,22 +10,17 @@ from faintspot.base.flags import SubapertureFlag
 from faintspot.slopes.kernels.compilation.compiling import compiled
 from faintspot.slopes.kernels.compilation.host import aligned_zeros
 from faintspot.slopes.kernels.compilation.simd import Lanes, load, store, width_of
+from faintspot.slopes.kernels.driver.gather import scatter_images
 from faintspot.slopes.kernels.driver.groups import (
     BACKGROUND,
     COMMON_ROWS,
-    COVARIANCE,
     DENOISED,
-    ERROR_X,
-    ERROR_Y,
     EXCESS,
-    FLUX,
     NO_FLUX,
+    RESULT_ROWS,
     TOO_MANY_BAD_PIXELS,
     VARIANCE,
-    X,
-    Y,
     driver_of,
-    store_stage,
 )
 from faintspot.slopes.kernels.gravity import brightest
 from faintspot.slopes.kernels.gravity.smoothing import gather_taps, smooth_group
@@ -45,9 +40,6 @@ NOT_CONVERGED = int(SubapertureFlag.NOT_CONVERGED)
 # Rows of the settings' table that follow the common ones.
 STRENGTH, TOLERANCE, LIMIT, RANK, SUBTRACT, FLOOR, LEVEL = range(COMMON_ROWS, COMMON_ROWS + 7)
 SETTING_ROWS = COMMON_ROWS + 7
-
-NOTHING, SMOOTH, DENOISE = range(3)
-"""Steps before the background subtraction."""
 
 
 class GravityTables(NamedTuple):
@@ -92,7 +84,7 @@ def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     flat_start, algorithm, taps = tables
     denoised = _first_step(flat_start, algorithm, taps, group, scratch.image, scratch.spare, own)
     if stages.shape[0] > 0:
-        store_stage(width, denoised, stages[DENOISED, group.frame], first)
+        scatter_images(width, denoised, first, stages[DENOISED, group.frame])
     _set_threshold(lanes, denoised, ny * nx, own.centroid)
     if settings[VARIANCE, first] >= 0.0:
         place = first * ny * nx
@@ -101,16 +93,9 @@ def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
         _centre_of_gravity(lanes, denoised, ny, nx, own.centroid)
     if stages.shape[0] > 0:
         _subtract_background(lanes, denoised, ny * nx, own.centroid, scratch.spare)
-        store_stage(width, scratch.spare, stages[BACKGROUND, group.frame], first)
-    for row, found in (
-        (FLUX, brightest.SUM),
-        (X, brightest.X),
-        (Y, brightest.Y),
-        (ERROR_X, brightest.ERROR_X),
-        (ERROR_Y, brightest.ERROR_Y),
-        (COVARIANCE, brightest.COVARIANCE),
-    ):
-        store(scratch.results, row * width, load(lanes, own.centroid, found * width))
+        scatter_images(width, scratch.spare, first, stages[BACKGROUND, group.frame])
+    for row in range(RESULT_ROWS):
+        store(scratch.results, row * width, load(lanes, own.centroid, (brightest.X + row) * width))
     for lane in range(width):
         _flag_lane(width, lane, ny, nx, first, settings, own, scratch)
 
@@ -179,27 +164,19 @@ def _flag_lane(
     s = min(first + lane, settings.shape[1] - 1)
     counts, centroid = own.counts, own.centroid
     bits = scratch.flags[lane]
+    flux, largest = centroid[brightest.SUM * width + lane], centroid[brightest.LARGEST * width + lane]
+    x, y = centroid[brightest.X * width + lane], centroid[brightest.Y * width + lane]
     if not bits & TOO_MANY_BAD_PIXELS:  # else no further flags are added
         if counts[total_variation.INFEASIBLE * width + lane]:
             bits |= INFEASIBLE_STRENGTH
         if not counts[total_variation.CONVERGED * width + lane] and settings[TOLERANCE, s] > 0.0:
             bits |= NOT_CONVERGED
-    flux, largest = centroid[brightest.SUM * width + lane], centroid[brightest.LARGEST * width + lane]
-    x, y = centroid[brightest.X * width + lane], centroid[brightest.Y * width + lane]
-    scratch.flags[lane] = bits | lightless(ny, nx, bits, flux, settings[FLOOR, s] * largest, x, y)
+        # A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
+        inside = abs(x) <= 0.5 * nx and abs(y) <= 0.5 * ny
+        if not (inside and flux > settings[FLOOR, s] * largest):
+            bits |= NO_FLUX
+    scratch.flags[lane] = bits
     scratch.iterations[lane] = counts[total_variation.ITERATIONS * width + lane]
-
-
-@compiled
-def lightless(ny: Any, nx: Any, bits: Any, flux: Any, floor: Any, x: Any, y: Any) -> Any:
-    """Return NO_FLUX if an otherwise valid image has no usable flux, else 0.
-
-    A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
-    """
-    inside = abs(x) <= 0.5 * nx and abs(y) <= 0.5 * ny
-    if bits & TOO_MANY_BAD_PIXELS or (flux > floor and inside):
-        return 0
-    return NO_FLUX
 
 
 gravity_of_groups = driver_of(locate_gravity)

@@ -7,7 +7,7 @@ from typing import Any
 
 from faintspot.slopes.kernels.compilation.compiling import compiled
 from faintspot.slopes.kernels.compilation.simd import splat, store, width_of
-from faintspot.slopes.kernels.driver.gather import gather_image, scatter_image
+from faintspot.slopes.kernels.driver.gather import gather_images, scatter_images
 from faintspot.slopes.kernels.gravity import brightest
 from faintspot.slopes.kernels.total_variation import denoise as total_variation
 from faintspot.slopes.kernels.total_variation.denoise import denoise_group
@@ -44,18 +44,18 @@ def denoise_stack(
     n = images.shape[0]
     for group in range(start, stop):
         first = group * width
+        gather_images(width, images, first, image)
         for lane in range(width):
             s = min(first + lane, n - 1)
-            gather_image(width, images, s, lane, image)
             denoiser[total_variation.STRENGTH * width + lane] = settings[0, s]
             denoiser[total_variation.TOLERANCE * width + lane] = settings[1, s]
             counts[total_variation.LIMIT * width + lane] = int(settings[2, s])
         denoise_group(
             lanes, algorithm, lowers, table, ny, nx, image, output, own.state, own.rows, denoiser, counts
         )
+        scatter_images(width, output, first, denoised)
         for lane in range(min(width, n - first)):
             s = first + lane
-            scatter_image(width, output, lane, denoised, s)
             multiplier[s] = denoiser[total_variation.MULTIPLIER * width + lane]
             counts_out[0, s] = counts[total_variation.ITERATIONS * width + lane]
             counts_out[1, s] = counts[total_variation.CONVERGED * width + lane]
@@ -72,15 +72,13 @@ def subtract_stack(
     n, pixels = images.shape
     for group in range(start, stop):
         first = group * width
+        gather_images(width, images, first, image)
         for lane in range(width):
-            s = min(first + lane, n - 1)
-            gather_image(width, images, s, lane, image)
-            centroid[brightest.RANK * width + lane] = rank[s]
+            centroid[brightest.RANK * width + lane] = rank[min(first + lane, n - 1)]
             centroid[brightest.SUBTRACT * width + lane] = subtract
         _find_threshold(lanes, image, pixels, centroid)
         _subtract_background(lanes, image, pixels, centroid, image)
-        for lane in range(min(width, n - first)):
-            scatter_image(width, image, lane, result, first + lane)
+        scatter_images(width, image, first, result)
 
 
 @compiled
@@ -95,8 +93,7 @@ def centroid_stack(
     store(centroid, brightest.SUBTRACT * width, splat(lanes, 0.0))
     for group in range(start, stop):
         first = group * width
-        for lane in range(width):
-            gather_image(width, images, min(first + lane, n - 1), lane, image)
+        gather_images(width, images, first, image)
         _centre_of_gravity(lanes, image, ny, nx, centroid)
         for lane in range(min(width, n - first)):
             positions[first + lane, 0] = centroid[brightest.X * width + lane]

@@ -28,17 +28,19 @@ from faintspot.slopes.kernels.compilation.simd import (
     widened,
     width_of,
 )
+from faintspot.slopes.kernels.compilation.subnormals import flush_subnormals, restore_control
 from faintspot.slopes.kernels.driver import groups
 from faintspot.slopes.kernels.driver.groups import (
     COMMON_ROWS,
     NO_FLUX,
     SATURATED,
     TOO_MANY_BAD_PIXELS,
+    Task,
     driver_of,
+    place_of,
     store_covariance,
     store_slope,
 )
-from faintspot.slopes.kernels.driver.row_driver import rows_driver_of
 
 # Rows of the settings' table that follow the common ones: what the sums are divided by (0: the frame's own
 # flux; negative: not measurable); position of a sum of 0; what a flux of 1 e- at the reference adds to the
@@ -189,11 +191,29 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
     )
     bits = SATURATED if any_lane(brightest >= splat(pixels, source.saturation)) else 0
     bits |= 0 if usable else NO_FLUX
-    slopes.iterations[f, s] = slopes.bad_pixels[f, s] = 0
-    slopes.flux[f, s] = seen
-    store_slope(f, s, settings, x, y, error_x, error_y, bits, slopes)
+    store_slope(f, s, settings, x, y, seen, error_x, error_y, bits, 0, 0, slopes)
     store_covariance(f, s, settings, covariance, slopes)
     return True
 
 
-window_in_rows = rows_driver_of(_measure, window_of_groups)
+@compiled
+def window_in_rows(
+    source: Any, task: Any, start: Any, stop: Any, scratch: Any, slopes: Any, stages: Any
+) -> None:
+    """Compute the slopes of the groups [start, stop) of a block of frames; see `groups.measure_groups`."""
+    width, n = width_of(source.lanes), source.corners.shape[0]
+    control = flush_subnormals()
+    for item in range(start, stop):
+        f, first = place_of(source, item)
+        last = min(first + width, n)
+        settings = task.settings[task.variants[f]]
+        whole = stages.shape[0] == 0
+        for s in range(first, last):
+            whole = _measure(source, task.tables, f, s, settings, slopes) and whole
+        if whole:
+            continue
+        filled = Task(task.settings, task.variants, task.prior, task.tables.gathered, task.variances)
+        window_of_groups(source, filled, item, item + 1, scratch, slopes, stages)
+        for s in range(first, last):  # those without bad pixels once more: slopes depend on no neighbour
+            _measure(source, task.tables, f, s, settings, slopes)
+    restore_control(control)

@@ -16,15 +16,13 @@ from faintspot.slopes.kernels.compilation.simd import (
     load,
     maximum,
     multiply_add,
-    reciprocal,
     select,
     splat,
     store,
     width_of,
 )
-from faintspot.slopes.kernels.gravity.pixel_noise import variance_of, weight_variance_of
+from faintspot.slopes.kernels.spot_fits.model import model_at, noise_of, weigh
 from faintspot.slopes.kernels.spot_fits.spot_rows import (
-    EXCESS,
     FLUX,
     I_FF,
     I_XF,
@@ -38,13 +36,9 @@ from faintspot.slopes.kernels.spot_fits.spot_rows import (
     J_XY,
     J_YF,
     J_YY,
-    MODEL_ERROR,
     SCORE_F,
     SCORE_X,
     SCORE_Y,
-    VARIANCE,
-    WEIGHT_EXCESS,
-    WEIGHT_VARIANCE,
 )
 
 _LEAST_LEFT = 1e-5  # of the information on the flux: below it is round-off, and the spot resembles a constant
@@ -74,34 +68,19 @@ def eliminate_background(
     Parameters as `likelihood.fit_group`; SCORE_*, I_* and J_* are read and written.
     """
     width = width_of(lanes)
-    rank, padded = profiles.shape[1], profiles.shape[3]
     zero = splat(lanes, 0.0)
-    v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
-    wv, we = (
-        load(lanes, lane_values, WEIGHT_VARIANCE * width),
-        load(lanes, lane_values, WEIGHT_EXCESS * width),
-    )
-    model_error, flux = load(lanes, lane_values, MODEL_ERROR * width), load(lanes, lane_values, FLUX * width)
+    noise, flux = noise_of(lanes, lane_values), load(lanes, lane_values, FLUX * width)
     s, i, ix, iy, im, j, jx, jy, jm = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for y in range(ny):
         for x in range(nx):
-            m, mx, my = zero, zero, zero
-            for term in range(rank):
-                along, across = 2 * term * padded + x, 2 * (rank + term) * padded + y
-                fx = load(lanes, profiles, along * width)
-                fy = load(lanes, profiles, across * width)
-                m = multiply_add(fx, fy, m)
-                mx = multiply_add(load(lanes, profiles, (along + padded) * width), fy, mx)
-                my = multiply_add(fx, load(lanes, profiles, (across + padded) * width), my)
+            m, mx, my = model_at(lanes, profiles, x, y)
             m = flux * m
-            expected = maximum(m, zero)
             at = (y * nx + x) * width
-            own = weight_variance_of(lanes, variances, place + at, v, wv)
-            w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), own))
+            w, wt = weigh(lanes, noise, variances, place + at, m)
             s = multiply_add(w, load(lanes, image, at) - m, s)
             i, im = i + w, multiply_add(w, m, im)
             ix, iy = multiply_add(w, mx, ix), multiply_add(w, my, iy)
-            wt = w * (w * multiply_add(expected, e, variance_of(lanes, variances, place + at, v)))
+            wt = w * wt
             j, jm = j + wt, multiply_add(wt, m, jm)
             jx, jy = multiply_add(wt, mx, jx), multiply_add(wt, my, jy)
     inverse = splat(lanes, 1.0) / maximum(i, splat(lanes, 1e-30))

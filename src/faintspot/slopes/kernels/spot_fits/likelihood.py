@@ -18,20 +18,19 @@ from faintspot.slopes.kernels.compilation.simd import (
     maximum,
     minimum,
     multiply_add,
-    reciprocal,
     select,
     splat,
     store,
+    store_all,
     width_of,
 )
-from faintspot.slopes.kernels.gravity.pixel_noise import variance_of, weight_variance_of
 from faintspot.slopes.kernels.spot_fits.background import eliminate_background
+from faintspot.slopes.kernels.spot_fits.model import model_at, noise_of, weigh
 from faintspot.slopes.kernels.spot_fits.profiles import look_up
 from faintspot.slopes.kernels.spot_fits.spot_rows import (
     COVARIANCE,
     ERROR_X,
     ERROR_Y,
-    EXCESS,
     FLUX,
     HIGH_X,
     HIGH_Y,
@@ -50,7 +49,6 @@ from faintspot.slopes.kernels.spot_fits.spot_rows import (
     LARGEST_MOVE,
     LOW_X,
     LOW_Y,
-    MODEL_ERROR,
     MOVE,
     MOVE_BEFORE,
     PRIOR_WEIGHT,
@@ -61,9 +59,6 @@ from faintspot.slopes.kernels.spot_fits.spot_rows import (
     SCORE_Y,
     SEEN,
     SEEN_ERROR,
-    VARIANCE,
-    WEIGHT_EXCESS,
-    WEIGHT_VARIANCE,
     X,
     Y,
 )
@@ -80,12 +75,7 @@ def _separable_sums(
     width = width_of(lanes)
     padded = profiles.shape[3]
     zero = splat(lanes, 0.0)
-    v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
-    wv, we = (
-        load(lanes, lane_values, WEIGHT_VARIANCE * width),
-        load(lanes, lane_values, WEIGHT_EXCESS * width),
-    )
-    model_error, flux = load(lanes, lane_values, MODEL_ERROR * width), load(lanes, lane_values, FLUX * width)
+    noise, flux = noise_of(lanes, lane_values), load(lanes, lane_values, FLUX * width)
     sx, sy, sf = zero, zero, zero
     ixx, iyy, iff, ixy, ixf, iyf = zero, zero, zero, zero, zero, zero
     jxx, jyy, jff, jxy, jxf, jyf = zero, zero, zero, zero, zero, zero
@@ -96,15 +86,12 @@ def _separable_sums(
         for x in range(nx):
             fx, dx = load(lanes, profiles, x * width), load(lanes, profiles, (padded + x) * width)
             m = fx * fy
-            expected = maximum(m, zero)
             at = (y * nx + x) * width
-            own = weight_variance_of(lanes, variances, place + at, v, wv)
-            w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), own))
+            w, wt = weigh(lanes, noise, variances, place + at, m)
             r = load(lanes, image, at) - m
             wf, wd = w * fx, w * dx
             s0, s1 = multiply_add(r, wf, s0), multiply_add(r, wd, s1)
             i0, i1, i2 = multiply_add(wf, fx, i0), multiply_add(wd, fx, i1), multiply_add(wd, dx, i2)
-            wt = w * multiply_add(expected, e, variance_of(lanes, variances, place + at, v))
             tf, td = wt * wf, wt * wd
             j0, j1, j2 = multiply_add(tf, fx, j0), multiply_add(td, fx, j1), multiply_add(td, dx, j2)
         sx, sy, sf = multiply_add(s1, fy, sx), multiply_add(s0, dy, sy), multiply_add(s0, fy, sf)
@@ -113,8 +100,8 @@ def _separable_sums(
         ixy, ixf, iyf = multiply_add(i1, fd, ixy), multiply_add(i1, ff, ixf), multiply_add(i0, fd, iyf)
         jxx, jyy, jff = multiply_add(j2, ff, jxx), multiply_add(j0, dd, jyy), multiply_add(j0, ff, jff)
         jxy, jxf, jyf = multiply_add(j1, fd, jxy), multiply_add(j1, ff, jxf), multiply_add(j0, fd, jyf)
-    _store_sums(lanes, lane_values, sx, sy, sf, ixx, iyy, iff, ixy, ixf, iyf)
-    _store_covariance(lanes, lane_values, jxx, jyy, jff, jxy, jxf, jyf)
+    sums = sx, sy, sf, ixx, iyy, iff, ixy, ixf, iyf, jxx, jyy, jff, jxy, jxf, jyf
+    store_all(lane_values, SCORE_X * width, sums)
 
 
 @compiled
@@ -123,86 +110,27 @@ def _general_sums(
 ) -> None:
     """Sum as `_separable_sums`, for a PSF of several separable terms."""
     width = width_of(lanes)
-    rank, padded = profiles.shape[1], profiles.shape[3]
     zero = splat(lanes, 0.0)
-    v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
-    wv, we = (
-        load(lanes, lane_values, WEIGHT_VARIANCE * width),
-        load(lanes, lane_values, WEIGHT_EXCESS * width),
-    )
-    model_error, flux = load(lanes, lane_values, MODEL_ERROR * width), load(lanes, lane_values, FLUX * width)
+    noise, flux = noise_of(lanes, lane_values), load(lanes, lane_values, FLUX * width)
     sx, sy, sf = zero, zero, zero
     ixx, iyy, iff, ixy, ixf, iyf = zero, zero, zero, zero, zero, zero
     jxx, jyy, jff, jxy, jxf, jyf = zero, zero, zero, zero, zero, zero
     for y in range(ny):
         for x in range(nx):
-            m, mx, my = zero, zero, zero
-            for term in range(rank):
-                along, across = 2 * term * padded + x, 2 * (rank + term) * padded + y
-                fx, dx = (
-                    load(lanes, profiles, along * width),
-                    load(lanes, profiles, (along + padded) * width),
-                )
-                fy, dy = (
-                    load(lanes, profiles, across * width),
-                    load(lanes, profiles, (across + padded) * width),
-                )
-                m, mx, my = multiply_add(fx, fy, m), multiply_add(dx, fy, mx), multiply_add(fx, dy, my)
+            m, mx, my = model_at(lanes, profiles, x, y)
             m, mx, my = flux * m, flux * mx, flux * my
-            expected = maximum(m, zero)
             at = (y * nx + x) * width
-            own = weight_variance_of(lanes, variances, place + at, v, wv)
-            w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), own))
+            w, wt = weigh(lanes, noise, variances, place + at, m)
             wr = w * (load(lanes, image, at) - m)
             sx, sy, sf = multiply_add(wr, mx, sx), multiply_add(wr, my, sy), multiply_add(wr, m, sf)
             wx, wy, wm = w * mx, w * my, w * m
             ixx, iyy, iff = multiply_add(wx, mx, ixx), multiply_add(wy, my, iyy), multiply_add(wm, m, iff)
             ixy, ixf, iyf = multiply_add(wx, my, ixy), multiply_add(wx, m, ixf), multiply_add(wy, m, iyf)
-            wt = w * multiply_add(expected, e, variance_of(lanes, variances, place + at, v))
             wx, wy, wm = wt * wx, wt * wy, wt * wm
             jxx, jyy, jff = multiply_add(wx, mx, jxx), multiply_add(wy, my, jyy), multiply_add(wm, m, jff)
             jxy, jxf, jyf = multiply_add(wx, my, jxy), multiply_add(wx, m, jxf), multiply_add(wy, m, jyf)
-    _store_sums(lanes, lane_values, sx, sy, sf, ixx, iyy, iff, ixy, ixf, iyf)
-    _store_covariance(lanes, lane_values, jxx, jyy, jff, jxy, jxf, jyf)
-
-
-@compiled
-def _store_sums(
-    lanes: Any,
-    lane_values: Any,
-    sx: Any,
-    sy: Any,
-    sf: Any,
-    ixx: Any,
-    iyy: Any,
-    iff: Any,
-    ixy: Any,
-    ixf: Any,
-    iyf: Any,
-) -> None:
-    width = width_of(lanes)
-    store(lane_values, SCORE_X * width, sx)
-    store(lane_values, SCORE_Y * width, sy)
-    store(lane_values, SCORE_F * width, sf)
-    store(lane_values, I_XX * width, ixx)
-    store(lane_values, I_YY * width, iyy)
-    store(lane_values, I_FF * width, iff)
-    store(lane_values, I_XY * width, ixy)
-    store(lane_values, I_XF * width, ixf)
-    store(lane_values, I_YF * width, iyf)
-
-
-@compiled
-def _store_covariance(
-    lanes: Any, lane_values: Any, jxx: Any, jyy: Any, jff: Any, jxy: Any, jxf: Any, jyf: Any
-) -> None:
-    width = width_of(lanes)
-    store(lane_values, J_XX * width, jxx)
-    store(lane_values, J_YY * width, jyy)
-    store(lane_values, J_FF * width, jff)
-    store(lane_values, J_XY * width, jxy)
-    store(lane_values, J_XF * width, jxf)
-    store(lane_values, J_YF * width, jyf)
+    sums = sx, sy, sf, ixx, iyy, iff, ixy, ixf, iyf, jxx, jyy, jff, jxy, jxf, jyf
+    store_all(lane_values, SCORE_X * width, sums)
 
 
 @compiled

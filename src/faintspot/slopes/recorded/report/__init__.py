@@ -1,1 +1,1 @@
-"""The report of recorded slopes: sections, maps, key numbers, advice."""
+"""Report of recorded slopes: `page` is made of `sections`, whose numbers are in `key_numbers` and `maps`."""

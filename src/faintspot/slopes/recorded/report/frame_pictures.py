@@ -74,13 +74,13 @@ class Example:
 
     def positions(self) -> dict[str, Floats]:
         """Return valid positions by method, and the truth, from the window's middle, px; NaN if invalid."""
-        found = {}
+        positions = {}
         for name, stages in self.stages.items():
             xy = np.stack([stages.slopes.x, stages.slopes.y], axis=-1).astype(np.float64)
-            found[name] = np.where(stages.slopes.valid[:, None], xy, np.nan) + self.layout.offsets
+            positions[name] = np.where(stages.slopes.valid[:, None], xy, np.nan) + self.layout.offsets
         if self.truth is not None:
-            found["truth"] = self.truth + self.layout.offsets
-        return found
+            positions["truth"] = self.truth + self.layout.offsets
+        return positions
 
 
 @styled
@@ -89,7 +89,7 @@ def whole_sensor(example: Example) -> Figure:
     layout, steps = example.layout, example.shown_steps
     factor = coarseness(layout)
     sheets = {
-        title: coarser(assembled(layout, getattr(example.first, of)), factor) for title, of in steps.items()
+        title: coarser(assembled(layout, getattr(example.first, key)), factor) for title, key in steps.items()
     }
     figure, axes = _step_panels(len(steps), sheets["raw"].shape)
     start = layout.corners.min(axis=0) - 0.5
@@ -157,15 +157,15 @@ def zoom(example: Example) -> Figure:
     grid = figure.subplots(len(chosen), len(steps), squeeze=False, sharex=True, sharey=True)
     extent = (-width / 2, width / 2, -height / 2, height / 2)
     positions = example.positions()
-    for row, (what, index) in enumerate(chosen.items()):
+    for row, (which, index) in enumerate(chosen.items()):
         axes = list(grid[row])
-        images = {title: getattr(example.first, of)[index] for title, of in steps.items()}
+        images = {title: getattr(example.first, step)[index] for title, step in steps.items()}
         shown = _draw_steps(axes, images, example.raw_is_calibrated, extent, titles=row == 0)
         if not example.raw_is_calibrated:
             colour_bar(axes[0], shown["raw"], "ADU")
         electrons = axes if example.raw_is_calibrated else axes[1:]
         colour_bar(electrons, list(shown.values())[-1], "e- per pixel")
-        axes[0].set_ylabel(f"{what}\nno. {index}, {_flux(example.first, index)} e-\ny (px)")
+        axes[0].set_ylabel(f"{which}\nno. {index}, {_flux(example.first, index)} e-\ny (px)")
         for panel in axes[1:] or axes:
             _mark(panel, {name: xy[index : index + 1] for name, xy in positions.items()}, size=13)
     for panel in grid[-1]:

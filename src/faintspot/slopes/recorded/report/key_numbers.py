@@ -49,12 +49,12 @@ class Comparison:
         noise = [frame_to_frame_noise(method, used) for method, used in zip(methods, valid, strict=True)]
         last, unknown = methods[-1], (np.nan, np.nan)
         same = len(methods) > 1 and all(np.array_equal(method.number, last.number) for method in methods)
-        found = [relative_gain(method, last, valid[-1]) if same else unknown for method in methods]
-        return cls(methods, noise, [each if each[1] < _KNOWN else unknown for each in found])
+        gains = [relative_gain(method, last, valid[-1]) if same else unknown for method in methods]
+        return cls(methods, noise, [gain if gain[1] < _KNOWN else unknown for gain in gains])
 
-    def equal_noise(self, place: int) -> Floats:
+    def equal_noise(self, index: int) -> Floats:
         """Return the noise of a method at the gain of the last one, px."""
-        equal: Floats = self.noise_px[place] / self.gains[place][0]
+        equal: Floats = self.noise_px[index] / self.gains[index][0]
         return equal
 
     def warnings(self) -> list[str]:
@@ -69,7 +69,7 @@ class Comparison:
 
     def verdict(self) -> str:
         """Name the method with the least noise at equal gain, if the errors allow it."""
-        levels = [median(self.equal_noise(place)) for place in range(len(self.methods))]
+        levels = [median(self.equal_noise(index)) for index in range(len(self.methods))]
         if len(levels) < 2 or self.methods[0].n_frames < 2:
             return ""
         if not np.isfinite(levels).all():
@@ -78,8 +78,8 @@ class Comparison:
         difference = self.equal_noise(second) - self.equal_noise(best)
         difference = difference[np.isfinite(difference)]
         size, error = float(difference.mean()), float(difference.std() / max(len(difference) - 1, 1) ** 0.5)
-        for place, other in ((best, second), (second, best)):
-            gain, gain_error = self.gains[place]
+        for method, other in ((best, second), (second, best)):
+            gain, gain_error = self.gains[method]
             error = float(np.hypot(error, levels[other] * gain_error / gain))
         names = {"best": self.methods[best].name, "second": self.methods[second].name}
         if len(difference) < 2 or size < _SURELY * error:
@@ -98,8 +98,8 @@ def key_numbers(
     """Return the table of all methods: errors where the truth is known, noise, and the rest."""
     methods = comparison.methods
     rows = [
-        _noise_cells(comparison, place, scale_arcsec) | _other_cells(method, summary, scatter)
-        for place, (method, summary, scatter) in enumerate(zip(methods, summaries, jitters, strict=True))
+        _noise_cells(comparison, index, scale_arcsec) | _other_cells(method, summary, scatter)
+        for index, (method, summary, scatter) in enumerate(zip(methods, summaries, jitters, strict=True))
     ]
     text = [verdict] if truth is None and (verdict := comparison.verdict()) else []
     if truth is not None:
@@ -152,13 +152,13 @@ def _caption(methods: Sequence[MeasuredSlopes], columns: Sequence[str]) -> str:
     )
 
 
-def _noise_cells(comparison: Comparison, place: int, scale_arcsec: float | None) -> dict[str, str]:
-    noise = median(comparison.noise_px[place])
-    gain, error = comparison.gains[place]
+def _noise_cells(comparison: Comparison, index: int, scale_arcsec: float | None) -> dict[str, str]:
+    noise = median(comparison.noise_px[index])
+    gain, error = comparison.gains[index]
     cells = {
         "noise (px)": number_text(noise, "", 3),
         _GAIN: "1" if error == 0 else f"{gain:.3f} ± {error:.3f}" if np.isfinite(gain) else "–",
-        _EQUAL: number_text(median(comparison.equal_noise(place)), "", 3),
+        _EQUAL: number_text(median(comparison.equal_noise(index)), "", 3),
     }
     if scale_arcsec is not None:
         cells["noise (arcsec)"] = number_text(noise * scale_arcsec, "", 3)
@@ -182,12 +182,12 @@ def _truth_cells(
     last = methods[-1]
     for method in methods:
         error, gain = slope_error(method, truth, valid)
-        own = {
+        cells_of = {
             "slope error R (px)": f"{number_text(error.value, '', 4)} ± "
             + number_text(error.standard_error, "", 2),
             "centroid gain": number_text(gain, "", 3),
         }
-        cells.append(own | (_against(method, last, truth, valid) if len(methods) > 1 else {}))
+        cells.append(cells_of | (_against(method, last, truth, valid) if len(methods) > 1 else {}))
     shared = "valid" if len(methods) == 1 else "valid in every method"
     note = _TEXT(
         "numbers.truth", low=truth.min(), high=truth.max(), count=np.count_nonzero(valid), shared=shared

@@ -73,12 +73,12 @@ def slope_arrows(
         if len(layout) <= MOST_WITH_GAPS:  # of more, outlines would hide the arrows
             panel.add_collection(_outlines(layout))
         place_axes(panel, layout)
-        known = np.isfinite(summary.x_px)
-        slopes = np.stack([summary.x_px[known], summary.y_px[known]])
+        finite = np.isfinite(summary.x_px)
+        slopes = np.stack([summary.x_px[finite], summary.y_px[finite]])
         long = np.hypot(*slopes)
         slopes *= np.minimum(1.0, longest / np.maximum(long, longest))
         arrows = panel.quiver(
-            *layout.centres[known].T,
+            *layout.centres[finite].T,
             *slopes,
             color=np.where(long > longest, "black", colour),
             angles="xy",
@@ -89,7 +89,7 @@ def slope_arrows(
         panel.quiverkey(
             arrows, 0.87, -0.1, key, f"{key:g} px", labelpos="E", coordinates="axes", color=colour
         )
-        panel.plot(*layout.centres[~known].T, "x", color=GREY, markersize=5)
+        panel.plot(*layout.centres[~finite].T, "x", color=GREY, markersize=5)
         panel.set_title(f"{method.name}: {'mean slope' if method.n_frames > 1 else 'slope'}", loc="left")
     return figure
 
@@ -143,10 +143,10 @@ def jitter_plot(methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) ->
     order = np.argsort(jitters[-1].px)
     for method, item, colour in zip(methods, jitters, METHOD_COLOURS, strict=False):
         order = order[item.measured[order]]
-        place = np.arange(1, len(order) + 1)
-        axes[0].plot(place, item.px[order], ".", color=colour, label=f"{method.name}: standard deviation")
+        rank = np.arange(1, len(order) + 1)
+        axes[0].plot(rank, item.px[order], ".", color=colour, label=f"{method.name}: standard deviation")
         axes[0].plot(
-            place,
+            rank,
             _running_median(item.robust_px[order]),
             "-",
             lw=1.3,

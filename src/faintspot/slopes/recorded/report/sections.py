@@ -112,7 +112,7 @@ def _frame(run: ReportInputs) -> Section:
     if len(run.layout) > frame_pictures.MOST_MARKED:
         marks = _TEXT("sensor.unmarked", shown=shown)
     factor, several = frame_pictures.coarseness(run.layout), len(example.shown_steps) > 2
-    whole = {
+    values = {
         "frame": run.example_frame,
         "scale": _scale_in_words(example),
         "marks": marks,
@@ -121,7 +121,7 @@ def _frame(run: ReportInputs) -> Section:
     }
     noise = "whether the noise goes and the spot stays, and " if several else ""
     figures = [
-        _TEXT.figure("sensor", frame_pictures.whole_sensor(example), **whole),
+        _TEXT.figure("sensor", frame_pictures.whole_sensor(example), **values),
         _TEXT.figure("subapertures", frame_pictures.zoom(example), noise=noise),
     ]
     return Section("frame", title, figures=figures)
@@ -177,7 +177,7 @@ def _slopes(run: ReportInputs) -> Section:
             for method, item in zip(run.methods, run.jitters, strict=True)
         )
         noise = _TEXT("slopes.noise", errors=errors)
-    what = (
+    subject = (
         "Mean slope of each sub-aperture over its valid frames" if run.methods[0].n_frames > 1 else "Slopes"
     )
     longest, number = maps.longest_arrow(run.summaries)
@@ -186,7 +186,7 @@ def _slopes(run: ReportInputs) -> Section:
         long = number_text(longest, "px", 2)
         cut = _TEXT("slopes.cut", longest=long, percent=maps.ARROWS_WHOLE_PERCENT, number=number)
     figure = maps.slope_arrows(run.methods, run.summaries, run.layout)
-    shown = _TEXT.figure("slopes", figure, what=what, cut=cut, tilts=tilts, noise=noise)
+    shown = _TEXT.figure("slopes", figure, what=subject, cut=cut, tilts=tilts, noise=noise)
     return Section("slopes", "Mean slopes", figures=[shown])
 
 

@@ -30,11 +30,11 @@ def profile_figure(profiles: Mapping[str, SodiumProfile]) -> FigureWithData:
     axes = figure.subplots()
     rows: list[tuple[Any, ...]] = []
     *before, newest = profiles
-    for place, (name, profile) in enumerate(profiles.items()):
+    for index, (name, profile) in enumerate(profiles.items()):
         altitude, density = profile.altitudes_m / 1e3, 1e3 * profile.density
         style: dict[str, Any] = {"color": METHOD_COLOURS[1], "lw": 2.2}
         if name != newest:
-            dashes = ("--", ":", "-.")[place % 3] if len(before) > 1 else "--"
+            dashes = ("--", ":", "-.")[index % 3] if len(before) > 1 else "--"
             style = {"color": GREY, "lw": 1.6, "ls": dashes}
         mean = f"mean {profile.mean_m / 1e3:.1f} km, std {profile.std_m / 1e3:.1f} km"
         axes.plot(density, altitude, label=f"{name}\n({mean})", **style)
@@ -49,23 +49,23 @@ def sodium_section_of_frames(
 ) -> Section:
     """Return the section with the configured profile, and that of frames; or why there is none."""
     try:
-        known, _ = sodium_of_frames(source, layout, calibration, laser, most_frames=most_frames)
+        sodium, _ = sodium_of_frames(source, layout, calibration, laser, most_frames=most_frames)
     except InputError as error:
         return Section("sodium", "Sodium profile", missing=f"Not fitted: {error}.")
-    profiles = {"configured": known.star.focused(laser.profile), "these frames": known.fit.profile}
-    return _section(profiles, known.spot_fwhm_arcsec)
+    profiles = {"configured": sodium.star.focused(laser.profile), "these frames": sodium.fit.profile}
+    return _section(profiles, sodium.spot_fwhm_arcsec)
 
 
 def sodium_sections_of_changes(changes: Sequence[Mapping[str, Any]]) -> list[Section]:
     """Return the section with the profiles that an engine has followed, from telemetry's changes; or none."""
     followed = [change["changes"][SODIUM] for change in changes if SODIUM in change["changes"]]
-    followed = [each for each in followed if isinstance(each, Mapping)]  # else it was too long
+    followed = [change for change in followed if isinstance(change, Mapping)]  # else it was too long
     if not followed:
         return []
     first, last = followed[0], followed[-1]
     shown = ("at the start", first, "before_per_km"), ("at the end", last, "flux_per_km")
     profiles = {
-        name: SodiumProfile(1e3 * np.asarray(each["altitude_km"]), each[of]) for name, each, of in shown
+        name: SodiumProfile(1e3 * np.asarray(fit["altitude_km"]), fit[key]) for name, fit, key in shown
     }
     return [_section(profiles, float(last["spot_fwhm_arcsec"]))]
 

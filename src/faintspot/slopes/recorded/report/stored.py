@@ -55,8 +55,8 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
         raise InputError(f"slopes: expected one file or two to compare, got {len(paths)}")
     stores = [open_run(Path(path)) for path in paths]
     first = stores[0]
-    for other in stores[1:]:
-        _check_same_sensor(first, other)
+    for store in stores[1:]:
+        _check_same_sensor(first, store)
     methods, notes = _methods(stores)
     total = np.where(methods[0].valid, methods[0].flux, 0.0).sum(axis=1)
     example_frame = int(np.argsort(total, kind="stable")[(len(total) - 1) // 2])
@@ -88,8 +88,8 @@ def _sodium(store: StoredRun, frames: Sequence[str | Path] | None) -> list[Secti
         return []
     try:
         with _source(store, frames) as source:
-            known = store.layout, store.calibration, store.laser
-            return [sodium_section_of_frames(source, *known, _FRAMES_OF_PROFILE)]
+            parts = store.layout, store.calibration, store.laser
+            return [sodium_section_of_frames(source, *parts, _FRAMES_OF_PROFILE)]
     except InputError as error:
         return [Section("sodium", "Sodium profile", missing=f"Not fitted: {error}.")]
 
@@ -109,19 +109,19 @@ def _labelled_notes(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlope
     return [label + note for label, store in zip(labels, stores, strict=True) for note in store.notes]
 
 
-def _check_same_sensor(first: StoredRun, other: StoredRun) -> None:
-    mine, theirs = (store.stored.variables["x"].shape[1] for store in (first, other))
-    if mine != theirs:
-        raise InputError(f"{other.path}: expected {mine} sub-apertures, as in {first.path}, got {theirs}")
-    if first.layout is None or other.layout is None:
+def _check_same_sensor(first: StoredRun, second: StoredRun) -> None:
+    n, other_n = (store.stored.variables["x"].shape[1] for store in (first, second))
+    if n != other_n:
+        raise InputError(f"{second.path}: expected {n} sub-apertures, as in {first.path}, got {other_n}")
+    if first.layout is None or second.layout is None:
         return
     same = all(
         np.shape(a) == np.shape(b) and np.allclose(a, b, atol=_SAME_PLACE_PX)
         for name in ("frame_shape", "window", "corners", "centres")
-        for a, b in [(getattr(first.layout, name), getattr(other.layout, name))]
+        for a, b in [(getattr(first.layout, name), getattr(second.layout, name))]
     )
     if not same:
-        raise InputError(f"{other.path}: expected the layout of {first.path}, got another")
+        raise InputError(f"{second.path}: expected the layout of {first.path}, got another")
 
 
 def _methods(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[str]]:
@@ -131,13 +131,13 @@ def _methods(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[st
     if len(set(counts)) > 1:
         lengths = {"first": counts[0], "second": counts[1], "fewest": min(counts)}
         notes.append(_TEXT("stored.other_lengths", **lengths))
-    known = [store.sources for store in stores if store.sources]
-    if len(known) == 2 and known[0] != known[1]:
+    sources = [store.sources for store in stores if store.sources]
+    if len(sources) == 2 and sources[0] != sources[1]:
         notes.append(_TEXT["stored.other_sources"])
     methods = []
     for name, store in zip(_names(stores), stores, strict=True):
         variables = store.stored.variables
-        arrays = [variables[of][: min(counts)] for of in ARRAYS]
+        arrays = [variables[array][: min(counts)] for array in ARRAYS]
         # Iterations of other estimators are their own steps.
         denoised = None if store.estimator is None or store.estimator.denoises else False
         stated = _median_standard_error(store)
@@ -190,10 +190,10 @@ def _example(
 
 def _source(store: StoredRun, frames: Sequence[str | Path] | None) -> FrameSource:
     """Open the frames of a run."""
-    places = list(frames) if frames is not None else store.sources
-    if not places:
+    locations = list(frames) if frames is not None else store.sources
+    if not locations:
         raise InputError(f"{store.path.name} does not say where its frames came from")
-    return open_frames(places, key=store.stored.attributes.get("source_key") or None)
+    return open_frames(locations, key=store.stored.attributes.get("source_key") or None)
 
 
 def _frame(store: StoredRun, number: int, frames: Sequence[str | Path] | None) -> NDArray[Any]:
@@ -205,9 +205,9 @@ def _frame(store: StoredRun, number: int, frames: Sequence[str | Path] | None) -
 def _disagreement(store: StoredRun, method: MeasuredSlopes, frame: NDArray[Any], number: int) -> list[str]:
     """Warn if the example frame, measured again, gives other slopes than those stored."""
     slopes = store.pipeline(reference=store.stored.attributes.get("reference"))(frame)
-    both = slopes.valid & method.valid[number]
-    again = np.stack([slopes.x, slopes.y])[:, both]
-    distance = np.abs(again - np.stack([method.x[number], method.y[number]])[:, both])
+    valid = slopes.valid & method.valid[number]
+    again = np.stack([slopes.x, slopes.y])[:, valid]
+    distance = np.abs(again - np.stack([method.x[number], method.y[number]])[:, valid])
     if distance.size == 0 or distance.max() <= _SAME_POSITION_PX:
         return []
     names = {"frame": number, "file": store.path.name}
@@ -217,16 +217,16 @@ def _disagreement(store: StoredRun, method: MeasuredSlopes, frame: NDArray[Any],
 def _range_in_words(store: StoredRun) -> str:
     if store.layout is None or store.settings is None or store.settings.search_range_px is None:
         return ""
-    each = store.settings.values("search_range_px", len(store.layout), store.layout.pixels)
-    return f"; positions within {np.max(each):g} px"
+    range_px = store.settings.values("search_range_px", len(store.layout), store.layout.pixels)
+    return f"; positions within {np.max(range_px):g} px"
 
 
 def _median_standard_error(store: StoredRun) -> float:
     """Median over the slopes whose standard error is known of its rms of x and y, px; NaN without any."""
     x, y = (store.stored.variables[f"standard_error_{axis}"].astype(np.float64) for axis in "xy")
     errors = np.sqrt((x**2 + y**2) / 2)
-    known = errors[np.isfinite(errors)]
-    return float(np.median(known)) if known.size else np.nan
+    finite = errors[np.isfinite(errors)]
+    return float(np.median(finite)) if finite.size else np.nan
 
 
 def _facts(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
@@ -240,8 +240,8 @@ def _facts(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> di
         words = "not stored"
         if store.estimator is not None and store.layout is not None:
             words = store.estimator.in_words(len(store.layout), store.layout.pixels) + _range_in_words(store)
-        of = f" of {method.name!r}" if len(methods) > 1 else ""
-        facts[f"Settings{of}"] = words
+        owner = f" of {method.name!r}" if len(methods) > 1 else ""
+        facts[f"Settings{owner}"] = words
     if any("reference" in store.stored.attributes for store in stores):
         facts["Reference"] = "slopes are relative to stored reference positions; crosses in pictures are not"
     return {**facts, "Measured with": f"faintspot {', '.join(versions)}"}

@@ -22,16 +22,16 @@ def wavefront_sections(slopes: Mapping[str, Slopes], layout: Layout | None) -> l
         return []
     tables, figures, missing = [], [], []
     text = [_TEXT["wavefront.about"]]
-    for number, (name, own) in enumerate(slopes.items()):
+    for number, (name, method_slopes) in enumerate(slopes.items()):
         try:
-            found = fit_wavefront(own, layout)
+            wavefront = fit_wavefront(method_slopes, layout)
         except InputError as error:
             missing.append(f"Wavefront of {name!r}: {error}.")
             continue
-        text += [line for line in remarks(found) if line not in text]
-        header, rows = rms_table(found)
+        text += [line for line in remarks(wavefront) if line not in text]
+        header, rows = rms_table(wavefront)
         tables.append(Table(header, rows, caption=name))
-        header, rows = mode_table(found)
+        header, rows = mode_table(wavefront)
         tables.append(Table(header, rows, caption=name, folded=f"Coefficients of {name!r}"))
-        figures.append(wavefront_figure(found, layout, name, file=f"wavefront-{number + 1}"))
+        figures.append(wavefront_figure(wavefront, layout, name, file=f"wavefront-{number + 1}"))
     return [Section("wavefront", "Wavefront", text, tables, figures, missing=" ".join(missing))]

@@ -32,8 +32,9 @@ _PLACED = 2.0
 # +-15 % of the pitch have 0.09, and spots at the edge of the pupil have more than the bright ones.
 _SMALLEST_SHIFT = 0.12
 # Maximum displacement of a spot from its node by such aberrations along both axes and by an error of the
-# lattice. Peaks farther out, up to the search radius of 0.35, are mostly due to stray light.
-_FARTHEST, _RIM = 0.28, 0.02
+# lattice. Peaks farther out, up to the search radius of 0.35, are mostly due to stray light, unless their
+# signal-to-noise ratio is as high as this.
+_FARTHEST, _FARTHEST_BRIGHT, _RIM, _BRIGHT = 0.28, 0.33, 0.02, 20.0
 # Fraction of the reference flux that separates illuminated from dark, if it is not given: around 0.3, within
 # a factor of 1.7. A half-illuminated lenslet counts as illuminated; light scattered and reflected between
 # lenslets is mostly less than 0.2.
@@ -50,12 +51,12 @@ _SCATTER = (0.1, 0.6)
 _SHARE = 0.1
 # Lenslets with flux within this factor of the dividing flux are ambiguous; a warning is given if their share
 # of the illuminated ones exceeds this limit, or if spots are less significant than this.
-_CLOSE, _DOUBTFUL, _FAINT = 1.25, 0.05, 5.0
+_CLOSE, _DOUBTFUL, _FAINT = 1.25, 0.15, 6.0
 # Peaks distributed over the search area have a median distance of 0.25 pitch from its centre; spots have
 # less.
 _SCATTERED = 0.2
 # Share of dim lenslets among the illuminated ones above which there may be a second, dimmer set of spots.
-_DIM = 0.3
+_DIM = 0.4
 _PASSES = 4
 
 
@@ -151,7 +152,8 @@ def _detection(spots: NodeFlux) -> NDArray[np.float64]:
     # 1.1774 sigma is the median distance of a two-dimensional normal distribution.
     sigma = max(float(np.median(distance[certain])) / 1.1774, _SMALLEST_SHIFT)
     placed = np.log(SEARCH**2 / (2 * sigma**2)) - 0.5 * (distance / sigma) ** 2
-    beyond = np.maximum((distance - _FARTHEST) / _RIM, 0.0)
+    farthest = np.where(spots.signal_to_noise > _BRIGHT, _FARTHEST_BRIGHT, _FARTHEST)
+    beyond = np.maximum((distance - farthest) / _RIM, 0.0)
     in_reach = np.where(beyond > 0, -beyond, _CLEAR)
     return np.asarray(np.minimum(ratio + np.clip(placed, -_PLACED, _PLACED), in_reach))
 
@@ -229,14 +231,13 @@ def _doubt(
     ratio = float(np.median(spots.signal_to_noise[illuminated]))
     if ratio < _FAINT:
         return f"the spots are only {ratio:.1f} standard deviations above the noise; average more frames"
-    scattered = float(np.median(np.abs(spots.shifts[illuminated] - np.median(spots.shifts[illuminated]))))
-    if scattered > _SCATTERED:
+    if (scatter := spots.scatter(illuminated)) > _SCATTERED:
         return (
-            f"the spots lie {scattered:.2f} of the pitch from the lattice (median), as peaks anywhere would: "
+            f"the spots lie {scatter:.2f} of the pitch from the lattice (median), as peaks anywhere would: "
             "its pitch or geometry may be wrong; give pitch_px"
         )
     close = (detected > 0) & (spots.flux < dividing_flux * _CLOSE) & (spots.flux > dividing_flux / _CLOSE)
-    if np.count_nonzero(close) > max(1, _DOUBTFUL * count):
+    if np.count_nonzero(close) > max(3, _DOUBTFUL * count):
         return (
             f"{np.count_nonzero(close)} lenslets have about {dividing_flux / float(np.median(flux)):.2g} of "
             "the median flux, the limit between illuminated and dark, and may belong to either"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,40 +11,11 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, number_between, one_of, real_array
 from faintspot.base.errors import InputError
-from faintspot.slopes.sensor.detection.following import follow
-from faintspot.slopes.sensor.detection.illumination import Illumination, find_illumination
-from faintspot.slopes.sensor.detection.kin import best_kin
-from faintspot.slopes.sensor.detection.lattice import (
-    RATIOS,
-    SMALLEST_PITCH_PX,
-    Lattice,
-    find_lattice,
-    robust_std,
-)
-from faintspot.slopes.sensor.detection.nodes import (
-    Drift,
-    NodeFlux,
-    SpotFlux,
-    find_spots,
-    measure_nodes,
-    no_drift,
-    spot_width,
-)
-from faintspot.slopes.sensor.neighbours import as_rows, as_tree
+from faintspot.slopes.sensor.detection.fits import FEWEST, best_fit
+from faintspot.slopes.sensor.detection.lattice import RATIOS, SMALLEST_PITCH_PX, Lattice, robust_std
+from faintspot.slopes.sensor.neighbours import as_rows
 from faintspot.slopes.sensor.region import PupilRegion, Rectangle
 
-_FIT_PASSES = 4
-# A spot with this signal-to-noise ratio that is as bright as those of illuminated lenslets and this far
-# (pitches) from all of them belongs to another lenslet: a smooth aberration brings no two spots closer.
-_CLEAR, _ELSEWHERE = 6.0, 0.5
-# Displacements are followed if that reaches so many of these spots, or half of them (one may be a ghost), and
-# the spots are this near (pitches, median) to their expected positions, unlike peaks within spots.
-_REACHED, _FOLLOWED = 4, 0.15
-# Share of such spots relative to illuminated lenslets above which the lattice is doubtful; rows cut off by
-# the edge of the frame in a small array are fewer.
-_PART_ELSEWHERE = 0.25
-# Minimum shape similarity: fraction of the squared flux explained, relative to illuminated spots.
-_LIKE = 0.6
 _MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %
 _SMALLEST_GIVEN_PITCH_PX = 4
 
@@ -108,9 +79,10 @@ def find_lenslets(
 ) -> LensletGrid:
     """Find the lenslet grid in a frame without prior knowledge of the sensor.
 
-    The lattice is found in the power spectrum of a map of spot-like features (see `lattice`), and refined by
-    a robust least-squares fit to the spots at its nodes. The illuminated lenslets are chosen all together
-    (see `illumination`). An illuminated lenslet
+    Candidate lattices are found in the autocorrelation of maps of spot-like features (see `candidates`). Each
+    is refined by a robust least-squares fit to the spots at its nodes, and its illuminated lenslets are
+    chosen all together (see `illumination`). The first lattice is used whose lenslets have almost all of the
+    bright spots and few dark ones between them; there is a doubt if no lattice has. An illuminated lenslet
     has a spot that stands out of the noise of its own cell, enough flux above its own background, and
     mostly illuminated neighbours. Lenslets at the edge of the pupil with low flux and those behind the
     central obstruction are therefore omitted. So are lenslets whose node is within 0.12 pitch of the edge
@@ -162,14 +134,12 @@ def find_lenslets(
     image = _clean_image(frames[part.slices], bad[part.slices])
     geometries = tuple(RATIOS) if geometry == "auto" else (geometry,)
     pitch_range_px = _pitch_range(pitch_px, image.shape)
-    found = find_lattice(image, geometries, pitch_range_px) if np.ptp(image) > 0 else None
-    if found is None:
+    fit = best_fit(image, geometries, pitch_range_px, illuminated_fraction, circle)
+    if fit is None:
         raise InputError(_nothing_found(image, pitch_range_px, geometry))
-    lattice, map_of_spots = found
-    fit = _fitted(image, best_kin(map_of_spots, lattice, pitch_range_px), illuminated_fraction, circle)
     lattice, spots, illuminated = fit.lattice, fit.spots, fit.illuminated
     cells = spots.cells[illuminated.nodes]
-    if len(cells) < 4 or np.any(np.ptp(cells, axis=0) < 1):
+    if len(cells) < FEWEST or np.any(np.ptp(cells, axis=0) < 1):
         raise InputError(_too_few(len(cells), lattice, circle))
     at = lattice.positions(cells) + corner
     return LensletGrid(
@@ -301,99 +271,3 @@ def _median_of_good(image: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArr
     around[empty] = np.median(image[~bad])
     filled[y, x] = np.nanmedian(around, axis=1) if len(y) else 0.0
     return filled
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """Lattice fitted to the spots, with measurements at its nodes and their illumination.
-
-    `bright` are all spots as bright as the illuminated ones, `elsewhere` those of them at no
-    illuminated node.
-    """
-
-    lattice: Lattice
-    width_px: float
-    spots: NodeFlux
-    illuminated: Illumination
-    bright: NDArray[np.complex128]
-    elsewhere: NDArray[np.complex128]
-
-
-def _fitted(
-    image: NDArray[np.float64],
-    lattice: Lattice,
-    illuminated_fraction: float | None,
-    pupil: PupilRegion | None,
-) -> _Fit:
-    """Fit the lattice to the spots; if some are left over, follow them from neighbour to neighbour."""
-    image = image - np.median(image)
-    width_px = spot_width(image, lattice)
-    for _ in range(_FIT_PASSES):
-        spots = measure_nodes(image, lattice, width_px)
-        illuminated = find_illumination(spots, lattice, illuminated_fraction)
-        used = (
-            illuminated.nodes
-            if pupil is None
-            else illuminated.nodes & pupil.holds(lattice.positions(spots.cells))
-        )
-        if np.count_nonzero(used) < 4:
-            break
-        before = lattice
-        lattice = lattice.fitted(spots.cells[used], spots.positions[used]).canonical(image.shape)
-        if abs(lattice.step - before.step) * max(image.shape) < 0.02 * abs(lattice.step) ** 2:
-            break
-    everywhere = find_spots(image, lattice, width_px)
-    fit = _illuminated_of(image, lattice, width_px, illuminated_fraction, everywhere)
-    for _ in range(_FIT_PASSES):
-        if not 0 < len(fit.elsewhere) <= np.count_nonzero(fit.illuminated.nodes):
-            break
-        followed = follow(fit.bright, fit.lattice, image.shape)
-        if followed is None:
-            break
-        better = _illuminated_of(image, followed[0], width_px, illuminated_fraction, everywhere, followed[1])
-        reached = len(fit.elsewhere) - len(better.elsewhere)
-        near = np.median(np.abs(better.spots.shifts[better.illuminated.nodes])) < _FOLLOWED
-        if not near or reached < max(1.0, min(_REACHED, 0.5 * len(fit.elsewhere))):
-            break
-        fit = better
-    if pupil is not None:
-        held = pupil.holds(fit.lattice.positions(fit.spots.cells))
-        return replace(fit, illuminated=replace(fit.illuminated, nodes=held, doubt=""))
-    return replace(fit, illuminated=replace(fit.illuminated, doubt=_too_many(fit) or fit.illuminated.doubt))
-
-
-def _too_many(fit: _Fit) -> str:
-    """Return a one-line warning if the lattice explains only a part of the flux."""
-    count, illuminated = len(fit.elsewhere), int(np.count_nonzero(fit.illuminated.nodes))
-    if count <= _PART_ELSEWHERE * illuminated:
-        return ""
-    return (
-        f"{count} spots as bright as those of the {illuminated} lit lenslets belong to none of them, so that "
-        "the lattice explains only a part of the flux; its pitch or geometry may be wrong, give one of them"
-    )
-
-
-def _illuminated_of(
-    image: NDArray[np.float64],
-    lattice: Lattice,
-    width_px: float,
-    illuminated_fraction: float | None,
-    everywhere: SpotFlux,
-    drift: Drift = no_drift,
-) -> _Fit:
-    """Decide which lenslets of a lattice are illuminated, and which bright spots belong to none of them."""
-    spots = measure_nodes(image, lattice, width_px, drift)
-    illuminated = find_illumination(spots, lattice, illuminated_fraction)
-    elsewhere = bright = np.empty(0, dtype=np.complex128)
-    if illuminated.nodes.any():
-        likeness = float(np.median(spots.likeness[illuminated.nodes]))
-        bright = everywhere.positions[_bright(everywhere, illuminated, likeness)]
-        distance = as_tree(spots.positions[illuminated.nodes]).query(as_rows(bright))[0]
-        elsewhere = bright[distance > _ELSEWHERE * lattice.pitch_px]
-    return _Fit(lattice, width_px, spots, illuminated, bright, elsewhere)
-
-
-def _bright(spots: SpotFlux, illuminated: Illumination, likeness: float) -> NDArray[np.bool_]:
-    """Return which spots are as bright as those of illuminated lenslets, and of similar shape."""
-    clear = (spots.signal_to_noise > _CLEAR) & (spots.likeness > _LIKE * likeness)
-    return np.asarray(clear & (spots.flux >= illuminated.least_flux))

@@ -86,6 +86,12 @@ class NodeFlux(SpotFlux):
     drifts: NDArray[np.complex128]
     shifts: NDArray[np.complex128]
 
+    def scatter(self, chosen: NDArray[np.bool_]) -> float:
+        """Return the median distance of the chosen spots from their common displacement, in pitches."""
+        shifts = self.shifts[chosen]
+        middle = np.median(shifts.real) + 1j * np.median(shifts.imag)
+        return float(np.median(np.abs(shifts - middle)))
+
 
 def measure_nodes(
     image: NDArray[np.float64], lattice: Lattice, width_px: float, drift: Drift = no_drift

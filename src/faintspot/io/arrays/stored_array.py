@@ -1,0 +1,89 @@
+"""An array in a file, opened for the first read and read in parts."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.closing import Closing
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.sizes import check_bytes
+from faintspot.io.locations import one_line
+
+MOST_WHOLE_BYTES = 1 << 30
+"""Largest size of an array, or of a part of one, that can only be read whole."""
+
+OpenArray = Callable[[ExitStack], Any]
+"""Opens a file on a stack of contexts and returns an array that gives its items by ``array[start:stop]``."""
+
+
+class StoredArray(Closing):
+    """An array in a file whose first axis is read in parts; for one thread at a time.
+
+    Parameters
+    ----------
+    name : str
+        File and key, for messages.
+    shape : tuple of int
+        Shape stated by the file.
+    dtype : numpy.dtype
+        Type of the values, in any byte order; `read` returns them in native order.
+    open_array : callable
+        See `OpenArray`; it and the returned array may raise any error on damaged files.
+    """
+
+    def __init__(
+        self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], open_array: OpenArray
+    ) -> None:
+        self.name, self.shape = name, tuple(int(side) for side in shape)
+        self.dtype: np.dtype[Any] = dtype.newbyteorder("=")
+        self._open_array = open_array
+        self._open_files = ExitStack()
+        self._array: Any = None
+
+    @classmethod
+    def whole(
+        cls, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], load: Callable[[], NDArray[Any]]
+    ) -> StoredArray:
+        """Return an array that can only be read whole, by `load`; refuse one that needs too much memory."""
+        check_bytes(name, math.prod(shape) * dtype.itemsize, MOST_WHOLE_BYTES, "an array")
+        return cls(name, shape, dtype, lambda _: load())
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Return items `start` to `stop` of the first axis, C-ordered; the array belongs to the caller.
+
+        Raises
+        ------
+        InputError
+            When the file is damaged or incomplete; the message names the items.
+        """
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                if self._array is None:
+                    self._array = self._open_array(self._open_files)
+                values = np.asarray(self._array[start:stop])
+            if values.shape != (stop - start, *self.shape[1:]):
+                raise ValueError(f"its shape is {values.shape[1:]} instead of {self.shape[1:]}")
+        except (InputError, MissingExtraError):
+            raise
+        except Exception as error:  # decoders raise many kinds of errors on damaged files
+            self.close()
+            items = "frames" if len(self.shape) == 3 else "rows"
+            raise InputError(
+                f"{self.name}: {items} {start} to {stop - 1} (counted from 0) cannot be read: "
+                f"the file is damaged or incomplete ({one_line(error)})"
+            ) from None
+        # Values without memory of their own are a part of a mapped or whole array.
+        return np.array(values, self.dtype, order="C", copy=None if values.flags.owndata else True)
+
+    def close(self) -> None:
+        """Close the file; a later `read` opens it again."""
+        self._array = None
+        self._open_files.close()

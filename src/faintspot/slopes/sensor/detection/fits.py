@@ -1,0 +1,202 @@
+"""Lattices fitted to the spots of a frame, and the choice of the one that explains them best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from faintspot.slopes.sensor.detection.candidates import find_candidates
+from faintspot.slopes.sensor.detection.following import follow
+from faintspot.slopes.sensor.detection.illumination import Illumination, find_illumination
+from faintspot.slopes.sensor.detection.lattice import Lattice
+from faintspot.slopes.sensor.detection.nodes import (
+    Drift,
+    NodeFlux,
+    SpotFlux,
+    find_spots,
+    inside_frame,
+    measure_nodes,
+    no_drift,
+    spot_width,
+)
+from faintspot.slopes.sensor.neighbours import as_rows, as_tree
+from faintspot.slopes.sensor.region import PupilRegion
+
+_FIT_PASSES = 10
+# A spot with this signal-to-noise ratio that is as bright as those of illuminated lenslets and this far
+# (pitches) from all of them belongs to another lenslet: a smooth aberration brings no two spots closer.
+_CLEAR, _ELSEWHERE = 6.0, 0.4
+# Displacements are followed if that reaches so many of these spots, or half of them (one may be a ghost), and
+# the spots are this near (pitches, median) to their expected positions, unlike peaks within spots.
+_REACHED, _FOLLOWED = 4, 0.15
+# Spots farther than this from all illuminated nodes (in pitches) are not theirs, even if each lenslet has
+# several; those nearer to the edge of the frame may belong to a lenslet outside.
+_BETWEEN, _CUT = 0.45, 0.5
+# Part of the spots and nodes that a lattice explains if others need not be tried, unless its score as a
+# candidate is below this part of that of another; part below which there is a doubt; and part below which, of
+# doubtful lattices, others with a lower score may be better.
+_EXPLAINED, _SUFFICIENT, _CERTAIN, _LITTLE = 0.8, 0.6, 0.85, 0.4
+# Median distance of the spots from their nodes (pitches) above which a fit to them makes a lattice worse.
+_LOOSE = 0.18
+# Fewest lit lenslets, and fewest pairs of neighbouring spots in each direction: one pair is a coincidence.
+FEWEST, _PAIRS = 4, 1.4
+# Minimum shape similarity: fraction of the squared flux explained, relative to illuminated spots.
+_LIKE = 0.6
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Lattice fitted to the spots, with measurements at its nodes and their illumination.
+
+    `bright` are all spots as bright as the illuminated ones, `elsewhere` those of them at no
+    illuminated node.
+    """
+
+    lattice: Lattice
+    width_px: float
+    spots: NodeFlux
+    illuminated: Illumination
+    bright: NDArray[np.complex128]
+    elsewhere: NDArray[np.complex128]
+    shape: tuple[int, ...]
+
+    @property
+    def unexplained(self) -> tuple[int, int]:
+        """Number of bright spots far from illuminated nodes, and of dark nodes enclosed by these."""
+        lit = self.illuminated.nodes
+        expected = (self.lattice.positions(self.spots.cells) + self.spots.drifts)[lit]
+        inside = inside_frame(self.bright, self.shape, _CUT * self.lattice.pitch_px)
+        distance = as_tree(expected).query(as_rows(self.bright[inside]))[0]
+        far = int(np.count_nonzero(distance > _BETWEEN * self.lattice.pitch_px))
+        cells = self.spots.cells[lit]
+        dark = np.ones(np.ptp(cells, axis=0) + 3, dtype=bool)
+        dark[tuple((cells - cells.min(axis=0) + 1).T)] = False
+        joined = [[0, 1, 0], [1, 1, 1], [0, 1, 0]]
+        if self.lattice.geometry == "hexagonal":
+            joined = [[0, 1, 1], [1, 1, 1], [1, 1, 0]]
+        sizes = np.bincount(scipy.ndimage.label(dark, joined)[0][dark])[2:]
+        # The largest enclosed part may be the central obstruction.
+        return far, int(sizes.sum() - sizes.max(initial=0))
+
+    @property
+    def explained(self) -> float:
+        """Agreement of lattice and spots, from 0 to 1: other spots and dark nodes speak against it."""
+        count = np.count_nonzero(self.illuminated.nodes)
+        return count / (count + sum(self.unexplained)) if count >= FEWEST else 0.0
+
+
+def best_fit(
+    image: NDArray[np.float64],
+    geometries: tuple[str, ...],
+    pitch_range_px: tuple[float, float],
+    illuminated_fraction: float | None,
+    pupil: PupilRegion | None,
+) -> Fit | None:
+    """Return the fit of the candidate lattice that explains the spots best, or None without one."""
+    if not np.ptp(image) > 0:
+        return None
+    image = image - np.median(image)
+    best, highest = None, -1.0
+    for score, lattice in find_candidates(image, geometries, pitch_range_px):
+        fit = _fitted(image, lattice, illuminated_fraction, pupil)
+        explained = fit.explained
+        if explained > 0 and score * np.count_nonzero(fit.illuminated.nodes) < _PAIRS:
+            continue
+        if explained > _EXPLAINED and score > _SUFFICIENT * highest:
+            best = fit
+            break
+        rank = score * min(1.0, explained / _LITTLE)
+        if rank > highest:
+            best, highest = fit, rank
+    if best is None:
+        return None
+    if pupil is not None:
+        held = pupil.holds(best.lattice.positions(best.spots.cells))
+        return replace(best, illuminated=replace(best.illuminated, nodes=held, doubt=""))
+    return replace(
+        best, illuminated=replace(best.illuminated, doubt=_unclear(best) or best.illuminated.doubt)
+    )
+
+
+def _fitted(
+    image: NDArray[np.float64],
+    lattice: Lattice,
+    illuminated_fraction: float | None,
+    pupil: PupilRegion | None,
+) -> Fit:
+    """Fit the lattice to the spots; if some are left over, follow them from neighbour to neighbour."""
+    width_px = spot_width(image, lattice)
+    for _ in range(_FIT_PASSES):
+        spots = measure_nodes(image, lattice, width_px)
+        illuminated = find_illumination(spots, lattice, illuminated_fraction)
+        used = illuminated.nodes
+        if pupil is not None:
+            used = used & pupil.holds(lattice.positions(spots.cells))
+        if np.count_nonzero(used) < FEWEST or spots.scatter(used) > _LOOSE:
+            break
+        before = lattice
+        lattice = lattice.fitted(spots.cells[used], spots.positions[used]).canonical(image.shape)
+        if abs(lattice.step - before.step) * max(image.shape) < 0.02 * abs(lattice.step) ** 2:
+            break
+    everywhere = find_spots(image, lattice, width_px)
+    fit = _illuminated_of(image, lattice, width_px, illuminated_fraction, everywhere)
+    for _ in range(_FIT_PASSES):
+        if not 0 < len(fit.elsewhere) <= np.count_nonzero(fit.illuminated.nodes):
+            break
+        followed = follow(fit.bright, fit.lattice, image.shape)
+        if followed is None:
+            break
+        better = _illuminated_of(image, followed[0], width_px, illuminated_fraction, everywhere, followed[1])
+        reached = len(fit.elsewhere) - len(better.elsewhere)
+        lit = better.illuminated.nodes
+        near = lit.any() and np.median(np.abs(better.spots.shifts[lit])) < _FOLLOWED
+        if not near or reached < max(1.0, min(_REACHED, 0.5 * len(fit.elsewhere))):
+            break
+        fit = better
+    return fit
+
+
+def _unclear(fit: Fit) -> str:
+    """Return a one-line warning if the lattice explains only a part of the spots."""
+    if fit.explained > _CERTAIN or fit.explained == 0:
+        return ""
+    elsewhere, dark = fit.unexplained
+    count = np.count_nonzero(fit.illuminated.nodes)
+    return (
+        f"the lattice explains only a part of the flux: {elsewhere} bright spots belong to none of its "
+        f"{count} lit lenslets, and {dark} dark ones lie between these; its pitch or geometry may be wrong, "
+        "give one of them"
+    )
+
+
+def _illuminated_of(
+    image: NDArray[np.float64],
+    lattice: Lattice,
+    width_px: float,
+    illuminated_fraction: float | None,
+    everywhere: SpotFlux,
+    drift: Drift = no_drift,
+) -> Fit:
+    """Decide which lenslets of a lattice are illuminated, and which bright spots belong to none of them."""
+    spots = measure_nodes(image, lattice, width_px, drift)
+    illuminated = find_illumination(spots, lattice, illuminated_fraction)
+    elsewhere = bright = np.empty(0, dtype=np.complex128)
+    if illuminated.nodes.any():
+        bright = everywhere.positions[_bright(everywhere, spots, illuminated)]
+        distance = as_tree(spots.positions[illuminated.nodes]).query(as_rows(bright))[0]
+        elsewhere = bright[distance > _ELSEWHERE * lattice.pitch_px]
+    return Fit(lattice, width_px, spots, illuminated, bright, elsewhere, image.shape)
+
+
+def _bright(everywhere: SpotFlux, spots: NodeFlux, illuminated: Illumination) -> NDArray[np.bool_]:
+    """Return which spots are as bright as those of illuminated lenslets, and of similar shape."""
+    ratio, likeness = (
+        float(np.median(values[illuminated.nodes])) for values in (spots.signal_to_noise, spots.likeness)
+    )
+    # In the cells of a lattice that is too coarse, other spots count as noise.
+    clear = everywhere.signal_to_noise > min(_CLEAR, 0.5 * ratio)
+    alike = everywhere.likeness > _LIKE * likeness
+    return np.asarray(clear & alike & (everywhere.flux >= illuminated.least_flux))

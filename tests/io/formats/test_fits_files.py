@@ -1,0 +1,151 @@
+from __future__ import annotations
+
+import gzip
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.io.frame_files import cube, fits, save
+from tests.refusals import refused
+
+from faintspot.io import open_frames, read_array
+
+
+def written(path: Path, stored: Any, *cards: tuple[str, Any]) -> Path:
+    """Write an image of stored numbers with these cards in its header."""
+    bits = (-8 if stored.dtype.kind == "f" else 8) * stored.itemsize
+    axes = [(f"NAXIS{axis}", side) for axis, side in enumerate(stored.shape[::-1], 1)]
+    header = fits.Header([("SIMPLE", True), ("BITPIX", bits), ("NAXIS", stored.ndim), *axes, *cards])
+    data = stored.astype(stored.dtype.newbyteorder(">")).tobytes()
+    content = header.tostring().encode() + data + bytes(-len(data) % 2880)
+    path.write_bytes(gzip.compress(content) if path.suffix == ".gz" else content)
+    return path
+
+
+class TestValues:
+    @pytest.mark.parametrize("name", ["a.fits", "a.fits.gz"])
+    def test_scale_and_zero_as_astropy_has_them(self, tmp_path: Path, name: str) -> None:
+        unit = fits.ImageHDU(cube(), name="SCI")
+        unit.data[1, 2, 3] = -999
+        unit.header["BSCALE"], unit.header["BZERO"], unit.header["BLANK"] = 0.5, 100.0, -999
+        units = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.ones((2, 3)), name="DARK"), unit])
+        units.writeto(tmp_path / name)
+        with fits.open(tmp_path / name) as opened:
+            expected = np.array(opened["SCI"].data)
+        for location in (f"{tmp_path / name}:sci", f"{tmp_path / name}:2"):
+            with open_frames([location]) as source:
+                np.testing.assert_array_equal(source.block(0, 11), expected)
+
+    @pytest.mark.parametrize(
+        ("zero", "scale", "blank", "expected"),
+        [
+            (1.0, 2.0, -7, [[[3.0, np.nan], [7.0, 9.0]]]),
+            (0.0, 1.0, 1, [[[np.nan, -7.0], [3.0, 4.0]]]),
+            (32768.0, 1.0, 3, [[[32769.0, 32761.0], [np.nan, 32772.0]]]),
+        ],
+    )
+    @pytest.mark.parametrize("name", ["a.fits", "a.fits.gz"])
+    def test_blank_becomes_nan(
+        self, tmp_path: Path, name: str, zero: float, scale: float, blank: int, expected: Any
+    ) -> None:
+        stored = np.array([[[1, -7], [3, 4]]], np.int16)
+        path = written(tmp_path / name, stored, ("BSCALE", scale), ("BZERO", zero), ("BLANK", blank))
+        assert read_array(path).dtype == np.float32
+        np.testing.assert_array_equal(read_array(path), expected)
+
+    def test_blank_of_numbers_that_are_not_whole_means_nothing(self, tmp_path: Path) -> None:
+        frames = cube().astype(np.float32)
+        frames[1, 2, 3] = 3.0
+        path = written(tmp_path / "a.fits", frames, ("BLANK", 3))
+        np.testing.assert_array_equal(read_array(path), frames)
+
+    @pytest.mark.parametrize("ending", ["fits", "fits.fz"])
+    @pytest.mark.parametrize("dtype", ["int8", "uint16", "uint32", "uint64", "float64", "int64"])
+    def test_integers_of_the_other_sign_are_exact(self, tmp_path: Path, dtype: str, ending: str) -> None:
+        if ending == "fits.fz" and dtype.endswith("64"):
+            return  # the compression does not know these types
+        if dtype.startswith("f"):
+            values = np.linspace(-1, 1, 24).reshape(2, 3, 4)
+        else:
+            limits = np.iinfo(dtype)
+            extremes = [limits.min, limits.min + 1, limits.max, limits.max // 2]
+            values = np.array(extremes * 6, dtype).reshape(2, 3, 4)
+        stored = read_array(save(tmp_path / f"a.{ending}", values))
+        assert stored.dtype == values.dtype
+        np.testing.assert_array_equal(stored, values)
+
+
+def test_no_such_extension_no_image_no_fits(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.fits", cube())
+    with refused("'SCI'", "PRIMARY"):
+        open_frames([path], key="SCI")
+    table = fits.BinTableHDU.from_columns([fits.Column("a", "E", array=np.zeros(3))], name="TAB")
+    fits.HDUList([fits.PrimaryHDU(), table]).writeto(tmp_path / "t.fits")
+    for key in (None, "TAB"):
+        with refused("t.fits", "image"):
+            open_frames([tmp_path / "t.fits"], key=key)
+    (tmp_path / "b.fits").write_bytes(b"SIMPLE  but no header" * 300)
+    (tmp_path / "c.fits.gz").write_bytes(gzip.compress(b"no header" * 300))
+    for name in ("b.fits", "c.fits.gz"):
+        with refused(name, "FITS"):
+            open_frames([tmp_path / name])
+
+
+@pytest.mark.parametrize(("name", "kept"), [("a.fits", 40_000), ("a.fits.fz", -40_000)])
+def test_truncated_file(tmp_path: Path, name: str, kept: int) -> None:
+    path = save(tmp_path / name, cube(100, 20, 20))
+    path.write_bytes(path.read_bytes()[:kept])
+    n_bytes = path.stat().st_size
+    with refused(f"{name}: truncated", f"the file has {n_bytes} bytes"):
+        open_frames([path])
+
+
+def test_zero_frames(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.fits", np.zeros((0, 4, 4), np.int16))
+    with refused("at least one frame", "(0, 4, 4)"):
+        open_frames([path])
+
+
+@pytest.mark.parametrize("kept", [0.5, 1.0])
+def test_truncated_gzip_keeps_the_frames_before(tmp_path: Path, kept: float) -> None:
+    """Either the frames are cut, or only the checksum at the end."""
+    frames = cube(20, 40, 40)
+    path = save(tmp_path / "a.fits.gz", frames)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * kept) - 4])
+    with open_frames([path]) as source:
+        np.testing.assert_array_equal(source.block(0, 5), frames[:5])
+        with refused("a.fits.gz: frames 5 to 19 ", "damaged or incomplete"):
+            source.block(5, 20)
+        np.testing.assert_array_equal(source.block(5, 7), frames[5:7])
+
+
+def test_damaged_tile(tmp_path: Path) -> None:
+    path = tmp_path / "a.fits.fz"
+    fits.CompImageHDU(cube(100, 20, 20), compression_type="GZIP_1", tile_shape=(1, 20, 20)).writeto(path)
+    content = bytearray(path.read_bytes())
+    content[40_000:50_000] = bytes(10_000)
+    path.write_bytes(content)
+    with refused("a.fits.fz", "frames", "damaged"), open_frames([path]) as source:
+        for _ in source.blocks(0, 100, 10):
+            pass
+
+
+def test_image_larger_than_memory_allows(tmp_path: Path) -> None:
+    """4 GB, of which nothing is on the disk and only blocks are in memory; without padding at the end."""
+    header = fits.PrimaryHDU(np.zeros((1, 128, 128), np.int16)).header
+    header["NAXIS3"] = 131_072
+    start_of_file = header.tostring().encode()
+    with (tmp_path / "a.fits").open("wb") as stream:
+        stream.write(start_of_file)
+        stream.truncate(len(start_of_file) + 2 * 131_072 * 128 * 128)
+    with open_frames([tmp_path / "a.fits"]) as source:
+        tracemalloc.start()
+        try:
+            for start in (0, 99_995, source.n_frames - 10):
+                assert not source.block(start, start + 10).any()
+            assert tracemalloc.get_traced_memory()[1] < 8_000_000
+        finally:
+            tracemalloc.stop()

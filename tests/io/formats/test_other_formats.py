@@ -1,0 +1,103 @@
+"""HDF5, MATLAB and PNG files: tests beyond those of every format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from PIL import Image
+from tests.io.frame_files import cube, h5py, save
+from tests.refusals import refused
+
+from faintspot.base.errors import InputError
+from faintspot.io import open_frames, read_array
+
+
+class TestHdf5:
+    def test_several_data_sets_are_listed(self, tmp_path: Path) -> None:
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            file["camera/sky"], file["camera/bias"], file["time"] = cube(), cube(3), np.arange(11)
+        with refused("camera/bias, camera/sky, time", "a.h5:NAME"):
+            open_frames([tmp_path / "a.h5"])
+        for key in ("camera/sky", "/camera/sky"):
+            with open_frames([f"{tmp_path / 'a.h5'}:{key}"]) as source:
+                np.testing.assert_array_equal(source.block(2, 9), cube()[2:9])
+        with open_frames([tmp_path / "a.h5"], key="camera/bias") as source:
+            assert source.n_frames == 3
+        with refused("no array 'camera'"):
+            open_frames([f"{tmp_path / 'a.h5'}:camera"])
+
+    def test_many_are_not_all_listed(self, tmp_path: Path) -> None:
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            for number in range(50):
+                file[f"set{number}"] = cube(1)
+        with pytest.raises(InputError, match="and 30 more"):
+            open_frames([tmp_path / "a.h5"])
+
+    def test_numbers_in_other_files_are_not_read(self, tmp_path: Path) -> None:
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            layout = h5py.VirtualLayout((2, 4, 4), "u1")
+            layout[0] = h5py.VirtualSource("/dev/zero", "x", (4, 4))
+            file.create_virtual_dataset("virtual", layout)
+            file.create_dataset("external", (2, 4, 4), "u1", external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)])
+            file["link"] = h5py.ExternalLink("other.h5", "frames")
+        for name in ("virtual", "external"):
+            with refused("stored in other files"):
+                open_frames([f"{tmp_path}/a.h5:{name}"])
+        with refused("no array 'link'"):
+            open_frames([f"{tmp_path}/a.h5:link"])
+
+    def test_only_numbers(self, tmp_path: Path) -> None:
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            file["text"] = [["a", "b"], ["c", "d"]]
+            file["complex"] = np.ones((3, 4, 5), complex)
+        for name in ("text", "complex"):
+            with pytest.raises(InputError, match=f"a.h5:{name}: expected"):
+                open_frames([f"{tmp_path / 'a.h5'}:{name}"])
+
+
+class TestMatlab:
+    @pytest.mark.parametrize("name", ["mat", "7.3.mat"])
+    def test_matrices_are_as_matlab_has_them(self, tmp_path: Path, name: str) -> None:
+        path = save(tmp_path / f"a.{name}", cube())
+        matrix = np.arange(12.0).reshape(3, 4)
+        if name == "mat":
+            scipy.io.savemat(path, {"matrix": matrix, "text": "abc", "cell": np.array([[1, "a"]], object)})
+        else:
+            with h5py.File(path, "r+") as file:
+                file["matrix"], file["#refs#/a"] = matrix.T, cube()
+        np.testing.assert_array_equal(read_array(f"{path}:matrix"), matrix)
+
+    @pytest.mark.parametrize("kind", ["u1", "i2", "u2", "f4", "f8", "?"])
+    def test_types(self, tmp_path: Path, kind: str) -> None:
+        values = cube(4).astype(kind)
+        scipy.io.savemat(tmp_path / "a.mat", {"b": np.moveaxis(values, 0, -1)})
+        with open_frames([tmp_path / "a.mat"]) as source:
+            assert source.dtype == (np.uint8 if kind == "?" else kind)
+            np.testing.assert_array_equal(source.block(1, 3), values[1:3])
+
+
+class TestPng:
+    @pytest.mark.parametrize("kind", ["u1", "u2"])
+    def test_grey(self, tmp_path: Path, kind: str) -> None:
+        frames = cube(2).astype(kind)
+        paths = [tmp_path / "a.png", tmp_path / "b.png"]
+        for path, frame in zip(paths, frames, strict=True):
+            Image.fromarray(frame).save(path)
+        with open_frames(paths) as source:
+            assert source.dtype == kind
+            np.testing.assert_array_equal(source.block(0, 2), frames)
+
+    def test_refused(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.png"
+        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(path)
+        with pytest.raises(InputError, match="expected a grey image of 8 or 16 bits, got mode RGB"):
+            open_frames([path])
+        Image.fromarray(cube(1, 60, 80)[0].astype("u1")).save(path)
+        with pytest.raises(InputError, match="one unnamed"):
+            open_frames([path], key="frames")
+        path.write_bytes(path.read_bytes()[:200])
+        with pytest.raises(InputError, match=r"a\.png: .*damaged"), open_frames([path]) as source:
+            source.block(0, 1)

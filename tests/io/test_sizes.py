@@ -1,0 +1,103 @@
+"""Sizes that files state are limited: refused in one line before the memory is used."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.io
+from tests import refusals
+from tests.io.frame_files import h5py, zarr
+from tests.io.slope_files import result, write
+
+from faintspot.base.npz import read_arrays
+from faintspot.io import open_frames, read_array, read_slopes
+from faintspot.io.references import read_reference
+from faintspot.io.stored import slopes_format
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.score import TrainedScore
+
+MIB = 1 << 20
+
+
+@pytest.fixture(autouse=True)
+def small_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Limits of 8 MiB, so that files that exceed them are made quickly."""
+    for module in ("frames", "arrays.stored_array", "arrays.zarr_store", "formats.hdf5_files"):
+        monkeypatch.setattr(f"faintspot.io.{module}.MOST_WHOLE_BYTES", 8 * MIB)
+    monkeypatch.setattr(read_arrays, "__defaults__", (None, (), 8 * MIB))
+    monkeypatch.setattr(slopes_format, "memory_bytes", lambda: 16 * MIB)
+
+
+@contextmanager
+def refused(*words: str) -> Iterator[None]:
+    """Expect a refusal before much memory is used."""
+    tracemalloc.start()
+    try:
+        with refusals.refused(*words):
+            yield
+        assert tracemalloc.get_traced_memory()[1] < 30 * MIB
+    finally:
+        tracemalloc.stop()
+
+
+READERS: list[tuple[str, Callable[[Path], Any]]] = [
+    ("samples", PSF.load),
+    ("tables", TrainedScore.load),
+    ("frames", read_array),
+    ("frames", lambda path: read_arrays(path, "a PSF", most=8 * MIB)),
+    ("x", read_slopes),
+    ("x", read_reference),
+]
+
+
+@pytest.mark.parametrize(("name", "read"), READERS)
+def test_large_array_in_npz(tmp_path: Path, name: str, read: Callable[[Path], Any]) -> None:
+    arrays: Any = {name: np.zeros((64, MIB), np.uint8)}
+    np.savez_compressed(tmp_path / "a.npz", **arrays)
+    with refused("a.npz"):
+        read(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("ending", ["npz", "fits.gz", "fits", "zarr"])
+def test_slopes_beyond_the_memory(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"slopes.{ending}"
+    write(path, result(400, 1000))
+    with refused("MiB of memory, expected slopes of at most 8 MiB"):
+        read_slopes(path)
+
+
+def test_dark_of_many_frames_is_read_in_parts(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "a.npz", dark=np.full((600, 256, 256), 7, np.uint8))
+    (tmp_path / "a.toml").write_text('[calibration]\ndark = "a.npz:dark"\n')
+    assert np.array_equal(Calibration.load(tmp_path / "a.toml").dark, np.full((256, 256), 7.0))
+
+
+def test_large_chunks(tmp_path: Path) -> None:
+    shape = (1 << 40, 64, 64)
+    zarr.create_array(str(tmp_path / "a.zarr"), shape=shape, dtype="f4", chunks=shape)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("frames", (100, 1000, 1000), "f8", chunks=(100, 1000, 1000))
+    for name in ("a.zarr", "a.h5"):
+        with refused(name, "a chunk of at most 8 MiB"):
+            open_frames([tmp_path / name])
+
+
+def test_large_matlab_variable(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "a.mat", {"frames": np.zeros((64, 1024, 1024), np.uint8)})
+    with refused("a.mat", "of memory, expected an array of at most 8 MiB"):
+        open_frames([tmp_path / "a.mat"])
+
+
+def test_more_pixels_than_a_frame_may_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one byte each they need less memory than is allowed; arrays made from them need more."""
+    monkeypatch.setattr("faintspot.io.frames.MOST_WHOLE_BYTES", 1 << 30)
+    np.lib.format.open_memmap(tmp_path / "map.npy", "w+", np.uint8, (1 << 14, 1 << 15))  # no disk is used
+    with refused("16384 x 32768"):
+        read_array(tmp_path / "map.npy")
