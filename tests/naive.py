@@ -307,6 +307,7 @@ def light(
     electrons = calibrate(frame, fs.Calibration() if calibration is None else calibration)
     windows = np.stack([electrons[y : y + ny, x : x + nx] for y, x in layout.corners])
     several = [(2 * i + 1) * n // (2 * min(n, 16)) for i in range(min(n, 16))]
+    several = [s for s in several if np.asarray(measured)[s]]
     rows = np.abs(windows[several][:, [0, ny - 2]] - windows[several][:, [1, ny - 1]])
     known = [np.nanmean(each) for each in rows if not np.isnan(each).all()]
     noise = 0.5 * np.sqrt(np.pi) * np.median(known) if known else 0.0

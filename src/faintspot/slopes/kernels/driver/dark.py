@@ -97,7 +97,7 @@ def flag_dark(test: Any, frames: Any, slopes: Any, scratch: Any) -> None:
             suspects += slopes.flux[f, s] < least
         if suspects == 0 or not typical > 0.0:
             continue
-        noise = frame_noise(test, frames, f, min(n, NOISE_WINDOWS), scratch)
+        noise = frame_noise(test, frames, f, min(n, NOISE_WINDOWS), slopes.flags[f], scratch)
         if not (noise > 0.0 and _is_bright(test, frames, f, noise, scratch)):
             continue
         for s in range(n):
@@ -175,7 +175,7 @@ def significances(test: Any, frames: Any, found: Any, scratch: Any) -> None:
     `scratch` has `scratch_size` numbers or more.
     """
     n = found.shape[0]
-    noise = test.unit * frame_noise(test, frames, 0, min(n, SAMPLED), scratch)
+    noise = test.unit * frame_noise(test, frames, 0, min(n, SAMPLED), found[:0], scratch)
     for s in range(n):
         found[s] = peak_above_border(test, frames, 0, s, scratch) / noise if noise > 0.0 else math.inf
 
@@ -205,15 +205,19 @@ def add_windows(test: Any, frames: Any, start: Any, stop: Any, weight: Any, mean
 
 
 @compiled
-def frame_noise(test: Any, frames: Any, f: Any, windows: Any, scratch: Any) -> Any:
+def frame_noise(test: Any, frames: Any, f: Any, windows: Any, flags: Any, scratch: Any) -> Any:
     """Return the noise of a pixel, from differences of pixels along the borders of some windows.
 
     It is the median over windows, evenly spread, of which each has the mean absolute difference of its first
-    and second rows of pixels, and of its last two. `scratch` is used from element `SAMPLED`.
+    and second rows of pixels, and of its last two. Those that `flags` (n or 0,) call unmeasured are left out.
+    `scratch` is used from element `SAMPLED`.
     """
     n, known = test.corners.shape[0], 0
     for i in range(windows):
-        difference = _border_difference(test, frames, f, (2 * i + 1) * n // (2 * windows))
+        s = (2 * i + 1) * n // (2 * windows)
+        if flags.shape[0] > 0 and int(flags[s]) & _UNMEASURED:
+            continue
+        difference = _border_difference(test, frames, f, s)
         if difference >= 0.0:
             place = SAMPLED + known
             while place > SAMPLED and scratch[place - 1] > difference:
