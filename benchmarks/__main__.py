@@ -28,6 +28,7 @@ _ORDER = (
     "realtime",
     "realtime_loop",
     "realtime_guard",
+    "validity",
     "telemetry",
     "recorded_tip_tilt",
     "live_page",

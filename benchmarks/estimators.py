@@ -66,7 +66,7 @@ def _gather(layout: fs.Layout, frame: Any) -> Candidate:
     """Return a run of gathering and calibrating alone."""
     lanes = lanes_for(np.float32)
     n, (ny, nx) = len(layout), layout.window
-    calibration = packed_calibration(layout, fs.Calibration(), lanes.width)
+    calibration = packed_calibration(layout, fs.Calibration().maps(layout.frame_shape), lanes.width)
     scratch, flux = new_scratch(lanes, ny, nx), np.empty((1, n), np.float32)
     groups = -(-n // lanes.width)
     source = Source(lanes, frame[None], layout.corners, ny, nx, calibration, np.inf)

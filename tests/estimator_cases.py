@@ -212,12 +212,12 @@ def assert_sane(slopes: fs.Slopes) -> None:
     """What holds whatever the images are."""
     for name in ("x", "y", "flux"):
         assert np.all(np.isfinite(getattr(slopes, name))), name
-    invalid = ~slopes.valid
+    invalid = ~slopes.measured
     for name in ("x", "y"):
         error = getattr(slopes, f"standard_error_{name}")
         assert np.all(getattr(slopes, name)[invalid] == 0)
         assert np.all(np.isposinf(error[invalid]))
-        assert np.all(error[slopes.valid] >= 0)  # and not NaN; 0 where a single pixel is left
+        assert np.all(error[slopes.measured] >= 0)  # and not NaN; 0 where a single pixel is left
     known = np.isfinite(slopes.standard_error_x)
     largest = slopes.standard_error_x[known].astype(float) * slopes.standard_error_y[known]
     assert np.all(np.abs(slopes.covariance_xy[known]) <= largest * (1 + 1e-6))  # rounding of float32

@@ -6,6 +6,7 @@ Written from the definitions, not from the kernels, so that a mistake in one doe
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -278,6 +279,70 @@ def slopes(
     return results
 
 
+@dataclass
+class Light:
+    """Which sub-apertures of a frame are dark, and of which rounding may decide."""
+
+    dark: NDArray[np.bool_]
+    unsure: NDArray[np.bool_]
+
+
+def light(
+    frame: ArrayLike,
+    layout: fs.Layout,
+    calibration: fs.Calibration | None,
+    fwhm: float | None,
+    flux: ArrayLike,
+    measured: ArrayLike,
+) -> Light:
+    """Judge the windows of one frame; `flux` and `measured` (n,) are those of its slopes."""
+    n, (ny, nx) = len(layout), layout.window
+    flux, none = np.asarray(flux, np.float64), np.zeros(n, bool)
+    box = box_of(layout.window, fwhm)
+    sampled = [i * n // min(n, 32) for i in range(min(n, 32))]
+    bright = sorted((s for s in sampled if np.asarray(measured)[s] and flux[s] > 0), key=lambda s: -flux[s])
+    typical = bright[len(sampled) // 16 :][:3]
+    if box == 0 or not typical:
+        return Light(none, none)
+    electrons = calibrate(frame, fs.Calibration() if calibration is None else calibration)
+    windows = np.stack([electrons[y : y + ny, x : x + nx] for y, x in layout.corners])
+    several = [(2 * i + 1) * n // (2 * min(n, 16)) for i in range(min(n, 16))]
+    several = [s for s in several if np.asarray(measured)[s]]
+    rows = np.abs(windows[several][:, [0, ny - 2]] - windows[several][:, [1, ny - 1]])
+    known = [np.nanmean(each) for each in rows if not np.isnan(each).all()]
+    noise = 0.5 * np.sqrt(np.pi) * np.median(known) if known else 0.0
+    if noise == 0:
+        return Light(none, none)
+    unit = noise * np.sqrt(box**2 + 0.2982 * box**4 / ((ny + nx) / 2))
+    peaks = np.array([peak_in_box(window, box) for window in windows])
+    needed = max(25 * unit, 100)
+    trials = ny * nx * min(8 / box**2, 1)
+    limit = NormalDist().inv_cdf(0.999 ** (1 / trials)) * unit
+    suspect = (flux < 0.5 * flux[typical[len(typical) // 2]]) & np.asarray(measured)
+    many = 2 * np.count_nonzero(peaks[typical] >= needed) > len(typical)
+    near = np.any(np.abs(peaks[typical] / needed - 1) < 0.01)
+    return Light(suspect & many & (peaks < limit), suspect & (near | (np.abs(peaks / limit - 1) < 0.01)))
+
+
+def box_of(window: tuple[int, int], fwhm: float | None) -> int:
+    """The odd side of a box that holds most of a spot and fits twice into the window."""
+    if min(window) < 4:
+        return 0
+    wanted = 3.0 if fwhm is None else max(1.25 * fwhm, 3.0)
+    return min(range(1, min(window) // 2 + 1, 2), key=lambda side: abs(side - wanted))
+
+
+def peak_in_box(window: Floats, box: int) -> float:
+    """The largest sum over a box of pixels above the border; infinite if a side has no good pixel."""
+    sides = window[0], window[-1], window[:, 0], window[:, -1]
+    if any(np.isnan(side).all() for side in sides):
+        return np.inf
+    above = np.nan_to_num(window - np.median([np.nanmean(side) for side in sides]))
+    ny, nx = window.shape
+    boxes = [above[y : y + box, x : x + box] for y in range(ny - box + 1) for x in range(nx - box + 1)]
+    return float(max(each.sum() for each in boxes))
+
+
 def doubtful(
     measured: fs.Slopes, layout: fs.Layout, fwhm: ArrayLike, reference: ArrayLike | float = 0.0
 ) -> NDArray[np.int64]:
@@ -288,22 +353,47 @@ def doubtful(
     n, half = len(layout), np.array(layout.window[::-1]) / 2
     slopes = np.column_stack([measured.x, measured.y]).astype(np.float64)
     places = slopes + layout.offsets + np.asarray(reference, np.float64)
-    least = np.full(n, np.nan)
-    for s in range(n):
-        away = np.hypot(*(layout.centres - layout.centres[s]).T)
-        near = (away > 0) & (away < 1.6 * (layout.pitch_px or 0.0)) & measured.valid
-        if measured.valid[s] and near.sum() >= 2:
-            least[s] = np.hypot(*(slopes[near] - slopes[s]).T).min()
-    several = np.sort(least[~np.isnan(least)])
-    usual = float(several[(len(several) - 1) // 2]) if several.size else 0.0
+    pitch = layout.pitch_px or 0.0
+    usual, least = np.full(n, np.nan), np.full(n, np.nan)
+    for s in np.flatnonzero(measured.measured).tolist():
+        away = [
+            (slopes[s] - weight * slopes[a] - (1 - weight) * slopes[b], 1 + weight**2 + (1 - weight) ** 2)
+            for a, b, weight in in_line(layout, s)
+            if measured.measured[a] and measured.measured[b]
+        ]
+        if away:
+            usual[s] = np.sqrt(min((x**2 + y**2) / variance for (x, y), variance in away))
+            least[s] = min(np.hypot(*each) for each, _ in away)
+    several = np.sort(usual[~np.isnan(usual)])
+    typical = float(several[(len(several) - 1) // 2]) if several.size else 0.0
     flags = np.zeros(n, np.int64)
-    for s in np.flatnonzero(measured.valid).tolist():
+    for s in np.flatnonzero(measured.measured).tolist():
         whole = half - np.broadcast_to(fwhm, (n, 2))[s] / 2
         if np.any((np.abs(places[s]) > whole) & (whole > half / 2)):
             flags[s] |= int(Flag.AT_SEARCH_LIMIT)
-        if least[s] > max(0.1 * (layout.pitch_px or 0.0), 5 * usual):
+        if pitch and least[s] > min(0.1 * pitch, 0.3) and usual[s] > 4.5 * typical:
             flags[s] |= int(Flag.UNLIKE_NEIGHBOURS)
     return flags
+
+
+def in_line(layout: fs.Layout, s: int) -> list[tuple[int, int, float]]:
+    """Two sub-apertures in line with s, and the weight of the first of them: both sides, else one."""
+
+    def at(step: Floats) -> int | None:
+        away = np.hypot(*(layout.centres - layout.centres[s] - step).T)
+        return int(away.argmin()) if away.min() < 0.3 * (layout.pitch_px or 0.0) else None
+
+    steps = [
+        step
+        for step in (layout.centres - layout.centres[s])
+        if 0 < np.hypot(*step) < 1.6 * (layout.pitch_px or 0.0)
+    ]
+    opposite = {frozenset((at(step), at(-step))) for step in steps} - {None}
+    both = [tuple(pair) for pair in opposite if None not in pair]
+    found: list[Any] = [(a, b, 0.5) for a, b in both]
+    if len(both) < 2:
+        found += [(at(step), at(2 * step), 2.0) for step in steps if at(2 * step) is not None]
+    return found
 
 
 def _denoised(image: Floats, settings: fs.Settings, s: int, n: int) -> Denoised:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.flags import INVALID
+from faintspot.base.flags import UNMEASURED
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator, Need
 from faintspot.slopes.estimators.registry import estimator_named
@@ -88,7 +88,7 @@ class EstimatorTests:
                 assert np.all(np.isfinite(values))
             assert not np.any(np.isnan(slopes.standard_error_x) | np.isnan(slopes.standard_error_y))
             assert np.all(np.isfinite(slopes.covariance_xy))
-            assert np.all((slopes.flags & INVALID == 0) | ((slopes.x == 0) & (slopes.y == 0)))
+            assert np.all((slopes.flags & UNMEASURED == 0) | ((slopes.x == 0) & (slopes.y == 0)))
 
     def test_finds_the_centre_of_symmetric_spots(self) -> None:
         frame, _ = self.frame(noise=False, reach_px=0.0)

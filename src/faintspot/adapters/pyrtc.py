@@ -202,7 +202,7 @@ class _Measuring:
             return np.zeros((2 * n, n), np.float32)
         found = self._tool.measure(image, prior_px=prior, noise_free=self.noise_free)
         slopes = np.zeros((2 * n, n), np.float32)
-        slopes.ravel()[at] = np.where(self._tool.last.valid, found - reference, 0.0).ravel()
+        slopes.ravel()[at] = np.where(self._tool.last.measured, found - reference, 0.0).ravel()
         return slopes
 
     def _made(self, process: Any, shape: tuple[int, ...], used: NDArray[np.int64]) -> ToolSlopes:

@@ -105,7 +105,7 @@ class Spots:
         found = self.measured.measure(images.reshape(-1, side), prior_px=prior, noise_free=noise_free)[
             self._order
         ]
-        found = np.where(self.measured.last.valid, found, reference)
+        found = np.where(self.measured.last.measured, found, reference)
         if not noise_free:
             self._slopes = ((found - reference) / unit).ravel()
         return found

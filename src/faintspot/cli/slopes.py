@@ -56,6 +56,14 @@ from faintspot.slopes.recorded import Summary, measure_recorded
     help="Take the flux of spots as their mean over the recording, not that of each frame: for steady, "
     "faint stars.",
 )
+@option(
+    "--keep",
+    metavar="limited,unlike",
+    default="",
+    help="Doubtful slopes that stay valid: limited (at search_range_px, or cut by their window), unlike (all "
+    "neighbours).",
+    show_default="none",
+)
 @REFERENCE
 @KEY
 @option("--threads", type=click.IntRange(1), help="Most threads to use.", show_default="all processors")
@@ -75,6 +83,7 @@ def command(
     estimator: str | None,
     changes: tuple[str, ...],
     no_denoise: bool,
+    keep: str,
     **options: Any,
 ) -> None:
     """Turn recorded frames into slopes.
@@ -86,9 +95,10 @@ def command(
     measured (--key names one of several); where the configuration has no [layout], with the file's
     sub-apertures and reference slopes.
 
-    The output holds x, y (px, or arcsec, from the sub-aperture's centre, 0 where not valid), flux (e-),
-    valid, flags, iterations and bad_pixels of every frame and sub-aperture. A .zarr store opens with
-    xarray.open_zarr.
+    The output holds x, y (px, or arcsec, from the sub-aperture's centre), flux (e-), valid, flags,
+    iterations and bad_pixels of every frame and sub-aperture. Slopes are not valid without flux (x and y are
+    0 then), at their search limit, cut by their window, or unlike all neighbours; --keep changes that. A
+    .zarr store opens with xarray.open_zarr.
 
     \b
     Examples:
@@ -104,9 +114,10 @@ def command(
         split_location(name)  # refuses what is not there
     changed = {} if estimator is None else {"estimator": estimator}
     changed |= parse_changes(changes) if changes else {}
+    options |= {"keep": [name.strip() for name in keep.split(",") if name.strip()], "changes": changed}
     with progress_bar("slopes") as advance:
         summary = measure_recorded(
-            frames, config, output, changes=changed, denoise=not no_denoise, progress=advance, **options
+            frames, config, output, denoise=not no_denoise, progress=advance, **options
         )
     for line in describe(summary, output):
         click.echo(line)
@@ -146,7 +157,7 @@ def describe(summary: Summary, output: str) -> list[str]:
             f"  went on at frame {summary.resumed_at} (counted from 0); the counts are from there on"
         )
     texts = {
-        SubapertureFlag.NO_FLUX: "without flux",
+        SubapertureFlag.NO_FLUX: "without flux above zero",
         SubapertureFlag.TOO_MANY_BAD_PIXELS: "with too many bad pixels",
         SubapertureFlag.UNLIKE_NEIGHBOURS: "unlike those of all neighbours (probably a wrong spot)",
         SubapertureFlag.SATURATED: "with saturated pixels",

@@ -65,7 +65,8 @@ def command(
     given: dict[str, Any] = {name: value for name, value in scales.items() if value is not None}
     layout = replace(run.layout, **given)
     try:
-        wavefront = fit_wavefront(Slopes.from_variables(run.stored.variables), layout, modes=modes)
+        measured = Slopes.from_variables(run.stored.variables, keep=run.keep)
+        wavefront = fit_wavefront(measured, layout, modes=modes)
     except InputError as error:
         raise InputError(f"{slopes}: {error}") from None
     _print(wavefront)

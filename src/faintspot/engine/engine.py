@@ -17,6 +17,7 @@ from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.timing import Counters, Latencies
 from faintspot.engine.path.workers import Workers
 from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.settings.dark_following import DarkFollower
 from faintspot.engine.settings.estimators import EngineEstimators
 from faintspot.engine.settings.flux_following import FluxFollower
 from faintspot.engine.settings.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
@@ -32,6 +33,7 @@ from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 
 _WATCH_S = 0.02  # between two checks of the watcher
+_LOOKS_FOR_DARK = 10  # ditto, between two searches for dark sub-apertures
 _LOOKS_BETWEEN_STALE = 10  # asking the operating system whether the source is alive takes longer
 DEADLINE_S = 1e-3
 IMAGES_EVERY = 100
@@ -137,6 +139,7 @@ class Engine:
         self.live: RunningSettings[EnginePlan] = RunningSettings(self.preparer.prepare, settings)
         self.estimators = EngineEstimators(self.live, self.preparer)
         self._flux = None if mean_flux is None else FluxFollower(self.live, mean_flux)
+        self._dark = DarkFollower(self.live.running.pipelines[0])
         layout = self.live.running.layout
         self._raw = np.zeros(layout.frame_shape, np.float32)
         if control is not None:
@@ -188,6 +191,7 @@ class Engine:
             "latency": self.latencies.as_dict(),
             "estimator": self.live.settings.estimator.name,
             "subapertures": len(self.live.running.layout),
+            "dark": np.flatnonzero(self._dark.dark).tolist(),
             "methods": interleaving.labels,
             "every": interleaving.every,
             "loaded": {name: str(file.path) for name, file in self.estimators.loaded.items()},
@@ -351,6 +355,7 @@ class Engine:
     def _measure_next(self, ring: PixelRing) -> bool:
         """Measure and publish the next frame; return False when the wait for it was ended."""
         path, method = self._take(ring)
+        path.set_dark(self._dark.dark, self._dark.changes)
         self._path, self._waiting = path, True
         arrival = self._arrival + 1
         explain = self._images_every > 0 and self._measured.get(method, 0) % self._images_every == 0
@@ -424,6 +429,7 @@ class Engine:
             number, method, change, moment, published, slopes, causes=causes, loop=state, commands=commands
         )
         self._lost = 0, IN_TIME
+        self._dark.take(path.frame)
         if self._flux is not None:
             self._flux.take(slopes.flux)
         if self._streams.commands_lost:
@@ -495,6 +501,8 @@ class Engine:
             if self._workers is not None:
                 self.counters.worker_restarts += self._workers.replace_dead()
             self.live.let_go()
+            if looks % _LOOKS_FOR_DARK == 0:
+                self._dark.look()
             if self._prediction is not None:
                 self._prediction.look_after()
             if looks % _LOOKS_BETWEEN_STALE == 0:

@@ -18,6 +18,7 @@ from faintspot.engine.path.workers import Workers
 from faintspot.loop.control import slope_product
 from faintspot.loop.control.slope_product import SlopeProduct
 from faintspot.slopes.kernels.compilation.ordered import store
+from faintspot.slopes.kernels.driver.groups import SlopeArrays
 from faintspot.slopes.kernels.driver.streaming import (
     COLD,
     LAST_ROW,
@@ -79,7 +80,7 @@ class Source:
 
 
 def assert_same(found: fs.Slopes, expected: fs.Slopes, index: int) -> None:
-    for name in vars(expected):
+    for name in SlopeArrays._fields:
         assert np.array_equal(getattr(found, name), getattr(expected, name)[index]), name
 
 

@@ -8,6 +8,7 @@ import pytest
 from tests.simulated import frames_of
 
 from faintspot import Calibration, InputError, Layout, MissingExtraError, Settings, SlopePipeline, Slopes
+from faintspot.slopes.kernels.driver.groups import SlopeArrays
 
 LAYOUT = Layout.grid((2, 3), pixels=8, pixel_scale_arcsec=0.5)
 
@@ -48,7 +49,7 @@ def test_a_table_has_a_row_for_each_slope(slopes: Slopes) -> None:
     table = slopes.to_pandas(LAYOUT, unit="arcsec")
     assert table.loc[(2, 1), "x_arcsec"] == 0.5 * slopes.x[2, 1]
     assert table.loc[(2, 1), "covariance_xy_arcsec2"] == 0.25 * slopes.covariance_xy[2, 1]
-    one = replace(slopes, **{name: values[0] for name, values in vars(slopes).items()})
+    one = replace(slopes, **{name: getattr(slopes, name)[0] for name in SlopeArrays._fields})
     assert len(one.to_pandas()) == 6
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -289,7 +290,9 @@ def test_slopes_at_the_search_range_are_flagged() -> None:
     slopes = fs.SlopePipeline(layout, limited)(frame)
     assert slopes.x.tolist() == [0.5, 2.0, -0.5]
     assert ((slopes.flags & Flag.AT_SEARCH_LIMIT) != 0).tolist() == [False, True, False]
-    assert slopes.valid.all()
+    assert slopes.measured.all()
+    assert slopes.valid.tolist() == [True, False, True]
+    assert replace(slopes, keep=Flag.AT_SEARCH_LIMIT).valid.all()
 
 
 def test_integers_with_a_mask_saturate_as_without() -> None:

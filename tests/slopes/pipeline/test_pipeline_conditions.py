@@ -32,9 +32,9 @@ class TestBadFrames:
             slopes = self.pipeline(frame)
         for field in FIELDS:
             assert np.isfinite(getattr(slopes, field)).all(), field
-        invalid = ~slopes.valid
-        assert np.all(slopes.x[invalid] == 0.0)
-        assert np.all(slopes.y[invalid] == 0.0)
+        unmeasured = ~slopes.measured
+        assert np.all(slopes.x[unmeasured] == 0.0)
+        assert np.all(slopes.y[unmeasured] == 0.0)
         return slopes
 
     @pytest.mark.parametrize("value", [0.0, 5.0, -3.0, 1e29, 1e-42])

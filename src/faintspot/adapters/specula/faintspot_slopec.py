@@ -141,7 +141,7 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
             prior = ((_two_rows("in_predicted", predicted, n) + null) / self._tool.unit_per_px).ravel()
         found = self._tool.measure(images, prior_px=prior, noise_free=self._noise_free)
         last = self._tool.last
-        found = np.where(last.valid, found, null)
+        found = np.where(last.measured, found, null)
         self.slopes.xslopes, self.slopes.yslopes = (self.to_xp(row, dtype=self.dtype) for row in found)
         flux = np.nan_to_num(last.flux).astype(np.float64)
         self.flux_per_subaperture_vector.value[:] = self.to_xp(flux, dtype=self.dtype)

@@ -20,7 +20,7 @@ from faintspot.engine.path.workers import Workers
 from faintspot.loop.control.configuration import prior_std_px
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.kernels.compilation.host import WIDTHS, lanes_for
-from faintspot.slopes.kernels.driver.groups import DENOISED, STAGE_ROWS, SlopeArrays, new_scratch
+from faintspot.slopes.kernels.driver.groups import DENOISED, ERROR_SCALE, STAGE_ROWS, SlopeArrays, new_scratch
 from faintspot.slopes.kernels.driver.products import NO_PRODUCT, ProductPart
 from faintspot.slopes.kernels.driver.streaming import (
     COLD,
@@ -177,7 +177,8 @@ class FramePath:
     ) -> None:
         self.pipeline, self._progress, self._workers = pipeline, progress, workers
         self._check(slots)
-        self._slots = len(slots)
+        self._frames = [slot[None] for slot in slots]
+        self._slot = 0  # of the last frame
         self._shares = 1 + (0 if workers is None else workers.count)
         self._no_product = [NO_PRODUCT] * self._shares
         n, pixels = len(pipeline.layout), pipeline.layout.pixels
@@ -206,6 +207,7 @@ class FramePath:
             groups = full * wide // width, full * wide // width + 1
             self._narrow = _Groups(pipeline.with_width(width), slots, groups, 1, prior)
         self._prior, self._prior_changes = prior, 0
+        self._dark_changes = 0
         self._usual_std_px = prior_std_px(pipeline.settings, pipeline.layout)
         self.prior_std_px = None if prior is None else self._usual_std_px
         """Standard deviation of the slopes' prior, (2 n,); None: no prior."""
@@ -281,7 +283,8 @@ class FramePath:
         self._pace[:, LAST_ROW] = after_ns
         if self._prior is not None and self._prior.changes != self._prior_changes:
             self._widen(self._prior)
-        frame = number, number % self._slots if slot is None else slot
+        self._slot = number % len(self._frames) if slot is None else slot
+        frame = number, self._slot
         after = self._explaining if explain else self._plain
         parts = product or self._no_product
         if self._workers is None:
@@ -292,7 +295,28 @@ class FramePath:
 
     def flag_doubtful(self) -> None:
         """Set the flags of the last frame that depend on all its slopes; see `SlopePipeline`."""
-        self.pipeline.flag_doubtful(self._results)
+        self.pipeline.flag_doubtful(self._results, self._frames[self._slot])
+
+    @property
+    def frame(self) -> NDArray[Any]:
+        """Pixels of the last frame, (1, h, w), until others are written there."""
+        return self._frames[self._slot]
+
+    def set_dark(self, dark: NDArray[np.bool_], changes: int) -> None:
+        """Set which sub-apertures have no flux: their slopes are 0. Return at once if nothing has changed.
+
+        Parameters
+        ----------
+        dark : (n,) array of bool
+        changes : int
+            Number of its changes, from 0: none is dark.
+        """
+        if changes == self._dark_changes:
+            return
+        self._dark_changes = changes
+        for groups in filter(None, (self._wide, self._narrow)):
+            scale = groups.settings[ERROR_SCALE]
+            np.copysign(scale, np.where(dark, -1.0, 1.0), out=scale)
 
     def await_start(self, number: int, after_ns: int = 0) -> None:
         """Wait for the first row of a frame, or until `stop` is called; `after_ns` as for `measure`."""

@@ -118,7 +118,7 @@ class CellMethods:
         slopes = self.measure(method, candidate, images)
         positions = np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64)
         stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1).astype(np.float64)
-        return positions[:, None], np.asarray(slopes.valid)[:, None], stated
+        return positions[:, None], np.asarray(slopes.measured)[:, None], stated
 
     def _method(self, estimator: Estimator) -> Method:
         """Tell an estimator what it has to know."""

@@ -31,8 +31,10 @@ VARIABLES: Mapping[str, Variable] = {
     "x": Variable("float32", "px", "spot position along columns, from the sub-aperture's centre", "x_px"),
     "y": Variable("float32", "px", "spot position along rows, from the sub-aperture's centre", "y_px"),
     "flux": Variable("float32", "e-", "flux left after background subtraction", "flux_e"),
-    "valid": Variable("bool", "1", "position was measured (else it is the reference position)", "valid"),
-    "flags": Variable("uint8", "1", "why a position is not valid, as bits", "flags"),
+    "valid": Variable("bool", "1", "position was measured and is not doubtful", "valid"),
+    "flags": Variable(
+        "uint8", "1", "how a position came about, as bits: see faintspot.SubapertureFlag", "flags"
+    ),
     "iterations": Variable("int32", "1", "iterations of the denoiser", "iterations"),
     "bad_pixels": Variable("int32", "1", "pixels that were replaced", "bad_pixels"),
     "standard_error_x": Variable(

@@ -131,7 +131,7 @@ class Telemetry:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Whether each slope was measured."""
+        """Whether each slope was measured, and is not flagged as probably wrong."""
         return (self.flags & INVALID) == 0  # type: ignore[no-any-return]
 
     @property

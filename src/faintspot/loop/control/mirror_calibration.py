@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.base.flags import INVALID, SubapertureFlag
+from faintspot.base.flags import UNMEASURED, SubapertureFlag
 
 Floats = NDArray[np.float64]
 
@@ -268,7 +268,7 @@ class _Pokes:
         command = np.zeros(self._mirror.commands)
         command[actuator] = amount
         slopes, flags = self._mirror.slopes(command)
-        valid = (flags & np.uint8(INVALID)) == 0
+        valid = (flags & np.uint8(UNMEASURED)) == 0
         at_limit = (flags & np.uint8(SubapertureFlag.AT_SEARCH_LIMIT)) != 0
         self._counts += valid.size, valid.size - np.count_nonzero(valid), np.count_nonzero(at_limit)
         weight = np.tile(valid, 2)

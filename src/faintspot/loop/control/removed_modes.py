@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, one_of
 from faintspot.base.errors import InputError
-from faintspot.base.flags import INVALID
+from faintspot.base.flags import UNMEASURED
 from faintspot.loop.control.compiled import MEAN_SQUARE
 from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
 
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 NONE, TIP_TILT, TIP_TILT_FOCUS = "none", "tip_tilt", "tip_tilt_focus"
 REMOVED_MODES = NONE, TIP_TILT, TIP_TILT_FOCUS
 _LEAST_SPREAD = 1e-9  # of the positions, relative to their size: less has no focus
-_INVALID = int(INVALID)
+_UNMEASURED = int(UNMEASURED)
 _compiled = partial(compiled_with, source=__file__)
 
 
@@ -28,7 +28,7 @@ def _mean(values: Any, flags: Any) -> float:
     """Return the mean over valid sub-apertures; 0 without any."""
     total, valid = 0.0, 0
     for s in range(flags.shape[0]):
-        if flags[s] & _INVALID == 0:
+        if flags[s] & _UNMEASURED == 0:
             total += values[s]
             valid += 1
     return total / max(valid, 1)
@@ -44,7 +44,7 @@ def _remove(flags: Any, focus: Any, slopes: Any, statistics: Any) -> None:
         curved = focus.shape[0] > 0
         centre = _mean(focus[first : first + n], flags) if curved else 0.0
         for s in range(n):
-            if flags[s] & _INVALID == 0:
+            if flags[s] & _UNMEASURED == 0:
                 slopes[first + s] -= middle
                 valid += 1
                 if curved:
@@ -55,7 +55,7 @@ def _remove(flags: Any, focus: Any, slopes: Any, statistics: Any) -> None:
     for first in (0, n):
         centre = _mean(focus[first : first + n], flags) if amount != 0.0 else 0.0
         for s in range(n):
-            if flags[s] & _INVALID == 0:
+            if flags[s] & _UNMEASURED == 0:
                 if amount != 0.0:
                     slopes[first + s] -= amount * (focus[first + s] - centre)
                 residual += slopes[first + s] * slopes[first + s]

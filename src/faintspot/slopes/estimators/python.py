@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.base.errors import InputError
-from faintspot.base.flags import INVALID, SubapertureFlag
+from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Positions
 from faintspot.slopes.estimators.built_in.gravity import keep_all
 from faintspot.slopes.estimators.faults import faults_of
@@ -30,7 +30,7 @@ def _limited(away: NDArray[Any], table: NDArray[np.float32], flags: NDArray[np.u
     reach = table[groups.RANGE]
     at_limit = np.abs(away).max(axis=1) >= reach - groups.LIMIT_ROUNDING_PX
     flags &= ~_AT_SEARCH_LIMIT
-    flags[at_limit & (flags & INVALID == 0)] |= _AT_SEARCH_LIMIT
+    flags[at_limit & (flags & UNMEASURED == 0)] |= _AT_SEARCH_LIMIT
     slopes: NDArray[Any] = np.clip(away, -reach[:, None], reach[:, None])
     return slopes
 
@@ -159,11 +159,12 @@ class PythonPlan(EstimatorPlan):
         usable = (np.abs(found.x) <= 0.5 * nx) & (np.abs(found.y) <= 0.5 * ny)  # false for NaN, too
         usable &= np.abs(found.flux) <= LARGEST_FLOAT32
         usable &= True if found.valid is None else found.valid != 0
+        slopes.flux[frame] = np.where(usable, found.flux, 0.0)
+        usable &= table[groups.ERROR_SCALE] > 0  # else known to be dark
         flags = slopes.flags[frame]
         flags &= ~_NO_FLUX
-        flags[~usable & (flags & INVALID == 0)] |= _NO_FLUX
-        valid = (flags & INVALID) == 0
-        slopes.flux[frame] = np.where(usable, found.flux, 0.0)
+        flags[~usable & (flags & UNMEASURED == 0)] |= _NO_FLUX
+        valid = (flags & UNMEASURED) == 0
         positions = np.stack([found.x, found.y], axis=1)
         away = np.where(valid[:, None], positions - self.sensor.zero, 0.0)
         slopes.x[frame], slopes.y[frame] = _limited(away, table, flags).T

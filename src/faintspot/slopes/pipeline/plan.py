@@ -20,7 +20,7 @@ from faintspot.slopes.kernels.driver.doubtful import Expected
 from faintspot.slopes.kernels.driver.groups import Task
 from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, neighbours_of
+from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, LEAST_DIFFERENCE_PX, lines_of, neighbours_of
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.score import Score
 
@@ -30,12 +30,13 @@ _MOST_FLUX_E = 9e8  # mean flux per sub-aperture above which settings stay const
 Floats = NDArray[np.float64]
 
 
-def packed_calibration(layout: Layout, calibration: Calibration, width: int) -> NDArray[np.float32]:
+def packed_calibration(layout: Layout, maps: NDArray[np.float32], width: int) -> NDArray[np.float32]:
     """Return dark and scale of all sub-aperture pixels in the order in which the kernel reads them.
 
-    The shape is (n_groups, pixels, 2, W); the last group is padded with its last sub-aperture.
+    The shape is (n_groups, pixels, 2, W); the last group is padded with its last sub-aperture. `maps` are
+    those of `Calibration.maps`.
     """
-    return _packed(layout.images(calibration.maps(layout.frame_shape)), width)
+    return _packed(layout.images(maps), width)
 
 
 def _packed(windows: NDArray[Any], width: int) -> NDArray[np.float32]:
@@ -100,7 +101,9 @@ class Plan:
         """Variance of each dark pixel for the kernel, if it differs: see `kernels.driver.groups.Task`."""
         if self.sensor.has_noise_map:
             self.variances = _packed(self.prepared.pixel_variance[None], width)[:, :, 0]
-        self.expected = self._expected(settings)
+        self.spot_fwhm_px = self._spot_fwhm(settings)
+        """Width of each spot along x and y, (n, 2); NaN where unknown."""
+        self.expected = self._expected()
         """Expected range of the spot positions; spots outside are flagged."""
         self.no_prior = np.zeros((1, 2, n), np.float32)
         """Prior used without predicted slopes: 0."""
@@ -183,22 +186,33 @@ class Plan:
         self.prepared.fill_flux(table, flux_e)
         self._levels.append(table)
 
-    def _expected(self, settings: Settings) -> Expected:
+    def _spot_fwhm(self, settings: Settings) -> Floats:
+        """Return the widths of the spots that are stated, or for which the pixels to keep were chosen."""
+        sensor = self.sensor
+        if "keep_brightest" not in settings.declared() or is_auto(settings.keep_brightest):
+            return sensor.spot_fwhm_px
+        kept = settings.values("keep_brightest", sensor.n, sensor.pixels).astype(np.float64)
+        of_kept = _FWHM_OF_KEPT * np.sqrt(kept)[:, None]
+        return np.where(np.isnan(sensor.spot_fwhm_px), of_kept, sensor.spot_fwhm_px)
+
+    @property
+    def typical_fwhm_px(self) -> float | None:
+        """Median width of the spots; None if unknown."""
+        known = self.spot_fwhm_px[~np.isnan(self.spot_fwhm_px)]
+        return float(np.median(known)) if known.size else None
+
+    def _expected(self) -> Expected:
         """Return the expected positions; a spot is complete if half its width is inside the window."""
         sensor, layout = self.sensor, self.sensor.layout
-        fwhm = np.ones((sensor.n, 2))
-        if "keep_brightest" in settings.declared() and not is_auto(settings.keep_brightest):
-            kept = settings.values("keep_brightest", sensor.n, sensor.pixels).astype(np.float64)
-            fwhm *= _FWHM_OF_KEPT * np.sqrt(kept)[:, None]
-        fwhm = np.where(np.isnan(sensor.spot_fwhm_px), fwhm, sensor.spot_fwhm_px)
+        fwhm = np.where(np.isnan(self.spot_fwhm_px), 1.0, self.spot_fwhm_px)
         half = 0.5 * np.array(sensor.window[::-1])
         edge = np.where(fwhm < half, half - 0.5 * fwhm, np.inf)
         pitch = layout.pitch_px
         return Expected(
             np.ascontiguousarray(sensor.zero.T, np.float32),
             np.ascontiguousarray(edge.T, np.float32),
-            neighbours_of(layout.cells, layout.geometry, diagonal=True),
-            np.float32(np.inf if pitch is None else LEAST_DIFFERENCE * pitch),
+            *lines_of(neighbours_of(layout.cells, layout.geometry, diagonal=True)),
+            np.float32(np.inf if pitch is None else min(LEAST_DIFFERENCE * pitch, LEAST_DIFFERENCE_PX)),
         )
 
     def _fixed_table(self, per_subaperture: Any) -> NDArray[np.float32]:

@@ -7,6 +7,7 @@ import hashlib
 import math
 import threading
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,13 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.kernels.compilation.host import lanes_for
+from faintspot.slopes.kernels.compilation.simd import Lanes
+from faintspot.slopes.kernels.driver.dark import flag_dark, scratch_size
 from faintspot.slopes.kernels.driver.doubtful import flag_doubtful
 from faintspot.slopes.kernels.driver.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
 from faintspot.slopes.kernels.parallel import most_threads, run_groups, thread_scratch
 from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.pipeline.light import MeanLight, light_test
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
 from faintspot.slopes.pipeline.plan import Plan, packed_calibration
 from faintspot.slopes.pipeline.settings import Settings
@@ -99,10 +103,8 @@ class SlopePipeline:
             None if threads is None else int(number_between("threads", threads, 1, 4096, integer=True))
         )
         self._lanes = lanes_for(np.float32, width)
-        self._calibration = packed_calibration(layout, self.calibration, self._lanes.width)
         self._parts = psf, score, layout.offsets + _reference_positions(reference, layout)
-        self.plan = self._prepared()
-        """Settings and tables computed before the first frame."""
+        self._prepare()
         self._identity = _identity(*self._parts)
 
     @classmethod
@@ -111,10 +113,15 @@ class SlopePipeline:
         layout, settings, calibration, psf, score = configuration.load_all(path)
         return cls(layout, settings, calibration, psf=psf, score=score, **options)
 
-    def _prepared(self) -> Plan:
+    def _prepare(self) -> None:
         """Compute the tables for the current SIMD width; forget what was prepared for small frames."""
         self._small = threading.local()
-        return Plan(self.layout, self.settings, self.calibration, *self._parts, self._lanes.width)
+        width, maps = self._lanes.width, self.calibration.maps(self.layout.frame_shape)
+        self._calibration = packed_calibration(self.layout, maps, width)
+        self.plan = Plan(self.layout, self.settings, self.calibration, *self._parts, width)
+        """Settings and tables computed before the first frame."""
+        self.light_test = light_test(self.layout, maps, self.plan.typical_fwhm_px)
+        """Test for sub-apertures without flux."""
 
     @property
     def width(self) -> int:
@@ -131,8 +138,7 @@ class SlopePipeline:
         """
         pipeline = copy.copy(self)
         pipeline._lanes = lanes_for(np.float32, width)
-        pipeline._calibration = packed_calibration(self.layout, self.calibration, width)
-        pipeline.plan = pipeline._prepared()
+        pipeline._prepare()
         return pipeline
 
     @property
@@ -192,6 +198,23 @@ class SlopePipeline:
         rounded = np.exp(step * np.rint(np.log(flux_e) / step))
         return self.with_settings(self.settings.replace(flux_e=np.broadcast_to(rounded, planned_e.shape)))
 
+    def with_dark(self, mean: NDArray[Any]) -> SlopePipeline:
+        """Return the same pipeline for frames of this mean: what has no flux in it is dark in all of them.
+
+        A single frame shows which sub-apertures are dark only if its spots are bright. The mean of all frames
+        shows it for faint stars, and for none at all.
+
+        Parameters
+        ----------
+        mean : (h, w) array
+            Mean of the frames [ADU]; NaN in pixels without any value.
+        """
+        light = MeanLight(self.layout, self.light_test.maps, self.plan.typical_fwhm_px)
+        dark = np.flatnonzero(light.significances(mean) < 1.0)
+        other = copy.copy(self)
+        other._small, other.light_test = threading.local(), self.light_test._replace(dark=dark)
+        return other
+
     def for_images(self) -> SlopePipeline:
         """Return the same pipeline for calibrated images (n, ny, nx) [electrons], read as one tall frame."""
         layout, camera = self.layout, self.calibration
@@ -205,8 +228,7 @@ class SlopePipeline:
             read_noise_e=self._noise_of_images(),
             background_e=camera.background_e,
         )
-        pipeline._calibration = packed_calibration(pipeline.layout, pipeline.calibration, self.width)
-        pipeline.plan = pipeline._prepared()
+        pipeline._prepare()
         return pipeline
 
     def _noise_of_images(self) -> Any:
@@ -326,16 +348,26 @@ class SlopePipeline:
             for f in range(n_frames):
                 predicted_f = task.prior[min(f, len(task.prior) - 1)]
                 prepared.locate_frame(images[f], predicted_f, task.settings[0], f, results)
-        self.flag_doubtful(results)
+        self.flag_doubtful(results, frames)
         return Slopes(*(results if array.ndim == 3 else [result[0] for result in results])), stages
 
-    def flag_doubtful(self, results: SlopeArrays) -> None:
-        """Set the flags of spots that are cut by the edge of their window or differ from all neighbours.
+    def flag_doubtful(self, results: SlopeArrays, frames: NDArray[Any]) -> None:
+        """Flag dark sub-apertures of bright frames, and spots cut by their window or unlike all neighbours.
 
-        The flags need the slopes of whole frames; slopes can be used before they are set.
+        The flags need the slopes of whole frames; slopes can be used before they are set. Those of dark
+        sub-apertures become 0.
+
+        Parameters
+        ----------
+        results : SlopeArrays
+            Slopes of the frames; changed.
+        frames : (n, h, w) array, uint16 or float32, contiguous
         """
-        scratch = np.empty(len(self.layout), np.float32)
-        _flag_doubtful(results.x, results.y, results.flags, self.plan.expected, scratch)
+        scratch = np.empty(scratch_size(len(self.layout), *self.layout.window), np.float32)
+        flag_dark_in = _flag_dark(frames.dtype, self.light_test.lanes)
+        flag_dark_in(self.light_test, frames, results, scratch)
+        n = len(self.layout)
+        _flag_doubtful(results.x, results.y, results.flags, self.plan.expected, scratch[:n])
 
     def source(self, frames: NDArray[Any], dtype: DTypeLike) -> Source:
         """Return the frames in the form that kernels read.
@@ -365,6 +397,12 @@ class SlopePipeline:
         n_groups = n_frames * -(-n // self._lanes.width)
         run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, cost=_FLUX_COST)
         return self.plan.variants(flux.mean(axis=1, dtype=np.float64))
+
+
+@cache
+def _flag_dark(dtype: np.dtype[Any], lanes: Lanes) -> Direct:
+    """Return `flag_dark` for frames of a type, and windows whose pixels are in so many lanes."""
+    return Direct(flag_dark)
 
 
 def kernel_frames(array: NDArray[Any]) -> NDArray[Any]:

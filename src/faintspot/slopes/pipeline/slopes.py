@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.flags import INVALID
+from faintspot.base.flags import INVALID, NO_FLAG, UNMEASURED, SubapertureFlag
 from faintspot.io.stored.slopes_format import VARIABLES
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class Slopes:
     """
 
     x: NDArray[np.float32]
-    """Position of the spot along columns, px from the reference position; 0 where invalid."""
+    """Position of the spot along columns, px from the reference position; 0 where not `measured`."""
     y: NDArray[np.float32]
     """Position of the spot along rows, likewise."""
     flux: NDArray[np.float32]
@@ -53,16 +53,26 @@ class Slopes:
     bad_pixels: NDArray[np.int32]
     """Number of pixels that were masked, NaN or infinite."""
     standard_error_x: NDArray[np.float32]
-    """Standard error of x [px]; infinite where invalid, and where the read noise is unknown."""
+    """Standard error of x [px]; infinite where not `measured`, and where the read noise is unknown."""
     standard_error_y: NDArray[np.float32]
     covariance_xy: NDArray[np.float32]
     """Covariance of the errors of x and y [px^2]; 0 where a standard error is infinite, and for an estimator
     that does not know it (`trained`)."""
+    keep: SubapertureFlag = field(default=NO_FLAG, kw_only=True)
+    """Flags of `KEEPABLE` that do not make a slope invalid."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Whether the slope was measured."""
-        return (self.flags & INVALID) == 0  # type: ignore[no-any-return]
+        """Whether the slope was measured, and is not limited, nor cut by its window or unlike all neighbours.
+
+        The flags in `keep` do not count.
+        """
+        return (self.flags & (INVALID & ~self.keep)) == 0  # type: ignore[no-any-return]
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Whether there is a position, however doubtful: what a control loop uses."""
+        return (self.flags & UNMEASURED) == 0  # type: ignore[no-any-return]
 
     @property
     def vector(self) -> NDArray[np.float32]:
@@ -70,9 +80,15 @@ class Slopes:
         return np.concatenate([self.x, self.y], axis=-1)
 
     @classmethod
-    def from_variables(cls, variables: Mapping[str, NDArray[Any]], n_frames: int | None = None) -> Slopes:
+    def from_variables(
+        cls,
+        variables: Mapping[str, NDArray[Any]],
+        n_frames: int | None = None,
+        keep: SubapertureFlag = NO_FLAG,
+    ) -> Slopes:
         """Return the slopes from a file's variables, all frames or the first `n_frames`."""
-        return cls(**{item.name: variables[item.name][:n_frames] for item in fields(cls)})
+        arrays = {item.name: variables[item.name][:n_frames] for item in fields(cls) if item.name != "keep"}
+        return cls(**arrays, keep=keep)
 
     @property
     def variables(self) -> dict[str, NDArray[Any]]:

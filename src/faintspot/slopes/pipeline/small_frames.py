@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,11 @@ class SmallFrames:
     """
 
     def __init__(
-        self, plan: Plan, source: Source, scratch: Scratch, flag_doubtful: Callable[[SlopeArrays], None]
+        self,
+        plan: Plan,
+        source: Source,
+        scratch: Scratch,
+        flag_doubtful: Callable[[SlopeArrays, NDArray[Any]], None],
     ) -> None:
         n = len(source.corners)
         groups = -(-n // source.lanes.width)
@@ -46,5 +51,5 @@ class SmallFrames:
         """Measure a frame (h, w)."""
         np.copyto(self._frame, frame)
         self._kernel(*self._arguments)
-        self._flag_doubtful(self._results)
+        self._flag_doubtful(self._results, self._frame[None])
         return Slopes(*[values.copy() for values in self._slopes])

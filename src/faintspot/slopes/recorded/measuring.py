@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import one_of
 from faintspot.base.config.tables import read_tables
 from faintspot.base.errors import InputError
-from faintspot.base.flags import SubapertureFlag
+from faintspot.base.flags import SubapertureFlag, kept_flags
 from faintspot.base.version import __version__
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.io.locations import split_location
@@ -24,19 +23,18 @@ from faintspot.io.references import read_reference
 from faintspot.io.slopes import create_writer
 from faintspot.io.stored.slopes_format import UNITS, pixels_in, scaled_positions
 from faintspot.io.telemetry.aot_reading import is_aot, read_aot
-from faintspot.slopes.camera.saturation import LargestValues
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.labelled import layout_coordinates
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings, with_preset, without_denoising
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.recorded.survey import survey
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
 
-_FRAMES_FOR_SATURATION, _LOOK_BYTES = 200, 1 << 21
 _LOOKS_FOR_FLUX, _FRAMES_FOR_FLUX = 20, 50  # stretches of frames over the whole recording
 
 Progress = Callable[[int, int], None]
@@ -88,6 +86,7 @@ def measure_recorded(
     changes: Mapping[str, Any] | None = None,
     unit: str = "px",
     mean_flux: bool = False,
+    keep: Sequence[str] = (),
     reference: NDArray[Any] | str | Path | None = None,
     key: str | None = None,
     threads: int | None = None,
@@ -121,6 +120,9 @@ def measure_recorded(
     mean_flux : bool
         Tell the estimator the mean flux of every sub-aperture over the recording, instead of letting it take
         that of each frame: better where the star is faint and steady; see `faintspot.MeanFlux`.
+    keep : sequence of {"limited", "unlike"}
+        Doubtful slopes that stay valid: those at their search limit or cut by their window, and those unlike
+        all neighbours.
     reference : array or path, optional
         Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key", or
         slopes of which they are the mean; see `faintspot.io.references.read_reference`.
@@ -140,6 +142,7 @@ def measure_recorded(
     InputError
         When a file cannot be read or written, or frames and configuration do not fit together.
     """
+    kept = kept_flags(keep)
     parts, origin, stored_reference = _configured(configuration_file, frames, key)
     layout, settings, calibration, psf, score = parts
     if changes:
@@ -165,18 +168,20 @@ def measure_recorded(
                 f"{source.description}: frames of {source.shape[0]} x {source.shape[1]} pixels, expected "
                 f"{layout.frame_shape[0]} x {layout.frame_shape[1]} as in {configuration_file}"
             )
-        saturation_adu = _saturation(source) if calibration.saturation_adu is None else None
+        seen = survey(source)
+        saturation_adu = seen.saturation_adu if calibration.saturation_adu is None else None
         if saturation_adu is not None:
             calibration = replace(calibration, saturation_adu=saturation_adu)
             pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
         if mean_flux:
             pipeline = _with_mean_flux(pipeline, source)
-        attributes = _attributes(pipeline, source, frames, configuration_file, key, unit)
+        attributes = _attributes(pipeline, source, frames, configuration_file, key, unit, keep)
         factor = pixels_in(one_of("unit", unit, UNITS), attributes)
         if positions is not None:
             attributes["reference"] = np.asarray(positions).tolist()
             if isinstance(reference, str | Path):
                 attributes["reference_file"] = str(reference)
+        pipeline = pipeline.with_dark(seen.mean)
         summary = Summary(source.n_frames, len(layout), origin=origin, doubtful=bool(layout.doubts))
         summary.saturation_adu = saturation_adu
         if positions is None:
@@ -192,7 +197,7 @@ def measure_recorded(
         ) as writer:
             summary.resumed_at = writer.finished()
             for start, block in source.blocks(summary.resumed_at, source.n_frames, size):
-                slopes = pipeline(block)
+                slopes = replace(pipeline(block), keep=kept)
                 writer.append(start, scaled_positions(slopes.variables, factor))
                 summary.add(slopes)
                 if progress is not None:
@@ -268,16 +273,6 @@ def _with_mean_flux(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeli
     return pipeline.with_flux(MeanFlux(np.concatenate(flux)))
 
 
-def _saturation(source: FrameSource) -> float | None:
-    """Return the level at which values of the first frames pile up; None if they do not."""
-    values = LargestValues()
-    size = max(1, _LOOK_BYTES // (source.shape[0] * source.shape[1]))
-    with suppress(InputError):  # of a damaged frame; it is said when it is measured
-        for _, block in source.blocks(0, min(_FRAMES_FOR_SATURATION, source.n_frames), size):
-            values.add(block)
-    return values.saturation_adu
-
-
 def _check_output(output: str | Path, frames: Sequence[str | Path]) -> None:
     """Refuse to replace the frames by their slopes."""
     if Path(output).resolve() in [split_location(path)[0].resolve() for path in frames]:
@@ -297,6 +292,7 @@ def _attributes(
     configuration_file: str | Path,
     key: str | None,
     unit: str,
+    keep: Sequence[str],
 ) -> dict[str, Any]:
     """Return the attributes of the output; the fingerprint decides whether a run may be continued."""
     text = configuration.to_text(pipeline.layout, pipeline.settings, pipeline.calibration)
@@ -307,6 +303,7 @@ def _attributes(
         text,
         str(key),
         *([] if unit == "px" else [unit]),
+        *sorted(keep),
         *paths,
         *(_version(split_location(path)[0]) for path in frames),
         str((source.n_frames, source.shape, source.dtype)),
@@ -323,6 +320,7 @@ def _attributes(
         **_files_of_the_spot(configuration_file),
         "sources": paths,
         "source_key": key or "",
+        "keep": sorted(keep),
         "faintspot_version": __version__,
         "fingerprint": state.hexdigest(),
     }

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
-from faintspot.base.flags import INVALID, SubapertureFlag
+from faintspot.base.flags import INVALID, NO_FLAG, SubapertureFlag
 from faintspot.base.statistics import Estimate, absolute_errors, slope_statistics
 
 Floats = NDArray[np.float64]
@@ -49,6 +49,8 @@ class MeasuredSlopes:
         Frame numbers; frames follow each other where these do. Default: counted from 0.
     standard_error_px : float
         Median standard error that the estimator states, per axis; NaN where it is not known.
+    keep : SubapertureFlag
+        Flags that do not make a measurement invalid, see `faintspot.Slopes`.
 
     Raises
     ------
@@ -65,6 +67,7 @@ class MeasuredSlopes:
     denoised: bool | None = field(default=None, kw_only=True)
     frames: NDArray[np.int64] | None = field(default=None, kw_only=True)
     standard_error_px: float = field(default=np.nan, kw_only=True)
+    keep: SubapertureFlag = field(default=NO_FLAG, kw_only=True)
 
     def __post_init__(self) -> None:
         for name in ARRAYS:
@@ -99,7 +102,7 @@ class MeasuredSlopes:
     @property
     def valid(self) -> NDArray[np.bool_]:
         """Mask of valid measurements."""
-        return (self.flags & int(INVALID)) == 0  # type: ignore[no-any-return]
+        return (self.flags & int(INVALID & ~self.keep)) == 0  # type: ignore[no-any-return]
 
     @property
     def is_denoised(self) -> bool:

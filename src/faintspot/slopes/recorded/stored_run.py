@@ -15,6 +15,7 @@ from tomlkit.exceptions import TOMLKitError
 
 from faintspot.base.config.tables import read_tables
 from faintspot.base.errors import DoubtWarning, InputError
+from faintspot.base.flags import SubapertureFlag, kept_flags
 from faintspot.io import StoredSlopes, read_slopes
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator
@@ -56,6 +57,11 @@ class StoredRun:
         """The files that the frames came from."""
         sources = self.stored.attributes.get("sources", [])
         return [sources] if isinstance(sources, str) else [str(item) for item in sources]
+
+    @property
+    def keep(self) -> SubapertureFlag:
+        """Flags that do not make its slopes invalid."""
+        return kept_flags(self.stored.attributes.get("keep", ()))
 
     @property
     def text(self) -> str:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from faintspot.slopes.kernels.driver.doubtful import Expected, flag_doubtful
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, neighbours_of
+from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, lines_of, neighbours_of
 from faintspot.slopes.sensor.windows import Windows, find_windows
 
 
@@ -97,7 +97,7 @@ def _unlike(grid: LensletGrid) -> NDArray[np.bool_]:
     expected = Expected(
         np.zeros((2, n), np.float32),
         np.full((2, n), np.inf, np.float32),
-        neighbours_of(grid.cells, grid.geometry, diagonal=True),
+        *lines_of(neighbours_of(grid.cells, grid.geometry, diagonal=True)),
         np.float32(LEAST_DIFFERENCE * grid.pitch_px),
     )
     x, y = np.ascontiguousarray(x[None]), np.ascontiguousarray(y[None])

@@ -8,6 +8,8 @@ from scipy.spatial import cKDTree
 
 LEAST_DIFFERENCE = 0.1
 """Smaller differences between displacements of spots are treated as equal, in pitches."""
+LEAST_DIFFERENCE_PX = 0.3
+"""Likewise in px; the smaller one counts."""
 
 _BESIDE = ((0, 1), (0, -1), (1, 0), (-1, 0))
 _DIAGONAL = ((1, -1), (-1, 1), (1, 1), (-1, -1))
@@ -30,6 +32,34 @@ def neighbours_of(cells: NDArray[np.int64], geometry: str, *, diagonal: bool = F
     index = np.full(shifted.max(axis=0) + 2, len(cells), dtype=np.int64)
     index[shifted[:, 0], shifted[:, 1]] = np.arange(len(cells))
     return np.column_stack([index[shifted[:, 0] + row, shifted[:, 1] + column] for row, column in steps])
+
+
+def lines_of(neighbours: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return pairs of cells in line with each cell, from the table that `neighbours_of` returns.
+
+    They are opposite neighbours. Cells at the edge of the array, with fewer than two of these pairs, also
+    have each neighbour with the next one behind it.
+
+    Returns
+    -------
+    lines : (n, m, 2) array of int
+        n where there is none; those come last.
+    outside : (n, m) array of bool
+        Whether both are on the same side, the nearer one first.
+    """
+    n, count = neighbours.shape
+    behind = np.vstack([neighbours, np.full(count, n)])[neighbours, np.arange(count)]
+    opposite = neighbours.reshape(n, count // 2, 2)
+    few = (opposite < n).all(axis=2).sum(axis=1) < 2
+    same_side = np.stack([neighbours, behind], axis=2)
+    same_side[~few] = n
+    lines = np.concatenate([opposite, same_side], axis=1)
+    outside = np.broadcast_to(np.arange(lines.shape[1]) >= count // 2, lines.shape[:2])
+    complete = (lines < n).all(axis=2)
+    lines[~complete] = n
+    order = np.argsort(~complete, axis=1, kind="stable")[:, : max(complete.sum(axis=1).max(), 1)]
+    taken = np.take_along_axis(lines, order[:, :, None], axis=1)
+    return np.ascontiguousarray(taken), np.ascontiguousarray(np.take_along_axis(outside, order, axis=1))
 
 
 def as_rows(at: NDArray[np.complex128]) -> NDArray[np.float64]:

@@ -70,7 +70,7 @@ def slope_discrepancy(slopes: Slopes, layout: Layout) -> Discrepancy:
     """
     if layout.geometry != "square":
         raise InputError(f"layout.geometry: expected 'square' for a discrepancy, got {layout.geometry!r}")
-    vector, valid = np.atleast_2d(slopes.vector).astype(np.float64), np.atleast_2d(slopes.valid)
+    vector, valid = np.atleast_2d(slopes.vector).astype(np.float64), np.atleast_2d(slopes.measured)
     if vector.shape[1] != 2 * len(layout):
         n = vector.shape[1] // 2
         raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {n}")

@@ -59,7 +59,7 @@ class TestAgainstOracle:
         arrays.x[0], arrays.y[0] = rng.normal(0.0, np.where(wild, 4.0, rng.choice([0.05, 0.5, 3.0])))
         arrays.flags[0] = rng.choice([0, 0, 0, Flag.NO_FLUX, Flag.SATURATED], n)
         before = arrays.flags.copy()
-        pipeline.flag_doubtful(arrays)
+        pipeline.flag_doubtful(arrays, np.zeros((1, *layout.frame_shape), np.float32))
         slopes = fs.Slopes(*(array[0] for array in arrays))
         expected = naive.doubtful(slopes, layout, fwhm[:, None], reference)
         assert np.array_equal(slopes.flags, before[0] | expected)
@@ -73,7 +73,8 @@ class TestAgainstOracle:
         )
         arrays = SlopeArrays(*(np.zeros((1, 25), kind) for kind in RESULT_TYPES))
         arrays.x[0, [0, 12]] = 3.0
-        fs.SlopePipeline(layout, fs.Settings("centroid")).flag_doubtful(arrays)
+        pipeline = fs.SlopePipeline(layout, fs.Settings("centroid"))
+        pipeline.flag_doubtful(arrays, np.zeros((1, *layout.frame_shape), np.float32))
         assert np.flatnonzero(arrays.flags[0] & Flag.UNLIKE_NEIGHBOURS).tolist() == [0, 12]
 
 

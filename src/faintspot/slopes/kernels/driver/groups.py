@@ -31,8 +31,8 @@ LIMIT_ROUNDING_PX = 1e-4
 
 # Rows of the table of per-sub-aperture settings (n_rows, n_subapertures), float32, that all estimators share:
 # reference position and how far from it a position may be; bad pixels; noise of a pixel that collects m
-# electrons, VARIANCE + EXCESS m (negative where unknown); factor on the standard error. An estimator's own
-# rows follow.
+# electrons, VARIANCE + EXCESS m (negative where unknown); factor on the standard error, negative in
+# sub-apertures that are known to be dark. An estimator's own rows follow.
 ZERO_X, ZERO_Y, RANGE, MOST_BAD, VARIANCE, EXCESS, ERROR_SCALE = range(7)
 COMMON_ROWS = 7
 
@@ -208,6 +208,8 @@ def store_slope(
     slopes.flux[f, s] = flux
     slopes.iterations[f, s] = iterations
     slopes.bad_pixels[f, s] = bad_pixels
+    if settings[ERROR_SCALE, s] < 0.0 and bits & TOO_MANY_BAD_PIXELS == 0:
+        bits |= NO_FLUX
     valid = bits & (NO_FLUX | TOO_MANY_BAD_PIXELS) == 0
     reach = settings[RANGE, s]
     away_x, away_y = x - settings[ZERO_X, s], y - settings[ZERO_Y, s]

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.base.flags import INVALID
+from faintspot.base.flags import UNMEASURED
 from faintspot.slopes.kernels.compilation.compiling import compiled, inlined
 
-_INVALID = int(INVALID)
+_UNMEASURED = int(UNMEASURED)
 _LARGEST_PX = 1000.0
 """Larger slopes are not begun with: a sum from which they are taken away again would be inaccurate."""
 
@@ -103,7 +103,7 @@ def add_changes(columns: Any, vector: Any, taken: Any, out: Any, start: Any, sto
 @inlined
 def is_measured(x: Any, y: Any, flags: Any) -> Any:
     """Return whether a slope counts: its sub-aperture is valid, and both numbers are finite."""
-    return flags & _INVALID == 0 and np.isfinite(x) and np.isfinite(y)
+    return flags & _UNMEASURED == 0 and np.isfinite(x) and np.isfinite(y)
 
 
 @compiled

@@ -75,7 +75,7 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
         warnings=list(dict.fromkeys([*_labelled_notes(stores, methods), *notes])),
         why_no_stages=reason,
         slopes={
-            method.name: Slopes.from_variables(store.stored.variables, method.n_frames)
+            method.name: Slopes.from_variables(store.stored.variables, method.n_frames, store.keep)
             for store, method in zip(stores, methods, strict=True)
         },
         sections=_sodium(first, frames),
@@ -141,7 +141,8 @@ def _methods(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[st
         # Iterations of other estimators are their own steps.
         denoised = None if store.estimator is None or store.estimator.denoises else False
         stated = _median_standard_error(store)
-        methods.append(MeasuredSlopes(name, *arrays, denoised=denoised, standard_error_px=stated))
+        options: dict[str, Any] = {"denoised": denoised, "standard_error_px": stated, "keep": store.keep}
+        methods.append(MeasuredSlopes(name, *arrays, **options))
     return methods, notes
 
 
