@@ -58,7 +58,8 @@ def test_ellipses_hold_95_percent(name: str, flux: float) -> None:
         "shape": (window, fs.FixedWeights.shaped(PSF, SIDE)),
     }[name]
     slopes = fs.SlopePipeline(LAYOUT, settings, CALIBRATION, psf=PSF, score=score)(frames)
-    assert slopes.valid.all()
+    assert slopes.measured.all()
+    assert slopes.valid.mean() > 0.97, slopes.valid.mean()
     found = distances(slopes, truth)
     assert 0.93 < np.mean(found < OF_95_PERCENT) < 0.97
     correlation = slopes.covariance_xy / (slopes.standard_error_x * slopes.standard_error_y)
