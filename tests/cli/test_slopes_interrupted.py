@@ -7,7 +7,6 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +32,8 @@ def frames() -> np.ndarray:
 @pytest.fixture(scope="module")
 def uninterrupted(frames: np.ndarray) -> Slopes:
     few = SlopePipeline(LAYOUT, SETTINGS)(frames[:100])
-    names = [field.name for field in fields(Slopes)]
-    return Slopes(*(np.tile(getattr(few, name), (N_FRAMES // 100, 1)) for name in names))
+    tiled = {name: np.tile(array, (N_FRAMES // 100, 1)) for name, array in few.variables.items()}
+    return Slopes.from_variables(tiled)
 
 
 def finished(output: Path) -> int:

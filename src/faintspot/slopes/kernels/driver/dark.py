@@ -37,8 +37,8 @@ GAUGES = 3
 """Sub-apertures of that flux whose significance shows whether the frame is bright."""
 NOISE_WINDOWS = 16
 """Windows that show the noise of the pixels."""
-BRIGHT = 25.0
-"""Significance of typical spots from which a single frame decides: a fifth of their flux still shows."""
+BRIGHT = 50.0
+"""Significance of typical spots from which a single frame decides: a tenth of their flux still shows."""
 BRIGHT_E = 100.0
 """Least flux in the box of typical spots [electrons]: photon noise alone never leaves one dark."""
 SUSPECT = 0.5
