@@ -70,7 +70,7 @@ class TestSequence:
         ("empty.fits", "empty"),
         ("text.txt", "HDF5 or MATLAB file or a Zarr store"),
         ("folder", "expected a Zarr store"),
-        ("short.npy", "expected a NumPy array"),
+        ("short.npy", "expected a whole .npy file"),
         ("cut.npy", "truncated"),
         ("cut.npy:frames", "one unnamed"),
     ],

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import lzma
-import math
 import zipfile
-import zlib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -19,111 +15,31 @@ from faintspot.base.sizes import check_bytes
 
 MOST_BYTES = 1 << 29
 """Maximum total memory of the arrays of a file."""
-DAMAGE = (
-    OSError,
-    EOFError,
-    zlib.error,
-    lzma.LZMAError,
-    zipfile.BadZipFile,
-    RuntimeError,
-    NotImplementedError,
-)
-"""Exceptions of the gzip and zip decoders."""
-
-
-@dataclass(frozen=True)
-class Header:
-    """Header of a .npy file, or of a member of a .npz file."""
-
-    shape: tuple[int, ...]
-    fortran_order: bool
-    dtype: np.dtype[Any]
-    offset: int
-
-    @property
-    def data_bytes(self) -> int:
-        """Size of the array in bytes."""
-        return math.prod(self.shape) * self.dtype.itemsize
-
-
-def read_header(name: str, stream: IO[bytes], actual_bytes: int) -> Header:
-    """Read the header of an array whose file has `actual_bytes` bytes including the header.
-
-    Raises
-    ------
-    InputError
-        If it is invalid, describes Python objects, or the array is truncated.
-    """
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    try:
-        version = np.lib.format.read_magic(stream)
-        shape, fortran_order, dtype = readers[version](stream)
-    except KeyError:
-        raise InputError(f"{name}: expected .npy format version 1 or 2, got another") from None
-    except DAMAGE:
-        raise
-    except Exception as error:  # NumPy evaluates the header as Python, which can fail in many ways
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{name}: expected a NumPy array ({reason})") from None
-    header = Header(shape, fortran_order, dtype, stream.tell())
-    if dtype.hasobject:
-        raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
-    if any(side < 0 for side in shape):
-        raise InputError(f"{name}: damaged: its header has the shape {shape}")
-    if actual_bytes < (promised := header.offset + header.data_bytes):
-        raise InputError(f"{name}: truncated: its header promises {promised} bytes, there are {actual_bytes}")
-    return header
-
-
-def open_archive(path: str | Path) -> tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo]]:
-    """Open a .npz file; return it, and its members by array name.
-
-    Raises
-    ------
-    InputError
-        If it is not a regular file.
-    Exception
-        Any of `DAMAGE`.
-    """
-    check_regular(path)
-    archive = zipfile.ZipFile(path)
-    items = [item for item in archive.infolist() if item.filename.endswith(".npy")]
-    return archive, {item.filename.removesuffix(".npy"): item for item in items}
-
-
-def headers_of(path: str | Path, names: Iterable[str] | None = None) -> dict[str, Header]:
-    """Return the headers of the named arrays that exist, or of all; errors are those of `open_archive`."""
-    archive, members = open_archive(path)
-    with archive:
-        headers = {}
-        for name in members if names is None else (name for name in names if name in members):
-            with archive.open(members[name]) as stream:
-                headers[name] = read_header(f"{path}:{name}", stream, members[name].file_size)
-    return headers
 
 
 def unpacked(
-    path: str | Path, what: str, names: Iterable[str] | None = None, most: int = MOST_BYTES
+    path: str | Path, what: str, names: Collection[str] | None = None, most: int = MOST_BYTES
 ) -> dict[str, Any]:
     """Return the named arrays that exist, or all, if they need at most `most` bytes.
 
     Raises
     ------
     InputError
-        If they need more.
+        If they need more, or the path is not a regular file.
     Exception
-        As for `open_archive`; ValueError if an array is damaged.
+        If the file is damaged, or no .npz file.
     """
-    headers = headers_of(path, names)
-    check_bytes(path, sum(header.data_bytes for header in headers.values()), most, what)
-    archive, members = open_archive(path)
-    values = {}
-    with archive:
-        for name in headers:
-            # zip returns no more bytes than the member states, whatever its data inflate to.
-            with archive.open(members[name]) as stream:
-                values[name] = np.lib.format.read_array(stream, allow_pickle=False)
-    return values
+    check_regular(path)
+    with Path(path).open("rb") as stream:
+        if not zipfile.is_zipfile(stream):  # np.load would read a .npy file whole
+            raise zipfile.BadZipFile("not a zip file")
+        stream.seek(0)
+        archive = np.load(stream, allow_pickle=False)
+        members = [item for item in archive.zip.infolist() if item.filename.endswith(".npy")]
+        n_bytes = {item.filename.removesuffix(".npy"): item.file_size for item in members}
+        chosen = [name for name in n_bytes if names is None or name in names]
+        check_bytes(path, sum(n_bytes[name] for name in chosen), most, what)
+        return {name: archive[name] for name in chosen}
 
 
 def save_arrays(path: str | Path, arrays: Mapping[str, Any]) -> None:

@@ -185,7 +185,7 @@ def read_array(location: str | Path) -> NDArray[Any]:
     array = _find_array(location, None)
     if array.dtype.kind not in "biuf":
         raise InputError(f"{array.name}: expected real numbers, got dtype {array.dtype}")
-    if 0 in array.shape:
+    if min(array.shape) < 1:
         raise InputError(f"{array.name}: expected at least one value, got shape {array.shape}")
     check_bytes(array.name, math.prod(array.shape) * array.dtype.itemsize, MOST_WHOLE_BYTES, "an array")
     check_size(array.name, array.shape)
@@ -221,7 +221,7 @@ def _check_frames(array: StoredArray) -> None:
         raise InputError(
             f"{array.name}: expected (frames, height, width) or (height, width), got shape {array.shape}"
         )
-    if 0 in array.shape:
+    if min(array.shape) < 1:
         raise InputError(f"{array.name}: expected at least one frame and pixel, got shape {array.shape}")
     check_size(f"{array.name}: its frames", array.shape[-2:], _MOST_PIXELS, "pixels")
 

@@ -53,7 +53,7 @@ def test_negative_shape(tmp_path: Path) -> None:
         header = {"descr": "<f4", "fortran_order": True, "shape": (-3, -4)}
         np.lib.format.write_array_header_1_0(file, header)
         file.write(bytes(48))
-    with refused("damaged: its header has the shape (-3, -4)"):
+    with refused("at least one frame", "(-3, -4)"):
         open_frames([tmp_path / "a.npy"])
 
 

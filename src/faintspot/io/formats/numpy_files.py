@@ -8,23 +8,22 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import parse_json
-from faintspot.base.npz import DAMAGE, headers_of, open_archive, read_header, unpacked
+from faintspot.base.files import check_regular, parse_json
+from faintspot.base.npz import unpacked
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
-from faintspot.io.arrays.streams import StreamedArray
+from faintspot.io.arrays.streams import StreamedArray, check_present
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.locations import PREFERRED_NAME, choose_name
 from faintspot.io.stored.slopes_format import (
     REQUIRED,
     VARIABLES,
     StoredSlopes,
-    check_stated,
     most_slopes_bytes,
     with_absent,
 )
@@ -49,7 +48,8 @@ class Npy(FileFormat):
         if key is not None:
             raise InputError(f"{path}: a .npy file holds one unnamed array, expected no key, got {key!r}")
         with path.open("rb") as stream:
-            header = read_header(str(path), stream, path.stat().st_size)
+            header = _Header.read(str(path), stream)
+        check_present(str(path), path, header.offset + math.prod(header.shape) * header.dtype.itemsize)
 
         def open_array(files: ExitStack) -> Any:
             if header.fortran_order:
@@ -77,33 +77,37 @@ class Npz(FileFormat):
             When the file has no such array, has several and no key is given, or has a cube in Fortran order,
             which cannot be read by frame.
         """
-        archive, members = open_archive(path)
-        archive.close()
-        wanted = PREFERRED_NAME if key is None else key
-        # Without a name, the headers decide which array to read.
-        headers = headers_of(path, [wanted] if wanted in members or key is not None else None)
+        with zipfile.ZipFile(path) as archive:
+            members = _members(archive)
+            wanted = PREFERRED_NAME if key is None else key
+            # Without a name, the headers decide which array to read.
+            chosen = [wanted] if wanted in members else list(members)
+            headers = {}
+            for name in chosen:
+                with archive.open(members[name]) as stream:
+                    headers[name] = _Header.read(f"{path}:{name}", stream)
         dimensions = {name: len(headers[name].shape) if name in headers else 0 for name in members}
-        chosen = choose_name(path, dimensions, key)
-        name, header = f"{path}:{chosen}", headers[chosen]
+        name = choose_name(path, dimensions, key)
+        member, header = members[name], headers[name]
         if header.fortran_order and len(header.shape) > 2:
             raise InputError(
-                f"{name}: stored in Fortran order, which cannot be read frame by frame: "
+                f"{path}:{name}: stored in Fortran order, which cannot be read frame by frame: "
                 "save numpy.ascontiguousarray of it"
             )
         if header.fortran_order:
             return StoredArray.whole(
-                name,
+                f"{path}:{name}",
                 header.shape,
                 header.dtype,
-                lambda: unpacked(path, "a frame", [chosen], MOST_WHOLE_BYTES)[chosen],
+                lambda: unpacked(path, "a frame", [name], MOST_WHOLE_BYTES)[name],
             )
 
         def open_array(files: ExitStack) -> Any:
             archive = files.enter_context(zipfile.ZipFile(path))
-            stream = files.enter_context(archive.open(members[chosen]))
+            stream = files.enter_context(archive.open(member))
             return StreamedArray(stream, header.offset, header.dtype, header.shape, compressed=True)
 
-        return StoredArray(name, header.shape, header.dtype, open_array)
+        return StoredArray(f"{path}:{name}", header.shape, header.dtype, open_array)
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
         """Write each variable and coordinate, and the attributes as a JSON text named `attributes`."""
@@ -123,9 +127,6 @@ class Npz(FileFormat):
 
     def read(self, path: Path) -> StoredSlopes:
         """Read a file of slopes; zip verifies the checksum of each array."""
-        shapes = {name: header.shape for name, header in headers_of(path).items()}
-        shapes.pop("attributes")
-        check_stated(path, shapes)
         arrays = unpacked(path, "slopes", most=most_slopes_bytes())
         variables = with_absent({name: arrays.pop(name) for name in VARIABLES if name in arrays})
         attributes = parse_json(str(arrays.pop("attributes")))
@@ -133,12 +134,36 @@ class Npz(FileFormat):
 
     def has_slopes(self, path: Path) -> bool:
         """Return whether the arrays have the names of slopes."""
+        check_regular(path)
         try:
-            archive, members = open_archive(path)
-        except DAMAGE:
-            return False  # its reader gives the reason
-        archive.close()
-        return {*REQUIRED, "attributes"} <= members.keys()
+            with zipfile.ZipFile(path) as archive:
+                return {*REQUIRED, "attributes"} <= _members(archive).keys()
+        except Exception:  # zip raises several kinds of errors on damaged files
+            return False  # the reader of arrays gives the reason
+
+
+class _Header(NamedTuple):
+    """Header of a .npy file, or of a member of a .npz file."""
+
+    shape: tuple[int, ...]
+    fortran_order: bool
+    dtype: np.dtype[Any]
+    offset: int
+
+    @classmethod
+    def read(cls, name: str, stream: IO[bytes]) -> _Header:
+        """Read the header at the start of a stream; refuse Python objects."""
+        readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        shape, fortran_order, dtype = readers[np.lib.format.read_magic(stream)](stream)
+        if dtype.hasobject:
+            raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
+        return cls(shape, fortran_order and len(shape) > 1, dtype, stream.tell())
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """Return the members of a .npz file by array name."""
+    members = [item for item in archive.infolist() if item.filename.endswith(".npy")]
+    return {item.filename.removesuffix(".npy"): item for item in members}
 
 
 def _pieces(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
