@@ -101,6 +101,8 @@ def _pipeline(
 ) -> SlopePipeline:
     """Return the pipeline of a configuration file, with the given reference slopes or those of [control]."""
     layout, settings, calibration, psf, score = configuration.load_all(path)
+    if layout.bin > 1:
+        raise InputError(f"{path}: layout.bin = {layout.bin}: expected 1, weights are of the camera's pixels")
     slopes: Any = read_reference(reference) if isinstance(reference, str | Path) else reference
     if slopes is None and control is not None:
         slopes = control.reference

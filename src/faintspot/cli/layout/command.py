@@ -25,6 +25,7 @@ from faintspot.cli.shared.needs import suggested_slopes
 from faintspot.cli.shared.options import DIAMETER, KEY, PIXEL_SCALE, SUBAPERTURE
 from faintspot.cli.shared.output import picture_file
 from faintspot.io.frames import FrameSource, open_frames
+from faintspot.slopes.camera.binning import binned
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.hot_pixels import find_hot_pixels
 from faintspot.slopes.camera.saturation import LargestValues
@@ -32,7 +33,7 @@ from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, first_settings
 from faintspot.slopes.sensor.found_layout import FoundLayout, find_layout
 from faintspot.slopes.sensor.known_grid import KnownGrid
-from faintspot.slopes.sensor.layout import GEOMETRIES, Layout
+from faintspot.slopes.sensor.layout import GEOMETRIES, LARGEST_BIN, Layout
 
 _MOST_FRAMES = 200  # averaged to find the spots
 _FIRST_FRAMES = 20  # measured for the settings
@@ -108,6 +109,15 @@ _OPTIONS = {
     show_default="the largest without overlap",
 )
 @_windows(
+    "--bin",
+    "factor",
+    type=click.IntRange(1, LARGEST_BIN),
+    metavar="N",
+    help="Measure in sums of N x N pixels, for windows over 64 px and colour mosaics; all results are in "
+    "the camera's pixels.",
+    show_default="1",
+)
+@_windows(
     "--move-windows",
     is_flag=True,
     help="Move all windows alike, off their spots, to keep lenslets at the frame's edge.",
@@ -157,6 +167,7 @@ def command(
     picture: str | None,
     grid: str | None,
     exclude: str | None,
+    factor: int | None,
     mask_hot_pixels: bool,
     key: str | None,
     overwrite: bool,
@@ -183,6 +194,7 @@ def command(
       faintspot layout flat_wavefront.fits -o faintspot.toml
       faintspot layout cube.npz --dark dark.fits --gain-e-per-adu 1.9 --pixels 16
       faintspot layout eye.fits --pupil 512,498,320,40 --exclude 0-3,57
+      faintspot layout large_windows.tif --bin 2
       faintspot layout quad_cells.fits --grid 40x40 --dark dark.fits
     """
     target = Path(output)
@@ -211,11 +223,16 @@ def command(
         mean, values = _mean_frame(source, calibration)
         hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
         mean[tuple(hot.T)] = np.nan
+        factor, shown = factor or 1, mean
+        if factor > 1:
+            shown, options = binned(mean, factor).astype(np.float64), layout_options.binned(options, factor)
         found: FoundLayout | KnownGrid
         if grid is not None:
-            found = layout_grid.illuminated(source.description, mean, grid, calibration, options)
+            found = layout_grid.illuminated(source.description, shown, grid, calibration, options)
         else:
-            found = _found(source.description, mean, options)
+            found = _found(source.description, shown, options)
+        if factor > 1:
+            found = found.magnified(factor, source.shape)
         kept = layout_options.kept(len(found.layout), exclude)
         if isinstance(found, FoundLayout):
             found = found[kept]

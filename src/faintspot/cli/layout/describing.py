@@ -52,7 +52,7 @@ def describe(output: str, found: FoundLayout, layout: Layout) -> list[str]:
     if layout.fitted:
         lines.append(f"  {reference_in_words(layout.fitted)}")
     moved = np.abs(np.median(layout.offsets, axis=0))
-    if moved.max() > 1:
+    if moved.max() > layout.bin:
         lines.append(
             f"  windows moved off the spots by ({moved[0]:.1f}, {moved[1]:.1f}) px: "
             "centres of gravity are worse in them"

@@ -15,6 +15,7 @@ from faintspot.base.config.tables import chosen_fields, read_tables
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration, read_map
 from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.sensor.binning import scaled_points
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.window_size import LARGEST_WINDOW
 
@@ -30,6 +31,28 @@ def numbers(option: str, text: str | None, counts: tuple[int, ...], expected: st
     if len(values) not in counts or not np.isfinite(values).all():
         raise InputError(f"{option} {text}: expected {expected}")
     return values
+
+
+def binned(options: dict[str, Any], factor: int) -> dict[str, Any]:
+    """Return the options that are distances or points in the pixels of binned frames."""
+    changed = dict(options)
+    for name, value in options.items():
+        if value is None:
+            continue
+        if name == "pitch_px":
+            changed[name] = value / factor
+        elif name == "pixels":
+            if np.any(np.array(value) % factor):
+                raise InputError(f"--pixels {value}: expected multiples of --bin {factor}")
+            changed[name] = (np.array(value) / factor).tolist()
+        elif name == "roi":
+            changed[name] = (np.array(value) // factor).tolist()
+        elif name == "centre":
+            changed[name] = scaled_points(value, 1 / factor).tolist()
+        elif name == "pupil":
+            radii = [radius / factor for radius in value[2:]]
+            changed[name] = [*scaled_points(value[:2], 1 / factor).tolist(), *radii]
+    return changed
 
 
 def grid_shape(text: str) -> tuple[int, int]:
@@ -102,11 +125,12 @@ def optics(target: Path, given: Mapping[str, float | None]) -> dict[str, Any]:
 def largest_window_note(layout: Layout) -> list[str]:
     """Return a line that says so where windows are limited and leave out much of a sub-aperture."""
     side = max(layout.window)
-    if side < LARGEST_WINDOW or layout.pitch_px is None or layout.pitch_px < side + 1:
+    most = LARGEST_WINDOW * layout.bin
+    if side < most or layout.pitch_px is None or layout.pitch_px < side + 1:
         return []
     return [
-        f"  windows stop at {LARGEST_WINDOW} px, of a pitch of {layout.pitch_px:.0f} px: spots farther than "
-        f"{LARGEST_WINDOW // 2} px from their centre are missed; bin the frames if they move so far"
+        f"  windows stop at {most} px, of a pitch of {layout.pitch_px:.0f} px: spots farther than "
+        f"{most // 2} px from their centre are missed; --bin {layout.bin + 1} allows larger ones"
     ]
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
@@ -25,6 +26,13 @@ class PipelineMaker:
     score: Score | None = None
     reference: NDArray[Any] | None = None
     """Reference slopes, as for `SlopePipeline`."""
+
+    def __post_init__(self) -> None:
+        if self.layout.bin > 1:
+            raise InputError(
+                f"layout.bin = {self.layout.bin}: expected 1, the engine measures rows as they arrive; "
+                "bin in the camera, or measure recorded frames with `faintspot slopes`"
+            )
 
     def __call__(self, settings: Settings) -> SlopePipeline:
         """Return the pipeline with settings."""

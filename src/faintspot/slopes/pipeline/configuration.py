@@ -17,6 +17,7 @@ from faintspot.base.files import derived
 from faintspot.base.toml_files import check_keys
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.laser_spots import laser_of, matched_filter
 from faintspot.slopes.spots.psf import PSF
@@ -177,7 +178,7 @@ def _laser_psf(path: Path, document: Mapping[str, dict[str, Any]]) -> PSF | None
     laser = laser_of(path, document)
     if laser is None or "layout" not in document:
         return None
-    layout = Layout.from_tables(path, document)
+    layout = binned_layout(Layout.from_tables(path, document))
     with errors_of_table(path, "laser"):
         return laser.psf(laser.star_of(layout), layout.window)
 
@@ -191,6 +192,8 @@ def _laser_score(path: Path, document: Mapping[str, dict[str, Any]], psf: PSF | 
     if psf is None:
         return None
     layout, settings = Layout.from_tables(path, document), Settings.from_tables(path, document)
+    if layout.bin > 1:
+        raise InputError(f"{path}: laser.matched_filter: expected layout.bin = 1, got {layout.bin}")
     if settings.flux_e is None:
         raise InputError(f"{path}: laser.matched_filter: expected flux_e in [settings], got none")
     flux = settings.values("flux_e", len(layout), layout.pixels)

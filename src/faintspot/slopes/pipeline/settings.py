@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import Option, Options, check_lengths, option
+from faintspot.base.config.options import Option, Options, PerSubaperture, check_lengths, option
 from faintspot.base.config.tables import errors_of_table, per_subaperture, read_tables, save_tables, table_of
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_known
@@ -226,6 +226,17 @@ class Settings:
     def _of(cls, estimator: Estimator, shared: SharedOptions) -> Settings:
         return cls(estimator, **vars(shared))
 
+    def magnified(self, scale: float) -> Settings:
+        """Return the settings with all stated distances, options whose names end in _px, times a factor."""
+        options = self.declared()
+        return self.replace(
+            **{
+                name: _times(value, scale, whole=options[name].whole)
+                for name, value in self.chosen().items()
+                if name.endswith("_px")
+            }
+        )
+
     def values(self, name: str, n_subapertures: int, pixels: int) -> NDArray[Any]:
         """Return one value per sub-aperture, with defaults filled in; NaN if there is none.
 
@@ -256,6 +267,17 @@ def check_option(name: str, kind: type[Estimator], prefix: str = "") -> None:
             f"{prefix}{name}: an option of {' and '.join(map(repr, others))}, not of {kind.name!r}"
         )
     check_known(prefix, name, [*kind.declared(), *Settings.SHARED], f"option of {kind.name!r}")
+
+
+def _times(value: Any, scale: float, *, whole: bool) -> Any:
+    """Return numbers times a factor; None and "auto" stay."""
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, PerSubaperture):
+        others = {index: _times(other, scale, whole=whole) for index, other in value.others.items()}
+        return PerSubaperture(_times(value.default, scale, whole=whole), others)
+    scaled = np.multiply(value, scale)
+    return (np.maximum(np.rint(scaled), 1).astype(int) if whole else scaled).tolist()
 
 
 def _plain_values(where: str, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between, real_array
 from faintspot.base.errors import InputError
+from faintspot.io.stored.slopes_format import scaled_positions
+from faintspot.slopes.camera.binning import binned, binned_calibration, spread
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.kernels.compilation.compiling import Direct
@@ -32,6 +34,7 @@ from faintspot.slopes.pipeline.plan import Plan, packed_calibration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes, Stages
 from faintspot.slopes.pipeline.small_frames import NO_STAGES, SmallFrames
+from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.score import Score
@@ -97,6 +100,8 @@ class SlopePipeline:
         threads: int | None = None,
     ) -> None:
         self.layout = layout
+        self.binned_layout = binned_layout(layout)
+        """Layout in the pixels of binned frames, in which slopes are measured: `layout` if its `bin` is 1."""
         self.settings = Settings(settings) if isinstance(settings, Estimator) else settings
         self.calibration = Calibration() if calibration is None else calibration
         self.threads = (
@@ -116,11 +121,17 @@ class SlopePipeline:
     def _prepare(self) -> None:
         """Compute the tables for the current SIMD width; forget what was prepared for small frames."""
         self._small = threading.local()
-        width, maps = self._lanes.width, self.calibration.maps(self.layout.frame_shape)
-        self._calibration = packed_calibration(self.layout, maps, width)
-        self.plan = Plan(self.layout, self.settings, self.calibration, *self._parts, width)
+        width, factor = self._lanes.width, self.layout.bin
+        psf, score, zero = self._parts
+        settings, calibration = self.settings, self.calibration
+        if factor > 1:
+            settings = settings.magnified(1 / factor)
+            calibration = binned_calibration(calibration, factor, self.layout.frame_shape)
+        maps = calibration.maps(self.binned_layout.frame_shape)
+        self._calibration = packed_calibration(self.binned_layout, maps, width)
+        self.plan = Plan(self.binned_layout, settings, calibration, psf, score, zero / factor, width)
         """Settings and tables computed before the first frame."""
-        self.light_test = light_test(self.layout, maps, self.plan.typical_fwhm_px)
+        self.light_test = light_test(self.binned_layout, maps, self.plan.typical_fwhm_px)
         """Test for sub-apertures without flux."""
 
     @property
@@ -209,7 +220,9 @@ class SlopePipeline:
         mean : (h, w) array
             Mean of the frames [ADU]; NaN in pixels without any value.
         """
-        light = MeanLight(self.layout, self.light_test.maps, self.plan.typical_fwhm_px)
+        if self.layout.bin > 1:
+            mean = binned(mean, self.layout.bin)
+        light = MeanLight(self.binned_layout, self.light_test.maps, self.plan.typical_fwhm_px)
         dark = np.flatnonzero(light.significances(mean) < 1.0)
         other = copy.copy(self)
         other._small, other.light_test = threading.local(), self.light_test._replace(dark=dark)
@@ -218,8 +231,10 @@ class SlopePipeline:
     def for_images(self) -> SlopePipeline:
         """Return the same pipeline for calibrated images (n, ny, nx) [electrons], read as one tall frame."""
         layout, camera = self.layout, self.calibration
+        if layout.bin > 1:
+            raise InputError(f"layout.bin = {layout.bin}: expected frames, which are binned; images are not")
         pipeline = copy.copy(self)
-        pipeline.layout = Layout.stacked(len(layout), layout.window, layout.offsets)
+        pipeline.layout = pipeline.binned_layout = Layout.stacked(len(layout), layout.window, layout.offsets)
         pipeline.calibration = Calibration(
             dark=None if camera.dark is None else 0.0,
             estimated=camera.estimated,
@@ -250,9 +265,9 @@ class SlopePipeline:
             parts.append(self.plan.sensor.pixel_noise_e)
         calibration = self.calibration
         text = (
-            f"{self.layout.window} {calibration.saturation_adu} {calibration.read_noise_photoelectrons} "
-            f"{calibration.background_e} {calibration.em_gain} {calibration.vouches_for_dark} "
-            f"{configuration.to_text(self.settings)}"
+            f"{self.layout.window} {self.layout.bin} {calibration.saturation_adu} "
+            f"{calibration.read_noise_photoelectrons} {calibration.background_e} {calibration.em_gain} "
+            f"{calibration.vouches_for_dark} {configuration.to_text(self.settings)}"
         )
         return (
             b"".join(np.ascontiguousarray(part).tobytes() for part in parts) + self._identity + text.encode()
@@ -276,7 +291,8 @@ class SlopePipeline:
         InputError
             If a frame is not real or does not have the layout's shape, or the prior has the wrong shape.
         """
-        if prior is None and type(frame) is np.ndarray and frame.shape == self.layout.frame_shape:
+        simple = prior is None and self.layout.bin == 1
+        if simple and type(frame) is np.ndarray and frame.shape == self.layout.frame_shape:
             small = vars(self._small)
             if frame.dtype not in small:
                 small[frame.dtype] = self._small_frames(frame.dtype)
@@ -303,7 +319,10 @@ class SlopePipeline:
         """
         array = self._checked(frame)
         slopes, stages = self._run(array, _camera_type(frame), prior, explain=True)
-        calibrated, denoised, background = stages.reshape(3, *slopes.x.shape, *self.layout.window)
+        stages = stages.reshape(3, *slopes.x.shape, *self.binned_layout.window)
+        if self.layout.bin > 1:
+            stages = spread(stages, self.layout.bin)
+        calibrated, denoised, background = stages
         return Stages(self.layout.images(array), calibrated, denoised, background, slopes)
 
     def _checked(self, frame: ArrayLike) -> NDArray[Any]:
@@ -323,16 +342,21 @@ class SlopePipeline:
         explain: bool,
     ) -> tuple[Slopes, NDArray[np.float32]]:
         """Compute the slopes, and the stages if requested."""
+        factor = self.layout.bin
+        if factor > 1:
+            array = binned(array, factor, self.calibration.saturation(dtype))
         frames = kernel_frames(array)
         n_frames, n = len(frames), len(self.layout)
         results = SlopeArrays(*[np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES])
         prepared = self.plan.prepared
         stages = NO_STAGES
         if explain or prepared.in_python:
-            stages = np.empty((STAGE_ROWS, n_frames, n, self.layout.pixels), np.float32)
+            stages = np.empty((STAGE_ROWS, n_frames, n, self.binned_layout.pixels), np.float32)
         source = self.source(frames, dtype)
         variants = self._variants(source)
-        predicted = None if prior is None else _prior_slopes(prior, n_frames, self.layout)
+        predicted = (
+            None if prior is None else _prior_slopes(prior, n_frames, self.layout) / np.float32(factor)
+        )
         task = self.plan.task(variants, predicted)
         kernel = self.plan.kernel(frames)
 
@@ -342,13 +366,15 @@ class SlopePipeline:
         n_groups = n_frames * -(-n // self._lanes.width)
         own_scratch = self.plan.own_scratch
         cost = self.plan.estimator.cost
-        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, own_scratch, cost)
+        run_groups(job, n_groups, self._lanes, self.binned_layout.window, self.threads, own_scratch, cost)
         if prepared.in_python:
-            images = stages[CALIBRATED].reshape(n_frames, n, *self.layout.window)
+            images = stages[CALIBRATED].reshape(n_frames, n, *self.binned_layout.window)
             for f in range(n_frames):
                 predicted_f = task.prior[min(f, len(task.prior) - 1)]
                 prepared.locate_frame(images[f], predicted_f, task.settings[0], f, results)
         self.flag_doubtful(results, frames)
+        if factor > 1:
+            results = SlopeArrays(**scaled_positions(results._asdict(), factor))
         return Slopes(*(results if array.ndim == 3 else [result[0] for result in results])), stages
 
     def flag_doubtful(self, results: SlopeArrays, frames: NDArray[Any]) -> None:
@@ -363,7 +389,7 @@ class SlopePipeline:
             Slopes of the frames; changed.
         frames : (n, h, w) array, uint16 or float32, contiguous
         """
-        scratch = np.empty(scratch_size(len(self.layout), *self.layout.window), np.float32)
+        scratch = np.empty(scratch_size(len(self.binned_layout), *self.binned_layout.window), np.float32)
         flag_dark_in = _flag_dark(frames.dtype, self.light_test.lanes)
         flag_dark_in(self.light_test, frames, results, scratch)
         n = len(self.layout)
@@ -378,8 +404,8 @@ class SlopePipeline:
         dtype : dtype
             Type of the camera's pixels, which sets their saturation level.
         """
-        saturation = self.calibration.saturation(np.dtype(dtype))
-        corners, window = self.layout.corners, self.layout.window
+        saturation = self.calibration.saturation(np.dtype(dtype)) * self.layout.bin**2
+        corners, window = self.binned_layout.corners, self.binned_layout.window
         return Source(self._lanes, frames, corners, *window, self._calibration, saturation)
 
     def _variants(self, source: Source) -> NDArray[np.int64]:
@@ -395,7 +421,7 @@ class SlopePipeline:
             flux_kernel(source, start, stop, scratch, flux)
 
         n_groups = n_frames * -(-n // self._lanes.width)
-        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, cost=_FLUX_COST)
+        run_groups(job, n_groups, self._lanes, self.binned_layout.window, self.threads, cost=_FLUX_COST)
         return self.plan.variants(flux.mean(axis=1, dtype=np.float64))
 
 

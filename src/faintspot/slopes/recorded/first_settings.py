@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.slopes.camera.binning import binned, binned_calibration
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.algorithms.noise import pixel_noise
 from faintspot.slopes.estimators.algorithms.spot_width import SeenSpots, seen_spots
 from faintspot.slopes.estimators.spot_tables import gaussian_psf
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
@@ -76,6 +78,10 @@ def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[Any
     -------
     FirstSettings
     """
+    if (factor := layout.bin) > 1:
+        camera = binned_calibration(calibration, factor, layout.frame_shape)
+        seen = first_settings(binned_layout(layout), camera, binned(frames, factor))
+        return replace(seen, settings=seen.settings.magnified(factor))
     calibrated = SlopePipeline(layout, Settings("brightest"), calibration).explain(frames).calibrated
     images: Floats = calibrated.astype(np.float64)
     noise = pixel_noise(images)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from faintspot.slopes.kernels.driver.doubtful import Expected, flag_doubtful
+from faintspot.slopes.sensor.binning import magnified_layout, scaled_points
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, lines_of, neighbours_of
@@ -47,6 +48,26 @@ class FoundLayout:
         """Return the result for the chosen (n_subapertures,) sub-apertures only."""
         return replace(
             self, layout=self.layout[chosen], clipped=self.clipped[chosen], unlike=self.unlike[chosen]
+        )
+
+    def magnified(self, factor: int, frame_shape: tuple[int, int]) -> FoundLayout:
+        """Return what was found in a binned frame in the pixels of the camera, of frames of `frame_shape`."""
+        grid = self.lenslets
+        lenslets = replace(
+            grid,
+            pitch_px=grid.pitch_px * factor,
+            centres=scaled_points(grid.centres, factor),
+            drifts=grid.drifts * factor,
+            spots=scaled_points(grid.spots, factor),
+            spot_px=grid.spot_px * factor,
+            elsewhere=scaled_points(grid.elsewhere, factor),
+        )
+        return replace(
+            self,
+            layout=magnified_layout(self.layout, factor, frame_shape),
+            lenslets=lenslets,
+            cut=scaled_points(self.cut, factor),
+            outside=scaled_points(self.outside, factor),
         )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
+from faintspot.slopes.sensor.binning import magnified_layout
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.region import PupilRegion, Rectangle
 from faintspot.slopes.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW, window_size
@@ -40,6 +41,11 @@ class KnownGrid:
     layout: Layout
     unlit: NDArray[np.float64]
     doubt: str
+
+    def magnified(self, factor: int, frame_shape: tuple[int, int]) -> KnownGrid:
+        """Return the grid of a binned frame in the pixels of the camera, of frames of `frame_shape`."""
+        layout = magnified_layout(self.layout, factor, frame_shape)
+        return replace(self, layout=layout, unlit=self.unlit / factor**2)
 
 
 def find_illuminated(

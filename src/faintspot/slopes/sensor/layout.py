@@ -35,6 +35,8 @@ OPTICS = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
 """Fields that define scales on the sky and in the pupil."""
 _MOST_LENSLETS = 1 << 20
 _LARGEST_PX = 1e9
+LARGEST_BIN = 64
+"""Largest `bin`."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Layout:
     frame_shape : (int, int)
         Height and width of a frame [px].
     window : (int, int)
-        Height and width of each sub-aperture [px], 2 (quad cells) to 64.
+        Height and width of each sub-aperture [px], 2 (quad cells) to 64, times `bin`.
     corners : (n, 2) array of int
         Row and column of the first pixel of each window.
     centres : (n, 2) array, optional
@@ -71,6 +73,9 @@ class Layout:
         rotation.
     doubts : tuple of str
         What may be wrong with a layout found in a frame, one sentence each.
+    bin : int
+        Slopes are measured in sums of bin x bin pixels, for windows over 64 px and colour mosaics. All fields
+        are in the camera's pixels; windows and corners are multiples of it.
 
     Raises
     ------
@@ -99,14 +104,20 @@ class Layout:
     diameter_m: float | None = None
     fitted: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
+    bin: int = 1
 
     def __post_init__(self) -> None:
         put = object.__setattr__
         put(self, "frame_shape", pair_of_numbers("layout.frame_shape", self.frame_shape, 1, 2**31))
         check_size("layout.frame_shape", self.frame_shape, what="pixels")
-        put(self, "window", window_size("layout.window", self.window))
+        put(self, "bin", int(number_between("layout.bin", self.bin, 1, LARGEST_BIN, integer=True)))
+        put(self, "window", window_size("layout.window", self.window, self.bin))
         corners = _rows_of_two("layout.corners", self.corners)
         corners = numbers_between("layout.corners", corners, -(2**31), 2**31, integer=True)
+        if (corners % self.bin).any():
+            raise InputError(
+                f"layout.corners: expected multiples of bin = {self.bin}; `faintspot layout --bin` makes them"
+            )
         middle = corners[:, ::-1] + 0.5 * (np.array(self.window[::-1]) - 1)
         centres = middle if self.centres is None else _rows_of_two("layout.centres", self.centres)
         pitch = np.array(self.window)
@@ -195,6 +206,7 @@ class Layout:
         pitch: int | tuple[int, int] | None = None,
         origin: tuple[int, int] = (0, 0),
         frame_shape: tuple[int, int] | None = None,
+        bin: int = 1,
         **optics: Any,
     ) -> Layout:
         """Make a regular grid of sub-apertures under an annular pupil.
@@ -216,6 +228,8 @@ class Layout:
             Row and column of the first pixel of the first window.
         frame_shape : (int, int), optional
             Default: the smallest frame that contains all windows.
+        bin : int
+            As for `Layout`.
         **optics
             pixel_scale_arcsec, subaperture_m and diameter_m, as for `Layout`.
 
@@ -227,7 +241,8 @@ class Layout:
         check_keys("", optics, OPTICS, what="argument")
         n_rows, n_columns = pair_of_numbers("shape", shape, 1, _LARGEST_PX)
         check_size("shape", (n_rows, n_columns), _MOST_LENSLETS, "lenslets")
-        window = window_size("pixels", pixels)
+        factor = int(number_between("bin", bin, 1, LARGEST_BIN, integer=True))
+        window = window_size("pixels", pixels, factor)
         step = window if pitch is None else pair_of_numbers("pitch", pitch, 1, 10_000)
         start = pair_of_numbers("origin", origin, 0, 2**31)
         outer = np.inf if outer_radius is None else number_between("outer_radius", outer_radius, 0.0)
@@ -245,7 +260,7 @@ class Layout:
             last = np.array(start) + (np.array([n_rows, n_columns]) - 1) * step + window
             frame_shape = (int(last[0]), int(last[1]))
         corners = np.array(start) + cells * step
-        return cls(frame_shape, window, corners, cells=cells, pitch_px=float(min(step)), **optics)
+        return cls(frame_shape, window, corners, cells=cells, pitch_px=float(min(step)), bin=factor, **optics)
 
     @classmethod
     def stacked(cls, n: int, window: tuple[int, int], offsets: NDArray[np.float64] | None = None) -> Layout:
@@ -373,8 +388,8 @@ class Layout:
         if "grid" not in values:
             check_fields("layout", cls, values)
             return cls(**values)
-        check_keys("layout.", values, ["grid", *OPTICS], what="key beside grid")
-        optics = {name: values[name] for name in OPTICS if name in values}
+        check_keys("layout.", values, ["grid", "bin", *OPTICS], what="key beside grid")
+        optics = {name: values[name] for name in ("bin", *OPTICS) if name in values}
         grid = checked_table("layout.grid", values["grid"])
         check_keys("layout.grid.", grid, GRID_KEYS, required=("shape", "pixels"))
         try:

@@ -12,9 +12,18 @@ from faintspot.base.errors import InputError
 SMALLEST_WINDOW, LARGEST_WINDOW = 2, 64
 
 
-def window_size(name: str, value: Any) -> tuple[int, int]:
-    """Return height and width of a window, from one number or two."""
-    return pair_of_numbers(name, value, SMALLEST_WINDOW, LARGEST_WINDOW)
+def window_size(name: str, value: Any, factor: int = 1) -> tuple[int, int]:
+    """Return height and width of a window, from one number or two; its frames are binned by `factor`."""
+    try:
+        window = pair_of_numbers(name, value, SMALLEST_WINDOW * factor, LARGEST_WINDOW * factor)
+    except InputError as error:
+        larger = np.size(value) > 0 and np.max(value) > LARGEST_WINDOW * factor
+        raise InputError(
+            f"{error}{f'; bin = {factor + 1} allows larger windows' if larger else ''}"
+        ) from None
+    if any(side % factor for side in window):
+        raise InputError(f"{name}: expected multiples of bin = {factor}, got {window[0]} x {window[1]}")
+    return window
 
 
 def pair_of_numbers(name: str, value: Any, low: float, high: float) -> tuple[int, int]:

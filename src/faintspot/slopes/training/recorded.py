@@ -352,6 +352,10 @@ def _images_and_reference(
     raw = real_array("frames", frames)
     if raw.ndim != 3:
         raise InputError(f"frames: expected shape (n, h, w), got {raw.shape}")
+    if layout.bin > 1:
+        raise InputError(
+            f"layout.bin = {layout.bin}: expected 1, spots are learnt from frames that are not binned"
+        )
     images = SlopePipeline(layout, Settings("brightest"), calibration).explain(raw).calibrated
     home = finite_array("reference", reference).astype(np.float64)
     if home.shape not in ((), (2,), (len(layout), 2)):
