@@ -86,7 +86,7 @@ def test_from_frames(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(tmp_path)
     np.save("frames.npy", simulated())
     LAYOUT.save("layout.toml")
-    arguments = ("--recording", "frames.npy", "--layout", "layout.toml", "--gain-e-per-adu", 1)
+    arguments = ("--recording", "frames.npy", "--config", "layout.toml", "--gain-e-per-adu", 1)
     result = run.ok("tune", *arguments, "--flux-e", 150)
     assert "PSF learnt" in result.out
     assert len(SlopePipeline.from_file("faintspot.toml").layout) == 16
@@ -102,8 +102,8 @@ def test_from_frames(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         ((*KNOWN, "--magnitude", 3), ("--magnitude", "both")),
         ((*KNOWN, "--budget", "3furlongs"), ("budget", "0.05arcsec")),
         ((*KNOWN, "--grid", "7-7"), ("--grid", "7x7")),
-        ((*KNOWN, "--grid", "7x7", "--layout", "a.toml"), ("--grid", "--layout")),
-        ((*KNOWN, "--layout", "nothere.toml"), ("nothere.toml",)),
+        ((*KNOWN, "--grid", "7x7", "--config", "a.toml"), ("--grid", "--config")),
+        ((*KNOWN, "--config", "nothere.toml"), ("nothere.toml",)),
         ((*KNOWN, "--dark", "dark.fits"), ("--recording",)),
         ((*KNOWN, "-o", "nofolder/faintspot.toml"), ("nofolder",)),
         (("--camera", "nothere.toml"), ("nothere.toml",)),

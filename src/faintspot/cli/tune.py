@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +16,16 @@ from faintspot.base.errors import InputError
 from faintspot.cli.layout.options import grid_shape
 from faintspot.cli.shared.commands import SectionedCommand, option
 from faintspot.cli.shared.needs import suggested_slopes
+from faintspot.cli.shared.options import which_frames
 from faintspot.cli.shared.output import check_target, picture_file, results_table, wrapped, write_picture
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.experiments.planner import text as answer_text
 from faintspot.experiments.planner.question import PROFILES, TABLES, read_camera
 from faintspot.io.frames import open_frames
+from faintspot.slopes.camera.binning import binned, binned_calibration, camera_calibration
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.simulate.photometry import (
     DEFAULT_BAND,
@@ -96,8 +100,15 @@ def _values(command: Callable[..., Any]) -> Callable[..., Any]:
     "--recording", multiple=True, metavar="FILE", help="Recorded frames, to measure the rest.", section=_GIVEN
 )
 @option("--dark", multiple=True, metavar="FILE", help="Dark frames.", section=_GIVEN)
-@option("--key", metavar="NAME", help="Which array to read of files that hold several.", section=_GIVEN)
-@option("--layout", "layout_file", metavar="TOML", help="Configuration with the layout.", section=_GIVEN)
+@which_frames(section=_GIVEN)
+@option(
+    "--config",
+    "-c",
+    metavar="TOML",
+    help="Configuration with layout and calibration.",
+    show_default="that of --output, if there is one",
+    section=_GIVEN,
+)
 @option(
     "--grid",
     metavar="ROWSxCOLUMNS",
@@ -114,15 +125,16 @@ def command(
     recording: tuple[str, ...],
     dark: tuple[str, ...],
     key: str | None,
+    time_axis: int | None,
     grid: str | None,
-    layout_file: str | None,
+    config: str | None,
     output: str,
     picture: str | None,
     seed: int,
     overwrite: bool,
     **options: Any,
 ) -> None:
-    """Recommend an estimator and settings for a camera and a star.
+    """Recommend an estimator and settings for a camera and a star, or for a recording.
 
     Simulates spots as the camera sees them and tries every estimator on them, those of installed packages
     included. Prints the slope error of each, says how many magnitudes it saves, draws it against the star's
@@ -142,14 +154,21 @@ def command(
     check_target(target, overwrite)
     drawing = picture_file(target, picture, "-tune.png")
     given = _given(camera, options)
-    known = _sensor(grid, layout_file, target, given)
-    given = {**known, **given, **({"layout": known["layout"]} if grid or layout_file else {})}
+    known = _sensor(grid, config, target, given)
+    given = {**known, **given, **({"layout": known["layout"]} if grid or config else {})}
+    camera_layout: Layout | None = given.get("layout")
+    factor = 1 if camera_layout is None else camera_layout.bin
+    if camera_layout is not None:
+        given["layout"] = binned_layout(camera_layout)
     with progress_bar("tuning", "steps") as advance:
-        question = _question(recording, dark, key, given)
+        opened = partial(_read, time_axis=time_axis, factor=factor)
+        question = _question(recording, dark, key, given, opened)
         from faintspot.experiments.planner.tuning import tune
 
         answer = tune(question, rng=np.random.default_rng(seed), progress=advance)
     console = Console(highlight=False)
+    if factor > 1:
+        click.echo(f"{factor} x {factor} pixels are summed: px here are those of binned frames")
     for line in wrapped([answer_text.situation(answer)], console):
         click.echo(line)
     console.print(answer_table(answer))
@@ -159,7 +178,10 @@ def command(
     click.echo("This rests on")
     for line in wrapped(answer_text.foundations(answer), console, "  "):
         click.echo(line)
-    _write(answer, target, drawing, recording)
+    answer.save(target)
+    if camera_layout is not None and factor > 1:
+        _save_in_camera_pixels(answer, target, camera_layout)
+    _say_what_is_next(answer, target, drawing, recording)
 
 
 def answer_table(answer: Answer) -> Table:
@@ -202,14 +224,19 @@ def _given(camera: str | None, options: dict[str, Any]) -> dict[str, Any]:
     return {**known, **chosen}
 
 
-def _sensor(grid: str | None, layout_file: str | None, target: Path, given: dict[str, Any]) -> dict[str, Any]:
+def _sensor(grid: str | None, config: str | None, target: Path, given: dict[str, Any]) -> dict[str, Any]:
     """Return the layout that was asked for or that the configuration has already, and its calibration."""
-    if grid is not None and layout_file is not None:
-        raise InputError("--grid, --layout: expected one of them, got both")
+    if grid is not None and config is not None:
+        raise InputError("--grid, --config: expected one of them, got both")
     found: dict[str, Any] = {}
-    source = layout_file or (str(target) if target.exists() else None)
+    source = config or (str(target) if target.exists() else None)
     if source is not None:
         calibration: Calibration = configuration.load(source, "calibration")
+        # The target may have no layout yet; a file that was named for its layout must.
+        if config is not None or "[layout" in target.read_text(encoding="utf-8"):
+            layout = found["layout"] = Layout.load(source)
+            if layout.bin > 1:
+                calibration = binned_calibration(calibration, layout.bin, layout.frame_shape)
         found["calibration"] = calibration
         default = Calibration()
         if calibration.read_noise_e is not None:
@@ -217,9 +244,6 @@ def _sensor(grid: str | None, layout_file: str | None, target: Path, given: dict
         for name in ("gain_e_per_adu", "em_gain", "background_e"):
             if getattr(calibration, name) != getattr(default, name):
                 found[name] = getattr(calibration, name)
-        # The target may have no layout yet; a file that was named for its layout must.
-        if layout_file is not None or "[layout" in target.read_text(encoding="utf-8"):
-            found["layout"] = Layout.load(source)
     if grid is not None:
         found["layout"] = _grid(grid, given)
     return found
@@ -233,7 +257,11 @@ def _grid(grid: str, given: dict[str, Any]) -> Layout:
 
 
 def _question(
-    frames: tuple[str, ...], dark: tuple[str, ...], key: str | None, given: dict[str, Any]
+    frames: tuple[str, ...],
+    dark: tuple[str, ...],
+    key: str | None,
+    given: dict[str, Any],
+    read: Callable[..., NDArray[Any]],
 ) -> Question:
     """Check what is given, and measure the rest in the frames."""
     from faintspot.experiments.planner.question import Question
@@ -245,7 +273,8 @@ def _question(
         if not frames:
             return Question(**given)
         given.pop("calibration", None)  # measured
-        return question_from_frames(_read(frames, key), _read(dark, None) if dark else None, **given)
+        darks = read(dark, None) if dark else None
+        return question_from_frames(read(frames, key), darks, **given)
     except InputError as error:
         raise InputError(f"{error}{_where(str(error))}") from None
 
@@ -259,16 +288,24 @@ def _where(text: str) -> str:
     return ""
 
 
-def _read(paths: tuple[str, ...], key: str | None) -> NDArray[Any]:
-    with open_frames(paths, key=key) as source:
+def _read(paths: tuple[str, ...], key: str | None, *, time_axis: int | None, factor: int) -> NDArray[Any]:
+    """Return the first frames of files, binned by a factor."""
+    with open_frames(paths, key=key, time_axis=time_axis) as source:
         rows, columns = source.shape
         enough = max(2, min(_MOST_FRAMES, _MOST_PIXELS // (rows * columns)))
-        return source.block(0, min(enough, source.n_frames))
+        block = source.block(0, min(enough, source.n_frames))
+    return block if factor == 1 else binned(block, factor)
 
 
-def _write(answer: Answer, target: Path, picture: Path | None, frames: tuple[str, ...]) -> None:
-    """Write configuration and picture, and say what comes next."""
-    answer.save(target)
+def _save_in_camera_pixels(answer: Answer, target: Path, layout: Layout) -> None:
+    """Replace layout, settings and calibration of binned frames by those of the camera."""
+    calibration = camera_calibration(answer.calibration, layout.bin)
+    for item in (layout, answer.best.settings.magnified(layout.bin), calibration):
+        configuration.save(target, item)
+
+
+def _say_what_is_next(answer: Answer, target: Path, picture: Path | None, frames: tuple[str, ...]) -> None:
+    """Write the picture, and say what comes next."""
     click.echo(f"{target}: written")
     if picture is not None:
         from faintspot.experiments.planner.figures import tune_figure

@@ -53,7 +53,7 @@ def test_there_is_nothing_to_tune(folder: Path, run: Commands) -> None:
     save_frames()
     run.ok("layout", "a.npy", "--grid", "8x8", "-o", "new.toml")
     run.refused(
-        "tune", "--recording", "a.npy", "--layout", "new.toml", "-o", "o.toml", naming=("quad cells",)
+        "tune", "--recording", "a.npy", "--config", "new.toml", "-o", "o.toml", naming=("quad cells",)
     )
     camera = ("--read-noise-e", "2", "--pixels", "2", "--fwhm-px", "1.8", "--flux-e", "300")
     run.refused("tune", *camera, "-o", "o.toml", naming=("quad cells",))

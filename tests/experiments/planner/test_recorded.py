@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.experiments.planner_cases import QUICK
+from tests.refusals import refused
 from tests.shared_data import shared_file
 
 from faintspot.base.errors import InputError
@@ -15,7 +16,7 @@ from faintspot.io.frames import read_array
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.simulate import Detector, sensor_frames
 
-LAYOUT = Layout.grid((6, 6), pixels=12)
+LAYOUT, WIDE = Layout.grid((6, 6), pixels=12), Layout.grid((6, 6), pixels=20)
 CAMERA = Detector(read_noise_e=4.0, gain_e_per_adu=0.5, offset_adu=100.0)
 
 
@@ -64,6 +65,42 @@ def test_what_is_given_is_not_measured() -> None:
     )
     assert (question.read_noise_e, question.fwhm_px, question.star_flux_e) == (4.0, 1.8, 50.0)
     assert question.psf is None
+
+
+def test_wrong_values_are_refused_before_anything_is_measured() -> None:
+    frames, _ = recorded(2)
+    with refused("flux_e", "NaN"):
+        question_from_frames(frames, layout=LAYOUT, flux_e=float("nan"))
+    with refused("budget", "furlongs"):
+        question_from_frames(frames, layout=LAYOUT, budget="3furlongs")
+    with refused("recording", "gain_e_per_adu", "1e+09"):
+        question_from_frames(frames, layout=LAYOUT, gain_e_per_adu=1e6)
+
+
+def bright_frames() -> np.ndarray:
+    """Return 8-bit frames of bright spots that move, with noise of 1 ADU and little photon noise."""
+    rng = np.random.default_rng(1)
+    v, u = np.indices(WIDE.frame_shape)
+    frames = np.zeros((60, *WIDE.frame_shape))
+    for frame in frames:
+        for x, y in WIDE.centres + rng.normal(0.0, 0.7, WIDE.centres.shape):
+            frame += 230 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 2.5**2))
+    frames = rng.poisson(1500 * frames) / 1500 + rng.normal(2.0, 1.0, frames.shape)
+    return np.clip(frames, 0, 255).round().astype(np.uint8)
+
+
+@pytest.mark.slow
+def test_bright_frames_with_little_photon_noise_have_an_answer() -> None:
+    question = question_from_frames(bright_frames(), layout=WIDE)
+    assert question.subject == "recording"
+    assert question.star_flux_e == pytest.approx(1.36e7, rel=0.4)  # the gain is known to 15 %
+    noise_adu = question.read_noise_e / question.gain_e_per_adu
+    assert noise_adu == pytest.approx(np.sqrt(1 + 1 / 12), rel=0.1)
+    answer = tune(question, **QUICK)
+    assert answer.magnitude_label == "magnitudes fainter than the recording"
+    assert answer.promise is not None
+    assert not answer.promise.contradicted
+    assert answer.best.statistics.error.value < 0.02
 
 
 def test_a_faint_recording_has_the_range_of_its_spots() -> None:

@@ -89,10 +89,16 @@ def plain_ticks(axis: XAxis | YAxis, values: Iterable[float], form: str = "g") -
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:{form}}"))
 
 
+_LONG_LABEL = 6  # letters, from which every other one is left out
+
+
 def axis_above(axes: Axes, positions: Any, values: Iterable[float], label: str) -> Any:
     """Put a second axis on top: numbers to three digits at places of the first one."""
     top = axes.secondary_xaxis("top")
-    top.set_xticks(positions, [f"{float(f'{value:.3g}'):g}" for value in values])
+    labels = [f"{float(f'{value:.3g}'):g}" for value in values]
+    if max(map(len, labels), default=0) > _LONG_LABEL:
+        labels[1::2] = [""] * len(labels[1::2])
+    top.set_xticks(positions, labels)
     top.set_xlabel(label)
     return top
 

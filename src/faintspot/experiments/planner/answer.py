@@ -110,7 +110,7 @@ class Answer:
         """What `magnitudes` counts."""
         photometry = self.question.photometry
         if photometry is None:
-            return "magnitudes fainter than the star"
+            return f"magnitudes fainter than the {self.question.subject}"
         return f"guide star magnitude ({photometry.band})"
 
     def magnitudes(self, flux_e: ArrayLike) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
 
 
 _WIDTH, _HEIGHT = 10.5, 6.6
-_TICKS = (0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3, 5)
+_TITLE_LETTERS, _NOTE_LETTERS = 100, 44  # in a line
+_TICKS = (1e-4, 2e-4, 5e-4, 0.001, 0.002, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3, 5)
 
 
 @styled
@@ -46,7 +48,7 @@ def tune_figure(answer: Answer) -> Figure:
         _draw_method(axes, answer, result, magnitudes)
     saturated = answer.question.search_range_px / 2
     bound = np.where(answer.bound_px < 1.5 * saturated, answer.bound_px, np.nan)
-    axes.plot(magnitudes, bound, color="black", lw=1.3, label="Cramér-Rao bound", zorder=6)
+    axes.plot(magnitudes, bound, color="black", lw=1.3, label="Cramér-Rao bound, without a prior", zorder=6)
     axes.axhline(saturated, color=GREY, lw=1, ls=(0, (1, 4)), label="always the reference")
     axes.set_yscale("log")
     _axis_limits(axes, answer, saturated)
@@ -56,7 +58,10 @@ def tune_figure(answer: Answer) -> Figure:
     plain_ticks(axes.yaxis, _TICKS)
     axes.grid(which="major", color=FLUX_GREY, lw=0.7)
     if answer.promise is not None and answer.promise.contradicted:
-        axes.set_title(answer_text.promise_lines(answer)[-1], color="#b00020", loc="left")
+        title = textwrap.fill(answer_text.promise_lines(answer)[-1], _TITLE_LETTERS)
+        axes.set_title(title, color="#b00020", loc="left")
+    why = textwrap.fill(answer_text.below_bound(answer), _NOTE_LETTERS)
+    axes.text(1.03, 0.0, why, transform=axes.transAxes, color="#666666", fontsize=10, va="bottom")
     axes.set_xlabel(answer.magnitude_label)
     axes.set_ylabel("slope error R, mean |error| per axis (px)")
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0)
@@ -94,7 +99,7 @@ def _axis_limits(axes: Axes, answer: Any, saturated: float) -> None:
 def _mark_star(axes: Axes, answer: Any) -> None:
     where = float(answer.magnitudes(answer.question.star_flux_e))
     axes.axvline(where, color="black", lw=0.8, ls=":", zorder=0)
-    note(axes, "the star", (where, 0.015), "data, axes fraction", xytext=(4, 0))
+    note(axes, f"the {answer.question.subject}", (where, 0.015), "data, axes fraction", xytext=(4, 0))
 
 
 def _mark_budget(axes: Axes, answer: Any) -> None:

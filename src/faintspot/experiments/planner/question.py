@@ -34,6 +34,8 @@ from faintspot.slopes.spots.speckled import LARGEST_D_OVER_R0
 PROFILES = tuple(FWHM_OF_SIZE_1_PX)
 SPECKLED_ABOVE = 0.7
 """Side of a sub-aperture in r0 above which spots count as speckled."""
+LARGEST_FLUX_E = 1e9
+"""Largest flux of a spot in a frame."""
 SEEING_WAVELENGTH_NM = 500.0
 """Wavelength at which r0 is given."""
 
@@ -116,6 +118,8 @@ class Question:
         Maps (dark, flat, bad pixels) to write beside the settings.
     facts : tuple of str
         Where the values came from, for the answer's account of what it rests on.
+    flux_is_measured : bool
+        Whether the flux is that of a recording, and not of a star that is asked about.
 
     Raises
     ------
@@ -159,6 +163,7 @@ class Question:
     layout: Layout | None = None
     calibration: Calibration | None = None
     facts: tuple[str, ...] = ()
+    flux_is_measured: bool = False
 
     def __post_init__(self) -> None:
         for name in _POSITIVE:
@@ -245,6 +250,11 @@ class Question:
             return float(self.flux_e)
         assert self.photometry is not None
         return float(self.photometry.electrons(self.magnitude))
+
+    @property
+    def subject(self) -> str:
+        """The source of the flux, for messages: a star, or a recording that is measured."""
+        return "recording" if self.flux_is_measured else "star"
 
     @property
     def flux_is_known(self) -> bool:
@@ -359,9 +369,10 @@ class Question:
         for name in ("throughput", "quantum_efficiency"):
             number_between(name, getattr(self, name), 0.0, 1.0, low_open=True)
         flux = self.star_flux_e
-        if not 0.1 <= flux <= 1e7:
+        if not 0.1 <= flux <= LARGEST_FLUX_E:
             raise InputError(
-                f"star: expected 0.1 to 1e7 electrons per sub-aperture and frame, got {flux:.3g}; check "
+                f"{self.subject}: expected 0.1 to {LARGEST_FLUX_E:.0e} electrons per sub-aperture and frame, "
+                f"got {flux:.3g}; check "
                 + ("flux_e" if self.magnitude is None else "magnitude, subaperture_m and frame_rate_hz")
             )
 

@@ -12,7 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
 from faintspot.experiments.planner.promise import frames_to_check
-from faintspot.experiments.planner.question import Question, check_not_quad_cells, default_search_range_px
+from faintspot.experiments.planner.question import (
+    LARGEST_FLUX_E,
+    Question,
+    check_not_quad_cells,
+    default_search_range_px,
+)
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.photon_transfer import DetectorMeasurement, measure_detector
 from faintspot.slopes.estimators.algorithms.noise import pixel_noise
@@ -91,6 +96,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **st
         facts.append(f"{len(layout)} sub-apertures of {ny} x {nx} px found in the frames")
     check_not_quad_cells(layout.window)
     stated.pop("pixels", None)
+    _check_stated(layout, stated)
     stack = stack[: 2 * frames_to_check(layout)]  # every second one; more cost memory and tell nothing
     calibration = _calibration(stack, dark_stack, layout, stated, facts)
     stated["em_gain"] = calibration.em_gain
@@ -98,7 +104,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **st
     fitted, used = _fitted(learning, layout, calibration, stated, facts)
     calibration = _without_background(calibration, fitted, darks is not None, stated, facts)
     if stated.get("flux_e") is None and stated.get("magnitude") is None:
-        stated["flux_e"] = float(fitted.flux_e.mean())
+        stated |= {"flux_e": float(fitted.flux_e.mean()), "flux_is_measured": True}
         sums = float(_electrons(used, layout, calibration).sum(axis=(-2, -1)).mean())
         facts.append(
             f"light measured by fitting spots and background: {stated['flux_e']:.0f} electrons per "
@@ -114,6 +120,26 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **st
     earlier = tuple(stated.pop("facts", ()))
     parts = {"layout": layout, "calibration": calibration, "recording": recording}
     return Question(**{**stated, **values, **parts}, facts=(*earlier, *facts))
+
+
+def _check_stated(layout: Layout, stated: dict[str, Any]) -> None:
+    """Refuse wrong values before anything is measured: those not stated are assumed for it."""
+    assumed: dict[str, Any] = {"read_noise_e": 1.0, "layout": layout}
+    if stated.get("psf") is None and stated.get("laser") is None:
+        assumed["fwhm_px"] = 1.0
+    if stated.get("magnitude") is None:
+        assumed["flux_e"] = 100.0
+    Question(**{**assumed, **stated})
+
+
+def _check_flux(stack: NDArray[Any], dark: Any, layout: Layout, gain: float) -> None:
+    """Refuse spots so bright that photon noise plays no part."""
+    flux_e = gain * float(np.median(layout.images(stack.mean(axis=0) - dark).sum(axis=(-2, -1))))
+    if flux_e > LARGEST_FLUX_E:
+        raise InputError(
+            f"recording: its spots have {flux_e:.2g} electrons at {gain:.3g} electrons per ADU, expected at "
+            f"most {LARGEST_FLUX_E:.0e}; if the gain is another one, give gain_e_per_adu"
+        )
 
 
 def _stack(name: str, value: Any) -> NDArray[Any]:
@@ -157,6 +183,7 @@ def _calibration(
             if darks is None or len(darks) < 2:
                 read_noise_adu, how = about_spots.read_noise_adu, "in the pixels about the fitted spots"
         facts.append(f"gain measured {way}: {gain:.3g} +- {error:.2g} electrons per ADU")
+    _check_flux(stack, dark, layout, gain / em_gain)
     if read_noise is None:
         read_noise = float(f"{read_noise_adu * gain:.3g}")
         facts.append(f"read noise measured {how}: {read_noise:g} electrons")

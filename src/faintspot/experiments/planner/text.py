@@ -47,7 +47,9 @@ def recommendation(answer: Answer) -> list[str]:
     lines = [f"Recommended: {best.method.label} ({settings_in_words(best.settings)})"]
     if answer.is_hopeless:
         rms = best.statistics.corrected_rms.value
-        lines.append(_TEXT("answer.too_faint", rms=rms, prior=answer.prior_rms_px))
+        lines.append(
+            _TEXT("answer.too_faint", rms=rms, prior=answer.prior_rms_px, subject=answer.question.subject)
+        )
     if best.method.name != BRIGHTEST:
         gains = (gain_in_words(answer, gain) for gain in (best.over_brightest, best.over_thresholded))
         lines.append(_TEXT("answer.saves", **dict(zip(("brightest", "thresholded"), gains, strict=True))))
@@ -157,6 +159,20 @@ def _about_tv(answer: Answer) -> list[str]:
         return [_TEXT("answer.tv_does_not", gain=gain_in_words(answer, gain))]
     saved = gain_in_words(answer, gain)
     return [_TEXT("answer.tv_saves", gain=saved, times=times, label=best.method.label)]
+
+
+def below_bound(answer: Answer) -> str:
+    """Return why methods lie below the Cramer-Rao bound, where always answering the reference is worse."""
+    drawn = answer.bound_px < answer.question.search_range_px / 2
+    labels = [
+        result.method.label
+        for result in answer.results
+        if (drawn & (result.error_px + 2 * result.standard_error_px < answer.bound_px)).any()
+    ]
+    if not labels:
+        return ""
+    reach = answer.question.search_range_px
+    return _TEXT("answer.below_bound", labels=", ".join(labels), reach=reach)
 
 
 def _limiting(answer: Answer) -> list[str]:

@@ -66,3 +66,20 @@ def binned_calibration(calibration: Calibration, factor: int, frame_shape: tuple
     if bad.any():
         values["bad_pixels"] = blocks(bad, factor).any(axis=-1)
     return replace(calibration, **values)
+
+
+def camera_calibration(calibration: Calibration, factor: int) -> Calibration:
+    """Return the calibration of the camera whose binned frames have this one, without maps but the dark."""
+    n, dark, noise = factor**2, calibration.dark, calibration.typical_read_noise_e
+    if isinstance(dark, np.ndarray):
+        dark = spread(dark, factor)
+    elif dark is not None:
+        dark /= n
+    return Calibration(
+        dark=dark,
+        estimated=tuple(name for name in calibration.estimated if name == "dark"),
+        gain_e_per_adu=calibration.gain_e_per_adu,
+        em_gain=calibration.em_gain,
+        read_noise_e=None if noise is None else noise / factor,
+        background_e=calibration.background_e / n,
+    )

@@ -32,7 +32,7 @@ METHODS = ("tv", "none", "smoothed")
 PROFILES = ("diffraction", "gaussian")
 
 SMALLEST_FWHM_PX = 0.05
-_LARGEST = 1e9
+_LARGEST = 1e12
 _SMALLEST_VARIANCE = 1e-4  # e-^2, if there is neither read noise nor background
 # Noise-equivalent area / FWHM^2; A is (3 size)^2 for both profiles, FWHM is 1.772 size and 2 size (px).
 _AREA_OF_SQUARED_FWHM = {"diffraction": 2.866, "gaussian": 2.25}
