@@ -50,7 +50,9 @@ def _fits(path: Path, frames: NDArray[Any]) -> None:
 
 def _tiles(path: Path, frames: NDArray[Any]) -> None:
     lossless = {} if frames.dtype.kind != "f" else {"compression_type": "GZIP_1", "quantize_level": 0}
-    fits.CompImageHDU(frames, tile_shape=(1, *frames.shape[1:]), **lossless).writeto(path)
+    fits.CompImageHDU(frames, tile_shape=(1,) * (frames.ndim - 2) + frames.shape[-2:], **lossless).writeto(
+        path
+    )
 
 
 def _array(path: Path, frames: NDArray[Any], zarr_format: int) -> None:
@@ -106,6 +108,10 @@ _KINDS = (
         checksum=True,
     ),
     FrameFile("fits", _fits, "0", "astropy.io.fits"),
+    FrameFile("n1.fits", lambda path, frames: _fits(path, frames[..., None, :, :]), "0", "astropy.io.fits"),
+    FrameFile("1n.fits", lambda path, frames: _fits(path, frames[None, None]), "0", "astropy.io.fits"),
+    FrameFile("1n.fits.fz", lambda path, frames: _tiles(path, frames[None]), "1", "astropy.io.fits"),
+    FrameFile("n1.h5", lambda path, frames: _hdf5(path, frames[..., None, :, :]), "detector/frames", "h5py"),
     FrameFile("fits.gz", _fits, "primary", "astropy.io.fits", checksum=True),
     FrameFile("fits.fz", _tiles, "1", "astropy.io.fits"),
     FrameFile("v2.zarr", partial(_array, zarr_format=2), package="zarr"),

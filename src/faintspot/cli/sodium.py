@@ -45,6 +45,7 @@ def command(
     most: int,
     picture: str | None,
     key: str | None,
+    time_axis: int | None,
 ) -> None:
     """Learn the sodium profile of a laser guide star, and the width of its spots, from frames.
 
@@ -69,7 +70,7 @@ def command(
         raise InputError(f"{config}: expected a table [laser], or --launch-m")
     layout, calibration = Layout.from_tables(config, document), Calibration.from_tables(config, document)
     drawing = picture_file(Path(config), picture, ".sodium.png")
-    with open_frames(frames, key=key) as source, progress_bar("sodium", "steps") as show:
+    with open_frames(frames, key=key, time_axis=time_axis) as source, progress_bar("sodium", "steps") as show:
         found = sodium_of_frames(source, layout, calibration, laser, most_frames=most, progress=show)
     known, path = found.sodium, derived(config, ".sodium.npz")
     profile = known.fit.profile

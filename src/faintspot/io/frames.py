@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.sizes import check_bytes, check_size
+from faintspot.io.arrays.axes import arranged
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
 from faintspot.io.formats.registry import frame_format
 from faintspot.io.locations import one_line, split_location
@@ -39,6 +40,8 @@ class FrameSource(Closing):
         Data type of every block.
     description : str
         The file names, for messages.
+    note : str
+        How the files were understood, if that is not evident.
 
     Examples
     --------
@@ -61,6 +64,7 @@ class FrameSource(Closing):
         self.n_frames: int = self._starts[-1]
         self.dtype: np.dtype[Any] = np.result_type(*(array.dtype for array in arrays))
         others = f" and {len(arrays) - 1} more" if len(arrays) > 1 else ""
+        self.note: str = next((array.note for array in arrays if array.note), "")
         self.description: str = f"{arrays[0].name}{others}"
 
     def block(self, start: int, stop: int) -> NDArray[Any]:
@@ -105,11 +109,14 @@ class FrameSource(Closing):
         return array.read(start, stop)
 
 
-def open_frames(paths: Sequence[str | Path], *, key: str | None = None) -> FrameSource:
+def open_frames(
+    paths: Sequence[str | Path], *, key: str | None = None, time_axis: int | None = None
+) -> FrameSource:
     """Open files of frames, concatenated in the order given.
 
-    FITS (plain, .gz, .fz), TIFF, PNG, HDF5, MATLAB, .npy, .npz and Zarr stores are recognised by content.
-    Each holds a cube (n, height, width) or a single frame (height, width).
+    FITS (plain, .gz, .fz), TIFF, PNG, BMP, JPEG, HDF5, MATLAB, .npy, .npz and Zarr stores are recognised by
+    content. Each holds a cube (n, height, width) or a single frame (height, width); other axes of length one
+    are dropped. Images in colours are read if these are equal, or one of them is selected.
 
     Parameters
     ----------
@@ -119,6 +126,8 @@ def open_frames(paths: Sequence[str | Path], *, key: str | None = None) -> Frame
         the array named "frames", or the only 2-D or 3-D array.
     key : str, optional
         Array to read from every file whose name does not select one.
+    time_axis : {0, 1, 2}, optional
+        Axis of cubes that counts the frames. Default: 0, or the odd one of three of which two are equal.
 
     Raises
     ------
@@ -143,7 +152,7 @@ def open_frames(paths: Sequence[str | Path], *, key: str | None = None) -> Frame
         raise InputError("frames: expected at least one file, got none")
     arrays: list[StoredArray] = []
     for path in paths:
-        array = _find_array(path, key)
+        array = arranged(_find_array(path, key), time_axis)
         _check_frames(array)
         if arrays and array.shape[-2:] != arrays[0].shape[-2:]:
             raise InputError(

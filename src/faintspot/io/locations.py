@@ -63,6 +63,7 @@ def choose_name(path: Path, dimensions: Mapping[str, int], key: str | None) -> s
     if PREFERRED_NAME in dimensions:
         return PREFERRED_NAME
     images = [name for name, count in dimensions.items() if count in (2, 3)]
+    images = images or [name for name, count in dimensions.items() if count > 3]
     if len(images) != 1:
         raise InputError(
             f"{path}: expected one array of frames, or one named 'frames'; "

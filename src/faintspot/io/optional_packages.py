@@ -20,7 +20,7 @@ def load_hdf5() -> Any:
 
 def load_pillow() -> Any:
     """Return the module PIL.Image."""
-    return _load("PIL.Image", "pillow", "Reading a PNG file or a compressed TIFF file")
+    return _load("PIL.Image", "pillow", "Reading a PNG, BMP, JPEG or compressed TIFF file")
 
 
 def load_tifffile() -> Any:

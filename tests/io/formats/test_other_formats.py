@@ -1,4 +1,4 @@
-"""HDF5, MATLAB and PNG files: tests beyond those of every format."""
+"""HDF5, MATLAB and image files: tests beyond those of every format."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.io
 from PIL import Image
-from tests.io.frame_files import cube, h5py, save
+from tests.io.frame_files import cube, h5py, save, tifffile
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError
@@ -79,9 +79,9 @@ class TestMatlab:
             np.testing.assert_array_equal(source.block(1, 3), values[1:3])
 
 
-class TestPng:
+class TestImages:
     @pytest.mark.parametrize("kind", ["u1", "u2"])
-    def test_grey(self, tmp_path: Path, kind: str) -> None:
+    def test_grey_png(self, tmp_path: Path, kind: str) -> None:
         frames = cube(2).astype(kind)
         paths = [tmp_path / "a.png", tmp_path / "b.png"]
         for path, frame in zip(paths, frames, strict=True):
@@ -90,10 +90,39 @@ class TestPng:
             assert source.dtype == kind
             np.testing.assert_array_equal(source.block(0, 2), frames)
 
+    @pytest.mark.parametrize("ending", ["png", "bmp", "jpg", "tif"])
+    @pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
+    def test_grey_in_any_mode(self, tmp_path: Path, ending: str, mode: str) -> None:
+        path, frame = tmp_path / f"a.{ending}", np.full((16, 24), 7, np.uint8)
+        frame[8:, 8:16] = 200  # whole blocks, which JPEG keeps
+        image = Image.fromarray(frame)
+        image.convert("RGB" if ending == "jpg" and mode != "L" else mode).save(path)
+        with open_frames([path]) as source:
+            assert (source.n_frames, source.dtype) == (1, np.dtype(np.uint8))
+            np.testing.assert_allclose(source.block(0, 1)[0], frame, atol=2 if ending == "jpg" else 0)
+            assert ("equal" in source.note) == (mode != "L")
+
+    @pytest.mark.parametrize("ending", ["png", "bmp", "tif"])
+    def test_colours_that_differ(self, tmp_path: Path, ending: str) -> None:
+        path, values = tmp_path / f"a.{ending}", np.zeros((6, 8, 3), np.uint8)
+        values[0, 0] = 1, 2, 3
+        Image.fromarray(values).save(path)
+        with refused(path.name, "colours differ in 2.1 %", "one"), open_frames([path]) as source:
+            source.block(0, 1)
+        if ending != "tif":
+            with open_frames([f"{path}:green"]) as source:
+                np.testing.assert_array_equal(source.block(0, 1)[0], values[..., 1])
+
+    def test_several_pages_in_equal_colours(self, tmp_path: Path) -> None:
+        frames = cube(3).astype("u2")
+        tifffile.imwrite(tmp_path / "a.tif", np.repeat(frames[..., None], 3, axis=-1), photometric="rgb")
+        with open_frames([tmp_path / "a.tif"]) as source:
+            np.testing.assert_array_equal(source.block(0, 3), frames)
+
     def test_refused(self, tmp_path: Path) -> None:
         path = tmp_path / "a.png"
-        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(path)
-        with pytest.raises(InputError, match="expected a grey image of 8 or 16 bits, got mode RGB"):
+        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).convert("P").save(path)
+        with refused("expected a grey image of 8 or 16 bits, got mode P"):
             open_frames([path])
         Image.fromarray(cube(1, 60, 80)[0].astype("u1")).save(path)
         with pytest.raises(InputError, match="one unnamed"):

@@ -170,6 +170,7 @@ def command(
     factor: int | None,
     mask_hot_pixels: bool,
     key: str | None,
+    time_axis: int | None,
     overwrite: bool,
     accept: bool,
     **options: Any,
@@ -217,7 +218,7 @@ def command(
     optics = layout_options.optics(target, {name: options.pop(name) for name in _OPTICS})
     of_camera = {name: options.pop(name) for name in _CALIBRATION}
     drawing = picture_file(target, picture, ".png")
-    with open_frames(frames, key=key) as source:
+    with open_frames(frames, key=key, time_axis=time_axis) as source:
         calibration = layout_options.calibration(target, of_camera)
         stated = layout_options.kept_calibration(calibration, of_camera)
         mean, values = _mean_frame(source, calibration)
@@ -241,6 +242,8 @@ def command(
             layout = replace(found.layout[kept], **optics, doubts=(found.doubt,) if found.doubt else ())
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
     calibration, notes = _completed(calibration, found, layout, mean, hot)
+    if source.note:
+        notes.append(f"  {source.description}: {source.note}")
     if calibration.saturation_adu is None and values.saturation_adu is not None:
         estimated = (*calibration.estimated, "saturation_adu")
         calibration = replace(calibration, saturation_adu=values.saturation_adu, estimated=estimated)
@@ -282,7 +285,9 @@ def command(
         )
     if drawing is not None:
         click.echo(f"  picture: {drawing}")
-    arguments = [*frames, *(["--key", key] if key else []), "--config", output, "-o", suggested_slopes()]
+    arguments = [*frames, *(["--key", key] if key else [])]
+    arguments += [] if time_axis is None else ["--time-axis", str(time_axis)]
+    arguments += ["--config", output, "-o", suggested_slopes()]
     click.echo(f"Next: faintspot slopes {shlex.join(arguments)}")
 
 

@@ -49,6 +49,7 @@ def replay(
     name: str,
     frame_rate_hz: float | None,
     key: str | None,
+    time_axis: int | None,
     slots: int,
     **options: Any,
 ) -> None:
@@ -80,7 +81,7 @@ def replay(
     with (
         stop_on_signal() as stop,
         quick_switching(),
-        open_frames(frames, key=key) as source,
+        open_frames(frames, key=key, time_axis=time_axis) as source,
         PixelRing.create(name, source.shape, ring_type(source.dtype), slots=slots) as ring,
         Replay(source, ring, frame_rate_hz=rate_hz, waits=waits, **options) as player,
     ):

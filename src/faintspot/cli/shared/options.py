@@ -24,7 +24,23 @@ def name_option(what: str) -> Option:
 
 ENGINE_NAME = name_option("Name of the engine.")
 AS_JSON = option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
-KEY = option("--key", metavar="NAME", help="Which array to read of files that hold several.")
+
+
+def which_frames(**options: Any) -> Option:
+    """Return --key and --time-axis: which array of a file holds frames, and how."""
+    key = option("--key", metavar="NAME", help="Which array to read of files that hold several.", **options)
+    time_axis = option(
+        "--time-axis",
+        type=click.IntRange(0, 2),
+        metavar="AXIS",
+        help="Axis of a cube that counts the frames.",
+        show_default="0, or the odd one of three of which two are equal",
+        **options,
+    )
+    return lambda command: key(time_axis(command))
+
+
+KEY = which_frames()
 FRAMES = option(
     "--frames", type=click.IntRange(1), help="Stop after this number of frames.", show_default="at Ctrl-C"
 )

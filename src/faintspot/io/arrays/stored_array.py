@@ -36,11 +36,23 @@ class StoredArray(Closing):
         Type of the values, in any byte order; `read` returns them in native order.
     open_array : callable
         See `OpenArray`; it and the returned array may raise any error on damaged files.
+    note : str
+        How the file was understood, if that is not evident.
+    matlab : bool
+        Whether MATLAB's last axis was put first.
     """
 
     def __init__(
-        self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], open_array: OpenArray
+        self,
+        name: str,
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        open_array: OpenArray,
+        *,
+        note: str = "",
+        matlab: bool = False,
     ) -> None:
+        self.note, self.matlab = note, matlab
         self.name, self.shape = name, tuple(int(side) for side in shape)
         self.dtype: np.dtype[Any] = dtype.newbyteorder("=")
         self._open_array = open_array
@@ -49,11 +61,20 @@ class StoredArray(Closing):
 
     @classmethod
     def whole(
-        cls, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], load: Callable[[], NDArray[Any]]
+        cls,
+        name: str,
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        load: Callable[[], NDArray[Any]],
+        **options: Any,
     ) -> StoredArray:
         """Return an array that can only be read whole, by `load`; refuse one that needs too much memory."""
         check_bytes(name, math.prod(shape) * dtype.itemsize, MOST_WHOLE_BYTES, "an array")
-        return cls(name, shape, dtype, lambda _: load())
+        return cls(name, shape, dtype, lambda _: load(), **options)
+
+    def opened(self, files: ExitStack) -> Any:
+        """Open the file on another stack; see `OpenArray`."""
+        return self._open_array(files)
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Return items `start` to `stop` of the first axis, C-ordered; the array belongs to the caller.

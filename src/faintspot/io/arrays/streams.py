@@ -69,12 +69,17 @@ class StreamedArray:
         self._stream, self._offset, self._dtype, self._shape = stream, offset, dtype, shape
         self._compressed = compressed
 
-    def __getitem__(self, part: slice) -> NDArray[Any]:
-        """Return items of the first axis, in native byte order; raise EOFError if the data end too early."""
-        values = np.empty((part.stop - part.start, *self._shape[1:]), self._dtype)
-        self._stream.seek(self._offset + part.start * math.prod(self._shape[1:]) * self._dtype.itemsize)
+    def __getitem__(self, chosen: slice | tuple[Any, ...]) -> NDArray[Any]:
+        """Return items of the first axis, in native byte order; raise EOFError if the data end too early.
+
+        Zeros may come before the slice, for axes of length one.
+        """
+        *ones, part = chosen if isinstance(chosen, tuple) else (chosen,)
+        shape = self._shape[len(ones) :]
+        values = np.empty((part.stop - part.start, *shape[1:]), self._dtype)
+        self._stream.seek(self._offset + part.start * math.prod(shape[1:]) * self._dtype.itemsize)
         if self._stream.readinto(values.reshape(-1).view(np.uint8)) < values.nbytes:  # type: ignore[attr-defined]
             raise EOFError("the data end too early")
-        while self._compressed and part.stop == self._shape[0] and self._stream.read(_PIECE_BYTES):
+        while self._compressed and part.stop == shape[0] and self._stream.read(_PIECE_BYTES):
             pass
         return values.astype(self._dtype.newbyteorder("="), copy=False)

@@ -40,7 +40,7 @@ class Hdf5(FileFormat):
                 data_set = files.enter_context(h5py.File(path, "r"))[chosen]
                 return _Transposed(data_set) if reverse else data_set
 
-            return StoredArray(name, shape, data_set.dtype, open_array)
+            return StoredArray(name, shape, data_set.dtype, open_array, matlab=self.matlab)
 
 
 class Matlab73(Hdf5):

@@ -38,7 +38,7 @@ class Matlab(FileFormat):
 
         def load() -> NDArray[Any]:
             values = scipy.io.loadmat(path, variable_names=[chosen], mat_dtype=True)[chosen]
-            return np.asarray(np.moveaxis(values, -1, 0) if values.ndim == 3 else values)
+            return np.asarray(np.moveaxis(values, -1, 0) if values.ndim > 2 else values)
 
-        frames_first = (*shape[2:], *shape[:2])
-        return StoredArray.whole(f"{path}:{chosen}", frames_first, np.dtype(_TYPES[kind]), load)
+        frames_first = (*shape[2:], *shape[:2]) if len(shape) < 4 else (shape[-1], *shape[:-1])
+        return StoredArray.whole(f"{path}:{chosen}", frames_first, np.dtype(_TYPES[kind]), load, matlab=True)

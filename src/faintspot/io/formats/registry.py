@@ -10,9 +10,9 @@ from faintspot.io.formats.csv_files import Csv
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.formats.fits_files import Fits, FitsGz
 from faintspot.io.formats.hdf5_files import Hdf5, Matlab73
+from faintspot.io.formats.image_files import Bmp, Jpeg, Png
 from faintspot.io.formats.matlab_files import Matlab
 from faintspot.io.formats.numpy_files import Npy, Npz
-from faintspot.io.formats.png_files import Png
 from faintspot.io.formats.tiff_files import Tiff
 from faintspot.io.formats.zarr_files import Zarr
 
@@ -24,6 +24,8 @@ FORMATS: tuple[FileFormat, ...] = (
     Npz(),
     Tiff(),
     Png(),
+    Bmp(),
+    Jpeg(),
     Hdf5(),
     Matlab73(),
     Matlab(),

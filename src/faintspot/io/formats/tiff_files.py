@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.io.arrays.channels import EQUAL_COLOURS, grey
 from faintspot.io.arrays.stored_array import StoredArray
 from faintspot.io.arrays.streams import StreamedArray, check_present
 from faintspot.io.formats.file_format import FileFormat
@@ -84,12 +85,13 @@ def _array(name: str, path: Path, chosen: list[Any], numbers: list[int]) -> Stor
     """Return the pages of series as one array: as plain bytes if contiguous, else page by page."""
     series = chosen[0]
     size = tuple(series.keyframe.shape)
-    if series.keyframe.samplesperpixel != 1 or len(size) != 2:
+    is_colour = len(size) == 3 and size[-1] in (3, 4)
+    if not is_colour and (series.keyframe.samplesperpixel != 1 or len(size) != 2):
         raise InputError(f"{name}: expected grey frames, got pages of shape {size}")
     count = sum(item.size for item in chosen) // math.prod(size)
-    shape = (count, *size) if count > 1 else size
+    shape = (count, *size[:2]) if count > 1 else size[:2]
     dtype = np.dtype(series.dtype).newbyteorder(series.parent.byteorder)
-    if len(chosen) == 1 and series.dataoffset is not None:
+    if len(chosen) == 1 and series.dataoffset is not None and not is_colour:
         offset = series.dataoffset
         check_present(name, path, offset + math.prod(shape) * dtype.itemsize)
         return StoredArray(
@@ -104,7 +106,7 @@ def _array(name: str, path: Path, chosen: list[Any], numbers: list[int]) -> Stor
         pages = _Pages(path, [page for number in numbers for page in file.series[number].pages])
         return pages if count > 1 else pages[0:1][0]
 
-    return StoredArray(name, shape, dtype, open_pages)
+    return StoredArray(name, shape, dtype, open_pages, note=EQUAL_COLOURS if is_colour else "")
 
 
 class _Pages:
@@ -115,7 +117,8 @@ class _Pages:
 
     def __getitem__(self, part: slice) -> NDArray[Any]:
         """Return pages, decoded by tifffile if possible, else by Pillow."""
-        return np.stack([self._decoded(page) for page in self._pages[part]])
+        pages = np.stack([self._decoded(page) for page in self._pages[part]])
+        return pages if pages.ndim == 3 else grey(str(self._path), pages, selectable=False)
 
     def _decoded(self, page: Any) -> NDArray[Any]:
         if page.compression in _PLAIN or importlib.util.find_spec("imagecodecs"):

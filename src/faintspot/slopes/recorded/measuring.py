@@ -89,6 +89,7 @@ def measure_recorded(
     keep: Sequence[str] = (),
     reference: NDArray[Any] | str | Path | None = None,
     key: str | None = None,
+    time_axis: int | None = None,
     threads: int | None = None,
     block_frames: int | None = None,
     overwrite: bool = False,
@@ -128,6 +129,8 @@ def measure_recorded(
         slopes of which they are the mean; see `faintspot.io.references.read_reference`.
     key : str, optional
         Which array of the files to read, where they hold several.
+    time_axis : {0, 1, 2}, optional
+        Axis of cubes that counts the frames, see `faintspot.io.open_frames`.
     threads : int, optional
         Most threads to use; default all processors.
     block_frames : int, optional
@@ -161,7 +164,7 @@ def measure_recorded(
         about_reference = positions is not None and str(error).startswith("reference")
         file = reference if about_reference and isinstance(reference, str | Path) else configuration_file
         raise InputError(f"{file}: {error}") from None
-    with open_frames(frames, key=key) as source:
+    with open_frames(frames, key=key, time_axis=time_axis) as source:
         _check_output(output, frames)
         if source.shape != layout.frame_shape:
             raise InputError(
@@ -176,6 +179,8 @@ def measure_recorded(
         if mean_flux:
             pipeline = _with_mean_flux(pipeline, source)
         attributes = _attributes(pipeline, source, frames, configuration_file, key, unit, keep)
+        if time_axis is not None:
+            attributes["source_time_axis"] = time_axis
         factor = pixels_in(one_of("unit", unit, UNITS), attributes)
         if positions is not None:
             attributes["reference"] = np.asarray(positions).tolist()

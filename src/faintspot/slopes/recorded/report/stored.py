@@ -193,7 +193,10 @@ def _source(store: StoredRun, frames: Sequence[str | Path] | None) -> FrameSourc
     locations = list(frames) if frames is not None else store.sources
     if not locations:
         raise InputError(f"{store.path.name} does not say where its frames came from")
-    return open_frames(locations, key=store.stored.attributes.get("source_key") or None)
+    known = store.stored.attributes
+    return open_frames(
+        locations, key=known.get("source_key") or None, time_axis=known.get("source_time_axis")
+    )
 
 
 def _frame(store: StoredRun, number: int, frames: Sequence[str | Path] | None) -> NDArray[Any]:
