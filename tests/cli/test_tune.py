@@ -7,7 +7,7 @@ import pytest
 from tests.cli.cli_cases import LAYOUT, Commands, simulated
 from tests.experiments.loop_answer_cases import made_up
 
-from faintspot import Calibration, SlopePipeline
+from faintspot import Calibration, Layout, SlopePipeline
 from faintspot.experiments.closed_loop import tuning as loop_tuning
 from faintspot.experiments.closed_loop.answer import LoopAnswer
 from faintspot.experiments.closed_loop.question import LoopQuestion
@@ -77,6 +77,22 @@ def test_calibration_of_an_existing_configuration_counts_and_stays(
     assert SlopePipeline.from_file("faintspot.toml").calibration == Calibration(
         dark=100.0, gain_e_per_adu=2.0, read_noise_e=4.0
     )
+
+
+def test_binned_layout(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    layout = Layout.grid((4, 4), pixels=16, bin=2, frame_shape=(65, 65))
+    layout.save("layout.toml")
+    Calibration(dark=100.0, read_noise_e=1.5).save("layout.toml")
+    values = ("--fwhm-px", "3.6", "--search-range-px", "2", "--flux-e", 200)
+    out = run.ok("tune", "--config", "layout.toml", *values).out
+    assert "2 x 2 pixels are summed" in out
+    assert "8 x 8" in out
+    assert "read noise 3 e-" in out
+    pipeline = SlopePipeline.from_file("faintspot.toml")
+    assert pipeline.layout == layout
+    assert (pipeline.calibration.dark, pipeline.calibration.read_noise_e) == (100.0, 1.5)
+    assert pipeline.settings.search_range_px == 2.0
 
 
 @pytest.mark.slow

@@ -89,10 +89,10 @@ def command(
     """Turn recorded frames into slopes.
 
     FRAMES are FITS (plain, .gz, .fz), TIFF, PNG, BMP, JPEG, HDF5, MATLAB, .npy, .npz or Zarr, in the order
-    given. They are read block by block, so that their size does not matter. Interrupted and started again, the
-    command resumes (this needs the extra io): until a file other than a .zarr store is complete, its slopes
-    are in OUTPUT.partial.zarr. Of telemetry in the AOT standard the frames of its Shack-Hartmann sensor are
-    measured (--key names one of several); where the configuration has no [layout], with the file's
+    given. They are read block by block, so that their size does not matter. Interrupted and started again,
+    the command resumes (this needs the extra io): until a file other than a .zarr store is complete, its
+    slopes are in OUTPUT.partial.zarr. Of telemetry in the AOT standard the frames of its Shack-Hartmann
+    sensor are measured (--key names one of several); where the configuration has no [layout], with the file's
     sub-apertures and reference slopes.
 
     The output holds x, y (px, or arcsec, from the sub-aperture's centre), flux (e-), valid, flags,

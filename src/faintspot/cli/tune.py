@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ import click
 import numpy as np
 from rich.console import Console
 
+from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
 from faintspot.cli.layout.options import grid_shape
 from faintspot.cli.shared.commands import SectionedCommand, option
@@ -158,8 +160,8 @@ def command(
     given = {**known, **given, **({"layout": known["layout"]} if grid or config else {})}
     camera_layout: Layout | None = given.get("layout")
     factor = 1 if camera_layout is None else camera_layout.bin
-    if camera_layout is not None:
-        given["layout"] = binned_layout(camera_layout)
+    if camera_layout is not None and factor > 1:
+        given = _binned(given, camera_layout)
     with progress_bar("tuning", "steps") as advance:
         opened = partial(_read, time_axis=time_axis, factor=factor)
         question = _question(recording, dark, key, given, opened)
@@ -224,6 +226,27 @@ def _given(camera: str | None, options: dict[str, Any]) -> dict[str, Any]:
     return {**known, **chosen}
 
 
+def _binned(given: dict[str, Any], layout: Layout) -> dict[str, Any]:
+    """Return the values of binned frames for those stated of the camera."""
+    factor = layout.bin
+    scales = {
+        "read_noise_e": factor,
+        "background_e": factor**2,
+        "pixel_scale_arcsec": factor,
+        "fwhm_px": 1 / factor,
+        "search_range_px": 1 / factor,
+    }
+    scaled = {name: value * scales[name] if name in scales else value for name, value in given.items()}
+    if (pixels := given.get("pixels")) is not None:
+        scaled["pixels"] = pixels // factor
+    if "calibration" in given:
+        scaled["calibration"] = binned_calibration(given["calibration"], factor, layout.frame_shape)
+    budget = str(given.get("budget", "")).removesuffix("px")
+    with suppress(ValueError):  # none, in another unit, or refused by the question
+        scaled["budget"] = float(budget) / factor
+    return {**scaled, "layout": binned_layout(layout)}
+
+
 def _sensor(grid: str | None, config: str | None, target: Path, given: dict[str, Any]) -> dict[str, Any]:
     """Return the layout that was asked for or that the configuration has already, and its calibration."""
     if grid is not None and config is not None:
@@ -234,9 +257,7 @@ def _sensor(grid: str | None, config: str | None, target: Path, given: dict[str,
         calibration: Calibration = configuration.load(source, "calibration")
         # The target may have no layout yet; a file that was named for its layout must.
         if config is not None or "[layout" in target.read_text(encoding="utf-8"):
-            layout = found["layout"] = Layout.load(source)
-            if layout.bin > 1:
-                calibration = binned_calibration(calibration, layout.bin, layout.frame_shape)
+            found["layout"] = Layout.load(source)
         found["calibration"] = calibration
         default = Calibration()
         if calibration.read_noise_e is not None:
@@ -302,6 +323,10 @@ def _save_in_camera_pixels(answer: Answer, target: Path, layout: Layout) -> None
     calibration = camera_calibration(answer.calibration, layout.bin)
     for item in (layout, answer.best.settings.magnified(layout.bin), calibration):
         configuration.save(target, item)
+    if answer.promise is not None:
+        table = answer.promise.to_table()
+        scaled = {name: layout.bin * value for name, value in table.items() if name.endswith("_px")}
+        save_tables(target, {"promise": {**table, **scaled}})
 
 
 def _say_what_is_next(answer: Answer, target: Path, picture: Path | None, frames: tuple[str, ...]) -> None:
