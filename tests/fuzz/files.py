@@ -104,12 +104,15 @@ def _read_aot(path: Path) -> None:
     _read_frames(path)
 
 
+_IMAGES = ("png", "bmp", "jpg", "lzw.tif")
+
+
 def _frame_readers() -> dict[str, Callable[[Path], Any]]:
     from tests.io import frame_files
 
     # SciPy ends the process on some damaged MATLAB files.
     endings = [ending for ending, kind in frame_files.FRAME_FILES.items() if not kind.whole]
-    return {f"frames.{ending}": _read_frames for ending in (*endings, "png", "lzw.tif")}
+    return {f"frames.{ending}": _read_frames for ending in (*endings, *_IMAGES)}
 
 
 READERS: dict[str, Callable[[Path], Any]] = {
@@ -141,9 +144,10 @@ def _originals() -> Path:
     _kept.append(keep)
     folder = Path(keep.name)
     for name in READERS:
-        if name in ("frames.png", "frames.lzw.tif"):
+        if name.removeprefix("frames.") in _IMAGES:
             options = {"compression": "tiff_lzw"} if name.endswith("tif") else {}
-            Image.fromarray(frame_files.cube(1, 60, 80, "uint16")[0]).save(folder / name, **options)
+            dtype = "uint8" if name.endswith(("bmp", "jpg")) else "uint16"
+            Image.fromarray(frame_files.cube(1, 60, 80, dtype)[0]).save(folder / name, **options)
         elif name.startswith("frames."):
             frame_files.save(folder / name, frame_files.cube(5))
         elif name.startswith("slopes."):
