@@ -107,7 +107,7 @@ class TestImages:
         path, values = tmp_path / f"a.{ending}", np.zeros((6, 8, 3), np.uint8)
         values[0, 0] = 1, 2, 3
         Image.fromarray(values).save(path)
-        with refused(path.name, "colours differ in 2.1 %", "one"), open_frames([path]) as source:
+        with refused(path.name, "colours differ in 2.08 %", "one"), open_frames([path]) as source:
             source.block(0, 1)
         if ending != "tif":
             with open_frames([f"{path}:green"]) as source:

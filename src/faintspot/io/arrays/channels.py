@@ -32,7 +32,7 @@ def grey(name: str, values: NDArray[Any], *, selectable: bool = True) -> NDArray
             else "save one of the colours in grey"
         )
         raise InputError(
-            f"{name}: expected a grey image, its colours differ in {part:.2g} % of the pixels; {way}"
+            f"{name}: expected a grey image, its colours differ in {part:.3g} % of the pixels; {way}"
         )
     return np.ascontiguousarray(first[..., 0])
 

@@ -28,12 +28,21 @@ def binned(frames: ArrayLike, factor: int, saturation: float = np.nan) -> NDArra
 
     A block with a saturated pixel becomes saturated as a whole: at least factor^2 times `saturation`.
     """
-    parts = blocks(frames, factor)
+    array = np.asarray(frames)
+    height, width = (side // factor * factor for side in array.shape[-2:])
+    # Strided parts of the frame: several times as fast as a reduction over blocks.
+    parts = [array[..., y:height:factor, x:width:factor] for y in range(factor) for x in range(factor)]
+    total = np.zeros(parts[0].shape)
     with np.errstate(over="ignore", invalid="ignore"):
-        sums: NDArray[np.float32] = parts.sum(axis=-1, dtype=np.float64).astype(np.float32)
+        for part in parts:
+            total += part
+        sums = total.astype(np.float32)
     if not np.isnan(saturation):
         level = np.nextafter(np.float32(saturation * factor**2), np.float32(np.inf))
-        sums[(parts >= saturation).any(axis=-1) & (sums < level)] = level
+        saturated = np.zeros(sums.shape, bool)
+        for part in parts:
+            saturated |= part >= saturation
+        sums[saturated & (sums < level)] = level
     return sums
 
 
