@@ -83,6 +83,8 @@ def command(
         f"of a single altitude {known.spot_fwhm_arcsec:.2f} arcsec wide, elongations {longest.min():.1f} to "
         f"{longest.max():.1f} px, mean flux {np.median(known.fit.flux_e):.3g} e-"
     )
+    if found.left_out:
+        click.echo(f"  {found.left_out}")
     click.echo(f"  {config}: profile and spot_fwhm_arcsec of [laser] written")
     if "centres" in document["layout"]:
         lattice = found.lattice_of(layout)

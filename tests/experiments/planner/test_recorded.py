@@ -176,3 +176,21 @@ def test_unreliable_gain_is_not_used() -> None:
     assert question.layout is not None
     assert len(question.layout) == 49  # those that the frame's edge does not cut
     assert question.fwhm_px == pytest.approx(3.7, abs=0.2)
+
+
+def test_dark_subapertures_are_left_out_of_the_question_but_not_of_the_layout() -> None:
+    lit = np.arange(36) != 7
+    frames, _ = sensor_frames(
+        LAYOUT.corners,
+        LAYOUT.window,
+        LAYOUT.frame_shape,
+        12,
+        flux_e=1000.0 * lit,
+        detector=CAMERA,
+        rng=np.random.default_rng(7),
+    )
+    question = question_from_frames(frames, layout=LAYOUT, gain_e_per_adu=0.5)
+    assert "left out 1 of 36 sub-apertures: dark" in question.facts
+    assert question.star_flux_e == pytest.approx(1000.0, rel=0.03)
+    assert question.layout == LAYOUT[lit]
+    assert question.whole_layout == LAYOUT

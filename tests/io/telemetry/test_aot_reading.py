@@ -66,6 +66,8 @@ def test_ours_bit_for_bit(tmp_path: Path, reference: Any) -> None:
     assert sensor.noise is not None
     assert np.array_equal(sensor.noise[:, 1], np.square(telemetry.standard_error_y))
     assert np.array_equal(sensor.noise[:, 2], telemetry.covariance_xy)
+    assert sensor.flags is not None
+    assert np.array_equal(sensor.flags, telemetry.flags)
     assert np.array_equal(sensor.frame, telemetry.frame)
     assert np.array_equal(sensor.unix_time_s, telemetry.unix_time_s)
     assert np.array_equal(sensor.image_frame, telemetry.image_frame)

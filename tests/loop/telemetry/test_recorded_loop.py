@@ -42,6 +42,20 @@ def test_npz_with_words(tmp_path: Path) -> None:
     same(read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml"))
 
 
+def test_slopes_that_are_not_valid_are_left_out(tmp_path: Path) -> None:
+    found = arrays()
+    flags = np.zeros((2550, 25), np.uint8)
+    flags[:, 3], flags[7, 4] = 1, 128
+    found["slopes"] = np.where(np.arange(50) == 30, np.nan, found["slopes"])
+    np.savez(tmp_path / "night.npz", **found, flags=flags)
+    (tmp_path / "system.toml").write_text(WORDS)
+    loop = read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml")
+    line = "slopes: left out 2 of 25 sub-apertures, 1 slope of others: dark, not finite, limited"
+    assert line in loop.remarks
+    assert np.isnan(loop.slopes[:, [3, 28, 5, 30]]).all()
+    assert np.isnan(loop.slopes).sum() == 4 * 2550 + 2
+
+
 def test_toml_that_names_arrays(tmp_path: Path) -> None:
     """Slopes as CSV in pairs, commands of the opposite sign, times with a gap."""
     found = arrays()
@@ -120,6 +134,7 @@ def test_aot_file(tmp_path: Path) -> None:
         ({"slopes": np.zeros((9, 51))}, r"slopes: expected shape \(frames, 2 n\)"),
         ({"cells": np.zeros((4, 2))}, r"cells: expected shape \(25, 2\)"),
         ({"time_s": np.zeros(2550)}, "time_s: expected 2550 increasing times"),
+        ({"flags": np.zeros((2550, 24), int)}, r"flags: expected integers of shape \(2550, 25\)"),
         ({"slope": 1.0}, "did you mean slopes"),
     ],
 )

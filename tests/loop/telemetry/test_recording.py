@@ -51,6 +51,7 @@ def recording(frames: int = 700) -> Any:
         commands=np.array(sent, np.float32)[kept],
         slopes=slopes_px,
         valid=np.ones((len(kept), 9), bool),
+        flags=np.repeat(np.uint8([[0, 0, 0, 0, 0, 0, 0, 0, 1]]), len(kept), axis=0),
         standard_error_x=error,
         standard_error_y=error,
         covariance_xy=-0.4 * error**2,
@@ -153,6 +154,7 @@ def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     result = learn("--control", "kalman", "--winds", "none")
     assert result.exception is None, result.exception
     assert "597 frames at 250 a second: kalman leaves 0." in result.output
+    assert "left out 1 of 9 sub-apertures: dark" in result.output
     control = load_control(path)
     assert control is not None
     assert (control.options.controller, control.prediction) == ("kalman", "controller")

@@ -59,7 +59,7 @@ def calibration() -> fs.Calibration:
 def test_profile_and_spot_are_found(recording: Path) -> None:
     """Two peaks from one: 12 % of the flux is elsewhere, of 30 % in the first estimate; the spot to 5 %."""
     with open_frames([recording / "frames.npy"]) as source:
-        known, places = found = sodium_of_frames(source, LAYOUT, calibration(), LASER)
+        known, places, *_ = found = sodium_of_frames(source, LAYOUT, calibration(), LASER)
     profile = known.fit.profile
     density = np.interp(TRUE.altitudes_m, profile.altitudes_m, profile.density, 0.0, 0.0)
     assert 0.5 * np.trapezoid(np.abs(density - TRUE.density), TRUE.altitudes_m) < 0.12
@@ -71,6 +71,20 @@ def test_profile_and_spot_are_found(recording: Path) -> None:
     wrong = replace(LAYOUT, centres=1.01 * LAYOUT.centres + 0.5)
     np.testing.assert_allclose(found.lattice_of(wrong).centres, LAYOUT.centres, atol=0.15)
     assert np.abs(places).max() < 0.5
+
+
+def test_dark_subapertures_are_left_out(recording: Path, tmp_path: Path) -> None:
+    """The profile is that of the others: their images are the only ones that weigh."""
+    frames = np.load(recording / "frames.npy")
+    frames[:, 10:20, 30:40] = DARK_ADU
+    np.save(tmp_path / "frames.npy", frames)
+    with open_frames([tmp_path / "frames.npy"]) as source:
+        found = sodium_of_frames(source, LAYOUT, calibration(), LASER)
+    assert found.left_out == "left out 1 of 36 sub-apertures: dark"
+    assert list(np.flatnonzero(~found.usable)) == [9]
+    np.testing.assert_allclose(np.delete(found.sodium.fit.flux_e, 9), 200.0, rtol=0.05)
+    wrong = replace(LAYOUT, centres=1.01 * LAYOUT.centres + 0.5)
+    np.testing.assert_allclose(found.lattice_of(wrong).centres, LAYOUT.centres, atol=0.15)
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from faintspot import InputError, Layout, Settings, SlopePipeline, Slopes, SubapertureFlag, fit_wavefront
 from faintspot.slopes.sensor.pupil import inside_pupil, lenslet_outlines, lit_outlines, pupil_of
 from faintspot.slopes.wavefront.discrepancy import slope_discrepancy
+from faintspot.slopes.wavefront.words import remarks
 from faintspot.slopes.wavefront.zernike import mean_gradients, zernike
 
 LAYOUT = Layout.grid((7, 7), pixels=8, outer_radius=3.5, inner_radius=0.5)
@@ -149,6 +150,8 @@ def test_frames_with_too_few_valid_are_left_out() -> None:
     slopes = flagged(slopes_of(slopes_of_modes(LAYOUT, true)), (1, slice(0, 31)))
     found = fit_wavefront(slopes, LAYOUT)
     assert list(found.fitted) == [True, False, True]
+    assert found.left_out == "left out 31 slopes of 108: dark"
+    assert "Left out 31 slopes of 108: dark." in remarks(found)
     np.testing.assert_allclose(found.mean, found.coefficients[0], rtol=1e-4)
 
 

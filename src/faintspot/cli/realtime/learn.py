@@ -93,6 +93,7 @@ def _learn_from(
     store: Path, config: str, kind: str, winds: str, layers: tuple[tuple[float, float, float], ...]
 ) -> None:
     """Learn from a recording."""
+    from faintspot.base.validity import leave_out
     from faintspot.io import read_telemetry
     from faintspot.loop.control.base import ASSUMED
     from faintspot.loop.control.configuration import load_control, prior_std_px, save_control
@@ -113,7 +114,9 @@ def _learn_from(
     path = derived(config, ".model.npz")
     learnt.model.save(path)
     save_control(config, controller=kind, model=path.name)
-    left = learnt.model.left
+    left, left_out = learnt.model.left, leave_out(night.flags)[1]
+    if left_out:
+        click.echo(left_out)
     click.echo(
         f"{len(telemetry)} frames at {rate_hz:.0f} a second: {kind} leaves {left[0] / left[1]:.2f} of the "
         f"phase variance that the integrator with gain {learnt.model.plain_gain:g} leaves"

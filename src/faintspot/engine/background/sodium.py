@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.flags import INVALID
+from faintspot.base.validity import are_valid
 from faintspot.engine.background.background_process import BackgroundProcess, background_process
 from faintspot.engine.engine import Engine
 from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
@@ -94,7 +94,7 @@ class SodiumFollower(BackgroundProcess):
 
     def _add(self, raw: NDArray[np.float32], record: NDArray[Any]) -> None:
         """Add an image and its slopes to the running mean."""
-        valid = record["flags"] & int(INVALID) == 0
+        valid = are_valid(record["flags"])
         if valid.mean() < _LEAST_VALID:
             return
         electrons, _ = calibrated_images(raw, self._layout, self._calibration)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.flags import INVALID, SubapertureFlag
+from faintspot.base.validity import are_valid
 from faintspot.engine.page.batch import Batch, Floats
 from faintspot.engine.settings.interleaving import methods_after
 from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
@@ -164,7 +165,7 @@ class PageState:
 
     def _rows(self, records: NDArray[Any]) -> Floats:
         """Return a row of `_FRAME` for each record."""
-        valid = (records["flags"] & INVALID) == 0
+        valid = are_valid(records["flags"])
         count = valid.sum(axis=1)
         n_valid = np.where(count > 0, count, np.nan)
         rows = np.full((len(records), len(_FRAME)), np.nan)

@@ -10,6 +10,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.report.page import POSITIONS, Page, Section, Table, configuration_section, html_of
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import Estimate
+from faintspot.base.validity import leave_out
 from faintspot.engine.telemetry.figures import latency_figure, methods_figure
 from faintspot.engine.telemetry.numbers import (
     PERCENTILES,
@@ -77,7 +78,7 @@ def _measured(telemetry: Telemetry) -> list[MeasuredSlopes]:
     for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
         rows = telemetry.method == method
         arrays = [getattr(telemetry, array)[rows] for array in ARRAYS]
-        finite = errors[rows][np.isfinite(errors[rows])]
+        finite = errors[rows][telemetry.valid[rows] & np.isfinite(errors[rows])]
         stated = float(np.median(finite)) if finite.size else np.nan
         frames = telemetry.frame[rows].astype(np.int64)
         measured.append(MeasuredSlopes(name, *arrays, frames=frames, standard_error_px=stated))
@@ -108,7 +109,8 @@ def _warnings(telemetry: Telemetry) -> list[str]:
         lines.append(_TEXT("telemetry.lost_frames", lost=lost, share=share))
     if telemetry.attributes.get("dropped_changes"):
         lines.append(_TEXT["telemetry.lost_changes"])
-    return lines
+    _, left_out = leave_out(telemetry.flags)
+    return [*lines, f"{left_out.capitalize()}."] if left_out else lines
 
 
 def _timing(telemetry: Telemetry) -> Section:

@@ -154,10 +154,11 @@ class Answer:
         question = self.question
         if question.laser is None:
             return self.best.method.psf
-        if question.layout is None or question.subaperture_m is None:
+        if question.whole_layout is None or question.subaperture_m is None:
             return None
         optics = {name: getattr(question, name) for name in ("pixel_scale_arcsec", "subaperture_m")}
-        return question.laser.psf(question.laser.star_of(replace(question.layout, **optics)), question.shape)
+        star = question.laser.star_of(replace(question.whole_layout, **optics))
+        return question.laser.psf(star, question.shape)
 
     def save(self, path: str | Path) -> None:
         """Write the recommended settings as a configuration file; what else it holds stays.
@@ -172,7 +173,7 @@ class Answer:
         """
         best = self.best
         for item in (
-            self.question.layout,
+            self.question.whole_layout,
             best.settings,
             self.calibration,
             self._psf,

@@ -114,6 +114,9 @@ class Question:
         Frames, not used for the values here, on which promised errors are checked; needs `layout` and
         `calibration`.
     layout : Layout, optional
+    whole_layout : Layout, optional
+        Layout to write, where `layout` lacks sub-apertures that the recording shows no spots in. Default:
+        `layout`.
     calibration : Calibration, optional
         Maps (dark, flat, bad pixels) to write beside the settings.
     facts : tuple of str
@@ -161,6 +164,7 @@ class Question:
     relative_flux: NDArray[np.float64] | None = None
     recording: NDArray[Any] | None = None
     layout: Layout | None = None
+    whole_layout: Layout | None = None
     calibration: Calibration | None = None
     facts: tuple[str, ...] = ()
     flux_is_measured: bool = False
@@ -178,6 +182,8 @@ class Question:
         self._check_spot()
         self._check_star()
         self._put("search_range_px", self._range())
+        if self.whole_layout is None:
+            self._put("whole_layout", self.layout)
         if self.budget is not None:
             _ = self.budget_px
 

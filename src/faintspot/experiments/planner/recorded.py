@@ -25,6 +25,7 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
 from faintspot.slopes.training.search_range import Images, SpotRange, spot_range
+from faintspot.slopes.training.usable import usable_subapertures
 
 if TYPE_CHECKING:
     from faintspot.slopes.training.psf_learning import LearntPSF
@@ -100,6 +101,10 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **st
     stack = stack[: 2 * frames_to_check(layout)]  # every second one; more cost memory and tell nothing
     calibration = _calibration(stack, dark_stack, layout, stated, facts)
     stated["em_gain"] = calibration.em_gain
+    whole, (usable, left_out) = layout, usable_subapertures(stack, layout, calibration)
+    if left_out:
+        layout = whole[usable]
+        facts.append(left_out)
     learning, recording = (stack[0::2], stack[1::2]) if len(stack) > 1 else (stack, None)
     fitted, used = _fitted(learning, layout, calibration, stated, facts)
     calibration = _without_background(calibration, fitted, darks is not None, stated, facts)
@@ -118,7 +123,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **st
     }
     values["background_e"] = calibration.background_e
     earlier = tuple(stated.pop("facts", ()))
-    parts = {"layout": layout, "calibration": calibration, "recording": recording}
+    parts = {"layout": layout, "calibration": calibration, "recording": recording, "whole_layout": whole}
     return Question(**{**stated, **values, **parts}, facts=(*earlier, *facts))
 
 

@@ -26,8 +26,9 @@ _PIXELS = ("pix", "pixel", "px")
 
 
 NOISE = "SLOPES_NOISE"
-"""Name of the table with the noise of slopes, in files written by faintspot."""
+"""Name of the table with the noise and the flags of slopes, in files written by faintspot."""
 NOISE_COLUMNS = "VAR_X", "VAR_Y", "COV_XY"
+FLAGS_COLUMN = "FLAGS"
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +78,8 @@ class AotSensor:
     unit: str
     noise: NDArray[Any] | None
     """Variances of x and y and their covariance, px^2, (t, 3, n), in files written by faintspot."""
+    flags: NDArray[np.uint8] | None
+    """Bits of `faintspot.SubapertureFlag`, (t, n), in files written by faintspot."""
     frame: NDArray[np.float64]
     """Frame numbers of the slopes; empty if the file has none."""
     unix_time_s: NDArray[np.float64]
@@ -172,7 +175,7 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
         try:
             # By default aotpy would ask for external images in a dialogue, or fetch them.
             system = AOTFITSReader(path, externals="ignore").get_system()
-            noise = _noise(path)
+            noise, flags = _noise_and_flags(path)
         except Exception as error:  # aotpy raises many kinds of errors on damaged files
             raise InputError(f"{path}: the AOT file is not valid ({one_line(error)})") from None
     sensors = [item for item in system.wavefront_sensors if isinstance(item, aotpy.ShackHartmann)]
@@ -181,7 +184,7 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
         loop for loop in system.loops if isinstance(loop, aotpy.ControlLoop) and loop.input_sensor is chosen
     ]
     try:
-        return _sensor(path, chosen, system, loops, noise)
+        return _sensor(path, chosen, system, loops, noise, flags)
     except InputError as error:
         raise InputError(f"{path}: sensor {chosen.uid!r}: {error}") from None
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
@@ -208,7 +211,7 @@ def _pixels_of(sensor: Any) -> str | None:
     return None if image is None or image.data is None else str(image.name)
 
 
-def _sensor(path: Path, sensor: Any, system: Any, loops: list[Any], noise: Any) -> AotSensor:
+def _sensor(path: Path, sensor: Any, system: Any, loops: list[Any], noise: Any, flags: Any) -> AotSensor:
     n = int(sensor.n_valid_subapertures)
     name, size = _pixels_of(sensor), None
     pixels = None if name is None else sensor.detector.pixel_intensities
@@ -228,6 +231,8 @@ def _sensor(path: Path, sensor: Any, system: Any, loops: list[Any], noise: Any) 
         raise InputError(f"measurements: expected shape (t, 2, {n}), got {slopes.shape}")
     if noise is not None and (slopes is None or noise.shape != (len(slopes), 3, n)):
         raise InputError(f"{NOISE}: expected as many variances and covariances as slopes, got {noise.shape}")
+    if flags is not None and (slopes is None or flags.shape != (len(slopes), n)):
+        raise InputError(f"{NOISE}: expected as many flags as slopes, got {flags.shape}")
     numbers, times = _time_of(sensor.measurements)
     scale = _number(sensor.detector, "pixel_scale")
     return AotSensor(
@@ -243,6 +248,7 @@ def _sensor(path: Path, sensor: Any, system: Any, loops: list[Any], noise: Any) 
         slopes,
         "" if slopes is None else str(sensor.measurements.unit or ""),
         noise,
+        flags,
         numbers,
         times,
         flux,
@@ -337,15 +343,16 @@ def _data_of(owner: Any, name: str) -> Any:
     return data.astype(data.dtype.newbyteorder("="), copy=False)
 
 
-def _noise(path: Path) -> NDArray[np.float32] | None:
-    """Return the noise of slopes in files written by faintspot, (t, 3, n), or None."""
+def _noise_and_flags(path: Path) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8] | None]:
+    """Return noise (t, 3, n) and flags (t, n) of the slopes in files written by faintspot, or None."""
     from astropy.io import fits
 
     with fits.open(path) as units:
         if NOISE not in units:
-            return None
+            return None, None
         table = units[NOISE].data
-        return np.stack([np.asarray(table[name], np.float32) for name in NOISE_COLUMNS], axis=1)
+        noise = np.stack([np.asarray(table[name], np.float32) for name in NOISE_COLUMNS], axis=1)
+        return noise, np.asarray(table[FLAGS_COLUMN], np.uint8)
 
 
 def _time_of(image: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

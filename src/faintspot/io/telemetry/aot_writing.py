@@ -20,7 +20,7 @@ from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import write_atomically
 from faintspot.base.toml_files import parse_text
-from faintspot.io.telemetry.aot_reading import NOISE, NOISE_COLUMNS
+from faintspot.io.telemetry.aot_reading import FLAGS_COLUMN, NOISE, NOISE_COLUMNS
 from faintspot.io.telemetry.recording import Telemetry
 
 # The standard demands both, which a sensor alone does not have.
@@ -37,9 +37,9 @@ def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") 
     electrons after background subtraction; the standard has averages in ADU. The keyword CONFIG holds the
     initial estimator and settings; CHG1, CHG2 and so on hold changes. LAYOUT and SUBTRACT of the references
     hold the layout and the exact reference slopes as JSON texts. The table SLOPES_NOISE, which is not part
-    of the standard, holds VAR_X, VAR_Y (infinite where unknown) and COV_XY of the slopes, px^2, a row for
-    each frame. There are no wavefront correctors and loops, so that aotpy warns when it reads the file.
-    All data are in memory at once.
+    of the standard, holds VAR_X, VAR_Y (infinite where unknown) and COV_XY of the slopes, px^2, and their
+    FLAGS, a row for each frame. There are no wavefront correctors and loops, so that aotpy warns when it
+    reads the file. All data are in memory at once.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def _system(telemetry: Telemetry, ao_mode: str) -> Any:
 
 
 def _noise(telemetry: Telemetry) -> Any:
-    """Return the table with variances and covariance of every slope's errors."""
+    """Return the table with variances and covariance of every slope's errors, and its flags."""
     from astropy.io import fits
 
     errors = telemetry.standard_error_x, telemetry.standard_error_y
@@ -109,6 +109,7 @@ def _noise(telemetry: Telemetry) -> Any:
         fits.Column(name, f"{values.shape[1]}E", "pix2", array=values)
         for name, values in zip(NOISE_COLUMNS, (*np.square(errors), telemetry.covariance_xy), strict=True)
     ]
+    columns.append(fits.Column(FLAGS_COLUMN, f"{telemetry.flags.shape[1]}B", array=telemetry.flags))
     return fits.BinTableHDU.from_columns(columns, name=NOISE)
 
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors
-from faintspot.base.flags import INVALID
 from faintspot.base.sizes import check_bytes, memory_bytes
+from faintspot.base.validity import are_valid
 from faintspot.io.arrays.zarr_store import (
     TELEMETRY,
     checked_codecs,
@@ -132,7 +132,7 @@ class Telemetry:
     @property
     def valid(self) -> NDArray[np.bool_]:
         """Whether each slope was measured, and is not flagged as probably wrong."""
-        return (self.flags & INVALID) == 0  # type: ignore[no-any-return]
+        return are_valid(self.flags)
 
     @property
     def latency_s(self) -> NDArray[np.float64]:

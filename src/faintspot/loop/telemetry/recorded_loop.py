@@ -13,6 +13,7 @@ from faintspot.base.checks import finite_array, number_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays
 from faintspot.base.toml_files import check_keys, parse_file
+from faintspot.base.validity import leave_out
 from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.frames import read_array
 from faintspot.io.telemetry.recording import read_telemetry
@@ -27,7 +28,7 @@ SCIENCE_WAVELENGTH_M = 1.65e-6
 UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
 """Units of slopes, in arcsec."""
 _OF_AOT = {"pix": "px", "pixel": "px", "px": "px", "arcsec": "arcsec", "rad": "rad"}
-_ARRAYS = ("slopes", "commands", "interaction_matrix", "control_matrix", "cells", "time_s", "frame")
+_ARRAYS = ("slopes", "commands", "interaction_matrix", "control_matrix", "cells", "time_s", "frame", "flags")
 _NUMBERS = (
     "frame_rate_hz",
     "pixel_scale_arcsec",
@@ -159,10 +160,9 @@ def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
     layout = recording.attributes["layout"]
     closed = np.asarray(recording.loop) == CLOSED
     rows = closed if closed.any() else np.ones(len(recording.frame), np.bool_)
-    slopes = recording.slopes[rows].astype(np.float64)
-    slopes[~np.tile(recording.valid[rows], 2)] = np.nan
     values: dict[str, Any] = {
-        "slopes": slopes,
+        "slopes": recording.slopes[rows].astype(np.float64),
+        "flags": recording.flags[rows],
         "slope_unit": "px",
         "frame": recording.frame[rows],
         "time_s": recording.last_row_time_ns[rows] / 1e9,
@@ -197,6 +197,7 @@ def _of_aot(path: Path) -> dict[str, Any]:
     if sensor.unit.lower() in _OF_AOT:
         values["slope_unit"] = _OF_AOT[sensor.unit.lower()]
     optional: dict[str, Any] = {
+        "flags": sensor.flags,
         "frame": sensor.frame,
         "time_s": sensor.unix_time_s,
         "cells": sensor.cells,
@@ -221,6 +222,8 @@ def _loop(name: str, values: dict[str, Any]) -> RecordedLoop:
         raise InputError(f"slopes: expected shape (frames, 2 n), got {slopes.shape}")
     if one_of("slope_order", values.get("slope_order", _AXES), (_AXES, _PAIRS)) == _PAIRS:
         slopes = np.hstack([slopes[:, ::2], slopes[:, 1::2]])
+    slopes, left_out = _usable(slopes, values.get("flags"))
+    remarks += [f"slopes: {left_out}"] if left_out else []
     numbers = {key: number_between(key, values[key], 0, low_open=True) for key in _NUMBERS if key in values}
     if "slope_unit" not in values:
         raise InputError(f"slope_unit: unknown; give it in a TOML file with --system ({', '.join(UNITS)})")
@@ -255,6 +258,16 @@ def _loop(name: str, values: dict[str, Any]) -> RecordedLoop:
         one_of("loop", values.get("loop", "closed"), ("closed", "open")) == "closed",
     )
     return _with_sign(replace(loop, remarks=tuple(remarks)))
+
+
+def _usable(slopes: Floats, flags: NDArray[np.uint8] | None) -> tuple[Floats, str]:
+    """Return slopes (frames, 2 n) with NaN where they are not valid, and the line about these."""
+    x, y = np.split(slopes, 2, axis=1)
+    flags = np.zeros(x.shape, np.uint8) if flags is None else np.asarray(flags)
+    if flags.shape != x.shape or flags.dtype.kind not in "ui":
+        raise InputError(f"flags: expected integers of shape {x.shape}, got {flags.dtype} of {flags.shape}")
+    valid, left_out = leave_out(flags, others={"not finite": ~np.isfinite(x + y)})
+    return np.where(np.tile(valid, 2), slopes, np.nan), left_out
 
 
 def _cells(stated: Any, n: int) -> NDArray[np.int64]:

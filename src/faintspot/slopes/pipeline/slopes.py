@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.flags import INVALID, NO_FLAG, UNMEASURED, SubapertureFlag
+from faintspot.base.flags import NO_FLAG, UNMEASURED, SubapertureFlag
+from faintspot.base.validity import are_valid
 from faintspot.io.stored.slopes_format import VARIABLES
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ class Slopes:
 
         The flags in `keep` do not count.
         """
-        return (self.flags & (INVALID & ~self.keep)) == 0  # type: ignore[no-any-return]
+        return are_valid(self.flags, self.keep)
 
     @property
     def measured(self) -> NDArray[np.bool_]:

@@ -15,8 +15,14 @@ from faintspot.slopes.pipeline.images import measure_images
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.laser_spots import LaserSpots
-from faintspot.slopes.training.known_sodium import KnownSodium, calibrated_images, dark_variance_e2
+from faintspot.slopes.training.known_sodium import (
+    IGNORED_E2,
+    KnownSodium,
+    calibrated_images,
+    dark_variance_e2,
+)
 from faintspot.slopes.training.sodium import MeanImages
+from faintspot.slopes.training.usable import usable_subapertures
 
 _BLOCK_FRAMES = 20
 _FITS = 2  # the first one finds the shape, with which the spots are located for the second
@@ -31,6 +37,10 @@ class SodiumOfFrames(NamedTuple):
     sodium: KnownSodium
     positions_px: NDArray[np.float64]
     """x and y of the spots' centres of gravity from the window centres, (n, 2)."""
+    usable: NDArray[np.bool_]
+    """Whether the sub-aperture was used, (n,)."""
+    left_out: str
+    """Line about the sub-apertures that were not used; empty if there are none."""
 
     def lattice_of(self, layout: Layout) -> Layout:
         """Return the layout with centres on the lattice of the spots' centres of gravity.
@@ -39,7 +49,8 @@ class SodiumOfFrames(NamedTuple):
         profile with several peaks.
         """
         before = np.column_stack([layout.centres, np.ones(len(layout))])
-        lit = self.sodium.fit.flux_e > _LIT * np.median(self.sodium.fit.flux_e)
+        flux = self.sodium.fit.flux_e
+        lit = self.usable & (flux > _LIT * np.median(flux[self.usable]))
         spots = layout.centres - layout.offsets + self.positions_px
         moved = np.linalg.lstsq(before[lit], spots[lit], rcond=None)[0]
         return replace(layout, centres=before @ moved)
@@ -77,12 +88,16 @@ def sodium_of_frames(
     """
     star, count = laser.star_of(layout), min(source.n_frames, most_frames)
     total: NDArray[np.float64] = np.zeros((len(layout), *layout.window))
+    frame: NDArray[np.float64] = np.zeros(layout.frame_shape)
     for first, block in source.blocks(0, count, _BLOCK_FRAMES):
         images, _ = calibrated_images(block, layout, calibration)
         total += images.sum(axis=0, dtype=np.float64)
+        frame += block.sum(axis=0, dtype=np.float64)
         if progress is not None:
             progress(min(first + _BLOCK_FRAMES, count), count + _FITS)
     images_e, dark = total / count, dark_variance_e2(layout, calibration)
+    usable, left_out = usable_subapertures(frame / count, layout, calibration)
+    images_e[~usable], dark[~usable] = 0.0, IGNORED_E2
     positions, profile = _centres_of_gravity(images_e), star.focused(laser.profile)
     for fits in range(1, _FITS + 1):
         mean = MeanImages(images_e, positions, frames=count)
@@ -90,13 +105,13 @@ def sodium_of_frames(
         located = measure_images(
             images_e.astype(np.float32),
             Settings("ml", search_range_px=_SEARCH_RANGE_PX),
-            calibration=Calibration(read_noise_e=float(np.sqrt(np.median(dark))), dark=0.0),
+            calibration=Calibration(read_noise_e=float(np.sqrt(np.median(dark[usable]))), dark=0.0),
             psf=sodium.psf(layout.window),
         )
         positions, profile = np.stack([located.x, located.y], axis=1).astype(np.float64), sodium.fit.profile
         if progress is not None:
             progress(count + fits, count + _FITS)
-    return SodiumOfFrames(sodium, positions)
+    return SodiumOfFrames(sodium, positions, usable, left_out)
 
 
 def _centres_of_gravity(images: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
-from faintspot.base.flags import INVALID, NO_FLAG, SubapertureFlag
+from faintspot.base.flags import NO_FLAG, SubapertureFlag
 from faintspot.base.statistics import Estimate, absolute_errors, slope_statistics
+from faintspot.base.validity import are_valid
 
 Floats = NDArray[np.float64]
 
@@ -102,7 +103,7 @@ class MeasuredSlopes:
     @property
     def valid(self) -> NDArray[np.bool_]:
         """Mask of valid measurements."""
-        return (self.flags & int(INVALID & ~self.keep)) == 0  # type: ignore[no-any-return]
+        return are_valid(self.flags, self.keep)
 
     @property
     def is_denoised(self) -> bool:

@@ -23,7 +23,8 @@ SODIUM = "sodium"
 """Name of a new profile among an engine's changes of settings."""
 _NARROWEST_PX = 1.2  # spot from which the fit begins
 _FEWEST_ALTITUDES, _ALTITUDES = 20, 41
-_IGNORED_E2 = 1e12  # variance of bad pixels
+IGNORED_E2 = 1e12
+"""Variance of pixels that do not count [electrons^2]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,5 +112,5 @@ def dark_variance_e2(layout: Layout, calibration: Calibration) -> Floats:
         noise_e = calibration.read_noise_photoelectrons
         noise = np.full(layout.frame_shape, 1.0 if noise_e is None else noise_e)
     bad = ~np.isfinite(calibration.maps(layout.frame_shape)).all(axis=0)
-    variance: Floats = layout.images(np.where(bad, _IGNORED_E2, np.nan_to_num(noise) ** 2))
+    variance: Floats = layout.images(np.where(bad, IGNORED_E2, np.nan_to_num(noise) ** 2))
     return variance

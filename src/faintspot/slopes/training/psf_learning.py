@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +27,7 @@ from faintspot.slopes.training.psf_rounds import (
     registered,
 )
 from faintspot.slopes.training.registration import Registered, Stack
+from faintspot.slopes.training.usable import usable_subapertures
 
 SCOPES = ("sensor", "subaperture")
 
@@ -74,8 +76,9 @@ def learn_psf(
     Parameters
     ----------
     frames : (h, w) or (n, h, w) array, ADU
-        NaN, infinite and saturated pixels are left out. A few hundred spots will do, even of 30 electrons;
-        they must lie at different sub-pixel positions.
+        NaN, infinite and saturated pixels are left out, and sub-apertures that are dark, limited or unlike
+        their neighbours, which a warning says. A few hundred spots will do, even of 30 electrons; they must
+        lie at different sub-pixel positions.
     layout : Layout
     calibration : Calibration, optional
         Default: frames are in electrons already. The read noise is measured where it is not given.
@@ -123,10 +126,15 @@ def learn_psf(
     """
     calibration = Calibration() if calibration is None else calibration
     stack = frame_stack(frames, layout, calibration)
-    regions = _regions(scope, len(layout))
-    _, numbers = np.unique(regions, return_inverse=True)
-    index = np.tile(numbers, len(stack.images) // len(layout))
     options = checked_options(layout.window, oversampling, radius_px, rounds)
+    regions = _regions(scope, len(layout))
+    usable, left_out = usable_subapertures(np.asarray(frames), layout, calibration)
+    if left_out:
+        warnings.warn(f"PSF: {left_out}", stacklevel=2)
+    numbers = np.zeros(len(layout), np.int64)
+    numbers[usable] = np.unique(regions[usable], return_inverse=True)[1]
+    n_frames = len(stack.images) // len(layout)
+    stack, index = stack.part(np.tile(usable, n_frames)), np.tile(numbers[usable], n_frames)
     learnt = _learn(stack, index, start, options, rng, progress)
     return PSF(learnt.psf.samples, oversampling, None if len(learnt.psf.samples) == 1 else numbers)
 

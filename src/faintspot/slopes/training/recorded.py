@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from faintspot.slopes.spots.score import STARTS, TrainedScore, smoothed_peak, ta
 from faintspot.slopes.training.fitting import Sample, fit_passes
 from faintspot.slopes.training.simulation import MOST_PASSES, flux_classes
 from faintspot.slopes.training.splines import STEPS_PER_PX, SYMMETRIES, SplineTables, splines_for
+from faintspot.slopes.training.usable import usable_subapertures
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -144,7 +146,8 @@ def train_from_frames(
     ----------
     frames : (n_frames, h, w) array, ADU
         Spots must move from frame to frame as they will in use: that is the prior. Values must be neither
-        rounded to electrons nor clipped at the dark level.
+        rounded to electrons nor clipped at the dark level. Sub-apertures that are dark, limited or unlike
+        their neighbours are left out, which a warning says.
     layout : Layout
     calibration : Calibration
         Its read noise must be known; that, background and multiplication gain give the images' noise.
@@ -219,14 +222,17 @@ def train_from_frames(
     basis = splines_for(spacing, farthest, one_of("symmetry", symmetry, SYMMETRIES))
     n_passes = int(number_between("passes", passes, 1, MOST_PASSES, integer=True))
     n_draws = int(number_between("draws", draws, 1, integer=True))
-    recorded = _Recorded.of(stack, splitter, home)
     kinds = _checked_kinds(index, stack.shape[1])
+    usable, left_out = usable_subapertures(np.asarray(frames), layout, calibration)
+    if left_out:
+        warnings.warn(f"score: {left_out}", stacklevel=2)
+    recorded, kinds_used = _Recorded.of(stack[:, usable], splitter, home[usable]), kinds[usable]
     levels, flux_e = recorded.classes()
     trained = []
     n_kinds = int(kinds.max()) + 1
     for number, kind_rng in enumerate(spawn(rng, n_kinds * len(flux_e))):
         kind, level = divmod(number, len(flux_e))
-        members = (np.flatnonzero(levels == level), np.flatnonzero(kinds == kind))
+        members = (np.flatnonzero(levels == level), np.flatnonzero(kinds_used == kind))
         trained.append(recorded.train(members, splitter, basis, n_passes, n_draws, kind_rng))
         if progress is not None:
             progress(number + 1, n_kinds * len(flux_e))

@@ -93,6 +93,7 @@ def _json(wavefront: Wavefront) -> str:
         "pupil_radius_subapertures": wavefront.pupil.radius_subapertures,
         "standard_errors_from": wavefront.errors_from,
         "condition": wavefront.condition,
+        "left_out": wavefront.left_out,
         "mean": {
             "rms": float(total(wavefront.mean)),
             "rms_without_tilt": float(total(wavefront.mean, tilt=False)),

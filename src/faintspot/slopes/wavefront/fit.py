@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
+from faintspot.base.validity import leave_out
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, lit_outlines, pupil_of
@@ -49,6 +50,8 @@ class Wavefront:
     pupil: Pupil
     condition: float
     """Condition number of the fit with every sub-aperture that is ever valid."""
+    left_out: str = ""
+    """Line about the slopes that were left out; empty if there are none."""
 
     @property
     def fitted(self) -> NDArray[np.bool_]:
@@ -153,12 +156,12 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     >>> print(f"tip {tip:.0f} nm, no other mode more than {np.abs(others).max():.0f} nm")
     tip 774 nm, no other mode more than 5 nm
     """
-    x, y, valid = (np.atleast_2d(getattr(slopes, name)) for name in ("x", "y", "valid"))
+    x, y, flags = (np.atleast_2d(getattr(slopes, name)) for name in ("x", "y", "flags"))
     if x.ndim != 2 or x.shape[1] != len(layout):
         raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {x.shape[-1]}")
     pupil = pupil_of(layout)
     outlines, share = _in_pupil(layout, pupil)
-    valid = valid & (share >= _LEAST_SHARE)
+    valid, left_out = leave_out(flags, slopes.keep, {"outside the pupil": share < _LEAST_SHARE})
     illuminated = np.asarray(valid.any(axis=0))
     if not illuminated.any():
         raise InputError("slopes: expected valid sub-apertures to fit a wavefront, found none")
@@ -183,6 +186,7 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
         unit,
         pupil,
         condition,
+        left_out,
     )
 
 

@@ -74,6 +74,8 @@ def remarks(wavefront: Wavefront) -> list[str]:
             "fitted modes, which include higher modes."
         )
     lines.append(noise)
+    if wavefront.left_out:
+        lines.append(f"{wavefront.left_out.capitalize()}.")
     fitted = int(np.count_nonzero(wavefront.fitted))
     if fitted > 1:
         lines.append(

@@ -255,3 +255,18 @@ def test_slopes_relative_to_a_reference_are_said_to_be(tmp_path: Path) -> None:
     assert "slopes are relative to stored reference positions" in text
     assert "positions that differ" not in text
     assert "Not drawn" not in text
+
+
+def test_slopes_that_are_left_out_are_counted(tmp_path: Path) -> None:
+    """Their standard errors do not count either."""
+    flags, x = np.zeros((5, 9), np.uint8), np.full((5, 9), 0.05)
+    flags[:, 2], flags[1, 3] = 1, 128
+    x[:, 2] = 30.0
+    errors = {"standard_error_x": x, "standard_error_y": x}
+    first = store(tmp_path / "a.npz", sensor(), errors={**errors, "flags": flags})
+    page = Page(report_of_stored([first]))
+    assert "Left out 1 of 9 sub-apertures, 1 slope of others: dark, limited." in page.text
+    kept = store(tmp_path / "b.npz", sensor(), errors={**errors, "flags": flags}, keep=["limited"])
+    page = Page(report_of_stored([first, kept]))
+    assert "a.npz: left out 1 of 9 sub-apertures, 1 slope of others: dark, limited." in page.text
+    assert "b.npz: left out 1 of 9 sub-apertures: dark." in page.text

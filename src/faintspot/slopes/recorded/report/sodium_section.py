@@ -49,11 +49,12 @@ def sodium_section_of_frames(
 ) -> Section:
     """Return the section with the configured profile, and that of frames; or why there is none."""
     try:
-        sodium, _ = sodium_of_frames(source, layout, calibration, laser, most_frames=most_frames)
+        found = sodium_of_frames(source, layout, calibration, laser, most_frames=most_frames)
     except InputError as error:
         return Section("sodium", "Sodium profile", missing=f"Not fitted: {error}.")
+    sodium = found.sodium
     profiles = {"configured": sodium.star.focused(laser.profile), "these frames": sodium.fit.profile}
-    return _section(profiles, sodium.spot_fwhm_arcsec)
+    return _section(profiles, sodium.spot_fwhm_arcsec, found.left_out)
 
 
 def sodium_sections_of_changes(changes: Sequence[Mapping[str, Any]]) -> list[Section]:
@@ -70,6 +71,7 @@ def sodium_sections_of_changes(changes: Sequence[Mapping[str, Any]]) -> list[Sec
     return [_section(profiles, float(last["spot_fwhm_arcsec"]))]
 
 
-def _section(profiles: Mapping[str, SodiumProfile], spot_fwhm_arcsec: float) -> Section:
+def _section(profiles: Mapping[str, SodiumProfile], spot_fwhm_arcsec: float, left_out: str = "") -> Section:
     text = [_TEXT["sodium.about"], _TEXT("sodium.spot", width=spot_fwhm_arcsec)]
+    text += [f"{left_out.capitalize()}."] if left_out else []
     return Section("sodium", "Sodium profile", text, figures=[profile_figure(profiles)])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.report.page import Section
 from faintspot.base.report.texts import Texts
+from faintspot.base.validity import are_valid, leave_out
 from faintspot.io import open_frames
 from faintspot.io.frames import FrameSource
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
@@ -105,8 +106,13 @@ def _configurations(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlope
 
 def _labelled_notes(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> list[str]:
     """Return the notes of all runs, with the name of their method where there are several."""
-    labels = [f"{method.name}: " if len(methods) > 1 else "" for method in methods]
-    return [label + note for label, store in zip(labels, stores, strict=True) for note in store.notes]
+    notes = []
+    for store, method in zip(stores, methods, strict=True):
+        label = f"{method.name}: " if len(methods) > 1 else ""
+        _, left_out = leave_out(method.flags, method.keep)
+        notes += [label + note for note in store.notes]
+        notes += [f"{label}{left_out}." if label else f"{left_out.capitalize()}."] if left_out else []
+    return notes
 
 
 def _check_same_sensor(first: StoredRun, second: StoredRun) -> None:
@@ -225,8 +231,10 @@ def _range_in_words(store: StoredRun) -> str:
 
 
 def _median_standard_error(store: StoredRun) -> float:
-    """Median over the slopes whose standard error is known of its rms of x and y, px; NaN without any."""
-    x, y = (store.stored.variables[f"standard_error_{axis}"].astype(np.float64) for axis in "xy")
+    """Median over the valid slopes of the rms standard error of x and y, px; NaN without any."""
+    variables = store.stored.variables
+    valid = are_valid(variables["flags"], store.keep)
+    x, y = (variables[f"standard_error_{axis}"][valid].astype(np.float64) for axis in "xy")
     errors = np.sqrt((x**2 + y**2) / 2)
     finite = errors[np.isfinite(errors)]
     return float(np.median(finite)) if finite.size else np.nan
