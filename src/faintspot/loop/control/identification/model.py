@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -232,8 +233,8 @@ class ControlModel:
         variance, covariance = (self.arrays[name] for name in _NOISE)
         return variance, covariance
 
-    def save(self, path: str | Path) -> None:
-        """Write the model to a NumPy file (.npz).
+    def save(self, path: str | Path, others: Mapping[str, Any] = MappingProxyType({})) -> None:
+        """Write the model to a NumPy file (.npz), with other arrays beside it.
 
         Raises
         ------
@@ -242,7 +243,7 @@ class ControlModel:
         """
         numbers = {name: np.asarray(getattr(self, name), np.float64) for name in _OF_ALL}
         kind = _LOCAL if self.is_local else self.kind
-        save_arrays(path, {"kind": np.array(kind), **numbers, **self.arrays})
+        save_arrays(path, {"kind": np.array(kind), **numbers, **self.arrays, **others})
 
     @classmethod
     def load(cls, path: str | Path, plant: LoopPlant) -> ControlModel:
