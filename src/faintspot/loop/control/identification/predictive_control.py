@@ -26,6 +26,7 @@ from faintspot.loop.control.identification.open_loop import (
     site_of_loop,
 )
 from faintspot.loop.control.identification.recording import Prepared, Recording, prepared
+from faintspot.loop.control.identification.state_space import state_space, write_matrices
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 Floats = NDArray[np.float64]
@@ -175,6 +176,26 @@ class PredictiveControl:
             return cls(loop, ControlModel.load(path, loop.plant))
         except (ValueError, TypeError, IndexError):
             raise InputError(f"{path}: expected {_CONTENTS}, got arrays of another shape") from None
+
+    def export(self, path: str | Path) -> None:
+        """Write the filter as plain matrices, at the noise of the recording and without the guard.
+
+        The names are those of `state_space`, with `delay_frames` and `largest_command`; slopes and commands
+        are in the unit and of the sign of the recording.
+
+        Parameters
+        ----------
+        path : path
+            Its ending says the format: .npz, .mat or .fits.
+
+        Raises
+        ------
+        InputError
+            When the sensor has more than 300 slopes, or the file cannot be written.
+        """
+        matrices: dict[str, Any] = state_space(self.model, self._plant, self._loop.scale, self._loop.sign)
+        matrices["delay_frames"] = np.array(self._plant.delay_frames)
+        write_matrices(path, {**matrices, "largest_command": np.array(self._loop.largest_command)})
 
     def summary(self) -> str:
         """Return a summary of one line."""
