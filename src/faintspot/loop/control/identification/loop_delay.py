@@ -164,7 +164,8 @@ def _modes(site: SlopeTurbulence) -> Floats:
     """
     n = len(site.positions_m)
     without = np.kron(np.eye(2), np.eye(n) - 1 / n)
-    vectors = np.linalg.eigh(without @ site.covariance_px2() @ without)[1][:, ::-1][:, : 2 * n - 2]
+    covariance = replace(site, pixel_scale_rad=1.0).covariance_px2()  # the same modes in any unit
+    vectors = np.linalg.eigh(without @ covariance @ without)[1][:, ::-1][:, : 2 * n - 2]
     return np.asarray(vectors[:, np.unique(np.geomspace(1, 2 * n - 2, _MOST_MODES).astype(int)) - 1])
 
 
