@@ -23,7 +23,7 @@ from benchmarks.prediction import TELEMETRY_GAIN, Case
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import CompiledIntegrator
-from faintspot.loop.control.identification.learning import KALMAN, LoopPlant, learn
+from faintspot.loop.control.identification.learning import KALMAN, LoopPlant, learn_controller
 from faintspot.loop.control.identification.relearning import relearn
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.guarded import Guarded
@@ -204,9 +204,9 @@ def learning_table() -> Table:
     rate_hz = configuration.control.frame_rate_hz
     _, telemetry = case.observed(partial(plant.integrator, TELEMETRY_GAIN), *_LEARNING)
     first, rest = telemetry.part(0, _LEARNT), telemetry.part(_LEARNT, None)
-    learn(KALMAN, plant, first.part(0, _LEARNT // 8), site, rate_hz)  # compile
+    learn_controller(KALMAN, plant, first.part(0, _LEARNT // 8), site, rate_hz)  # compile
     begun = time.process_time()
-    learnt = learn(KALMAN, plant, first, site, rate_hz)
+    learnt = learn_controller(KALMAN, plant, first, site, rate_hz)
     cold = time.process_time()
     found = relearn(plant, learnt.model, rest, site, rate_hz, learnt.identified)
     warm = time.process_time()

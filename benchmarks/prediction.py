@@ -23,7 +23,7 @@ from benchmarks.measuring import Row, Table
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.base import LEARNT, Controller, Expected
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn
+from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn_controller
 from faintspot.loop.control.identification.model import LearntControl
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.phase import residual_phase
@@ -160,7 +160,7 @@ class Case:
 
     def learnt(self, telemetry: OpenLoopTelemetry, winds: str = LEARNT) -> LearntControl:
         """Return our filter."""
-        return learn(KALMAN, self.plant, telemetry, self.site, self.rate_hz, winds)
+        return learn_controller(KALMAN, self.plant, telemetry, self.site, self.rate_hz, winds)
 
     def telemetry(self) -> tuple[OpenLoopTelemetry, OpenLoopTelemetry]:
         """Return telemetry with an integrator, to learn from and to tune with."""

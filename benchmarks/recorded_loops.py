@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from benchmarks.prediction import Shaken
 from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop
-from faintspot.loop.simulation.configuration.configuration import ARCSEC
 from faintspot.loop.simulation.simulation import measure_gains
 from faintspot.loop.simulation.telescope.calibration import make_pipeline
 from faintspot.loop.simulation.telescope.model import TelescopeModel
-from faintspot.loop.telemetry.recorded_loop import RecordedLoop
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline.settings import Settings
 
 Floats = NDArray[np.float64]
@@ -110,7 +110,7 @@ def _with_vibration(case: Case, rng: np.random.Generator) -> Case:
     return replace(case, vibration=vibration, vibration_nm=rms_nm)
 
 
-def recorded(case: Case) -> tuple[RecordedLoop, Truth]:
+def recorded(case: Case) -> tuple[Recording, Truth]:
     """Run the loop of a case; slopes by `window`, divided by the calibrated centroid gain."""
     configuration = case.configuration()
     telescope = TelescopeModel(configuration, case.seed)
@@ -142,17 +142,16 @@ def recorded(case: Case) -> tuple[RecordedLoop, Truth]:
         commands.append(line.latest.copy())
         residual.append(optics.pupil.rms(after))
     kept = np.square(np.array(errors)[SETTLE_FRAMES:])
-    loop = RecordedLoop(
-        "simulated",
+    loop = Recording(
         np.array(slopes)[SETTLE_FRAMES:],
-        np.arange(SETTLE_FRAMES, case.frames),
-        rate,
-        "px",
-        optics.sensor.layout.cells,
         np.array(commands)[SETTLE_FRAMES:],
         optics.interaction,
-        configuration.subaperture_m,
-        configuration.pixel_scale_rad / ARCSEC,
+        optics.sensor.layout.cells,
+        rate,
+        subaperture_m=configuration.subaperture_m,
+        pixel_scale_arcsec=configuration.pixel_scale_rad / ARCSEC,
+        slope_unit="px",
+        name="simulated",
     )
     air = configuration.atmosphere
     truth = Truth(

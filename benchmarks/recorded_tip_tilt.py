@@ -11,18 +11,19 @@ import importlib.util
 import os
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from benchmarks.measuring import Row, Table
 from benchmarks.prediction import Make, rivals
 from faintspot.base.statistics import mean_by_blocks
-from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn
+from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.open_loop import open_loop_of, site_of_loop
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.replay import replayed_frames
 from faintspot.loop.control.reconstructor import make_reconstructor
-from faintspot.loop.telemetry.open_loop import open_loop_of, site_of_loop
-from faintspot.loop.telemetry.recorded_loop import RecordedLoop
 
 RATE_HZ, DIAMETER_M, LEAK = 1000.0, 10.0, 0.01
 DELAYS = 2, 1, 3
@@ -30,16 +31,14 @@ DELAYS = 2, 1, 3
 TUNED_FRAMES, SETTLE, BLOCK = 4000, 100, 1000
 
 
-def recording() -> RecordedLoop:
+def recording() -> Recording:
     """Return centroids and commands, which are subtracted from the turbulence."""
     folder = Path(os.environ.get("FAINTSPOT_SHARED", "")) / "keck_tt"
     slopes, commands = (
         np.load(folder / f"{name}_n0088.npy").astype(np.float64) for name in ("Centroid", "Commands")
     )
-    frame, cells = np.arange(len(slopes)), np.zeros((1, 2), np.int64)
-    return RecordedLoop(
-        "tip-tilt", slopes, frame, RATE_HZ, "arcsec", cells, -commands, np.eye(2), DIAMETER_M, 1.0
-    )
+    known: dict[str, Any] = {"subaperture_m": DIAMETER_M, "pixel_scale_arcsec": 1.0, "slope_unit": "arcsec"}
+    return Recording(slopes, -commands, np.eye(2), np.zeros((1, 2)), RATE_HZ, **known)
 
 
 def run() -> list[Table]:
@@ -64,7 +63,7 @@ def _replayed(delay: int) -> Table:
     if importlib.util.find_spec("pyrtc"):
         earlier = first.part(0, half - TUNED_FRAMES)
         makes["least_squares"] = best(list(rivals("least_squares", plant, earlier)))
-    learnt = learn(KALMAN, plant, first, site, RATE_HZ)
+    learnt = learn_controller(KALMAN, plant, first, site, RATE_HZ)
     makes["learnt"] = partial(learnt.model.controller, plant)
     makes["learnt, guarded"] = learnt.controller
     left = {"as it ran": np.square(seen.residual[half:]).sum(axis=1)}

@@ -17,12 +17,12 @@ import numpy as np
 from benchmarks.measuring import Row, Table
 from benchmarks.recorded_loops import Truth, drawn_cases, recorded, winds_of
 from faintspot.loop.control.identification.learning import KALMAN
+from faintspot.loop.control.identification.measured import Measured
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.simulation import LoopRecord, Method, load_loop, simulate_loop
-from faintspot.loop.simulation.configuration.configuration import ARCSEC
 from faintspot.loop.telemetry.choices import AS_RUN, FILTER
-from faintspot.loop.telemetry.measured import Measured
-from faintspot.loop.telemetry.recorded_loop import RecordedLoop
 from faintspot.loop.telemetry.report import LoopReport, report_of_loop
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline.settings import Settings
 
 Pairs = dict[str, list[tuple[Measured, float]]]
@@ -50,22 +50,21 @@ _LEAST_SHARE = 0.15  # of a layer, for its wind to be compared
 _SAME_LINE_HZ = 1.0
 
 
-def recording(record: LoopRecord) -> RecordedLoop:
+def recording(record: LoopRecord) -> Recording:
     """Return a simulated loop as a recording: the command of each row follows from its slopes."""
     later, first = record.delay_frames, record.settle_frames
     slopes = record.slopes_px.astype(np.float64) / record.centroid_gain[0]
     slopes[~np.tile(record.valid, 2)] = np.nan
-    return RecordedLoop(
-        "simulated",
+    return Recording(
         slopes[first:-later],
-        np.arange(first, record.frames - later),
-        record.frame_rate_hz,
-        "px",
-        record.cells,
-        record.commands[first + later :].astype(np.float64),
+        record.commands[first + later :],
         record.interaction_matrix,
-        record.subaperture_m,
-        record.pixel_scale_rad / ARCSEC,
+        record.cells,
+        record.frame_rate_hz,
+        subaperture_m=record.subaperture_m,
+        pixel_scale_arcsec=record.pixel_scale_rad / ARCSEC,
+        slope_unit="px",
+        name="simulated",
     )
 
 

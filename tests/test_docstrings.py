@@ -24,6 +24,8 @@ WITHOUT_EXAMPLE = {
     "faintspot.SubapertureFlag": "in that of Slopes",
     "faintspot.Wavefront": "in that of fit_wavefront",
     "faintspot.loop.simulation.LoopRecord": "in that of simulate_loop",
+    "faintspot.loop.control.PredictiveControl": "in that of learn",
+    "faintspot.loop.control.Recording": "in that of learn",
     "faintspot.experiments.Answer": "in that of tune",
     "faintspot.io.StoredSlopes": "in that of read_slopes",
     "faintspot.slopes.training.CentroidGain": "in that of measure_centroid_gain",

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from faintspot.base.errors import MissingExtraError as MissingExtraError
     from faintspot.base.flags import SubapertureFlag as SubapertureFlag
     from faintspot.experiments import tune as tune
+    from faintspot.loop import control as control
     from faintspot.slopes.camera.calibration import Calibration as Calibration
     from faintspot.slopes.camera.photon_transfer import measure_detector as measure_detector
     from faintspot.slopes.estimators.algorithms.brightest import brightest_pixels as brightest_pixels
@@ -68,6 +69,7 @@ _HOMES = {
     "Wavefront": "faintspot.slopes.wavefront",
     "brightest_pixels": "faintspot.slopes.estimators.algorithms.brightest",
     "centre_of_gravity": "faintspot.slopes.estimators.algorithms.centroid",
+    "control": "faintspot.loop.control",
     "cramer_rao": "faintspot.slopes.spots.bounds",
     "cramer_rao_covariance": "faintspot.slopes.spots.bounds",
     "fit_wavefront": "faintspot.slopes.wavefront",

@@ -21,7 +21,7 @@ from faintspot.engine.requests.requests import ControlServer
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.loop.control.base import ASSUMED
 from faintspot.loop.control.configuration import Control, ControlOptions, save_control
-from faintspot.loop.control.identification.learning import KALMAN, learn
+from faintspot.loop.control.identification.learning import KALMAN, learn_controller
 from faintspot.loop.control.identification.model import SETTLE_FRAMES, ControlModel, LearntControl, LoopPlant
 from faintspot.loop.control.identification.relearning import RelearntControl
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
@@ -39,7 +39,7 @@ OPTIONS = ControlOptions(controller=KALMAN)
 @pytest.fixture(scope="module")
 def model() -> ControlModel:
     frames = telemetry(500, NOISE_PX, seed=9, model=LAYERS)
-    return learn(KALMAN, PLANT, frames, TURBULENCE, 1 / FRAME_S, ASSUMED).model
+    return learn_controller(KALMAN, PLANT, frames, TURBULENCE, 1 / FRAME_S, ASSUMED).model
 
 
 def outdated(model: ControlModel) -> ControlModel:

@@ -18,7 +18,7 @@ from faintspot.loop.control import slope_product
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.configuration import Control, ControlOptions
-from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, KALMAN, learn
+from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, KALMAN, learn_controller
 from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.guarded import Guarded
@@ -51,7 +51,7 @@ class PlainControl(Control):
 
 @cache
 def learnt(kind: str) -> ControlModel:
-    return learn(kind, PLANT, telemetry(200, 0.3), TURBULENCE, 1 / FRAME_S).model
+    return learn_controller(kind, PLANT, telemetry(200, 0.3), TURBULENCE, 1 / FRAME_S).model
 
 
 def scaled(draw: Any, array: np.ndarray) -> np.ndarray:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from tests.loop.control.frozen_flow import frozen_slopes
 
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.reconstructor import make_reconstructor
-from faintspot.loop.simulation.configuration.configuration import ARCSEC
-from faintspot.loop.telemetry.recorded_loop import RecordedLoop
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 
 RATE_HZ, NOISE_PX, LOOP_GAIN = 250.0, 0.3, 0.35
 CELLS = np.argwhere(np.ones((5, 5)))
@@ -28,7 +27,7 @@ AIR = SlopeTurbulence(
 
 
 @lru_cache(maxsize=4)
-def recorded(delay: int = 2, centroid_gain: float = 1.0, frames: int = 2600) -> RecordedLoop:
+def recorded(delay: int = 2, centroid_gain: float = 1.0, frames: int = 2600) -> Recording:
     """Return a loop of an integrator; slopes are bilinear between corners of the sub-apertures."""
     rng = np.random.default_rng(7)
     atmosphere = frozen_slopes(AIR, frames, RATE_HZ, rng)
@@ -42,17 +41,6 @@ def recorded(delay: int = 2, centroid_gain: float = 1.0, frames: int = 2600) -> 
         noise = NOISE_PX * rng.standard_normal(len(interaction))
         slopes[frame] = centroid_gain * (atmosphere[frame] + interaction @ held) + noise
         commands[frame] = 0.99 * commands[frame - 1] - LOOP_GAIN * matrix @ slopes[frame]
-    known = replace(_EMPTY, slopes=slopes[50:], frame=np.arange(50, frames), cells=CELLS)
-    return replace(known, commands=commands[50:], interaction=interaction)
-
-
-_EMPTY = RecordedLoop(
-    "case",
-    np.zeros((1, 50)),
-    np.zeros(1, np.int64),
-    RATE_HZ,
-    "px",
-    CELLS,
-    subaperture_m=0.6,
-    pixel_scale_arcsec=0.2,
-)
+    known: dict[str, Any] = {"subaperture_m": 0.6, "pixel_scale_arcsec": 0.2, "slope_unit": "px"}
+    known |= {"frame": np.arange(50, frames), "name": "case"}
+    return Recording(slopes[50:], commands[50:], interaction, CELLS, RATE_HZ, **known)

@@ -15,9 +15,9 @@ from tests.loop.telemetry.loop_cases import AIR, LOOP_GAIN, NOISE_PX, RATE_HZ, r
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.measured import Measured
+from faintspot.loop.control.identification.open_loop import open_loop_of
 from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER, MODES
-from faintspot.loop.telemetry.measured import Measured
-from faintspot.loop.telemetry.open_loop import open_loop_of
 from faintspot.loop.telemetry.page import page_of_loop
 from faintspot.loop.telemetry.report import LoopReport, report_of_loop
 
@@ -118,7 +118,7 @@ def test_limits_of_actuators() -> None:
 
 
 def test_without_commands() -> None:
-    loop = replace(recorded(), commands=None, interaction=None)
+    loop = replace(recorded(), commands=None, interaction_matrix=None)
     report = report_of_loop(loop)
     assert "no commands" in report.parts["turbulence"].missing
     assert not report.parts["turbulence"].values
@@ -129,9 +129,9 @@ def test_open_loop() -> None:
     """An open loop has no delay; its turbulence is known all the same."""
     loop = recorded()
     assert loop.commands is not None
-    assert loop.interaction is not None
+    assert loop.interaction_matrix is not None
     held = np.zeros_like(loop.slopes)
-    held[2:] = (loop.commands @ loop.interaction.T)[:-2]
+    held[2:] = (loop.commands @ loop.interaction_matrix.T)[:-2]
     rows = slice(2, 1202)
     still = replace(
         loop, slopes=(loop.slopes - held)[rows], frame=loop.frame[rows], commands=np.zeros((1200, 36))
@@ -185,7 +185,7 @@ def test_a_single_sub_aperture() -> None:
         frame=np.arange(frames),
         cells=np.zeros((1, 2), np.int64),
         commands=commands,
-        interaction=np.eye(2),
+        interaction_matrix=np.eye(2),
         frame_rate_hz=500.0,
     )
     found = report_of_loop(loop)

@@ -10,19 +10,19 @@ from tests.loop.telemetry.loop_cases import recorded
 
 from faintspot.loop.control.identification.layers import Identification
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.telemetry.measured import Measured
-from faintspot.loop.telemetry.open_loop import open_loop_of, site_of_loop
+from faintspot.loop.control.identification.measured import Measured
+from faintspot.loop.control.identification.open_loop import open_loop_of, site_of_loop
 from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
 
 
 def found(change: np.ndarray, missing: float = 0.0) -> list[Measured]:
     """Return rotation and gain of a loop whose x and y slopes were changed by a matrix (2, 2)."""
     loop = recorded()
-    assert loop.interaction is not None
+    assert loop.interaction_matrix is not None
     whole = np.kron(change, np.eye(len(loop.cells)))
     slopes = loop.slopes @ whole.T
     slopes[:, np.random.default_rng(1).random(slopes.shape[1]) < missing] = np.nan
-    loop = replace(loop, slopes=slopes, interaction=whole @ loop.interaction)
+    loop = replace(loop, slopes=slopes, interaction_matrix=whole @ loop.interaction_matrix)
     seen = open_loop_of(loop, LoopDelay(2.0, 0.0, 1.0, 0.0))
     identified = Identification(seen.telemetry, site_of_loop(loop), loop.frame_rate_hz)
     return recorded_discrepancy(loop, seen, identified.of_winds(np.zeros((1, 2))))

@@ -97,7 +97,7 @@ def _learn_from(
     from faintspot.io import read_telemetry
     from faintspot.loop.control.base import ASSUMED
     from faintspot.loop.control.configuration import load_control, prior_std_px, save_control
-    from faintspot.loop.control.identification.learning import learn as learnt_by
+    from faintspot.loop.control.identification.learning import learn_controller
     from faintspot.loop.telemetry.recording import site_of, telemetry_of_recording
     from faintspot.slopes.pipeline.settings import Settings
     from faintspot.slopes.sensor.layout import Layout
@@ -110,7 +110,7 @@ def _learn_from(
     telemetry, rate_hz = telemetry_of_recording(night, control, prior)
     known = site_of(layout, layers), rate_hz, ASSUMED if layers else winds
     with progress_bar("Filter", "steps") as show:
-        learnt = learnt_by(kind, control.plant, telemetry, *known, progress=show)
+        learnt = learn_controller(kind, control.plant, telemetry, *known, progress=show)
     path = derived(config, ".model.npz")
     learnt.model.save(path)
     save_control(config, controller=kind, model=path.name)

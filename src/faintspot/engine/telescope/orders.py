@@ -9,7 +9,8 @@ from typing import Any
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys
-from faintspot.loop.simulation.configuration.configuration import ARCSEC, LoopConfiguration
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 
 ORDERS = ("photons", "magnitude", "r0_m", "seeing_arcsec", "wind_factor")

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.learning import INTEGRATOR, KALMAN, LearntControl, LoopPlant, learn
+from faintspot.loop.control.identification.learning import (
+    INTEGRATOR,
+    KALMAN,
+    LearntControl,
+    LoopPlant,
+    learn_controller,
+)
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.telemetry import OpenLoopTelemetry, make_telemetry
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
@@ -167,7 +173,7 @@ def _learnt(
     telemetry = _telemetry(_without_assumed(configuration), method, seed, simulate)
     site = slope_turbulence(configuration, optics.sensor.layout.cells)
     plant = LoopPlant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
-    return learn(kind, plant, telemetry, site, control.frame_rate_hz, control.winds, noise_scale)
+    return learn_controller(kind, plant, telemetry, site, control.frame_rate_hz, control.winds, noise_scale)
 
 
 @lru_cache(maxsize=8)

@@ -13,13 +13,14 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
 from faintspot.loop.control.configuration import TABLE, save_control
 from faintspot.loop.control.identification.learning import INTEGRATOR, KALMAN
-from faintspot.loop.simulation.configuration.configuration import ARCSEC, LoopConfiguration
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.control import learnt_control
 from faintspot.loop.simulation.methods import PRIOR, Method
 from faintspot.loop.simulation.simulation import measure_gains, simulate_loop
 from faintspot.loop.simulation.telescope.calibration import flat_psf, make_pipeline, reference_slopes
 from faintspot.loop.simulation.telescope.camera import camera_calibration
 from faintspot.loop.simulation.telescope.model import prepare
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.psf import PSF

@@ -19,18 +19,17 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import mean_by_blocks
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learning import GAINS, KALMAN, MODAL, learn
+from faintspot.loop.control.identification.learning import GAINS, KALMAN, MODAL, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.measured import Measured
 from faintspot.loop.control.identification.model import SETTLE_FRAMES, ControlModel, LoopPlant
+from faintspot.loop.control.identification.open_loop import OpenLoop
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.kalman.predictor import steady_covariance
 from faintspot.loop.control.phase import residual_phase
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
-from faintspot.loop.simulation.configuration.configuration import ARCSEC
-from faintspot.loop.telemetry.measured import Measured
-from faintspot.loop.telemetry.open_loop import OpenLoop
-from faintspot.loop.telemetry.recorded_loop import RecordedLoop
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 
 Floats = NDArray[np.float64]
 
@@ -71,7 +70,7 @@ class Choice:
 
 
 def compared_choices(
-    loop: RecordedLoop,
+    loop: Recording,
     open_loop: OpenLoop,
     delay: LoopDelay,
     site: SlopeTurbulence,
@@ -89,12 +88,12 @@ def compared_choices(
         When there are too few frames, or the mirror cannot be controlled by the slopes.
     """
     frames = len(open_loop.telemetry)
-    assert loop.interaction is not None
+    assert loop.interaction_matrix is not None
     if frames < FEWEST_FRAMES:
         raise InputError(f"{frames} frames, expected {FEWEST_FRAMES} for a replay")
-    reconstructor = make_reconstructor(loop.interaction)
-    plant = LoopPlant(loop.interaction, reconstructor, max(1, round(delay.delay_frames)), _LEAK)
-    phase = residual_phase(reconstructor.clean, loop.interaction, loop.cells)
+    reconstructor = make_reconstructor(loop.interaction_matrix)
+    plant = LoopPlant(loop.interaction_matrix, reconstructor, max(1, round(delay.delay_frames)), _LEAK)
+    phase = residual_phase(reconstructor.clean, loop.interaction_matrix, loop.cells)
     views = [_View.of(slopes, phase) for slopes in (open_loop, open_loop.scaled(delay.gain))]
     relative = float(open_loop.variance_error.mean()) / math.sqrt(len(reconstructor.modes.T))
     scale = _Scale.of(loop, r0, delay, relative)
@@ -115,7 +114,7 @@ def compared_choices(
     first = open_loop.telemetry.part(0, frames // 2)
     if len(open_loop.variance) <= _MOST_SLOPES:
         modal, learnt = (
-            learn(kind, plant, first, site, loop.frame_rate_hz).model for kind in (MODAL, KALMAN)
+            learn_controller(kind, plant, first, site, loop.frame_rate_hz).model for kind in (MODAL, KALMAN)
         )
         choices.append(compare(BEST, *integrators([learnt.plain_gain]), gain=learnt.plain_gain))
         choices.append(compare(MODES, learnt_left(modal)))
@@ -191,11 +190,11 @@ class _Scale:
     """Relative error of the noise's phase variance."""
 
     @classmethod
-    def of(cls, loop: RecordedLoop, r0: Measured, delay: LoopDelay, noise_error: float) -> _Scale:
+    def of(cls, loop: Recording, r0: Measured, delay: LoopDelay, noise_error: float) -> _Scale:
         gain_error = 2 * float(np.nan_to_num(delay.gain_error))
         if loop.subaperture_m is None or loop.pixel_scale_arcsec is None:
             unit = f"{loop.slope_unit} x sub-aperture"
-            return cls(unit, 1.0, math.nan, math.nan, math.nan, gain_error, noise_error)
+            return cls(unit, loop.unit, math.nan, math.nan, math.nan, gain_error, noise_error)
         factor = loop.pixel_scale_arcsec * ARCSEC * loop.subaperture_m * 1e9
         square = (loop.subaperture_m / r0.value) ** (5 / 3) * (_R0_WAVELENGTH_NM / (2 * math.pi)) ** 2
         unseen = _FITTING + _ALIASING

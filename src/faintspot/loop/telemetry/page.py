@@ -10,9 +10,9 @@ from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, colour_ba
 from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import Page, Section, Table, html_of
 from faintspot.base.report.texts import Texts
+from faintspot.loop.control.identification.measured import Measured, wind_errors
 from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER
-from faintspot.loop.telemetry.measured import Measured
-from faintspot.loop.telemetry.report import LoopReport, Part, wind_errors
+from faintspot.loop.telemetry.report import LoopReport, Part
 
 _TEXT = Texts("faintspot.loop.telemetry")
 _STREHL = "Strehl ratio"
@@ -143,7 +143,7 @@ def _spectra_figure(report: LoopReport) -> FigureWithData | None:
     for panel in panels[len(spectra.measured) :]:
         panel.set_visible(False)
     for panel, name in zip(panels, spectra.measured, strict=False):
-        measured, model = spectra.measured[name], spectra.model[name]
+        measured, model = (report.loop.unit**2 * power[name] for power in (spectra.measured, spectra.model))
         panel.loglog(spectra.frequency_hz, measured, color=GREY, lw=1, label="measured")
         panel.loglog(spectra.frequency_hz, model, color=METHOD_COLOURS[0], lw=1.6, label="found")
         spread = np.exp(1.96 / np.sqrt(0.55 * spectra.pieces))

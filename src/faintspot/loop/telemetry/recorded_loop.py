@@ -1,8 +1,8 @@
-"""Recorded loop of any system: slopes, commands and geometry."""
+"""Recorded loop of any system, read from its file."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,13 @@ from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.frames import read_array
 from faintspot.io.telemetry.recording import read_telemetry
 from faintspot.loop.control.configuration import load_control
-from faintspot.loop.simulation.configuration.configuration import ARCSEC
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.telemetry.recording import CLOSED
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.sensor.pupil import side_m
 
 Floats = NDArray[np.float64]
 
-SCIENCE_WAVELENGTH_M = 1.65e-6
 UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
 """Units of slopes, in arcsec."""
 _OF_AOT = {"pix": "px", "pixel": "px", "px": "px", "arcsec": "arcsec", "rad": "rad"}
@@ -39,57 +39,14 @@ _NUMBERS = (
     "outer_scale_m",
     "science_wavelength_m",
 )
-_WORDS = ("slope_unit", "slope_order", "loop")
+_WORDS = ("sent_after_frames", "slope_unit", "slope_order", "loop")
 _PAIRS, _AXES = "pairs", "axes"
 _TABLES = (".npz", ".npy", ".csv", ".txt")
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedLoop:
-    """Slopes and commands of a loop with n sub-apertures; None if unknown."""
-
-    name: str
-    slopes: Floats
-    """(frames, 2 n): residual slopes in `slope_unit`, all x, then all y; NaN where not measured."""
-    frame: NDArray[np.int64]
-    """(frames,): number of each frame; missing ones were lost."""
-    frame_rate_hz: float
-    slope_unit: str
-    cells: NDArray[np.int64]
-    """(n, 2): row and column of each sub-aperture."""
-    commands: Floats | None = None
-    """(frames, commands): computed from each frame."""
-    interaction: Floats | None = None
-    """(2 n, commands): slopes in `slope_unit` for a unit of each command."""
-    subaperture_m: float | None = None
-    pixel_scale_arcsec: float | None = None
-    """Angle of one `slope_unit`."""
-    delay_frames: float | None = None
-    largest_command: float | None = None
-    outer_scale_m: float | None = None
-    science_wavelength_m: float = SCIENCE_WAVELENGTH_M
-    is_closed: bool = True
-    remarks: tuple[str, ...] = ()
-    """Assumptions made."""
-
-    def __post_init__(self) -> None:
-        n, slopes = len(self.cells), self.slopes.shape
-        if slopes[1] != 2 * n:
-            raise InputError(f"slopes: expected {2 * n} columns for {n} sub-apertures, got {slopes[1]}")
-        if self.commands is None or self.interaction is None:
-            return
-        if len(self.commands) != slopes[0]:
-            raise InputError(
-                f"commands: expected {slopes[0]} frames, as of the slopes, got {len(self.commands)}"
-            )
-        if self.interaction.shape != (2 * n, self.commands.shape[1]):
-            expected = 2 * n, self.commands.shape[1]
-            raise InputError(f"interaction_matrix: expected shape {expected}, got {self.interaction.shape}")
-
-
 def read_recorded_loop(
     path: str | Path, system: str | Path | None = None, configuration: str | Path | None = None
-) -> RecordedLoop:
+) -> Recording:
     """Read a recording of a loop.
 
     Parameters
@@ -211,53 +168,44 @@ def _of_aot(path: Path) -> dict[str, Any]:
     return values | {name: value for name, value in optional.items() if value is not None and np.size(value)}
 
 
-def _loop(name: str, values: dict[str, Any]) -> RecordedLoop:
+def _loop(name: str, values: dict[str, Any]) -> Recording:
     """Return the loop of values from files, checked."""
     if "slopes" not in values:
         raise InputError("slopes: expected an array, found none")
     slopes, remarks = np.asarray(values["slopes"], np.float64), []
-    if slopes.ndim == 3:  # (frames, n, 2) or (frames, 2, n)
-        slopes = (slopes if slopes.shape[1] == 2 else slopes.swapaxes(1, 2)).reshape(len(slopes), -1)
-    if slopes.ndim != 2 or slopes.shape[1] % 2:
-        raise InputError(f"slopes: expected shape (frames, 2 n), got {slopes.shape}")
-    if one_of("slope_order", values.get("slope_order", _AXES), (_AXES, _PAIRS)) == _PAIRS:
+    in_pairs = one_of("slope_order", values.get("slope_order", _AXES), (_AXES, _PAIRS)) == _PAIRS
+    if in_pairs and slopes.ndim == 2:
         slopes = np.hstack([slopes[:, ::2], slopes[:, 1::2]])
-    slopes, left_out = _usable(slopes, values.get("flags"))
-    remarks += [f"slopes: {left_out}"] if left_out else []
     numbers = {key: number_between(key, values[key], 0, low_open=True) for key in _NUMBERS if key in values}
     if "slope_unit" not in values:
         raise InputError(f"slope_unit: unknown; give it in a TOML file with --system ({', '.join(UNITS)})")
     unit = one_of("slope_unit", values["slope_unit"], list(UNITS))
-    scale = UNITS[unit] or numbers.get("pixel_scale_arcsec")
-    cells = _cells(values.get("cells"), slopes.shape[1] // 2)
+    scale = UNITS[unit] or numbers.pop("pixel_scale_arcsec", None)
     frame, rate = _timing(values, len(slopes), numbers.get("frame_rate_hz"))
-    commands, interaction = values.get("commands"), values.get("interaction_matrix")
-    if commands is not None:
-        commands = finite_array("commands", commands).astype(np.float64).reshape(len(commands), -1)
+    interaction = values.get("interaction_matrix")
     if interaction is None and values.get("control_matrix") is not None:
         control = finite_array("control_matrix", values["control_matrix"]).astype(np.float64)
         interaction = np.linalg.pinv(control.reshape(len(control), -1), rcond=0.03)
         remarks.append("interaction matrix: pseudo-inverse of the control matrix")
-    if interaction is not None:
-        interaction = finite_array("interaction_matrix", interaction).astype(np.float64)
-    loop = RecordedLoop(
-        name,
+    diameter_m = numbers.pop("diameter_m", None)
+    known: dict[str, Any] = {**numbers, "pixel_scale_arcsec": scale}
+    known["frame_rate_hz"] = rate
+    loop = Recording(
         slopes,
-        frame,
-        rate,
-        unit,
-        cells,
-        commands,
+        values.get("commands"),
         interaction,
-        side_m(cells, numbers.get("subaperture_m"), numbers.get("diameter_m")),
-        scale,
-        numbers.get("delay_frames"),
-        numbers.get("largest_command"),
-        numbers.get("outer_scale_m"),
-        numbers.get("science_wavelength_m", SCIENCE_WAVELENGTH_M),
-        one_of("loop", values.get("loop", "closed"), ("closed", "open")) == "closed",
+        values.get("cells"),
+        **known,
+        sent_after_frames=values.get("sent_after_frames"),
+        frame=frame,
+        is_closed=one_of("loop", values.get("loop", "closed"), ("closed", "open")) == "closed",
+        slope_unit=unit,
+        name=name,
     )
-    return _with_sign(replace(loop, remarks=tuple(remarks)))
+    slopes, left_out = _usable(loop.slopes, values.get("flags"))
+    remarks += [f"slopes: {left_out}"] if left_out else []
+    side = side_m(loop.cells, loop.subaperture_m, diameter_m)
+    return replace(loop, slopes=slopes, subaperture_m=side, remarks=tuple(remarks))
 
 
 def _usable(slopes: Floats, flags: NDArray[np.uint8] | None) -> tuple[Floats, str]:
@@ -268,23 +216,6 @@ def _usable(slopes: Floats, flags: NDArray[np.uint8] | None) -> tuple[Floats, st
         raise InputError(f"flags: expected integers of shape {x.shape}, got {flags.dtype} of {flags.shape}")
     valid, left_out = leave_out(flags, others={"not finite": ~np.isfinite(x + y)})
     return np.where(np.tile(valid, 2), slopes, np.nan), left_out
-
-
-def _cells(stated: Any, n: int) -> NDArray[np.int64]:
-    """Return row and column of n sub-apertures, from a list, a mask, or a full square."""
-    if stated is None:
-        side = round(n**0.5)
-        if side * side != n:
-            raise InputError(
-                f"cells: expected row and column of the {n} sub-apertures; give them with --system"
-            )
-        return np.argwhere(np.ones((side, side)))
-    cells = finite_array("cells", stated)
-    if cells.shape == (n, 2):
-        return cells.astype(np.int64)
-    if cells.ndim == 2 and np.count_nonzero(cells > 0) == n:  # a mask
-        return np.argwhere(cells > 0)
-    raise InputError(f"cells: expected shape ({n}, 2), or a mask with {n} sub-apertures, got {cells.shape}")
 
 
 def _timing(values: dict[str, Any], frames: int, rate: float | None) -> tuple[NDArray[np.int64], float]:
@@ -304,14 +235,3 @@ def _timing(values: dict[str, Any], frames: int, rate: float | None) -> tuple[ND
     if len(frame) != frames or (np.diff(frame) <= 0).any():
         raise InputError(f"frame: expected {frames} increasing numbers, got {len(frame)}")
     return frame, rate
-
-
-def _with_sign(loop: RecordedLoop) -> RecordedLoop:
-    """Return a loop with the sign of commands such that they add to the slopes."""
-    if loop.commands is None or loop.interaction is None or not loop.is_closed:
-        return loop
-    change = np.diff(loop.commands, axis=0) @ loop.interaction.T
-    if np.nansum(change * loop.slopes[1:]) <= 0:
-        return loop
-    remark = "commands: sign reversed, as they are subtracted from the turbulence"
-    return replace(loop, commands=-loop.commands, remarks=(*loop.remarks, remark))

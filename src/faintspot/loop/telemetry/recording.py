@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -14,7 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.loop.control.configuration import NONE, STREAM, Control
 from faintspot.loop.control.identification.model import INTEGRATOR, KALMAN, MODAL
 from faintspot.loop.control.telemetry import OpenLoopTelemetry, make_telemetry
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.turbulence.strength import OUTER_SCALE_M
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import side_m
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 200
-_ARCSEC = math.pi / 180 / 3600
 CLOSED = 2
 """State of a closed loop in telemetry."""
 
@@ -144,7 +142,7 @@ def site_of(layout: Layout, layers: Sequence[tuple[float, float, float]] = ()) -
             "layout: expected subaperture_m or diameter_m, which say how fast the wind crosses a sub-aperture"
         )
     positions = layout.cells[:, ::-1].astype(np.float64) * side
-    scale = (layout.pixel_scale_arcsec or 1.0) * _ARCSEC
+    scale = (layout.pixel_scale_arcsec or 1.0) * ARCSEC
     speed, direction, share = np.asarray(layers or [(0.0, 0.0, 1.0)], np.float64).reshape(-1, 3).T
     numbers_between("layers: speed", speed, 0, 200)
     numbers_between("layers: direction", direction, -360, 360)

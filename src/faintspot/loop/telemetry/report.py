@@ -12,25 +12,28 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.layers import Identification, Identified
-from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay, loop_delay
-from faintspot.loop.simulation.configuration.configuration import ARCSEC
+from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
+from faintspot.loop.control.identification.measured import Measured, outer_scale_and_r0, wind_errors, winds_of
+from faintspot.loop.control.identification.open_loop import (
+    OpenLoop,
+    measured_delay,
+    open_loop_of,
+    site_of_loop,
+)
+from faintspot.loop.control.identification.recording import Recording, prepared
 from faintspot.loop.telemetry.choices import Choice, compared_choices
-from faintspot.loop.telemetry.measured import Measured, outer_scale_and_r0
-from faintspot.loop.telemetry.open_loop import OpenLoop, open_loop_of, runs_of, site_of_loop
-from faintspot.loop.telemetry.recorded_loop import RecordedLoop
 from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
 from faintspot.loop.telemetry.spectra import ModalSpectra, modal_spectra
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.loop.turbulence.strength import turbulence_strength
 from faintspot.slopes.sensor.pupil import subapertures_across
 
 Floats = NDArray[np.float64]
 
-_WHOLE_FRAMES = 0.1  # closer to a whole number of frames than this, a delay is taken for that
 _TIMES_AT_LIMIT = 3  # that a largest value occurs, to be taken for a limit
 _DRAWS = 1000
 _GAIN_SPREAD = 0.5  # of the deviation of the centroid gain from 1: it differs between spatial scales
 _MOST_UNMEASURED = 0.2  # of the slopes; large ones are missed most, so that the others vary too little
-_WIND_ERROR = 0.35  # sub-apertures per second: measured slopes are not quite mean gradients in squares
 _PARABOLA_ERROR = 0.03  # of the noise: turbulence and speckles within two frames are no parabola
 
 
@@ -48,7 +51,7 @@ class Part:
 class LoopReport:
     """Report of a recorded loop."""
 
-    loop: RecordedLoop
+    loop: Recording
     parts: dict[str, Part]
     noise_px: Floats | None = None
     """(2 n,): standard deviation of each slope's noise, in the unit of the slopes."""
@@ -74,23 +77,21 @@ class LoopReport:
         return {"recording": self.loop.name, "slope_unit": self.loop.slope_unit, **values}
 
 
-def report_of_loop(loop: RecordedLoop, progress: Callable[[str], None] = lambda _: None) -> LoopReport:
+def report_of_loop(loop: Recording, progress: Callable[[str], None] = lambda _: None) -> LoopReport:
     """Analyse a recorded loop.
 
     Parameters
     ----------
-    loop : RecordedLoop
+    loop : Recording
     progress : callable
         Called with the name of each step.
 
     Raises
     ------
     InputError
-        When the slopes do not vary.
+        When the slopes do not vary, or commands and slopes are not of one loop.
     """
-    slopes = loop.slopes[np.isfinite(loop.slopes)]
-    if not slopes.size or slopes.std() <= 1e-12 * max(1.0, float(np.abs(slopes).max())):
-        raise InputError(f"{loop.name}: expected slopes that vary, got constant ones")
+    loop = prepared(loop).recording
     titles = {
         "frames": "Frames",
         "loop": "Loop",
@@ -136,7 +137,7 @@ def _loop(report: LoopReport) -> LoopDelay:
     if not loop.is_closed or (is_still and loop.commands is not None):
         part.missing = "The loop was open: it has no delay and no gain to measure."
         return LoopDelay(1.0, 0.0, 1.0, 0.0)
-    if loop.commands is None or loop.interaction is None:
+    if loop.commands is None or loop.interaction_matrix is None:
         absent = "commands" if loop.commands is None else "an interaction or control matrix"
         why = f"The recording has no {absent}: its open-loop slopes are unknown."
         for name in ("loop", "turbulence", "vibrations", "spectra", "choices"):
@@ -147,28 +148,21 @@ def _loop(report: LoopReport) -> LoopDelay:
     return delay
 
 
-def _delay(loop: RecordedLoop) -> tuple[list[Measured], LoopDelay]:
-    """Return delay and gain as reported and as used, the latter rounded to whole frames if consistent."""
-    assert loop.commands is not None
-    assert loop.interaction is not None
+def _delay(loop: Recording) -> tuple[list[Measured], LoopDelay]:
+    """Return delay and gain as reported and as used."""
     names, assumed = (("delay", "frames"), ("centroid gain", "")), loop.delay_frames
-    slopes, mirror = np.nan_to_num(loop.slopes), loop.commands @ loop.interaction.T
-    context = runs_of(loop.frame), site_of_loop(loop), loop.frame_rate_hz
     try:
-        fit = loop_delay(slopes, mirror, *context, assumed)
-        nearest = float(round(fit.delay_frames))
-        remark, used = "given" if assumed is not None else "", fit
-        if assumed is None and abs(fit.delay_frames - nearest) < max(_WHOLE_FRAMES, 2 * fit.delay_error):
-            remark, used = f"{nearest:g} is used", loop_delay(slopes, mirror, *context, nearest)
+        fit, used = measured_delay(loop)
     except InputError as error:
         used = LoopDelay(assumed or 2.0, math.nan, 1.0, math.nan)
         remarks = f"{error}; {used.delay_frames:g} is used", f"{error}; 1 is used"
         return [Measured(*name, remark=text) for name, text in zip(names, remarks, strict=True)], used
+    remark = "given" if assumed is not None else f"{used.delay_frames:g} is used" if used is not fit else ""
     gain = Measured(*names[1], used.gain, used.gain_error, f"for a delay of {used.delay_frames:.3g} frames")
     return [Measured(*names[0], fit.delay_frames, fit.delay_error, remark), gain], used
 
 
-def _saturated(loop: RecordedLoop) -> Measured:
+def _saturated(loop: Recording) -> Measured:
     """Return how many actuators reached a limit, given or seen as a largest value that occurs repeatedly."""
     name, unit = "actuators that reached a limit", ""
     if loop.commands is None:
@@ -196,7 +190,7 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
         for name in ("noise", "turbulence", "vibrations", "spectra", "choices"):
             report.parts[name].missing = report.parts[name].missing or f"{error}."
         return None
-    report.noise_px = delay.gain * np.sqrt(open_loop.variance)
+    report.noise_px = loop.unit * delay.gain * np.sqrt(open_loop.variance)
     report.noise_error_px = 0.5 * report.noise_px * open_loop.variance_error
     rms = float(np.sqrt(np.square(report.noise_px).mean()))
     spread = 0.5 * rms * float(open_loop.variance_error.mean()) / math.sqrt(len(open_loop.variance))
@@ -207,7 +201,7 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
     if scale is None or loop.subaperture_m is None:
         part.missing = "Not in nm: pixel_scale_arcsec and subaperture_m are not known."
     else:
-        to_nm = scale * ARCSEC * loop.subaperture_m * 1e9
+        to_nm = scale / loop.unit * ARCSEC * loop.subaperture_m * 1e9
         part.values.append(Measured("tilt over a sub-aperture", "nm", rms * to_nm, spread * to_nm, remark))
     unmeasured = 1 - float(open_loop.telemetry.trust[open_loop.telemetry.trust.any(axis=1)].mean())
     if unmeasured > _MOST_UNMEASURED:
@@ -271,25 +265,9 @@ def _winds(identified: Identified, r0: Measured) -> list[Measured]:
         time_ms = 314 * r0.value / speed
         error = time_ms * math.hypot(r0.error / r0.value, float(mean.std()) / speed)
         values.append(Measured("coherence time at 500 nm", "ms", time_ms, error))
-    for rank, number in enumerate(np.argsort(-share), 1):
-        x, y = winds[number]
-        speed = math.hypot(x, y)
-        along = float(np.hypot(*(errors[number] * winds[number]))) / max(speed, 1e-9)
-        across = float(np.hypot(*(errors[number] * winds[number][::-1]))) / max(speed, 1e-9)
-        degrees = math.degrees(across / max(speed, 1e-9))
-        name = f"layer {rank}"
-        direction = math.degrees(math.atan2(y, x)) % 360
-        values += [
-            Measured(f"{name}: speed", "m/s", speed, along),
-            Measured(f"{name}: direction", "degrees", direction, degrees, "towards, from +x to +y"),
-            Measured(f"{name}: share", "", float(share[number]), float(identified.fraction_error[number])),
-        ]
+    for rank, wind in enumerate(winds_of(identified), 1):
+        values += [replace(value, name=f"layer {rank}: {value.name}") for value in vars(wind).values()]
     return values
-
-
-def wind_errors(identified: Identified) -> Floats:
-    """Return standard errors (layers, 2) of winds, m/s, with those of the model."""
-    return np.hypot(identified.wind_error_m_per_s, _WIND_ERROR * identified.turbulence.subaperture_m)
 
 
 def _vibrations(report: LoopReport, identified: Identified) -> None:
@@ -298,7 +276,8 @@ def _vibrations(report: LoopReport, identified: Identified) -> None:
     to_nm = math.sqrt(2) * (loop.pixel_scale_arcsec or math.nan) * ARCSEC * diameter_m / 4 * 1e9
     for line in identified.vibrations:
         rms = line.rms_px, line.rms_error_px
-        shown = Measured(f"rms of {line.mode}", loop.slope_unit, *rms, "over all slopes")
+        of_slopes = loop.unit * line.rms_px, loop.unit * line.rms_error_px
+        shown = Measured(f"rms of {line.mode}", loop.slope_unit, *of_slopes, "over all slopes")
         if line.mode != "focus" and math.isfinite(to_nm):
             shown = Measured(shown.name, "nm", to_nm * rms[0], to_nm * rms[1])
         frequency = line.frequency_hz, line.frequency_error_hz
@@ -309,7 +288,7 @@ def _vibrations(report: LoopReport, identified: Identified) -> None:
 
 def _choices(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> None:
     loop, part = report.loop, report.parts["choices"]
-    if loop.interaction is None:
+    if loop.interaction_matrix is None:
         part.missing = "The recording has no interaction or control matrix: no mirror can be replayed."
         return
     turbulence = report.parts["turbulence"].values

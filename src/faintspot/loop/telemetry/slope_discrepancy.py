@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.loop.control.identification.layers import Identified
+from faintspot.loop.control.identification.measured import Measured
+from faintspot.loop.control.identification.open_loop import OpenLoop
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.slope_records import interpolated
-from faintspot.loop.telemetry.measured import Measured
-from faintspot.loop.telemetry.open_loop import OpenLoop
-from faintspot.loop.telemetry.recorded_loop import RecordedLoop
 from faintspot.slopes.wavefront.discrepancy import not_gradients
 
 Floats = NDArray[np.float64]
@@ -22,7 +22,7 @@ _COMMON_ERRORS = 0.005, 0.02
 """Standard errors, rad and relative, of partly illuminated sub-apertures."""
 
 
-def recorded_discrepancy(loop: RecordedLoop, open_loop: OpenLoop, identified: Identified) -> list[Measured]:
+def recorded_discrepancy(loop: Recording, open_loop: OpenLoop, identified: Identified) -> list[Measured]:
     """Return the rotation of the slopes' axes, and the gain of x relative to that of y.
 
     The slopes of a wavefront, turned or stretched, are not those of any wavefront: that part is compared with

@@ -22,6 +22,7 @@ from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M, structure_functio
 
 Floats = NDArray[np.float64]
 
+ARCSEC = math.pi / 180 / 3600
 _SMALLEST, _LARGEST, _NODES = 1e-6, 1e3, 2000  # separations of the table in outer scales
 _DIRECTIONS = 8
 _POINTS = 6  # of the quadrature along half an edge

@@ -13,8 +13,8 @@ from faintspot.loop.control.identification.loop_delay import LoopDelay, loop_del
 def found(delay: int, gain: float, given: float | None = None, frames: int | None = None) -> LoopDelay:
     loop = recorded(delay, gain)
     assert loop.commands is not None
-    assert loop.interaction is not None
-    held = loop.commands @ loop.interaction.T
+    assert loop.interaction_matrix is not None
+    held = loop.commands @ loop.interaction_matrix.T
     run = np.zeros(len(held), np.int64)
     return loop_delay(loop.slopes[:frames], held[:frames], run[:frames], AIR, RATE_HZ, given)
 

@@ -12,7 +12,7 @@ from tests.loop.control.control_cases import COVARIANCES, FRAME_S, INTERACTION, 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.configuration import Control, ControlOptions
-from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, learn
+from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, learn_controller
 from faintspot.loop.control.identification.model import ControlModel, LearntControl
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.slopes.camera.calibration import Calibration
@@ -23,7 +23,7 @@ FRAMES = telemetry(600, 0.3)
 
 @pytest.fixture(scope="module")
 def learnt() -> dict[str, LearntControl]:
-    return {kind: learn(kind, PLANT, FRAMES, TURBULENCE, 1 / FRAME_S) for kind in KINDS}
+    return {kind: learn_controller(kind, PLANT, FRAMES, TURBULENCE, 1 / FRAME_S) for kind in KINDS}
 
 
 def commands(controller: Any, line: CommandDelayLine, frames: int = 60) -> np.ndarray:

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from tests.loop.control.driven import driven, oscillator
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn
+from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn_controller
 from faintspot.loop.control.identification.loop_delay import loop_delay
+from faintspot.loop.control.identification.open_loop import site_of_loop
 from faintspot.loop.control.identification.oscillators import fitted_oscillators
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
-from faintspot.loop.telemetry.open_loop import site_of_loop
-from faintspot.loop.telemetry.recorded_loop import RecordedLoop
 
 _RATE_HZ, _FRAMES, _NOISE = 500.0, 8000, 0.5
 _TURBULENCE, _VIBRATION, _BROAD = (
@@ -25,9 +25,7 @@ _TURBULENCE, _VIBRATION, _BROAD = (
     oscillator(45.0, 0.3, 0.4),
 )
 _CELLS = np.zeros((1, 2), np.int64)
-_SITE = site_of_loop(
-    RecordedLoop("tip-tilt", np.zeros((1, 2)), np.zeros(1, np.int64), _RATE_HZ, "px", _CELLS)
-)
+_SITE = site_of_loop(Recording(np.zeros((1, 2)), None, None, _CELLS, _RATE_HZ))
 
 
 def _seen(seed: int) -> NDArray[np.float64]:
@@ -56,7 +54,7 @@ def test_the_learnt_filter_beats_the_best_integrator() -> None:
         OpenLoopTelemetry(slopes, np.full(slopes.shape, _NOISE**2), np.ones(slopes.shape))
         for slopes in map(_seen, (2, 3))
     )
-    learnt = learn(KALMAN, plant, learning, _SITE, _RATE_HZ)
+    learnt = learn_controller(KALMAN, plant, learning, _SITE, _RATE_HZ)
     assert learnt.identified is not None
     assert learnt.identified.oscillators
     gain, plain = plant.best_gain(GAINS, scoring, np.eye(2))

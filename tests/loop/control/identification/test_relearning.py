@@ -9,7 +9,7 @@ from tests.loop.control.control_cases import FRAME_S, LAYERS, PLANT, TURBULENCE,
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import ASSUMED
-from faintspot.loop.control.identification.learning import KALMAN, learn
+from faintspot.loop.control.identification.learning import KALMAN, learn_controller
 from faintspot.loop.control.identification.model import LearntControl
 from faintspot.loop.control.identification.relearning import relearn
 
@@ -20,7 +20,9 @@ FRAMES = telemetry(1200, 0.3, model=LAYERS)
 @pytest.fixture(scope="module")
 def now() -> LearntControl:
     """Return a filter for the present turbulence, from other frames."""
-    return learn(KALMAN, PLANT, telemetry(800, 0.3, seed=9, model=LAYERS), TURBULENCE, RATE_HZ, ASSUMED)
+    return learn_controller(
+        KALMAN, PLANT, telemetry(800, 0.3, seed=9, model=LAYERS), TURBULENCE, RATE_HZ, ASSUMED
+    )
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from tests.loop.control.frozen_flow import frozen_slopes
 from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification import learning
-from faintspot.loop.control.identification.learning import KALMAN, LearntControl, learn
+from faintspot.loop.control.identification.learning import KALMAN, LearntControl, learn_controller
 from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.kalman import local_covariance, local_model
 from faintspot.loop.control.kalman import local_predictor as local_kalman
@@ -246,7 +246,9 @@ def test_large_sensors_learn_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     monkeypatch.setattr(learning, "_MOST_SLOPES", 10)
     frames = telemetry(600, 0.3, model=LAYERS)
     shown: list[tuple[int, int]] = []
-    learnt = learn(KALMAN, PLANT, frames, TURBULENCE, 1 / FRAME_S, progress=lambda *each: shown.append(each))
+    learnt = learn_controller(
+        KALMAN, PLANT, frames, TURBULENCE, 1 / FRAME_S, progress=lambda *each: shown.append(each)
+    )
     assert shown[-1][0] == shown[-1][1] == len(shown)
     assert learnt.model.is_local
     assert learnt.model.left[0] < learnt.model.left[1]

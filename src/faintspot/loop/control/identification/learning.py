@@ -30,7 +30,16 @@ from faintspot.loop.control.phase import phase_of_commands
 from faintspot.loop.control.telemetry import OpenLoopTelemetry, usual_noise
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 
-__all__ = ["CONTROLS", "INTEGRATOR", "KALMAN", "MODAL", "POLC", "LearntControl", "LoopPlant", "learn"]
+__all__ = [
+    "CONTROLS",
+    "INTEGRATOR",
+    "KALMAN",
+    "MODAL",
+    "POLC",
+    "LearntControl",
+    "LoopPlant",
+    "learn_controller",
+]
 
 Floats = NDArray[np.float64]
 Advance = Callable[[], None]
@@ -44,7 +53,7 @@ _MOST_REPLAYED, _FEWEST_REPLAYED = 1_200_000, 500  # slopes, and frames, by whic
 _LARGEST_PART = 0.85  # of the gain at which a mode would be unstable where slopes are fully trusted
 
 
-def learn(
+def learn_controller(
     kind: str,
     plant: LoopPlant,
     telemetry: OpenLoopTelemetry,

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -168,6 +169,7 @@ class ControlModel:
             plant.leak,
             noise_factor=self.noise_factor,
             prefers_plain=self.left[1] < self.left[0],
+            plain_residual=self.left[1],
             **options,
         )
 
@@ -232,8 +234,8 @@ class ControlModel:
         variance, covariance = (self.arrays[name] for name in _NOISE)
         return variance, covariance
 
-    def save(self, path: str | Path) -> None:
-        """Write the model to a NumPy file (.npz).
+    def save(self, path: str | Path, others: Mapping[str, Any] = MappingProxyType({})) -> None:
+        """Write the model to a NumPy file (.npz), with other arrays beside it.
 
         Raises
         ------
@@ -242,7 +244,7 @@ class ControlModel:
         """
         numbers = {name: np.asarray(getattr(self, name), np.float64) for name in _OF_ALL}
         kind = _LOCAL if self.is_local else self.kind
-        save_arrays(path, {"kind": np.array(kind), **numbers, **self.arrays})
+        save_arrays(path, {"kind": np.array(kind), **numbers, **self.arrays, **others})
 
     @classmethod
     def load(cls, path: str | Path, plant: LoopPlant) -> ControlModel:
@@ -317,16 +319,19 @@ class LearntControl:
         return self.model.expected_std_px
 
     def controller(
-        self, line: CommandDelayLine, prior_std_px: Floats | None = None
+        self, line: CommandDelayLine, prior_std_px: Floats | None = None, plain_frames: int = 0
     ) -> Guarded | CompiledKalman:
-        """Return the controller, with the estimator's prior if it has one."""
+        """Return the controller, with the estimator's prior if it has one; see `choice.prepare`."""
         plant, model = self.plant, self.model
         if model.kind == KALMAN and not model.is_local:
-            return model.compiled(plant, line, model.phase(plant), prior_std_px=prior_std_px)
+            guard: dict[str, Any] = {"prior_std_px": prior_std_px, "plain_frames": plain_frames}
+            return model.compiled(plant, line, model.phase(plant), **guard)
         options: dict[str, Any] = {
             "prior_std_px": prior_std_px,
             "noise_factor": model.noise_factor,
             "prefers_plain": model.left[1] < model.left[0],
+            "plain_residual": model.left[1],
+            "plain_frames": plain_frames,
         }
         interaction, gain = plant.interaction, model.plain_gain
         if model.is_local:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learning import KALMAN, LearntControl, LoopPlant, learn
+from faintspot.loop.control.identification.learning import KALMAN, LearntControl, LoopPlant, learn_controller
 from faintspot.loop.control.identification.model import SETTLE_FRAMES, ControlModel
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
@@ -88,7 +88,7 @@ def relearn(
     if frames < FEWEST_FRAMES:
         raise InputError(f"telemetry: expected {FEWEST_FRAMES} frames to judge a filter, got {frames}")
     first = frames - round(JUDGED_PART * frames)
-    learnt = learn(KALMAN, plant, telemetry.part(0, first), site, rate_hz, start=start)
+    learnt = learn_controller(KALMAN, plant, telemetry.part(0, first), site, rate_hz, start=start)
     new, begin = learnt.model, max(0, first - SETTLE_FRAMES)
     replayed = telemetry.part(begin, None)  # all have settled when the part begins that they are judged on
     phase = new.phase(plant)

@@ -31,11 +31,11 @@ from faintspot.loop.simulation.configuration.sections import (
     SensorParameters,
     Telescope,
 )
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.simulate.photometry import ZERO_POINTS, Photometry
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 
-ARCSEC = math.pi / 180 / 3600
 """Radians in one arcsecond."""
 
 SPOT_FWHM = 0.886  # full width at half maximum of sinc^2, in lambda / d

@@ -8,8 +8,9 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.simulation.configuration.configuration import ARCSEC, LoopConfiguration
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.telescope.wavefront_sensor import ShackHartmann
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.spots.laser import LaserGuideStar, gaussian_spot
 from faintspot.slopes.spots.psf import PSF
 

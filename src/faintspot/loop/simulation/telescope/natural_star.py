@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.loop.control.removed_modes import TIP_TILT, RemovedModes
-from faintspot.loop.simulation.configuration.configuration import ARCSEC, LoopConfiguration
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.telescope.laser import subaperture_centres_m
 from faintspot.loop.simulation.telescope.wavefront_sensor import ShackHartmann
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
 Floats = NDArray[np.float64]

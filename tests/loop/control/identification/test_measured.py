@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from faintspot.loop.telemetry.measured import Measured, outer_scale_and_r0
+from faintspot.loop.control.identification.measured import Measured, outer_scale_and_r0
 from faintspot.loop.turbulence.strength import Strength
 
 

@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
-from faintspot.loop.control.telemetry import LEAST_VARIANCE_PX2, OpenLoopTelemetry
-from faintspot.loop.simulation.configuration.configuration import ARCSEC
-from faintspot.loop.telemetry.recorded_loop import RecordedLoop
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay, loop_delay
+from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.control.telemetry import OpenLoopTelemetry
+from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.turbulence.strength import OUTER_SCALE_M
 
 Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 200
 _MOST_LOST = 0.3  # of the frames; with more, the longest run without a gap is used
+_WHOLE_FRAMES = 0.1  # closer to a whole number of frames than this, a delay is taken for that
 _LEAST_SIGNAL = 1e-6  # of the slopes' variance, that their noise is taken to have
 
 
@@ -47,7 +47,7 @@ class OpenLoop:
         return replace(self, telemetry=scaled, residual=residual)
 
 
-def site_of_loop(loop: RecordedLoop) -> SlopeTurbulence:
+def site_of_loop(loop: Recording) -> SlopeTurbulence:
     """Return the geometry; unknown scales are 1 m and 1 arcsec, which only r0 and winds depend on."""
     side, scale = loop.subaperture_m or 1.0, (loop.pixel_scale_arcsec or 1.0) * ARCSEC
     outer = loop.outer_scale_m or OUTER_SCALE_M
@@ -60,7 +60,28 @@ def runs_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.cumsum(np.diff(frame, prepend=frame[0] - 1) > 1).astype(np.int64)
 
 
-def open_loop_of(loop: RecordedLoop, delay: LoopDelay) -> OpenLoop:
+def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
+    """Return delay and gain as measured and as used, the latter for whole frames if consistent.
+
+    Raises
+    ------
+    InputError
+        When the loop is not closed, or too short.
+    """
+    if not loop.is_closed or not np.ptp(loop.commands, axis=0).any():
+        raise InputError("commands: expected those of a closed loop, got constant ones")
+    slopes, mirror = np.nan_to_num(loop.slopes), loop.commands @ loop.interaction_matrix.T
+    context = runs_of(loop.frame), site_of_loop(loop), loop.frame_rate_hz
+    fit = loop_delay(slopes, mirror, *context, loop.delay_frames)
+    nearest = float(round(fit.delay_frames))
+    if loop.delay_frames is None and abs(fit.delay_frames - nearest) < max(
+        _WHOLE_FRAMES, 2 * fit.delay_error
+    ):
+        return fit, loop_delay(slopes, mirror, *context, nearest)
+    return fit, fit
+
+
+def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:
     """Return open-loop slopes, with the noise from deviations from a parabola in time.
 
     Raises
@@ -85,7 +106,7 @@ def open_loop_of(loop: RecordedLoop, delay: LoopDelay) -> OpenLoop:
     residual, atmosphere = grid
     measured = np.isfinite(atmosphere)
     variance, count = _noise_variance(atmosphere)
-    variance = np.maximum(variance, max(LEAST_VARIANCE_PX2, _LEAST_SIGNAL * float(np.nanvar(atmosphere))))
+    variance = np.maximum(variance, _LEAST_SIGNAL * float(np.nanvar(atmosphere)))
     telemetry = OpenLoopTelemetry(
         np.where(measured, atmosphere, 0.0), np.where(measured, variance, np.inf), measured.astype(np.float64)
     )
@@ -95,13 +116,13 @@ def open_loop_of(loop: RecordedLoop, delay: LoopDelay) -> OpenLoop:
     return OpenLoop(telemetry, np.where(measured, residual, 0.0), runs, error)
 
 
-def _held(loop: RecordedLoop, delay: LoopDelay) -> tuple[Floats, NDArray[np.bool_]]:
+def _held(loop: Recording, delay: LoopDelay) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the slopes of the mirror in each frame, and whether they are known."""
     mirror, is_known = np.zeros_like(loop.slopes), np.ones(len(loop.slopes), np.bool_)
-    if loop.commands is None or loop.interaction is None or not loop.is_closed:
+    if loop.commands is None or loop.interaction_matrix is None or not loop.is_closed:
         return mirror, is_known
     frames, part = int(delay.delay_frames), delay.delay_frames % 1
-    caused = loop.commands @ loop.interaction.T
+    caused = loop.commands @ loop.interaction_matrix.T
     for lag, share in ((frames, 1 - part), (frames + 1, part)):
         if share > 0:
             mirror[lag:] += share * caused[: len(caused) - lag]

@@ -1,0 +1,285 @@
+"""Predictive control of any loop: learnt from a recording, then a command for every frame of slopes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.base.npz import read_arrays
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification.layers import Identified
+from faintspot.loop.control.identification.learning import learn_controller
+from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.measured import Measured, Wind, winds_of
+from faintspot.loop.control.identification.model import KALMAN, ControlModel, LearntControl, LoopPlant
+from faintspot.loop.control.identification.open_loop import (
+    OpenLoop,
+    measured_delay,
+    open_loop_of,
+    site_of_loop,
+)
+from faintspot.loop.control.identification.recording import Prepared, Recording, prepared
+from faintspot.loop.control.identification.state_space import state_space, write_matrices
+from faintspot.loop.control.reconstructor import make_reconstructor
+
+Floats = NDArray[np.float64]
+
+_LEAK = 0.01
+_MEASURED_FRAMES = 60  # that the integrator drives the mirror first, so that its residual is measured
+_MOST_SIGMAS = 5.0  # of the commands that the turbulence asks for
+_CONTENTS = "a predictive controller"
+
+
+@dataclass(frozen=True, eq=False)
+class _Loop:
+    """Loop of a controller, with conversions from the user's unit and sign."""
+
+    interaction: Floats
+    """(2 n, commands): in slopes divided by the rms of the recording's and by their centroid gain."""
+    standard_error: Floats
+    """(2 n,): of such slopes."""
+    scale: float
+    """Such slopes in a unit of the user's."""
+    sign: float
+    """-1 where the user's commands are subtracted from the turbulence."""
+    delay: Floats
+    """(4,): delay in frames, centroid gain, and their standard errors, at 0, 2 and 1, 3."""
+    winds: Floats
+    """(layers, 6): speed, direction and share, each with its standard error."""
+    largest_command: float
+    integrator_gain: float
+    sent_after_frames: int
+
+    @property
+    def plant(self) -> LoopPlant:
+        frames = max(1, round(float(self.delay[0])))
+        return LoopPlant(self.interaction, make_reconstructor(self.interaction), frames, _LEAK)
+
+
+class PredictiveControl:
+    """Predictive Kalman filter beside an integrator, of which the better one drives the mirror.
+
+    `control(slopes)` returns the command to send, in the unit and with the sign of the recording. It must be
+    called with every frame, in order. Made by `learn`; not by hand.
+    """
+
+    def __init__(self, loop: _Loop, model: ControlModel, identified: Identified | None = None) -> None:
+        self._loop, self._plant = loop, loop.plant
+        self.model, self._identified = model, identified
+        self.reset()
+
+    @property
+    def delay_frames(self) -> Measured:
+        """Frames from the slopes to the first frame in which their command acts, whole ones used."""
+        return Measured("delay", "frames", float(self._loop.delay[0]), float(self._loop.delay[1]))
+
+    @property
+    def centroid_gain(self) -> Measured:
+        """Gain of the slopes in the running loop, relative to the interaction matrix."""
+        return Measured("centroid gain", "", float(self._loop.delay[2]), float(self._loop.delay[3]))
+
+    @property
+    def winds(self) -> tuple[Wind, ...]:
+        """Layers that were found, the strongest first; none if the filter knows no winds."""
+        return tuple(Wind.of(row) for row in self._loop.winds)
+
+    @property
+    def integrator_gain(self) -> float:
+        """Best loop gain of an integrator on slopes as measured, by replay of the recording."""
+        return self._loop.integrator_gain
+
+    @property
+    def is_predicting(self) -> bool:
+        """Whether the filter drives the mirror; else the integrator does."""
+        return self._controller.chosen == 0
+
+    def reset(self) -> None:
+        """Start again with a flat mirror, without the memory of earlier frames."""
+        limit = self._loop.largest_command
+        self._line = CommandDelayLine(self._plant.interaction.shape[1], self._plant.delay_frames, limit)
+        self._controller = LearntControl(self._plant, self.model).controller(
+            self._line, plain_frames=_MEASURED_FRAMES
+        )
+
+    def __call__(self, slopes: ArrayLike, standard_errors: ArrayLike | None = None) -> Floats:
+        """Return the command to send after a frame.
+
+        Parameters
+        ----------
+        slopes : (2 n,) array
+            Residual slopes as in the recording; NaN: not measured.
+        standard_errors : (2 n,) array, optional
+            Standard errors of the slopes. Default: the noise of the recording.
+        """
+        loop = self._loop
+        scaled = np.asarray(slopes, np.float64) * loop.scale
+        errors = loop.standard_error
+        if standard_errors is not None:
+            errors = np.asarray(standard_errors, np.float64) * loop.scale
+        unmeasured = np.isnan(scaled)
+        if unmeasured.any():
+            scaled, errors = np.where(unmeasured, 0.0, scaled), np.where(unmeasured, np.inf, errors)
+        self._controller.update(scaled, errors)
+        return loop.sign * self._line.latest
+
+    def learn_again(self, recording: Recording) -> PredictiveControl:
+        """Learn from another recording of the same loop, from the turbulence known so far; return itself.
+
+        The recording may be of any controller. The mirror's command continues from the latest.
+
+        Raises
+        ------
+        InputError
+            As `learn`; then nothing changes.
+        """
+        if recording.sent_after_frames is None:
+            recording = replace(recording, sent_after_frames=self._loop.sent_after_frames)
+        again = learn(recording, self._identified)
+        latest = self._loop.sign * self._line.latest
+        self.__dict__.update(again.__dict__)
+        self._line.hold(self._loop.sign * latest)
+        self._controller.begin()
+        return self
+
+    def save(self, path: str | Path) -> None:
+        """Write the controller to a NumPy file (.npz).
+
+        Raises
+        ------
+        InputError
+            When it cannot be written.
+        """
+        self.model.save(path, {f"loop_{name}": np.asarray(value) for name, value in vars(self._loop).items()})
+
+    @classmethod
+    def load(cls, path: str | Path) -> PredictiveControl:
+        """Read a controller.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be read, or has numbers out of range.
+        """
+        names = _Loop.__dataclass_fields__
+        arrays = read_arrays(path, _CONTENTS, [f"loop_{name}" for name in names])
+        values: Mapping[str, Any] = {name: arrays[f"loop_{name}"] for name in names}
+        try:
+            plain = {name: array.item() if array.ndim == 0 else array for name, array in values.items()}
+            loop = _Loop(**plain)
+            return cls(loop, ControlModel.load(path, loop.plant))
+        except (ValueError, TypeError, IndexError):
+            raise InputError(f"{path}: expected {_CONTENTS}, got arrays of another shape") from None
+
+    def export(self, path: str | Path) -> None:
+        """Write the filter as plain matrices, at the noise of the recording and without the guard.
+
+        The names are those of `state_space`, with `delay_frames` and `largest_command`; slopes and commands
+        are in the unit and of the sign of the recording.
+
+        Parameters
+        ----------
+        path : path
+            Its ending says the format: .npz, .mat or .fits.
+
+        Raises
+        ------
+        InputError
+            When the sensor has more than 300 slopes, or the file cannot be written.
+        """
+        matrices: dict[str, Any] = state_space(self.model, self._plant, self._loop.scale, self._loop.sign)
+        matrices["delay_frames"] = np.array(self._plant.delay_frames)
+        write_matrices(path, {**matrices, "largest_command": np.array(self._loop.largest_command)})
+
+    def summary(self) -> str:
+        """Return a summary of one line."""
+        gain, delay = self.centroid_gain, self.delay_frames
+        left, plain = self.model.left
+        return (
+            f"delay {delay.value:.2f} +- {delay.error:.2f} frames, centroid gain {gain.value:.3f} +- "
+            f"{gain.error:.3f}; {self.model.description}; residual {left / plain:.2f} of an integrator's"
+        )
+
+
+def learn(recording: Recording, start: Identified | None = None) -> PredictiveControl:
+    """Learn a predictive controller from the recording of a closed loop.
+
+    Delay, centroid gain, noise, winds and vibrations are estimated from slopes and commands alone.
+
+    Parameters
+    ----------
+    recording : Recording
+    start : Identified, optional
+        Turbulence known so far, from which the search for winds starts.
+
+    Raises
+    ------
+    InputError
+        When it cannot be learnt from the recording; the reason is one line.
+
+    Examples
+    --------
+    A loop of 3 x 3 sub-apertures and 12 actuators on slopes that change at random:
+
+    >>> import numpy as np
+    >>> from faintspot.loop.control import Recording, learn
+    >>> rng = np.random.default_rng(1)
+    >>> matrix = rng.standard_normal((18, 12))
+    >>> turbulence = np.cumsum(rng.standard_normal((800, 18)), axis=0)
+    >>> slopes, commands = np.zeros((800, 18)), np.zeros((800, 12))
+    >>> for k in range(2, 800):
+    ...     slopes[k] = turbulence[k] - turbulence[k].mean() + matrix @ commands[k - 2]
+    ...     commands[k] = 0.99 * commands[k - 1] - 0.3 * np.linalg.pinv(matrix) @ slopes[k]
+    >>> recording = Recording(slopes, commands, matrix, np.ones((3, 3)), frame_rate_hz=250)
+    >>> control = learn(recording)
+    >>> control(slopes[0]).shape
+    (12,)
+    """
+    if recording.commands is None or recording.interaction_matrix is None:
+        absent = "commands" if recording.commands is None else "interaction_matrix"
+        raise InputError(f"{absent}: expected an array, got none")
+    ready = prepared(recording)
+    loop = ready.recording
+    measured, used = measured_delay(loop)
+    return _learnt(ready, replace(used, delay_error=measured.delay_error), start)
+
+
+def _learnt(ready: Prepared, delay: LoopDelay, start: Identified | None) -> PredictiveControl:
+    """Return the controller for a delay and a centroid gain."""
+    loop, gain = ready.recording, delay.gain
+    seen = open_loop_of(loop, delay)
+    described = _Loop(
+        loop.interaction_matrix,
+        np.sqrt(seen.variance),
+        1 / (loop.unit * gain),
+        ready.sign,
+        np.array([delay.delay_frames, delay.delay_error, gain, delay.gain_error]),
+        np.zeros((0, 6)),
+        _largest_command(loop, seen),
+        math.nan,
+        ready.sent_after_frames,
+    )
+    learnt = learn_controller(
+        KALMAN, described.plant, seen.telemetry, site_of_loop(loop), loop.frame_rate_hz, start=start
+    )
+    # The fallback is the integrator that has run, whatever the gain found.
+    plain = ready.loop_gain * gain if math.isfinite(ready.loop_gain) else learnt.model.plain_gain
+    model, identified = replace(learnt.model, plain_gain=plain), learnt.identified
+    described = replace(described, integrator_gain=learnt.model.plain_gain / gain)
+    if identified is not None and identified.is_layered:
+        described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
+    return PredictiveControl(described, model, identified)
+
+
+def _largest_command(loop: Recording, seen: OpenLoop) -> float:
+    """Return the stroke limit: the loop's, or 5 sigma of what the recorded wavefront asks for."""
+    asked = seen.telemetry.open_loop_px @ make_reconstructor(loop.interaction_matrix).matrix.T
+    static = np.abs(loop.commands.mean(axis=0))
+    limit = float((static + _MOST_SIGMAS * asked.std(axis=0)).max())
+    return limit if loop.largest_command is None else min(limit, loop.largest_command)

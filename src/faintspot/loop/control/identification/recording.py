@@ -1,0 +1,229 @@
+"""Recorded loop: slopes and commands in any unit and of either sign, brought to one convention."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import KW_ONLY, dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.checks import finite_array, number_between, real_array
+from faintspot.base.errors import InputError
+from faintspot.loop.control.reconstructor import make_reconstructor
+
+Floats = NDArray[np.float64]
+
+_MOST_SENT_AFTER = 5  # frames
+_CLEAR = 0.5  # correlation of an integrator's steps with its slopes, above which their rows are known
+_UNRELATED = 0.1  # correlation below which commands are not those of the loop
+_STEPS_FOR_TEST = 200  # fewest of them
+_OPTIONAL = (
+    "subaperture_m",
+    "pixel_scale_arcsec",
+    "delay_frames",
+    "largest_command",
+    "outer_scale_m",
+    "frame_rate_hz",
+    "science_wavelength_m",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Slopes and commands of consecutive frames of a loop with n sub-apertures; None if unknown.
+
+    Commands may add to the slopes of the turbulence or be subtracted from them.
+
+    Raises
+    ------
+    InputError
+        When shapes do not fit together or numbers are out of range.
+    """
+
+    slopes: Any
+    """(frames, 2 n): residual slopes in any unit, all x, then all y; NaN where not measured."""
+    commands: Any
+    """(frames, commands): one row for each frame; see `sent_after_frames`."""
+    interaction_matrix: Any
+    """(2 n, commands): slopes for a unit of each command, in the unit of `slopes`."""
+    cells: Any
+    """(n, 2): row and column of each sub-aperture in the lenslet array; or a mask of the array."""
+    frame_rate_hz: float
+    _: KW_ONLY
+    subaperture_m: float | None = None
+    pixel_scale_arcsec: float | None = None
+    """Angle of one unit of `slopes`; only r0 and lengths in nm depend on it."""
+    delay_frames: float | None = None
+    """The command computed from frame k acts first during frame k + delay. Default: measured."""
+    sent_after_frames: int | None = None
+    """Row k holds the command computed from frame k minus this: 0 before a delay line, more after it.
+    Default: found from the steps of the commands, which follow the slopes."""
+    frame: Any = None
+    """(frames,): number of each frame; missing ones were lost. Default: none was lost."""
+    largest_command: float | None = None
+    outer_scale_m: float | None = None
+    science_wavelength_m: float = 1.65e-6
+    is_closed: bool = True
+    slope_unit: str = ""
+    unit: float = 1.0
+    """Number of `slope_unit` in a unit of `slopes`."""
+    name: str = "recording"
+    remarks: tuple[str, ...] = ()
+    """Assumptions made."""
+
+    def __post_init__(self) -> None:
+        slopes = real_array("slopes", self.slopes, minimum_dimensions=2).astype(np.float64)
+        if slopes.ndim == 3:  # (frames, n, 2) or (frames, 2, n)
+            slopes = (slopes if slopes.shape[1] == 2 else slopes.swapaxes(1, 2)).reshape(len(slopes), -1)
+        if slopes.ndim != 2 or slopes.shape[1] % 2:
+            raise InputError(f"slopes: expected shape (frames, 2 n), got {slopes.shape}")
+        cells = cells_of(self.cells, slopes.shape[1] // 2)
+        frame = np.arange(len(slopes)) if self.frame is None else np.asarray(self.frame).astype(np.int64)
+        if len(frame) != len(slopes) or (np.diff(frame) <= 0).any():
+            raise InputError(f"frame: expected {len(slopes)} increasing numbers, got {len(frame)}")
+        values: dict[str, Any] = {"slopes": slopes, "cells": cells, "frame": frame}
+        for name in _OPTIONAL:
+            if getattr(self, name) is not None:
+                values[name] = number_between(name, getattr(self, name), 0, low_open=True)
+        if self.sent_after_frames is not None:
+            sent = number_between("sent_after_frames", self.sent_after_frames, 0, 100, integer=True)
+            values["sent_after_frames"] = int(sent)
+        for name in ("commands", "interaction_matrix"):
+            if getattr(self, name) is not None:
+                array = finite_array(name, getattr(self, name), minimum_dimensions=2).astype(np.float64)
+                values[name] = array.reshape(len(array), -1)
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        self._check_shapes()
+
+    def _check_shapes(self) -> None:
+        if self.commands is not None and len(self.commands) != len(self.slopes):
+            raise InputError(
+                f"commands: expected {len(self.slopes)} frames, as of the slopes, got {len(self.commands)}"
+            )
+        if self.commands is None or self.interaction_matrix is None:
+            return
+        expected = self.slopes.shape[1], self.commands.shape[1]
+        if self.interaction_matrix.shape != expected:
+            shape = self.interaction_matrix.shape
+            raise InputError(f"interaction_matrix: expected shape {expected}, got {shape}")
+
+    def part(self, rows: slice) -> Recording:
+        """Return some of the frames."""
+        commands = None if self.commands is None else self.commands[rows]
+        return replace(self, slopes=self.slopes[rows], commands=commands, frame=self.frame[rows])
+
+
+class Prepared(NamedTuple):
+    """Recording in one convention: commands add to the slopes, and row k is computed from frame k."""
+
+    recording: Recording
+    """Slopes and matrix in units of the slopes' rms."""
+    sign: float
+    """-1 where the commands of the original are subtracted."""
+    sent_after_frames: int
+    loop_gain: float
+    """Gain of the integrator that computed the commands; infinite if another controller did."""
+
+
+def prepared(recording: Recording) -> Prepared:
+    """Bring a recording to one convention of sign, rows and unit.
+
+    Raises
+    ------
+    InputError
+        When the slopes do not vary, or the commands have nothing to do with them.
+    """
+    slopes = recording.slopes[np.isfinite(recording.slopes)]
+    spread = float(slopes.std()) if slopes.size else 0.0
+    if not spread > 1e-12 * float(np.abs(slopes).max(initial=0.0)):
+        raise InputError(f"{recording.name}: expected slopes that vary, got constant ones")
+    matrix, scale = recording.interaction_matrix, recording.pixel_scale_arcsec
+    scaled = replace(
+        recording,
+        slopes=recording.slopes / spread,
+        interaction_matrix=None if matrix is None else matrix / spread,
+        pixel_scale_arcsec=None if scale is None else scale * spread,
+        unit=recording.unit * spread,
+    )
+    if recording.commands is None or matrix is None or not recording.is_closed:
+        return Prepared(scaled, 1.0, 0, math.inf)
+    return _with_convention(scaled)
+
+
+def _with_convention(loop: Recording) -> Prepared:
+    """Return a closed loop whose commands add, in the rows of the frames that they were computed from."""
+    if not np.ptp(loop.commands, axis=0).any():
+        return Prepared(loop, 1.0, 0, math.inf)
+    stated, remarks = loop.sent_after_frames, list(loop.remarks)
+    correlations, gains = _steps_on_slopes(loop)
+    clearest = int(np.argmax(np.abs(correlations)))
+    largest = float(np.abs(correlations[clearest]))
+    if len(loop.slopes) > _STEPS_FOR_TEST and largest < _UNRELATED:
+        raise InputError(
+            f"commands: expected commands computed from the slopes, got steps with a correlation of "
+            f"{largest:.2f} with them; check that both are of one loop and the interaction matrix is its own"
+        )
+    sent = stated if stated is not None else clearest if largest >= _CLEAR else 0
+    if stated is None and sent:
+        remarks.append(f"commands: computed {sent} frames before the row in which they are recorded")
+    if stated is not None and largest >= _CLEAR and clearest != stated:
+        remarks.append(f"sent_after_frames is {stated}, but the commands follow the slopes after {clearest}")
+    loop_gain = abs(float(gains[min(sent, _MOST_SENT_AFTER)]))
+    sign = -1.0 if correlations[min(sent, _MOST_SENT_AFTER)] > 0 else 1.0
+    if sign < 0:
+        remarks.append("commands: sign reversed, as they are subtracted from the turbulence")
+    rows = np.searchsorted(loop.frame, loop.frame + sent)
+    usable = rows < len(loop.frame)
+    usable[usable] = loop.frame[rows[usable]] == loop.frame[usable] + sent
+    moved = replace(
+        loop,
+        slopes=loop.slopes[usable],
+        frame=loop.frame[usable],
+        commands=sign * loop.commands[rows[usable]],
+        remarks=tuple(remarks),
+        sent_after_frames=0,
+    )
+    return Prepared(moved, sign, sent, loop_gain if largest >= _CLEAR else math.inf)
+
+
+def _steps_on_slopes(loop: Recording) -> tuple[Floats, Floats]:
+    """Return correlations of slopes with steps of the commands 0, 1, ... rows later, and regressions."""
+    reconstructor = make_reconstructor(loop.interaction_matrix)
+    controlled = np.nan_to_num(loop.slopes) @ reconstructor.matrix.T @ loop.interaction_matrix.T
+    controlled -= controlled.mean(axis=0)
+    steps = np.diff(loop.commands, axis=0, prepend=loop.commands[:1]) @ loop.interaction_matrix.T
+    steps[np.diff(loop.frame, prepend=loop.frame[0] - 1) != 1] = 0.0
+    correlations, regressions = [], []
+    for lag in range(_MOST_SENT_AFTER + 1):
+        one, other = controlled[: len(controlled) - lag], steps[lag:]
+        sizes = math.sqrt(float((one * one).sum()) * float((other * other).sum()))
+        product = float((one * other).sum())
+        correlations.append(product / max(sizes, 1e-300))
+        regressions.append(product / max(float((one * one).sum()), 1e-300))
+    return np.array(correlations), np.array(regressions)
+
+
+def cells_of(stated: Any, n: int) -> NDArray[np.int64]:
+    """Return row and column of n sub-apertures, from a list, a mask, or (None) a full square.
+
+    Raises
+    ------
+    InputError
+        When it is none of these.
+    """
+    if stated is None:
+        side = round(n**0.5)
+        if side * side != n:
+            raise InputError(
+                f"cells: expected row and column of the {n} sub-apertures; give them with --system"
+            )
+        return np.argwhere(np.ones((side, side)))
+    cells = finite_array("cells", stated)
+    if cells.shape == (n, 2):
+        return cells.astype(np.int64)
+    if cells.ndim == 2 and np.count_nonzero(cells > 0) == n:  # a mask
+        return np.argwhere(cells > 0)
+    raise InputError(f"cells: expected shape ({n}, 2), or a mask with {n} sub-apertures, got {cells.shape}")
