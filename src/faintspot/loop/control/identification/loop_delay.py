@@ -1,8 +1,9 @@
 """Delay and centroid gain of a closed loop from its slopes and commands.
 
 With the right delay and gain, slopes without the mirror's part are turbulence and white noise. With wrong
-ones the noise that the loop has sent to the mirror is left in them and modulates their spectrum. So the mean
-spectrum is compared with that of von Karman turbulence, carried by winds of several speeds, and white noise.
+ones the noise that the loop has sent to the mirror is left in them. So delay, gain, strengths of von Karman
+turbulence carried by winds of several speeds from anywhere, and noise are those for which the cross-spectra
+of the slopes are the most likely (Whittle). The gain of given spectra is generalised least squares.
 """
 
 from __future__ import annotations
@@ -18,19 +19,21 @@ from faintspot.loop.control.identification.slope_spectra import SlopeSpectra
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 _WINDOW = 128  # frames
 _FEWEST_PIECES = 8
 _MOST_DELAY = 5
-_DELAYS = np.arange(1.0, _MOST_DELAY + 0.01, 0.1)
-_GAINS, _FINE_GAINS = np.arange(0.25, 1.51, 0.05), np.arange(0.25, 1.51, 0.0125)
-_EXPECTED_GAIN, _LOWER_SPREAD, _HIGHER_SPREAD = 0.9, 0.3, 0.15
-"""Gain before telemetry: wide spots, noise and speckles reduce it, little raises it."""
+_STEP = 0.1  # of fractional delays
+_GAINS = 0.1, 1.6
+_START_GAIN = 0.6
 _MODEL_ERROR = 0.05  # frames: spectra of real slopes differ from the theory
+_GAIN_ERROR = 0.03  # absolute and relative, likewise
 _SPEEDS_M_PER_S = (1.0, 3.0, 6.0, 10.0, 15.0, 22.0, 32.0)
 _DIRECTIONS = 4  # of half a turn: opposite winds have the same spectrum
-_MOST_SUBAPERTURES = 40
-_UPDATES = 200
+_MOST_SUBAPERTURES, _MOST_MODES = 40, 36
+_UPDATES, _FEW_UPDATES, _POWER = 60, 15, 0.9
+_INDEPENDENT = 0.55  # part of half-overlapping pieces
 FEWEST_SUBAPERTURES = 3
 """Fewer show only tip and tilt, in which vibrations cannot be told from turbulence."""
 
@@ -88,90 +91,119 @@ def loop_delay(
     site = replace(site, positions_m=site.positions_m[kept])
     window = np.hanning(_WINDOW + 2)[1:-1]
     window /= np.linalg.norm(window)
-    slopes, sent = (_without_tilt(values[:, columns]) for values in (slopes_px, sent_px))
-    products = _products(slopes, sent, run, window)
-    delays, gains = (_DELAYS, _GAINS) if delay_frames is None else (np.array([delay_frames]), _FINE_GAINS)
-    spectra = np.array([_spectra(products, delay, gains) for delay in delays]).reshape(-1, len(products))
-    misfit = _misfit(spectra[:, 1:-1], _turbulence(site, rate_hz, window)[:, 1:-1])
-    misfit = misfit.reshape(len(delays), len(gains))
-    # As many independent values as the best fit is good, so that a model that does not fit has wide errors;
-    # half of them, as neighbouring frequencies are alike under the window.
-    spread = np.where(gains < _EXPECTED_GAIN, _LOWER_SPREAD, _HIGHER_SPREAD)
-    likelihood = -0.25 * (_WINDOW // 2 - 1) * misfit / misfit.min()
-    likelihood -= 0.5 * ((gains - _EXPECTED_GAIN) / spread) ** 2
-    weight = np.exp(likelihood - likelihood.max())
-    delay, delay_error = _moments(delays, weight.sum(axis=1))
-    gain, gain_error = _moments(gains, weight.sum(axis=0))
-    if delay_frames is None:
-        delay_error = math.hypot(delay_error, _MODEL_ERROR)
-    return LoopDelay(delay, delay_error, gain, gain_error)
+    basis = _modes(site)
+    slopes, sent = ((values - values.mean(axis=0))[:, columns] @ basis for values in (slopes_px, sent_px))
+    products, pieces = _products(slopes, sent, run, window)
+    fits = _Fits(products, _turbulence(site, rate_hz, window, basis), pieces)
+    if delay_frames is not None:
+        gain, gain_error, _ = fits.of(delay_frames, _UPDATES)
+        return LoopDelay(delay_frames, 0.0, gain, gain_error)
+    fits.of(2.0, _UPDATES)
+    whole = min(range(1, _MOST_DELAY + 1), key=lambda delay: fits.of(delay, _FEW_UPDATES)[-1])
+    delays = np.arange(max(whole - 1.0, 1.0), min(whole + 1.0, _MOST_DELAY) + 0.5 * _STEP, _STEP)
+    values = np.array([fits.of(delay, _FEW_UPDATES) for delay in delays])
+    weight = np.exp(values[:, 2].min() - values[:, 2])
+    weight /= weight.sum()
+    delay, gain = float(weight @ delays), float(weight @ values[:, 0])
+    delay_error = math.hypot(
+        math.sqrt(float(weight @ (delays - delay) ** 2)), _STEP / math.sqrt(12), _MODEL_ERROR
+    )
+    of_delay = math.sqrt(float(weight @ (values[:, 0] - gain) ** 2))
+    return LoopDelay(delay, delay_error, gain, math.hypot(of_delay, float(weight @ values[:, 1])))
 
 
-def _moments(values: Floats, weight: Floats) -> tuple[float, float]:
-    """Return mean and standard deviation, the latter not below that of the grid's step."""
-    mean = float(weight @ values / weight.sum())
-    step = float(values[1] - values[0]) if len(values) > 1 else 0.0
-    return mean, math.sqrt(float(weight @ (values - mean) ** 2 / weight.sum()) + step**2 / 12)
+class _Fits:
+    """Most likely gains for delays; strengths are kept from one delay to the next."""
+
+    def __init__(self, products: Complex, parts: Complex, pieces: int) -> None:
+        self._products, self._parts, self._pieces = products, parts, pieces
+        self._independent = _INDEPENDENT * pieces
+        level = np.trace(products[:, 0, 0], axis1=1, axis2=2).real.sum()
+        each = np.trace(parts, axis1=2, axis2=3).real.sum(axis=1)
+        self._strength = level / each / len(parts)
+        self._gain = _START_GAIN
+
+    def of(self, delay: float, updates: int) -> tuple[float, float, float]:
+        """Return gain, its standard error, and the misfit: minus the logarithm of the likelihood."""
+        first, part = min(int(delay), _MOST_DELAY), delay - min(int(delay), _MOST_DELAY)
+        share = {first: 1 - part, first + 1: part}
+        lags, weights = list(share), np.array(list(share.values()))
+        crossed = np.tensordot(self._products[:, 0, lags], weights, (1, 0))
+        within = self._products[:, lags][:, :, lags]
+        squared = np.tensordot(within, np.outer(weights, weights), ((1, 2), (0, 1)))
+        crossed = crossed + crossed.conj().swapaxes(1, 2)
+        strength, gain = self._strength, self._gain
+        for _ in range(updates):
+            measured = self._products[:, 0, 0] - gain * crossed + gain**2 * squared
+            inverse = np.linalg.inv(np.tensordot(strength, self._parts, 1))
+            explained = inverse @ measured @ inverse
+            both = (
+                np.einsum("sfij,fji->s", self._parts, matrices, optimize=True).real
+                for matrices in (explained, inverse)
+            )
+            strength = strength * np.maximum(np.divide(*both), 1e-9) ** _POWER
+            curvature = float((inverse * squared.swapaxes(1, 2)).sum().real)
+            slope = float((inverse * crossed.swapaxes(1, 2)).sum().real)
+            gain = float(np.clip(0.5 * slope / max(curvature, 1e-300), *_GAINS))
+        self._strength, self._gain = np.maximum(strength, 1e-12 * strength.max()), gain
+        model = np.tensordot(strength, self._parts, 1)
+        measured = self._products[:, 0, 0] - gain * crossed + gain**2 * squared
+        misfit = float(
+            np.linalg.slogdet(model)[1].sum() + (np.linalg.inv(model) * measured.swapaxes(1, 2)).sum().real
+        )
+        error = math.hypot(1 / math.sqrt(2 * self._independent * max(curvature, 1e-300)), _GAIN_ERROR * math.hypot(1, gain))
+        return gain, error, self._independent * float(misfit)
 
 
-def _without_tilt(slopes: Floats) -> Floats:
-    """Return slopes without each frame's mean along x and y, where vibrations are, and without their mean."""
-    axes = (slopes - slopes.mean(axis=0)).reshape(len(slopes), 2, -1)
-    axes = axes - axes.mean(axis=2, keepdims=True)
-    return np.asarray(axes.reshape(slopes.shape))
+def _modes(site: SlopeTurbulence) -> Floats:
+    """Return an orthonormal basis (2 n, modes) without tip and tilt, where vibrations are.
+
+    From those with the most turbulence to those with the least.
+    """
+    n = len(site.positions_m)
+    without = np.kron(np.eye(2), np.eye(n) - 1 / n)
+    vectors = np.linalg.eigh(without @ site.covariance_px2() @ without)[1][:, ::-1][:, : 2 * n - 2]
+    return np.asarray(vectors[:, np.unique(np.geomspace(1, 2 * n - 2, _MOST_MODES).astype(int)) - 1])
 
 
-def _products(slopes: Floats, commands_px: Floats, run: NDArray[np.int64], window: Floats) -> Floats:
-    """Return mean products (frequencies, 1 + lags, 1 + lags) of transforms of slopes and earlier commands."""
+def _products(slopes: Floats, sent: Floats, run: NDArray[np.int64], window: Floats) -> tuple[Complex, int]:
+    """Return cross-spectra (frequencies, 1 + lags, 1 + lags, m, m) of slopes and earlier commands."""
     lags = _MOST_DELAY + 1
-    length, total, pieces = len(window), 0.0, 0
+    length, pieces = len(window), 0
+    total: Complex | float = 0.0
     for start in range(lags, len(slopes) - length + 1, length // 2):
         if run[start - lags] != run[start + length - 1]:
             continue
         parts = [slopes[start : start + length]]
-        parts += [commands_px[start - lag : start - lag + length] for lag in range(1, lags + 1)]
-        transformed = np.fft.rfft(np.array(parts) * window[:, None], axis=1)
-        total = total + np.einsum("lfm,kfm->flk", transformed, transformed.conj()).real / slopes.shape[1]
+        parts += [sent[start - lag : start - lag + length] for lag in range(1, lags + 1)]
+        transformed = np.fft.rfft(np.array(parts) * window[:, None], axis=1)[:, _bins(length)]
+        flat = transformed.transpose(1, 0, 2).reshape(transformed.shape[1], -1)
+        total = total + flat[:, :, None] * flat[:, None].conj()
         pieces += 1
     if pieces < _FEWEST_PIECES:
         raise InputError(
             f"recording: expected {length * (_FEWEST_PIECES + 1) // 2} consecutive frames, got {len(slopes)}"
         )
-    return np.asarray(total / pieces)
+    m = slopes.shape[1]
+    shape = -1, 1 + lags, m, 1 + lags, m
+    return np.asarray(total / pieces).reshape(shape).transpose(0, 1, 3, 2, 4).copy(), pieces
 
 
-def _spectra(products: Floats, delay: float, gains: Floats) -> Floats:
-    """Return mean spectra (gains, frequencies) of open-loop slopes."""
-    whole_frames = min(int(delay), _MOST_DELAY)
-    weight = np.zeros((len(gains), products.shape[1]))
-    weight[:, 0] = 1.0
-    weight[:, whole_frames] -= gains * (1 - (delay - whole_frames))
-    weight[:, whole_frames + 1] -= gains * (delay - whole_frames)
-    return np.asarray(np.einsum("gl,flk,gk->gf", weight, products, weight, optimize=True))
+def _bins(length: int) -> NDArray[np.int64]:
+    """Return every second frequency, as neighbours are alike under the window."""
+    return np.arange(1, length // 2, 2)
 
 
-def _turbulence(site: SlopeTurbulence, rate_hz: float, window: Floats) -> Floats:
-    """Return mean spectra (speeds + 1, frequencies) without tilt, of turbulence and, last, of white noise."""
-    length, n = len(window), len(site.positions_m)
-    bins = np.arange(length // 2 + 1)
-    spectra = SlopeSpectra(site, 1 / rate_hz, window, bins, max(_SPEEDS_M_PER_S) * length / rate_hz)
+def _turbulence(site: SlopeTurbulence, rate_hz: float, window: Floats, basis: Floats) -> Complex:
+    """Return cross-spectra (speeds + 1, frequencies, m, m) of turbulence from anywhere and of white noise."""
+    bins = _bins(len(window))
+    spectra = SlopeSpectra(site, 1 / rate_hz, window, bins, max(_SPEEDS_M_PER_S) * len(window) / rate_hz)
     tables, _ = spectra.tables(site.outer_scale_m)
-    within = np.eye(n) - 1 / n
     angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-    levels = [np.ones(len(bins))]
+    parts = []
     for speed in _SPEEDS_M_PER_S:
         winds = speed * np.column_stack([np.cos(angles), np.sin(angles)])
-        full = spectra.matrices(np.mean([spectra.of_wind(wind, tables) for wind in winds], axis=0)).real
-        axes = full[:, :n, :n] + full[:, n:, n:]
-        levels.insert(-1, np.einsum("fij,ji->f", axes, within))
-    return np.array(levels)
-
-
-def _misfit(spectra: Floats, parts: Floats) -> Floats:
-    """Return half the deviance of spectra (k, frequencies) from non-negative sums of components, (k,)."""
-    strength = 0.1 * spectra.mean(axis=1)[:, None] / parts.mean(axis=1)
-    for _ in range(_UPDATES):
-        model = strength @ parts
-        strength *= (((spectra / model**2) @ parts.T) / ((1 / model) @ parts.T)) ** 0.9
-    ratio = spectra / (strength @ parts)
-    return np.asarray((ratio - 1 - np.log(ratio)).sum(axis=1))
+        full = spectra.matrices(np.mean([spectra.of_wind(wind, tables) for wind in winds], axis=0))
+        parts.append(basis.T @ full.real @ basis)
+    noise = np.broadcast_to(np.eye(basis.shape[1]), parts[0].shape)
+    return np.array([*parts, noise], np.complex128)
