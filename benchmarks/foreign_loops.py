@@ -43,6 +43,7 @@ _COLUMNS = (
 @click.option("--tool", type=click.Choice(TOOLS), help="Rows of one package only.")
 @click.option("--rows", "names", help=f"Some rows, with commas: {', '.join(row.name for row in ROWS)}.")
 @click.option("--quick", is_flag=True, help="Two short realisations, 3 s to learn from, one gain, no rivals.")
+@click.option("--others/--no-others", default=True, show_default=True, help="Own controls and pyRTC's, too.")
 @click.option("--again", is_flag=True, help="Run rows anew that the folder has results of.")
 @click.option(
     "--folder",
@@ -57,7 +58,13 @@ _COLUMNS = (
     help="Where turbulence and runs of controls that do not learn are kept. [default: temporary]",
 )
 def run_command(
-    tool: str | None, names: str | None, quick: bool, again: bool, folder: Path, cache: Path | None
+    tool: str | None,
+    names: str | None,
+    quick: bool,
+    others: bool,
+    again: bool,
+    folder: Path,
+    cache: Path | None,
 ) -> None:
     """Compare the learnt filter with other controls in loops of other packages."""
     chosen = tuple(names.split(",")) if names else ()
@@ -65,7 +72,7 @@ def run_command(
     if unknown:
         raise click.BadParameter(f"no row {unknown[0]}", param_hint="--rows")
     folder.mkdir(parents=True, exist_ok=True)
-    effort = evaluation.QUICK if quick else Effort()
+    effort = evaluation.QUICK if quick else Effort(with_others=others)
     with tempfile.TemporaryDirectory() as temporary:
         kept = Path(temporary) if cache is None else cache
         kept.mkdir(parents=True, exist_ok=True)

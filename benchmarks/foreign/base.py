@@ -62,7 +62,7 @@ class ForeignLoop(ABC):
     winds : list of (speed, direction)
         As given to the package.
     is_slow : bool
-        Whether rivals are left out, and fewer gains tried.
+        Whether other controls are left out, and fewer gains tried.
     own : dict
         Reconstructors (commands, 2 n) that the package makes of the interaction matrix.
     """

@@ -22,7 +22,6 @@ INTEGRATOR, FILTER = "integrator", "filter"
 _IN_LOOP = 3
 """Predictors of the rivals, the best in a replay, that are tried in the loop."""
 _TIMED_FRAMES = 300
-_WORSE = 0.1  # below the best gain so far: larger ones are not tried
 
 
 @dataclass(frozen=True)
@@ -33,14 +32,15 @@ class Effort:
     learning_s: float = 8.0
     seeds: tuple[int, ...] = (3, 4, 5)
     gains: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0, 1.2)
-    with_rivals: bool = True
+    with_others: bool = True
+    """Whether the package's own control and pyRTC's predictors are compared."""
 
     def of(self, loop: ForeignLoop) -> Effort:
-        """Return the effort for a loop: half as many gains, and no rivals, if it is slow."""
-        return replace(self, gains=self.gains[::2], with_rivals=False) if loop.is_slow else self
+        """Return the effort for a loop: half as many gains, and no others, if it is slow."""
+        return replace(self, gains=self.gains[::2], with_others=False) if loop.is_slow else self
 
 
-QUICK = Effort(250, 3.0, (3, 4), (0.4,), with_rivals=False)
+QUICK = Effort(250, 3.0, (3, 4), (0.4,), with_others=False)
 
 
 class Runs:
@@ -75,13 +75,19 @@ class Runs:
         return self.run(f"{name} {gain:g}", lambda: Integrator(self.loop, reconstructor, gain), seed, frames)
 
     def best_gain(self, name: str, reconstructor: Floats) -> tuple[float, dict[str, float]]:
-        """Return the best gain of an integrator in the turbulence for tuning, and all scores."""
-        tried: dict[float, float] = {}
-        for gain in self.effort.gains:
-            tried[gain] = self.integrator(name, reconstructor, gain, TUNING_SEED, self.effort.frames).score
-            if tried[gain] < max(tried.values()) - _WORSE:
-                break
-        return max(tried, key=tried.__getitem__), {f"{gain:g}": round(s, 4) for gain, s in tried.items()}
+        """Return the best gain of an integrator in the turbulence for tuning, uphill, and all scores."""
+        gains, tried = self.effort.gains, dict[float, float]()
+        place = len(gains) // 2 - 1
+        while True:
+            near = gains[max(0, place - 1) : place + 2]
+            for gain in near:
+                if gain not in tried:
+                    run = self.integrator(name, reconstructor, gain, TUNING_SEED, self.effort.frames)
+                    tried[gain] = run.score
+            best = max(near, key=tried.__getitem__)
+            if best == gains[place]:
+                return best, {f"{gain:g}": round(tried[gain], 4) for gain in sorted(tried)}
+            place = gains.index(best)
 
 
 @dataclass
@@ -158,11 +164,11 @@ def compared(ready: Commissioned, log: Log) -> dict[str, Any]:
     scores[FILTER] = [run.score for run in filtered]
     log(f"{FILTER}: {scores[FILTER]}")
     chosen = {INTEGRATOR: f"gain {ready.gain:g}", FILTER: ""}
-    for name, matrix in loop.own.items():
+    for name, matrix in loop.own.items() if effort.with_others else ():
         gain, _ = runs.best_gain(name, matrix)
         own = [runs.integrator(name, matrix, gain, seed, effort.frames).score for seed in effort.seeds]
         scores[name], chosen[name] = own, f"gain {gain:g}"
-    if effort.with_rivals and rivals.available():
+    if effort.with_others and rivals.available():
         for name in rivals.GRIDS:
             for text, gain in (("as calibrated", 1.0), ("gain corrected", _rounded(ready))):
                 label = f"pyRTC {name}, {text}"

@@ -57,7 +57,8 @@ class SpeculaLoop(ForeignLoop):
         self.interaction = matrix if matrix.shape[1] == modes else matrix.T
         self.own = {"SPECULA's Modalrec and Integrator": np.asarray(np.linalg.pinv(self.interaction))}
         subapertures = found.objs["slopec"].subapdata
-        self.cells = np.argwhere(np.asarray(subapertures.single_mask()) > 0)
+        pixels, side = np.asarray(subapertures.idxs), int(subapertures.np_sub)
+        self.cells = np.stack(np.divmod(pixels[:, 0], side * subapertures.nx), axis=1) // side
         speeds, directions = (list(values) for values in zip(*self.winds, strict=True))
         constant = self._example.constant
         self._system: dict[str, Any] = {

@@ -151,7 +151,9 @@ class _Fits:
         misfit = float(
             np.linalg.slogdet(model)[1].sum() + (np.linalg.inv(model) * measured.swapaxes(1, 2)).sum().real
         )
-        error = math.hypot(1 / math.sqrt(2 * self._independent * max(curvature, 1e-300)), _GAIN_ERROR * math.hypot(1, gain))
+        error = math.hypot(
+            1 / math.sqrt(2 * self._independent * max(curvature, 1e-300)), _GAIN_ERROR * math.hypot(1, gain)
+        )
         return gain, error, self._independent * float(misfit)
 
 
