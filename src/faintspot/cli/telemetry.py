@@ -85,6 +85,8 @@ def command(
     numbers = derived(page, ".json")
     write_atomically(numbers, json.dumps(report.as_values(), indent=1))
     write_atomically(page, page_of_loop(report))
+    if report.advice:
+        click.echo(report.advice)
     click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
 
 
