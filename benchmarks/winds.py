@@ -19,7 +19,7 @@ from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.learning import KALMAN
 from faintspot.loop.control.identification.model import LearntControl
 from faintspot.loop.control.identification.relearning import RelearntControl, relearn
-from faintspot.loop.control.kalman.guarded import HANDOVER_FRAMES
+from faintspot.loop.control.kalman.choice import HANDOVER_FRAMES
 
 CASES = {
     "diffraction_limit, 20 photons": Case(20.0, 0.0),

@@ -37,6 +37,7 @@ _SECONDS = 20.0
     help="Configuration with [control], for recordings of the engine.",
     show_default="with --engine: faintspot.toml",
 )
+@option("--controller", metavar="NPZ", help="Learn a predictive controller as well, and write it to a file.")
 @option("--output", "-o", metavar="HTML", help="Page to write.", show_default="FILE's or NAME's, with .html")
 def command(
     recording: Path | None,
@@ -44,6 +45,7 @@ def command(
     seconds: float | None,
     system: str | None,
     config: str | None,
+    controller: str | None,
     output: str | None,
 ) -> None:
     """Report noise, turbulence, vibrations and control of a recorded loop, of any system.
@@ -58,8 +60,10 @@ def command(
       faintspot telemetry night.zarr --config faintspot.toml
       faintspot telemetry night_aot.fits --system rate_and_unit.toml
       faintspot telemetry loop.toml -o loop.html
+      faintspot telemetry loop.npz --controller controller.npz
     """
     from faintspot.loop.control.configuration import load_control
+    from faintspot.loop.control.identification.predictive_control import learn
     from faintspot.loop.telemetry.page import page_of_loop
     from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
     from faintspot.loop.telemetry.report import report_of_loop
@@ -87,6 +91,11 @@ def command(
     write_atomically(page, page_of_loop(report))
     if report.advice:
         click.echo(report.advice)
+    if controller is not None:
+        click.echo("controller ...", err=True)
+        control = learn(loop)
+        control.save(controller)
+        click.echo(f"{controller}: {control.summary()}")
     click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
 
 

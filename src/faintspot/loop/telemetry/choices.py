@@ -298,11 +298,8 @@ def advice(choices: list[Choice]) -> str:
     low, high = best.less.interval
     if not low > 0:
         return "Keep the control as it is: no other choice leaves significantly less of the wavefront."
-    value, low, high = (f"{number:.3g}" for number in (best.less.value, low, high))
-    unit = best.less.unit
-    return (
-        f"Use {_recommended(best)}: it leaves {value} {unit} ({low} to {high}) less than the loop as it ran."
-    )
+    amount = f"{best.less.value:.3g} {best.less.unit} ({low:.3g} to {high:.3g})"
+    return f"Use {_recommended(best)}: it leaves {amount} less than the loop as it ran."
 
 
 def _residual(choice: Choice) -> float:

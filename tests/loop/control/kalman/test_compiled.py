@@ -11,8 +11,9 @@ import pytest
 from tests.loop.control.control_cases import INTERACTION, LAYERS, MODEL, PHASE, PLANT, telemetry
 
 from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.kalman.choice import HANDOVER_FRAMES
 from faintspot.loop.control.kalman.compiled import STEPS, CompiledKalman
-from faintspot.loop.control.kalman.guarded import HANDOVER_FRAMES, Guarded
+from faintspot.loop.control.kalman.guarded import Guarded
 from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 from faintspot.loop.control.kalman.slope_model import SlopeModel

@@ -169,6 +169,7 @@ class ControlModel:
             plant.leak,
             noise_factor=self.noise_factor,
             prefers_plain=self.left[1] < self.left[0],
+            plain_residual=self.left[1],
             **options,
         )
 
@@ -318,16 +319,19 @@ class LearntControl:
         return self.model.expected_std_px
 
     def controller(
-        self, line: CommandDelayLine, prior_std_px: Floats | None = None
+        self, line: CommandDelayLine, prior_std_px: Floats | None = None, plain_frames: int = 0
     ) -> Guarded | CompiledKalman:
-        """Return the controller, with the estimator's prior if it has one."""
+        """Return the controller, with the estimator's prior if it has one; see `choice.prepare`."""
         plant, model = self.plant, self.model
         if model.kind == KALMAN and not model.is_local:
-            return model.compiled(plant, line, model.phase(plant), prior_std_px=prior_std_px)
+            guard: dict[str, Any] = {"prior_std_px": prior_std_px, "plain_frames": plain_frames}
+            return model.compiled(plant, line, model.phase(plant), **guard)
         options: dict[str, Any] = {
             "prior_std_px": prior_std_px,
             "noise_factor": model.noise_factor,
             "prefers_plain": model.left[1] < model.left[0],
+            "plain_residual": model.left[1],
+            "plain_frames": plain_frames,
         }
         interaction, gain = plant.interaction, model.plain_gain
         if model.is_local:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,14 +19,21 @@ from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.measured import Measured, Wind, winds_of
 from faintspot.loop.control.identification.model import KALMAN, ControlModel, LearntControl, LoopPlant
-from faintspot.loop.control.identification.open_loop import measured_delay, open_loop_of, site_of_loop
-from faintspot.loop.control.identification.recording import Recording, prepared
+from faintspot.loop.control.identification.open_loop import (
+    OpenLoop,
+    measured_delay,
+    open_loop_of,
+    site_of_loop,
+)
+from faintspot.loop.control.identification.recording import Prepared, Recording, prepared
+from faintspot.loop.control.identification.state_space import state_space, write_matrices
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 Floats = NDArray[np.float64]
 
 _LEAK = 0.01
-_BEYOND_ALL = 1e30
+_MEASURED_FRAMES = 60  # that the integrator drives the mirror first, so that its residual is measured
+_MOST_SIGMAS = 5.0  # of the commands that the turbulence asks for
 _CONTENTS = "a predictive controller"
 
 
@@ -46,6 +54,7 @@ class _Loop:
     winds: Floats
     """(layers, 6): speed, direction and share, each with its standard error."""
     largest_command: float
+    integrator_gain: float
     sent_after_frames: int
 
     @property
@@ -84,7 +93,7 @@ class PredictiveControl:
     @property
     def integrator_gain(self) -> float:
         """Best loop gain of an integrator on slopes as measured, by replay of the recording."""
-        return self.model.plain_gain / self.centroid_gain.value
+        return self._loop.integrator_gain
 
     @property
     def is_predicting(self) -> bool:
@@ -95,7 +104,9 @@ class PredictiveControl:
         """Start again with a flat mirror, without the memory of earlier frames."""
         limit = self._loop.largest_command
         self._line = CommandDelayLine(self._plant.interaction.shape[1], self._plant.delay_frames, limit)
-        self._controller = LearntControl(self._plant, self.model).controller(self._line)
+        self._controller = LearntControl(self._plant, self.model).controller(
+            self._line, plain_frames=_MEASURED_FRAMES
+        )
 
     def __call__(self, slopes: ArrayLike, standard_errors: ArrayLike | None = None) -> Floats:
         """Return the command to send after a frame.
@@ -166,6 +177,26 @@ class PredictiveControl:
         except (ValueError, TypeError, IndexError):
             raise InputError(f"{path}: expected {_CONTENTS}, got arrays of another shape") from None
 
+    def export(self, path: str | Path) -> None:
+        """Write the filter as plain matrices, at the noise of the recording and without the guard.
+
+        The names are those of `state_space`, with `delay_frames` and `largest_command`; slopes and commands
+        are in the unit and of the sign of the recording.
+
+        Parameters
+        ----------
+        path : path
+            Its ending says the format: .npz, .mat or .fits.
+
+        Raises
+        ------
+        InputError
+            When the sensor has more than 300 slopes, or the file cannot be written.
+        """
+        matrices: dict[str, Any] = state_space(self.model, self._plant, self._loop.scale, self._loop.sign)
+        matrices["delay_frames"] = np.array(self._plant.delay_frames)
+        write_matrices(path, {**matrices, "largest_command": np.array(self._loop.largest_command)})
+
     def summary(self) -> str:
         """Return a summary of one line."""
         gain, delay = self.centroid_gain, self.delay_frames
@@ -213,24 +244,42 @@ def learn(recording: Recording, start: Identified | None = None) -> PredictiveCo
     if recording.commands is None or recording.interaction_matrix is None:
         absent = "commands" if recording.commands is None else "interaction_matrix"
         raise InputError(f"{absent}: expected an array, got none")
-    loop, sign, sent = prepared(recording)
+    ready = prepared(recording)
+    loop = ready.recording
     measured, used = measured_delay(loop)
-    return _learnt(loop, sign, sent, replace(used, delay_error=measured.delay_error), start)
+    return _learnt(ready, replace(used, delay_error=measured.delay_error), start)
 
 
-def _learnt(
-    loop: Recording, sign: float, sent: int, delay: LoopDelay, start: Identified | None
-) -> PredictiveControl:
+def _learnt(ready: Prepared, delay: LoopDelay, start: Identified | None) -> PredictiveControl:
     """Return the controller for a delay and a centroid gain."""
+    loop, gain = ready.recording, delay.gain
     seen = open_loop_of(loop, delay)
-    known = np.array([delay.delay_frames, delay.delay_error, delay.gain, delay.gain_error])
-    limit = loop.largest_command or _BEYOND_ALL
-    error, scale = np.sqrt(seen.variance), 1 / (loop.unit * delay.gain)
-    described = _Loop(loop.interaction_matrix, error, scale, sign, known, np.zeros((0, 6)), limit, sent)
+    described = _Loop(
+        loop.interaction_matrix,
+        np.sqrt(seen.variance),
+        1 / (loop.unit * gain),
+        ready.sign,
+        np.array([delay.delay_frames, delay.delay_error, gain, delay.gain_error]),
+        np.zeros((0, 6)),
+        _largest_command(loop, seen),
+        math.nan,
+        ready.sent_after_frames,
+    )
     learnt = learn_controller(
         KALMAN, described.plant, seen.telemetry, site_of_loop(loop), loop.frame_rate_hz, start=start
     )
-    identified = learnt.identified
+    # The fallback is the integrator that has run, whatever the gain found.
+    plain = ready.loop_gain * gain if math.isfinite(ready.loop_gain) else learnt.model.plain_gain
+    model, identified = replace(learnt.model, plain_gain=plain), learnt.identified
+    described = replace(described, integrator_gain=learnt.model.plain_gain / gain)
     if identified is not None and identified.is_layered:
         described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
-    return PredictiveControl(described, learnt.model, identified)
+    return PredictiveControl(described, model, identified)
+
+
+def _largest_command(loop: Recording, seen: OpenLoop) -> float:
+    """Return the stroke limit: the loop's, or 5 sigma of what the recorded wavefront asks for."""
+    asked = seen.telemetry.open_loop_px @ make_reconstructor(loop.interaction_matrix).matrix.T
+    static = np.abs(loop.commands.mean(axis=0))
+    limit = float((static + _MOST_SIGMAS * asked.std(axis=0)).max())
+    return limit if loop.largest_command is None else min(limit, loop.largest_command)

@@ -124,6 +124,8 @@ class Prepared(NamedTuple):
     sign: float
     """-1 where the commands of the original are subtracted."""
     sent_after_frames: int
+    loop_gain: float
+    """Gain of the integrator that computed the commands; infinite if another controller did."""
 
 
 def prepared(recording: Recording) -> Prepared:
@@ -147,16 +149,16 @@ def prepared(recording: Recording) -> Prepared:
         unit=recording.unit * spread,
     )
     if recording.commands is None or matrix is None or not recording.is_closed:
-        return Prepared(scaled, 1.0, 0)
+        return Prepared(scaled, 1.0, 0, math.inf)
     return _with_convention(scaled)
 
 
 def _with_convention(loop: Recording) -> Prepared:
     """Return a closed loop whose commands add, in the rows of the frames that they were computed from."""
     if not np.ptp(loop.commands, axis=0).any():
-        return Prepared(loop, 1.0, 0)
+        return Prepared(loop, 1.0, 0, math.inf)
     stated, remarks = loop.sent_after_frames, list(loop.remarks)
-    correlations = _steps_on_slopes(loop)
+    correlations, gains = _steps_on_slopes(loop)
     clearest = int(np.argmax(np.abs(correlations)))
     largest = float(np.abs(correlations[clearest]))
     if len(loop.slopes) > _STEPS_FOR_TEST and largest < _UNRELATED:
@@ -169,6 +171,7 @@ def _with_convention(loop: Recording) -> Prepared:
         remarks.append(f"commands: computed {sent} frames before the row in which they are recorded")
     if stated is not None and largest >= _CLEAR and clearest != stated:
         remarks.append(f"sent_after_frames is {stated}, but the commands follow the slopes after {clearest}")
+    loop_gain = abs(float(gains[min(sent, _MOST_SENT_AFTER)]))
     sign = -1.0 if correlations[min(sent, _MOST_SENT_AFTER)] > 0 else 1.0
     if sign < 0:
         remarks.append("commands: sign reversed, as they are subtracted from the turbulence")
@@ -183,22 +186,24 @@ def _with_convention(loop: Recording) -> Prepared:
         remarks=tuple(remarks),
         sent_after_frames=0,
     )
-    return Prepared(moved, sign, sent)
+    return Prepared(moved, sign, sent, loop_gain if largest >= _CLEAR else math.inf)
 
 
-def _steps_on_slopes(loop: Recording) -> Floats:
-    """Return correlations of each frame's slopes with steps of the commands 0, 1, ... rows later."""
+def _steps_on_slopes(loop: Recording) -> tuple[Floats, Floats]:
+    """Return correlations of slopes with steps of the commands 0, 1, ... rows later, and regressions."""
     reconstructor = make_reconstructor(loop.interaction_matrix)
     controlled = np.nan_to_num(loop.slopes) @ reconstructor.matrix.T @ loop.interaction_matrix.T
     controlled -= controlled.mean(axis=0)
     steps = np.diff(loop.commands, axis=0, prepend=loop.commands[:1]) @ loop.interaction_matrix.T
     steps[np.diff(loop.frame, prepend=loop.frame[0] - 1) != 1] = 0.0
-    correlations = []
+    correlations, regressions = [], []
     for lag in range(_MOST_SENT_AFTER + 1):
         one, other = controlled[: len(controlled) - lag], steps[lag:]
         sizes = math.sqrt(float((one * one).sum()) * float((other * other).sum()))
-        correlations.append(float((one * other).sum()) / max(sizes, 1e-300))
-    return np.array(correlations)
+        product = float((one * other).sum())
+        correlations.append(product / max(sizes, 1e-300))
+        regressions.append(product / max(float((one * one).sum()), 1e-300))
+    return np.array(correlations), np.array(regressions)
 
 
 def cells_of(stated: Any, n: int) -> NDArray[np.int64]:

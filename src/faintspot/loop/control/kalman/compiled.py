@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.loop.control.base import Expected
 from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.kalman.choice import CHOSEN, GUARD_NUMBERS, SENT, prepare, restart
 from faintspot.loop.control.kalman.kernels import (
-    CHOSEN,
     COMMAND_ROWS,
     FOLLOW,
-    FRAMES,
     GO_ON,
-    GUARD_NUMBERS,
     HELD,
     HOLD,
     LATEST_PLAIN,
     PREDICTED,
-    SENT,
     SLOPE_ROWS,
     Lines,
     Matrices,
@@ -62,8 +61,8 @@ class CompiledKalman:
         Prior of the estimator, whose mean is `expected`. Default: it has none.
     noise_factor : float
         What to multiply the variances of standard errors by.
-    prefers_plain : bool
-        Whether the integrator begins.
+    prefers_plain, plain_residual, plain_frames
+        See `choice.prepare`.
     steps : int
         Of conjugate gradients.
     """
@@ -84,6 +83,8 @@ class CompiledKalman:
         prior_std_px: Floats | None = None,
         noise_factor: float = 1.0,
         prefers_plain: bool = False,
+        plain_residual: float = math.inf,
+        plain_frames: int = 0,
         steps: int = STEPS,
     ) -> None:
         self._line, self._interaction = line, interaction
@@ -112,7 +113,12 @@ class CompiledKalman:
             np.zeros((SLOPE_ROWS, slopes)),
             np.zeros((COMMAND_ROWS, commands)),
         )
-        self._memory.guard[[CHOSEN, SENT]] = prefers_plain
+        prepare(
+            self._memory.guard,
+            prefers_plain=prefers_plain,
+            plain_residual=plain_residual,
+            plain_frames=plain_frames,
+        )
         self._noise_factor = float(noise_factor)
         self._numbers = float(plain_gain), 1.0 - leak, float(line.largest), steps
         self._std_px, self._shares = predictor.std_px, shares(predictor.model)
@@ -148,7 +154,7 @@ class CompiledKalman:
         open_loop = -(self._interaction @ latest)
         self._memory.state[:] = self._shares[:, None, None] * open_loop
         self._memory.slopes[PREDICTED] = open_loop
-        self._memory.guard[FRAMES:] = 0.0
+        restart(self._memory.guard)
         self._memory.guard[SENT] = self._memory.guard[CHOSEN]
         self._is_behind, self._held_at = False, -1
 

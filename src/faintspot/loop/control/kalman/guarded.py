@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -9,15 +10,19 @@ from numpy.typing import NDArray
 
 from faintspot.loop.control.base import Controller, Expected
 from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.kalman.choice import (
+    BLENDED,
+    CHOOSE,
+    CHOSEN,
+    GUARD_NUMBERS,
+    HANDOVER_FRAMES,
+    SENT,
+    prepare,
+    restart,
+)
 from faintspot.loop.control.telemetry import as_estimated, without_prior
 
 Floats = NDArray[np.float64]
-
-MEMORY_FRAMES = 100
-CORRELATED_FRAMES = 5  # over which residuals are alike
-FEWEST_FRAMES = 50  # before the first change
-STANDARD_ERRORS = 1.0  # by which one must leave less than the other
-HANDOVER_FRAMES = 10  # after which a controller's own commands are sent
 
 
 class Guarded:
@@ -42,8 +47,8 @@ class Guarded:
         Prior of the estimator, whose mean is `expected`. Default: it has none.
     noise_factor : float
         What to multiply the variances of standard errors by.
-    prefers_plain : bool
-        Whether the plain one begins.
+    prefers_plain, plain_residual, plain_frames
+        See `choice.prepare`.
     """
 
     undoes_prior = False
@@ -59,6 +64,8 @@ class Guarded:
         prior_std_px: Floats | None = None,
         noise_factor: float = 1.0,
         prefers_plain: bool = False,
+        plain_residual: float = math.inf,
+        plain_frames: int = 0,
     ) -> None:
         self._line, self._interaction, self._phase = line, interaction, phase
         sizes = interaction.shape[1], line.delay_frames, line.largest
@@ -66,12 +73,15 @@ class Guarded:
         makers = (learnt, plain)
         self.controllers = [make(own_line) for make, own_line in zip(makers, self._lines, strict=True)]
         self.prior_std_px, self._noise_factor = prior_std_px, noise_factor
-        self.chosen = int(prefers_plain)
+        self._guard, self._offset = np.zeros(GUARD_NUMBERS), np.zeros(interaction.shape[1])
+        prepare(
+            self._guard, prefers_plain=prefers_plain, plain_residual=plain_residual, plain_frames=plain_frames
+        )
+
+    @property
+    def chosen(self) -> int:
         """0: the learnt controller; 1: the plain one."""
-        self._sent: int | None = self.chosen  # whose commands the last frame's were
-        self._offset, self._blended = np.zeros(interaction.shape[1]), 0
-        self._difference = np.zeros(2)
-        self._frames = 0
+        return int(self._guard[CHOSEN])
 
     def expected(self) -> Expected:
         """See `Controller`."""
@@ -81,19 +91,19 @@ class Guarded:
 
     def fall_back(self) -> None:
         """Let the plain controller drive the mirror until the learnt one leaves less."""
-        self.chosen = 1
+        self._guard[CHOSEN] = 1.0
 
     def begin(self) -> None:
         """See `Controller`; both restart from there."""
         for controller, line in zip(self.controllers, self._lines, strict=True):
             line.hold(self._line.latest)
             controller.begin()
-        self._difference[:], self._frames = 0.0, 0
-        self._sent, self._blended = self.chosen, 0
+        restart(self._guard)
+        self._guard[SENT] = self._guard[CHOSEN]
 
     def hand_over(self) -> None:
         """Let the next commands follow on from the latest, which another filter has sent."""
-        self._sent = None
+        self._guard[SENT] = -1.0
 
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
@@ -112,25 +122,13 @@ class Guarded:
             variances.append(float(np.square(self._phase @ (trust * residual)).sum()))
             controller.update(as_estimated(residual, trust, controller), error, covariance)
         self._send()
-        self._choose((variances[0] - variances[1]) / max(variances[0] + variances[1], 1e-30))
+        CHOOSE(self._guard, *variances)
 
     def _send(self) -> None:
         """Send the chosen controller's command, with what is left of the offset."""
-        command = self._lines[self.chosen].latest
-        if self._sent != self.chosen:
-            self._sent, self._blended = self.chosen, HANDOVER_FRAMES
+        command, guard = self._lines[self.chosen].latest, self._guard
+        if guard[SENT] != guard[CHOSEN]:
+            guard[SENT], guard[BLENDED] = guard[CHOSEN], HANDOVER_FRAMES
             self._offset = self._line.latest - command
-        self._blended = max(0, self._blended - 1)
-        self._line.put(command + self._blended / HANDOVER_FRAMES * self._offset)
-
-    def _choose(self, difference: float) -> None:
-        """Switch from the next frame on if the recent mean difference exceeds its error."""
-        self._frames += 1
-        share = 1 / min(self._frames, MEMORY_FRAMES)
-        self._difference += share * (np.array([difference, difference**2]) - self._difference)
-        if self._frames < FEWEST_FRAMES:
-            return
-        mean, square = self._difference
-        values = min(self._frames, 2 * MEMORY_FRAMES) / CORRELATED_FRAMES
-        if abs(mean) > STANDARD_ERRORS * np.sqrt(max(0.0, square - mean**2) / values):
-            self.chosen = int(mean > 0)
+        guard[BLENDED] = max(0.0, guard[BLENDED] - 1.0)
+        self._line.put(command + guard[BLENDED] / HANDOVER_FRAMES * self._offset)

@@ -12,13 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.loop.control.kalman.guarded import (
-    CORRELATED_FRAMES,
-    FEWEST_FRAMES,
-    HANDOVER_FRAMES,
-    MEMORY_FRAMES,
-    STANDARD_ERRORS,
-)
+from faintspot.loop.control.kalman.choice import BLENDED, CHOSEN, HANDOVER_FRAMES, SENT, choose
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.loop.control.telemetry import LEAST_SHARE, LEAST_VARIANCE_PX2
 from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
@@ -32,10 +26,6 @@ _VARIANCE, _COVARIANCE, _SCALE, _SURPRISE, _SOLUTION, _DIRECTION, _IMAGE, _SPARE
 SLOPE_ROWS = 16
 _MADE, _LEFT, _OFFSET = 4, 5, 7
 COMMAND_ROWS = 8
-# Of the guard: 1 where the plain one's commands go out; the same of the frame before, or another number;
-# frames, mean difference of late, and its mean square; frames of the handover that are left.
-CHOSEN, SENT, FRAMES, _MEAN, _SQUARE, _BLENDED = range(6)
-GUARD_NUMBERS = 6
 
 
 class Matrices(NamedTuple):
@@ -205,11 +195,11 @@ def _send(command: Any, true: Any, row: Any, memory: Any, largest: Any) -> None:
     """Write the mirror's command; see `Guarded`."""
     guard, offset = memory.guard, memory.commands[_OFFSET]
     if guard[SENT] != guard[CHOSEN]:
-        guard[SENT], guard[_BLENDED] = guard[CHOSEN], HANDOVER_FRAMES
+        guard[SENT], guard[BLENDED] = guard[CHOSEN], HANDOVER_FRAMES
         for c in range(command.shape[0]):
             offset[c] = true[row - 1, c] - command[c]
-    guard[_BLENDED] = max(0.0, guard[_BLENDED] - 1.0)
-    share = guard[_BLENDED] / HANDOVER_FRAMES
+    guard[BLENDED] = max(0.0, guard[BLENDED] - 1.0)
+    share = guard[BLENDED] / HANDOVER_FRAMES
     for c in range(command.shape[0]):
         true[row, c] = min(max(command[c] + share * offset[c], -largest), largest)
 
@@ -227,22 +217,6 @@ def _advance(matrices: Any, memory: Any) -> None:
             state[layer, 1, s] = state[layer, 0, s]
             state[layer, 0, s] = now[0, s]
             rows[PREDICTED, s] += now[0, s]
-
-
-@_compiled
-def _choose(guard: Any, learnt: Any, plain: Any) -> None:
-    """Select the controller with the smaller residual; see `Guarded`."""
-    difference = (learnt - plain) / max(learnt + plain, 1e-30)
-    guard[FRAMES] += 1.0
-    share = 1.0 / min(guard[FRAMES], MEMORY_FRAMES)
-    guard[_MEAN] += share * (difference - guard[_MEAN])
-    guard[_SQUARE] += share * (difference * difference - guard[_SQUARE])
-    if guard[FRAMES] < FEWEST_FRAMES:
-        return
-    values = min(guard[FRAMES], 2 * MEMORY_FRAMES) / CORRELATED_FRAMES
-    variance = max(0.0, guard[_SQUARE] - guard[_MEAN] * guard[_MEAN]) / values
-    if abs(guard[_MEAN]) > STANDARD_ERRORS * math.sqrt(variance):
-        guard[CHOSEN] = 1.0 if guard[_MEAN] > 0.0 else 0.0
 
 
 @_compiled
@@ -329,7 +303,7 @@ def go_on(numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) 
     for c in range(wavefronts.shape[1]):
         learnt += wavefronts[0, c] * wavefronts[0, c]
         plain += wavefronts[1, c] * wavefronts[1, c]
-    _choose(memory.guard, learnt, plain)
+    choose(memory.guard, learnt, plain)
     _advance(matrices, memory)
     return total
 

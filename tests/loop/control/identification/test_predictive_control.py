@@ -1,0 +1,141 @@
+"""Predictive control of a loop whose matrix has the wrong gain, from a recording alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.loop.telemetry.loop_cases import recorded
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
+from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.control.identification.state_space import state_space
+
+pytestmark = pytest.mark.slow
+GAIN = 0.5
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    """Return a loop in radians, whose commands are subtracted, in metres."""
+    loop, unit = recorded(2, GAIN), 1e-6
+    matrix = 1e6 * unit * loop.interaction_matrix
+    return replace(
+        loop,
+        slopes=unit * loop.slopes,
+        commands=-1e-6 * loop.commands,
+        interaction_matrix=matrix,
+        pixel_scale_arcsec=0.2 / unit,
+    )
+
+
+@pytest.fixture(scope="module")
+def control(recording: Recording) -> PredictiveControl:
+    return learn(recording)
+
+
+def commands(control: PredictiveControl, slopes: np.ndarray) -> np.ndarray:
+    control.reset()
+    return np.array([control(row) for row in slopes])
+
+
+def test_what_is_learnt(control: PredictiveControl) -> None:
+    """Winds within 1 m/s; the gain within 15 %, as slopes of bilinear wavefronts are not mean gradients."""
+    assert control.delay_frames.value == 2.0
+    assert control.centroid_gain.value == pytest.approx(GAIN, rel=0.15)
+    speeds = [wind.speed.value for wind in control.winds[:2]]
+    assert speeds == pytest.approx([np.hypot(8, 3), np.hypot(6, 14)], abs=1.0)
+
+
+def test_unit_and_sign_do_not_matter(control: PredictiveControl, recording: Recording) -> None:
+    """What is fitted is the same but for rounding, which the search for winds amplifies."""
+    other = learn(recorded(2, GAIN))
+    assert control.centroid_gain.value == pytest.approx(other.centroid_gain.value, rel=1e-6)
+    for one, two in zip(control.winds, other.winds, strict=True):
+        assert one.speed.value == pytest.approx(two.speed.value, rel=0.02)
+    sent = -1e6 * commands(control, recording.slopes[:200])
+    difference = sent - commands(other, 1e6 * recording.slopes[:200])
+    assert np.abs(difference).max() < 0.05 * np.abs(sent).max()
+
+
+def test_file(control: PredictiveControl, recording: Recording, tmp_path: Path) -> None:
+    control.save(tmp_path / "controller.npz")
+    read = PredictiveControl.load(tmp_path / "controller.npz")
+    np.testing.assert_array_equal(
+        commands(read, recording.slopes[:100]), commands(control, recording.slopes[:100])
+    )
+    assert read.winds == control.winds
+    assert read.integrator_gain == control.integrator_gain
+
+
+def test_slopes_that_were_not_measured(control: PredictiveControl, recording: Recording) -> None:
+    control.reset()
+    slopes = recording.slopes[0].copy()
+    slopes[:3] = np.nan
+    assert np.isfinite(control(slopes)).all()
+    assert np.isfinite(control(np.full_like(slopes, np.nan))).all()
+
+
+@pytest.mark.parametrize("ending", ["npz", "mat"])
+def test_exported_matrices(
+    control: PredictiveControl, recording: Recording, tmp_path: Path, ending: str
+) -> None:
+    """They send what the filter sends without its guard, within 1e-6 of the largest command."""
+    control.export(tmp_path / f"controller.{ending}")
+    if ending == "npz":
+        file = dict(np.load(tmp_path / "controller.npz"))
+    else:
+        from scipy.io import loadmat
+
+        file = loadmat(tmp_path / "controller.mat")
+    line = CommandDelayLine(36, 2)
+    alone = control.model.controller(control._plant, line)
+    state, held = np.zeros(len(file["state_of_state"])), np.zeros((int(file["delay_frames"].item()), 36))
+    error = np.sqrt(control.model.arrays["variance_px2"])
+    for slopes in recording.slopes[:300]:
+        command = file["command_of_state"] @ state + file["command_of_slopes"] @ slopes
+        command += file["command_of_mirror"] @ held[0]
+        state = (
+            file["state_of_state"] @ state
+            + file["state_of_slopes"] @ slopes
+            + file["state_of_mirror"] @ held[0]
+        )
+        held = np.vstack([held[1:], command])
+        alone.update(control._loop.scale * slopes, error)
+        difference = np.abs(command + line.latest).max()
+        assert difference <= 1e-6 * np.abs(line.latest).max()
+
+
+def test_export_refuses_other_endings(control: PredictiveControl, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"\.npz, \.mat, \.fits"):
+        control.export(tmp_path / "controller.csv")
+    assert set(state_space(control.model, control._plant, 1.0, 1.0)) >= {"command_of_slopes"}
+
+
+def test_learn_again_continues(control: PredictiveControl, recording: Recording) -> None:
+    sent = commands(control, recording.slopes[:50])[-1]
+    control.learn_again(recording.part(slice(0, 1500)))
+    np.testing.assert_allclose(control(recording.slopes[50]), sent, atol=0.5 * np.abs(sent).max())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"commands": None}, "commands: expected an array"),
+        ({"is_closed": False}, "expected those of a closed loop"),
+        ({"commands": np.zeros((2550, 36))}, "expected those of a closed loop"),
+    ],
+)
+def test_refusals(recording: Recording, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        learn(replace(recording, **change))
+
+
+def test_too_short(recording: Recording) -> None:
+    with pytest.raises(InputError, match="expected 576 consecutive frames, got 100"):
+        learn(recording.part(slice(0, 100)))

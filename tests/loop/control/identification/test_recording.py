@@ -1,0 +1,76 @@
+"""Conventions of recorded loops: sign, rows and unit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.loop.telemetry.loop_cases import recorded
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.recording import Recording, prepared
+
+
+def later(loop: Recording, frames: int) -> Recording:
+    """Return a recording whose commands were recorded after a delay line."""
+    return replace(loop, commands=np.roll(loop.commands, frames, axis=0)).part(slice(frames, None))
+
+
+@pytest.mark.parametrize("sent", [0, 1, 3])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_rows_and_sign_are_found(sent: int, sign: float) -> None:
+    loop = recorded()
+    given = later(replace(loop, commands=sign * loop.commands), sent)
+    ready = prepared(given)
+    assert (ready.sign, ready.sent_after_frames) == (sign, sent)
+    assert ready.loop_gain == pytest.approx(0.35, rel=0.1)
+    first = given.frame[0] - loop.frame[0]
+    np.testing.assert_array_equal(ready.recording.commands[:100], loop.commands[first : first + 100])
+
+
+def test_rows_that_are_stated_wrongly_are_remarked() -> None:
+    ready = prepared(replace(recorded(), sent_after_frames=2))
+    assert any("after 0" in remark for remark in ready.recording.remarks)
+
+
+def test_lost_frames_lose_their_commands() -> None:
+    loop = recorded()
+    rows = np.r_[0:100, 107:400]
+    gap = replace(loop, slopes=loop.slopes[rows], commands=loop.commands[rows], frame=loop.frame[rows])
+    assert len(prepared(replace(gap, sent_after_frames=1)).recording.slopes) == len(rows) - 2
+
+
+@pytest.mark.parametrize("unit", [1e-6, 206265.0])
+def test_unit_does_not_matter(unit: float) -> None:
+    loop = recorded()
+    other = replace(loop, slopes=unit * loop.slopes, interaction_matrix=unit * loop.interaction_matrix)
+    one, two = prepared(loop).recording, prepared(other).recording
+    np.testing.assert_allclose(two.slopes, one.slopes, rtol=1e-9)
+    np.testing.assert_allclose(two.interaction_matrix, one.interaction_matrix, rtol=1e-9)
+    assert two.unit == pytest.approx(unit * one.unit)
+
+
+def test_commands_of_another_loop() -> None:
+    loop = recorded()
+    wrong = replace(loop, commands=np.random.default_rng(1).standard_normal(loop.commands.shape))
+    with pytest.raises(InputError, match="expected commands computed from the slopes, got steps with"):
+        prepared(wrong)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"slopes": np.ones((2550, 50))}, "expected slopes that vary"),
+        ({"interaction_matrix": np.ones((36, 50))}, r"interaction_matrix: expected shape \(50, 36\)"),
+        ({"commands": np.ones((10, 36))}, "commands: expected 2550 frames"),
+        ({"cells": np.ones((3, 3))}, "cells: expected shape"),
+        ({"frame": np.zeros(2550)}, "frame: expected 2550 increasing numbers"),
+        ({"sent_after_frames": -1}, "sent_after_frames"),
+        ({"frame_rate_hz": 0.0}, "frame_rate_hz"),
+    ],
+)
+def test_refusals(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        prepared(replace(recorded(), **change))
