@@ -39,6 +39,8 @@ NOT_RUN = {
     "from pyrtc import": "run by tests/adapters/test_manual.py",
     "simulate_loop(": "the tutorial on loops runs it",
     "wfs.valid_subapertures": "needs a loop of OOPAO",
+    "fs.control.Recording(": "needs a recorded loop",
+    "command_of_slopes": "run by the tests of predictive control",
     "open_study(": "needs a study's results",
     "PixelRing.create": "needs a camera",
     "pyshmem.open": "needs a running engine",

@@ -116,7 +116,7 @@ class _Fits:
     """Most likely gains for delays; strengths are kept from one delay to the next."""
 
     def __init__(self, products: Complex, parts: Complex, pieces: int) -> None:
-        self._products, self._parts, self._pieces = products, parts, pieces
+        self._products, self._parts = products, parts
         self._independent = _INDEPENDENT * pieces
         level = np.trace(products[:, 0, 0], axis1=1, axis2=2).real.sum()
         each = np.trace(parts, axis1=2, axis2=3).real.sum(axis=1)
