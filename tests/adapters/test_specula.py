@@ -95,6 +95,23 @@ class TestRealTool:
         assert 0.7 < np.polyfit(POSITIONS.T.ravel(), slopes, 1)[0] < 1.2
         assert computer.measured.last.valid.all()
 
+    def test_commands_come_after_their_delay(self, specula: Any) -> None:
+        from specula.data_objects.slopes import Slopes
+        from specula.lib.utils import import_class
+
+        kind = import_class("FaintspotControl", ["faintspot.adapters.specula"])
+        control, sent = kind(lambda slopes: slopes[:2] + slopes[2:], nmodes=2, delay=1), []
+        for time in (1, 2, 3):
+            slopes = Slopes(slopes=np.array([1.0, 2.0, 3.0, 4.0]) * time)
+            slopes.generation_time = time
+            control.inputs["in_slopes"].set(slopes)
+            control.setup()
+            control.check_ready(time)
+            control.trigger()
+            control.post_trigger()
+            sent.append(np.array(control.out_comm.value))
+        np.testing.assert_allclose(sent, [[0.0, 0.0], [4.0, 6.0], [8.0, 12.0]])
+
     def test_predicted_slopes_come_by_an_input(self, subapertures: Any, specula: Any) -> None:
         from specula.data_objects.slopes import Slopes
 

@@ -91,6 +91,8 @@ def command(
     write_atomically(page, page_of_loop(report))
     for remark in loop.remarks:
         click.echo(remark)
+    if report.advice:
+        click.echo(report.advice)
     if controller is not None:
         click.echo("controller ...", err=True)
         control = learn(loop)

@@ -39,8 +39,8 @@ FEWEST_FRAMES = 600
 _MOST_SLOPES = 500  # beyond, the filter takes too long to learn
 _LEAK = 0.01
 _BLOCKS = 12
-_SPREAD_AS_RUN, _SPREAD_OF_OTHERS = 0.5, 1.0
-"""Standard errors, in differences between the views: other control changes noise and gain of the slopes."""
+_MODEL_ERROR = 0.3  # of the difference between a filter's replay and its model: 16 nm of 60 in our simulation
+_WIDE = 1.96  # standard errors on each side in an interval
 _LEAST_COMPARED = 0.25  # of the frames: those with the largest shares of measured slopes
 _FITTING, _FITTING_ERROR = 0.28, 0.04  # rad^2 at (sub-aperture / r0)^(5/3): continuous mirrors
 _ALIASING = 0.08  # rad^2, likewise: what the sensor mistakes for larger scales (Rigaut et al. 1998)
@@ -94,7 +94,8 @@ def compared_choices(
     reconstructor = make_reconstructor(loop.interaction_matrix)
     plant = LoopPlant(loop.interaction_matrix, reconstructor, max(1, round(delay.delay_frames)), _LEAK)
     phase = residual_phase(reconstructor.clean, loop.interaction_matrix, loop.cells)
-    views = [_View.of(slopes, phase) for slopes in (open_loop, open_loop.scaled(delay.gain))]
+    gain_error = float(np.nan_to_num(delay.gain_error)) / delay.gain
+    views = [_View.of(slopes, phase) for slopes in (open_loop, open_loop.scaled(1 + gain_error))]
     relative = float(open_loop.variance_error.mean()) / math.sqrt(len(reconstructor.modes.T))
     scale = _Scale.of(loop, r0, delay, relative)
 
@@ -141,11 +142,7 @@ def _expected_left(identified: Identified, plant: LoopPlant, variance: Floats, p
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Second half of the recording with one centroid gain.
-
-    That of the loop holds for displacements as large as in the recording, that of the interaction matrix for
-    small ones. Another controller's are between them.
-    """
+    """Second half of the recording with one centroid gain: as found, or a standard error away from it."""
 
     replayed: OpenLoopTelemetry
     """Second half, and the frames before it in which controllers settle."""
@@ -193,7 +190,7 @@ class _Scale:
     def of(cls, loop: Recording, r0: Measured, delay: LoopDelay, noise_error: float) -> _Scale:
         gain_error = 2 * float(np.nan_to_num(delay.gain_error))
         if loop.subaperture_m is None or loop.pixel_scale_arcsec is None:
-            unit = f"{loop.slope_unit} x sub-aperture"
+            unit = f"{loop.slope_unit or 'slope unit'} x sub-aperture"
             return cls(unit, loop.unit, math.nan, math.nan, math.nan, gain_error, noise_error)
         factor = loop.pixel_scale_arcsec * ARCSEC * loop.subaperture_m * 1e9
         square = (loop.subaperture_m / r0.value) ** (5 / 3) * (_R0_WAVELENGTH_NM / (2 * math.pi)) ** 2
@@ -214,17 +211,17 @@ def _choice(
 ) -> Choice:
     """Return a choice from its squared phase in each view, or from the expected one."""
     unit = scale.factor**2
-    spread = _SPREAD_AS_RUN if name == AS_RUN else _SPREAD_OF_OTHERS
     without = [values - level for values, level in zip(squares, noise, strict=True)]
-    square, error = _mean_of_views(without, unit, spread)
+    square, error = _mean_of_views(without, unit)
     error = math.hypot(error, unit * noise[0] * scale.noise_error, scale.gain_error * square)
     less = Measured("less than as it ran", scale.unit, remark="the loop was open")
     corrected = 0.0 if math.isnan(expected) else square - unit * expected
-    square, error = square - corrected, math.hypot(error, corrected)
+    square, error = square - corrected, math.hypot(error, _MODEL_ERROR * corrected)
     if ran is not None:
-        less_by = [before - after for before, after in zip(ran, squares, strict=True)]
-        mean, spread_of_mean = _mean_of_views(less_by, unit, spread)
-        less = _root(less.name, scale.unit, mean + corrected, math.hypot(spread_of_mean, corrected))
+        saved, error_of_saved = _saved(ran, squares, noise)
+        level = unit * float(ran[0].mean() - noise[0])
+        saved_error = math.hypot(level * error_of_saved, _MODEL_ERROR * corrected)
+        less = _signed_root(less.name, scale.unit, level * saved + corrected, saved_error)
     total = square + scale.fitting_nm2
     total_error = math.hypot(error, scale.fitting_error_nm2)
     wave = (2 * math.pi / scale.wavelength_nm) ** 2
@@ -240,13 +237,25 @@ def _choice(
     )
 
 
-def _mean_of_views(values: list[Floats], unit: float, spread: float) -> tuple[float, float]:
-    """Return the mean of all views and its standard error."""
+def _saved(ran: list[Floats], squares: list[Floats], noise: list[float]) -> tuple[float, float]:
+    """Return the part of the loop's variance that another control saves in the same frames, and its error.
+
+    As a part, it does not depend on the scale of the wavefront, which differs between the views.
+    """
+    parts = [
+        (before - after) / max(float(before.mean()) - part, 1e-12 * float(before.mean()), 1e-300)
+        for before, after, part in zip(ran, squares, noise, strict=True)
+    ]
+    return _mean_of_views(parts, 1.0)
+
+
+def _mean_of_views(values: list[Floats], unit: float) -> tuple[float, float]:
+    """Return the mean for the centroid gain as found, and its error with that of the gain."""
     block = max(1, len(values[0]) // _BLOCKS)
     means = [mean_by_blocks(view, block) for view in values]
     estimates = [mean.value for mean in means]
-    error = math.hypot(means[0].standard_error, spread * (max(estimates) - min(estimates)))
-    return unit * float(np.mean(estimates)), unit * error
+    error = math.hypot(means[0].standard_error, max(estimates) - min(estimates))
+    return unit * estimates[0], unit * error
 
 
 def _root(name: str, unit: str, square: float, error: float, remark: str = "") -> Measured:
@@ -259,6 +268,47 @@ def _root(name: str, unit: str, square: float, error: float, remark: str = "") -
     return Measured(name, unit, root, error / max(2 * abs(root), math.sqrt(error), 1e-12), remark)
 
 
+def _signed_root(name: str, unit: str, square: float, error: float) -> Measured:
+    """Return the signed root of a difference of variances; its interval has 0 if the difference's has."""
+    if not (math.isfinite(square) and math.isfinite(error)):
+        return Measured(name, unit)
+    low, root, high = (
+        math.copysign(math.sqrt(abs(value)), value)
+        for value in (square - _WIDE * error, square, square + _WIDE * error)
+    )
+    return Measured(name, unit, root, max(root - low, high - root) / _WIDE)
+
+
 def _at_gain(choice: Choice, gain: float) -> Choice:
     """Return a choice whose integrator's gain is that of slopes as measured."""
     return replace(choice, gain=choice.gain / gain)
+
+
+def advice(choices: list[Choice]) -> str:
+    """Return one sentence that says which control to use."""
+    others = [choice for choice in choices if choice.name != AS_RUN]
+    if not others:
+        return ""
+    ran = any(choice.name == AS_RUN for choice in choices)
+    if not ran:
+        return (
+            f"Use {_recommended(min(others, key=_residual))}: it leaves least in a replay of the recording."
+        )
+    best = max(others, key=lambda choice: np.nan_to_num(choice.less.value, nan=-np.inf))
+    low, high = best.less.interval
+    if not low > 0:
+        return "Keep the control as it is: no other choice leaves significantly less of the wavefront."
+    amount = f"{best.less.value:.3g} {best.less.unit} ({low:.3g} to {high:.3g})"
+    return f"Use {_recommended(best)}: it leaves {amount} less than the loop as it ran."
+
+
+def _residual(choice: Choice) -> float:
+    return choice.residual.value if math.isfinite(choice.residual.value) else math.inf
+
+
+def _recommended(choice: Choice) -> str:
+    if math.isfinite(choice.gain):
+        return f"an integrator with a gain of {choice.gain:.2f}"
+    return (
+        "an integrator with a gain for each mode" if choice.name == MODES else "the predictive Kalman filter"
+    )

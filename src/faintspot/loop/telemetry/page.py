@@ -45,7 +45,9 @@ def page_of_loop(report: LoopReport) -> str:
         )
     loop = report.loop
     facts = {"Sub-apertures": str(len(loop.cells)), "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"}
-    return html_of(Page(f"Loop of {loop.name}", facts, sections, remark=_TEXT["remark"]))
+    todo = [report.advice] if report.advice else []
+    title, remark = f"Loop of {loop.name}", _TEXT["remark"]
+    return html_of(Page(title, facts, sections, todo, warnings_title="What to do", remark=remark))
 
 
 def _table(part: Part) -> Table:

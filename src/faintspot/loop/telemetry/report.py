@@ -21,7 +21,7 @@ from faintspot.loop.control.identification.open_loop import (
     site_of_loop,
 )
 from faintspot.loop.control.identification.recording import Recording, prepared
-from faintspot.loop.telemetry.choices import Choice, compared_choices
+from faintspot.loop.telemetry.choices import Choice, advice, compared_choices
 from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
 from faintspot.loop.telemetry.spectra import ModalSpectra, modal_spectra
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
@@ -60,6 +60,11 @@ class LoopReport:
     spectra: ModalSpectra | None = None
     choices: list[Choice] = field(default_factory=list)
 
+    @property
+    def advice(self) -> str:
+        """What to do, in one sentence; empty if no control was compared."""
+        return advice(self.choices)
+
     def as_values(self) -> dict[str, Any]:
         """Return the report as plain values, for JSON; null is not known."""
         values: dict[str, Any] = {
@@ -74,7 +79,12 @@ class LoopReport:
             values["noise"]["of_slopes"] = _plain(self.noise_px)
             values["noise"]["of_slopes_error"] = _plain(self.noise_error_px)
         values["choices"]["compared"] = [choice.as_values() for choice in self.choices]
-        return {"recording": self.loop.name, "slope_unit": self.loop.slope_unit, **values}
+        return {
+            "recording": self.loop.name,
+            "slope_unit": self.loop.slope_unit,
+            "advice": self.advice,
+            **values,
+        }
 
 
 def report_of_loop(loop: Recording, progress: Callable[[str], None] = lambda _: None) -> LoopReport:

@@ -1,0 +1,96 @@
+"""Loop of HCIPy: its example's telescope, sensor and mirror behind three of its infinite layers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import faintspot as fs
+from benchmarks.foreign.base import IMAGING_M, Floats, SteppedLoop
+from benchmarks.foreign.specula import example
+
+_R0_M = 0.2
+_SHARES = 0.5, 0.3, 0.2
+
+
+class HcipyLoop(SteppedLoop):
+    """Loop of HCIPy, 7 x 7 lenslets, slopes by `window`."""
+
+    name, rate_hz, delay_frames = "hcipy-40", 250.0, 2
+    winds = [(6.0, 20.0), (12.0, 110.0), (20.0, 230.0)]  # noqa: RUF012
+
+    def __init__(self, folder: Path) -> None:
+        from faintspot.adapters.hcipy import SlopeEstimator
+
+        super().__init__(folder, "hcipy")
+        self._example = system = example("hcipy_loop")
+        self.subaperture_m = system.DIAMETER_M / 7
+        settings = fs.Settings("window", flux_e=system.FLUX_E, window_fwhm_px=4.0)
+        camera = fs.Calibration(dark=0.0, read_noise_e=system.READ_NOISE_E)
+        psf = fs.PSF.analytic("diffraction", size=1.0)
+        self._estimator = SlopeEstimator(
+            system.sensor.mla_grid,
+            system.sensor.mla_index,
+            system.illuminated,
+            settings=settings,
+            calibration=camera,
+            psf=psf,
+        )
+        commands, slopes = system.mirror.num_actuators, []
+        with self._estimator.calibrating():
+            for poke_m in 3e-8 * np.vstack([np.eye(commands), -np.eye(commands)]):
+                system.mirror.actuators = poke_m
+                slopes.append(self._slopes(system.image(system.noiseless, 0 * system.pupil, system.photons)))
+        plus, minus = np.split(np.array(slopes), 2)
+        self._flat = np.mean(slopes, axis=0)
+        self.interaction = (plus - minus).T / 6e-8
+        self.own = {"HCIPy's Tikhonov inverse": system.hcipy.inverse_tikhonov(self.interaction, rcond=0.03)}
+        self.cells = self._cells()
+
+    def _cells(self) -> NDArray[np.int64]:
+        grid = self._example.sensor.mla_grid
+        used = np.asarray(self._example.illuminated) > 0
+        x, y = np.asarray(grid.x)[used], np.asarray(grid.y)[used]
+        pitch = np.diff(np.unique(x.round(9))).min()
+        rows, columns = ((values - values.min()) / pitch for values in (y, x))
+        return np.asarray(np.rint(np.stack([rows, columns], axis=1)), np.int64)
+
+    def _slopes(self, image: Any) -> Floats:
+        return np.asarray(self._estimator.estimate([image]), np.float64).ravel()
+
+    def simulated(self, seed: int, frames: int) -> NDArray[np.float32]:
+        """See `SteppedLoop`."""
+        system = self._example
+        strength = system.hcipy.Cn_squared_from_fried_parameter(_R0_M, 500e-9)
+        layers = [
+            system.hcipy.InfiniteAtmosphericLayer(
+                system.grid,
+                share * strength,
+                25.0,
+                speed * np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))]),
+                seed=10 * seed + number,
+            )
+            for number, (share, (speed, angle)) in enumerate(zip(_SHARES, self.winds, strict=True))
+        ]
+        paths_m = np.zeros((frames, system.grid.size), np.float32)
+        for number, path_m in enumerate(paths_m):
+            for layer in layers:
+                layer.t = number / self.rate_hz
+                path_m += (layer.phase_for(IMAGING_M) * IMAGING_M / (2 * np.pi)).astype(np.float32)
+        return paths_m
+
+    def begin(self, seed: int) -> None:
+        """See `SteppedLoop`."""
+        np.random.seed(seed)  # noqa: NPY002 - HCIPy's detectors draw from this one
+
+    def frame(self, path_m: NDArray[np.float32], command: Floats) -> tuple[Floats, float]:
+        """See `SteppedLoop`."""
+        system = self._example
+        system.mirror.actuators = command
+        residual = path_m + system.mirror.opd
+        field = np.average(np.exp(2j * np.pi / IMAGING_M * residual), weights=system.pupil)
+        slopes = self._slopes(system.image(system.noisy, path_m, system.photons)) - self._flat
+        return slopes, float(np.abs(field) ** 2)

@@ -1,0 +1,82 @@
+"""Rows of the table: loops of OOPAO, SPECULA and HCIPy."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from benchmarks.foreign.base import ForeignLoop
+from benchmarks.foreign.oopao import OopaoCase, OopaoLoop
+
+_MODULES = {"oopao": "OOPAO", "specula": "specula", "hcipy": "hcipy"}
+TOOLS = tuple(_MODULES)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A loop, and the Strehl ratio that the filter should have."""
+
+    name: str
+    title: str
+    make: Callable[[Path], ForeignLoop]
+    goal: float | None = None
+    turned: bool = False
+    """Whether the winds reverse after learning."""
+
+    @property
+    def tool(self) -> str:
+        """Package that simulates it."""
+        return self.name.partition("-")[0]
+
+
+def _oopao(case: OopaoCase) -> Callable[[Path], ForeignLoop]:
+    return partial(OopaoLoop, case)
+
+
+def _specula(flux_e: float, own_slopes: bool, folder: Path) -> ForeignLoop:
+    from benchmarks.foreign.specula import SpeculaLoop
+
+    return SpeculaLoop(flux_e, own_slopes=own_slopes, folder=folder)
+
+
+def _hcipy(folder: Path) -> ForeignLoop:
+    from benchmarks.foreign.hcipy import HcipyLoop
+
+    return HcipyLoop(folder)
+
+
+_FIRST = OopaoCase("first")
+_LARGE = OopaoCase("large", lenslets=16, lenslet_px=6, diameter_m=8.0, rate_hz=500.0)
+ROWS = (
+    Row("oopao-20", "r0 0.25 m, 20 e-, 3 e- read noise", _oopao(_FIRST), 0.73),
+    Row("oopao-60", "r0 0.15 m, 60 e-, 3 e-", _oopao(OopaoCase("60", 0.15, 60.0, 3.0, 4.0)), 0.60),
+    Row("oopao-200", "r0 0.25 m, 200 e-, 1 e-", _oopao(OopaoCase("200", 0.25, 200.0, 1.0)), 0.835),
+    Row(
+        "oopao-vibration",
+        "the first with a tip of 45 Hz, 120 nm rms",
+        _oopao(OopaoCase("vibration", vibration_nm=120.0)),
+        0.71,
+    ),
+    Row("oopao-delay3", "the first, delay of 3 frames", _oopao(OopaoCase("3", delay_frames=3)), 0.70),
+    Row("oopao-delay1", "the first, delay of 1 frame", _oopao(OopaoCase("1", delay_frames=1))),
+    Row("oopao-turned", "the first, winds reversed after learning", _oopao(_FIRST), turned=True),
+    Row("specula-40", "27 Zernikes, three winds, 40 e-", partial(_specula, 40.0, False), 0.70),
+    Row("specula-20", "27 Zernikes, three winds, 20 e-", partial(_specula, 20.0, False), 0.65),
+    Row("specula-own", "40 e-, SPECULA's own slopes", partial(_specula, 40.0, True), 0.725),
+    Row("hcipy-40", "three of its layers, 40 e-, 1 e-", _hcipy),
+    Row("oopao-large", "8 m, 16 x 16, 500 Hz, r0 0.25 m, 20 e-, 3 e-", _oopao(_LARGE)),
+)
+
+
+def chosen_rows(tool: str | None, names: tuple[str, ...]) -> list[Row]:
+    """Return rows of a package, or with some names; all by default."""
+    rows = [row for row in ROWS if (tool is None or row.tool == tool) and (not names or row.name in names)]
+    return sorted(rows, key=lambda row: names.index(row.name)) if names else rows
+
+
+def is_installed(tool: str) -> bool:
+    """Return whether a package is there."""
+    return importlib.util.find_spec(_MODULES[tool]) is not None

@@ -1,0 +1,112 @@
+"""Loop of SPECULA: 27 Zernike modes of 6 x 6 lenslets in three layers, from the example's parameter file."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.foreign.base import SETTLE_FRAMES, Control, ForeignLoop, Observed
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+_QUANTUM_EFFICIENCY = 0.01 / 40.0
+"""For an electron a lenslet: the star's brightness is that of the example."""
+
+
+def example(name: str) -> Any:
+    """Return an example as a module."""
+    if str(EXAMPLES) not in sys.path:
+        sys.path.insert(0, str(EXAMPLES))
+    return importlib.import_module(name)
+
+
+class SpeculaLoop(ForeignLoop):
+    """Loop of SPECULA.
+
+    Parameters
+    ----------
+    flux_e : float
+        Electrons a lenslet and frame.
+    own_slopes : bool
+        Slopes of SPECULA's weighted centre of gravity in place of faintspot's window.
+    """
+
+    winds = [(8.0, 20.0), (12.0, 110.0), (20.0, 200.0)]  # noqa: RUF012
+    sign, rate_hz, delay_frames, subaperture_m = -1.0, 250.0, 2, 0.6
+    is_slow = True
+
+    def __init__(self, flux_e: float, own_slopes: bool, folder: Path) -> None:
+        self.name = f"specula-{flux_e:g}-{own_slopes}"
+        self._example = example("specula_loop")
+        self._example.run(self._example.SYSTEM, self._example.SUBAPERTURES)
+        if own_slopes:
+            setup = self._example.Setup("6 px", {"weightedPixRad": 3.0})
+        else:
+            tables = {
+                "estimator": {"name": "window", "window_fwhm_px": 6.0},
+                "settings": {"flux_e": flux_e},
+            }
+            setup = self._example.Setup("window", **tables)
+        calibration = {**self._example.INTERACTION, "slopec_override": {**setup.keys, **setup.calibrating}}
+        found = self._example.run(self._example.SYSTEM, calibration)
+        matrix = np.asarray(found.objs["im_calibrator"].outputs["out_intmat"].get_value(), np.float64)
+        modes = self._example.MODES
+        self.interaction = matrix if matrix.shape[1] == modes else matrix.T
+        self.own = {"SPECULA's Modalrec and Integrator": np.asarray(np.linalg.pinv(self.interaction))}
+        subapertures = found.objs["slopec"].subapdata
+        pixels, side = np.asarray(subapertures.idxs), int(subapertures.np_sub)
+        self.cells = np.stack(np.divmod(pixels[:, 0], side * subapertures.nx), axis=1) // side
+        speeds, directions = (list(values) for values in zip(*self.winds, strict=True))
+        constant = self._example.constant
+        self._system: dict[str, Any] = {
+            **self._example.SYSTEM,
+            "wind_speed": constant(speeds),
+            "wind_direction": constant(directions),
+            "control": {
+                "class": "CalledControl",
+                "nmodes": modes,
+                "delay": 1,
+                "inputs": {"in_slopes": "slopec.out_slopes"},
+                "outputs": ["out_comm"],
+            },
+        }
+        del self._system["rec"]
+        self._settings = {
+            "slopec_override": setup.keys,
+            "psf_override": {"start_time": SETTLE_FRAMES / self.rate_hz},
+        }
+        self._quantum_efficiency = flux_e * _QUANTUM_EFFICIENCY
+
+    def run(self, control: Control, seed: int, frames: int, *, turned: bool = False) -> Observed:
+        """See `ForeignLoop`; the Strehl ratio is that of the long exposure."""
+        if turned:
+            raise ValueError("turned: SPECULA does not play turbulence backwards")
+        from benchmarks.foreign.specula_objects import called_control  # after specula.init, in the example
+
+        called_control.CONTROLS.append(control)
+        loop = {
+            "main_override": {
+                "total_time": frames / self.rate_hz,
+                "add_modules": ["faintspot.adapters.specula", "benchmarks.foreign.specula_objects"],
+            },
+            "atmo_override": {"seed": seed, "heights": [0.0] * 3, "Cn2": [0.5, 0.3, 0.2]},
+            "detector_override": {
+                "photon_seed": seed + 1000,
+                "readout_seed": seed + 2000,
+                "quantum_eff": self._quantum_efficiency,
+            },
+            **self._settings,
+        }
+        ran = self._example.run(self._system, loop).objs
+        called_control.CONTROLS.clear()
+        noted = ran["control"]
+        strehl = np.ravel(ran["psf"].outputs["out_int_sr"].value)[:1]
+        return Observed(
+            np.array(strehl, np.float64),
+            np.array(noted.slopes),
+            np.array(noted.commands),
+            np.array(noted.predicting),
+        )

@@ -1,0 +1,1 @@
+"""Objects that SPECULA finds by the name of their file."""
