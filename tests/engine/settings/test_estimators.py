@@ -182,7 +182,7 @@ def test_what_is_refused_changes_nothing(camera: Camera, tmp_path: Path) -> None
     camera.assert_measured_with(mine(path), camera.shoot())
     assert camera.engine.live.change_number == before
     # What passes in the other process may be too slow in this one.
-    write(tmp_path, "time.sleep(1)\nreturn sensor.zero")
+    write(tmp_path, "time.sleep(0.25)\nreturn sensor.zero")
     with pytest.raises(fs.InputError, match="us a frame"):
         camera.ask["swap"]({"source": str(path)})
     write(tmp_path)
