@@ -108,10 +108,10 @@ def test_flux_that_differs_between_subapertures_is_simulated_so() -> None:
 
 @pytest.mark.slow
 def test_unreliable_gain_is_not_used() -> None:
-    frames = read_array(f"{shared_file('data/ciao_bench_60x224x224.npz')}:frames")
-    with pytest.raises(InputError, match=r"gain_e_per_adu.*disagree"):
-        question_from_frames(frames)
+    frames = read_array(f"{shared_file('data/ciao_bench_60x224x224.npz')}:frames")[:8]  # as all 60 do
     question = question_from_frames(frames, gain_e_per_adu=2.0, flux_e=200.0)
     assert question.layout is not None
     assert len(question.layout) == 49  # those that the frame's edge does not cut
     assert question.fwhm_px == pytest.approx(3.7, abs=0.2)
+    with pytest.raises(InputError, match=r"gain_e_per_adu.*disagree"):
+        question_from_frames(frames, layout=question.layout)
