@@ -199,7 +199,7 @@ def test_type_of_the_frames(name: str, bits: int | None, dtype: str) -> None:
 )
 def test_bad_options(ring: PixelRing, options: dict[str, Any], text: str) -> None:
     arguments = {"layout": LAYOUT, "frame_rate_hz": 100.0, "n_distinct": 1, **options}
-    with refused(match=text.replace(".", r"\.")):
+    with refused(text):
         Camera(ring=ring, **arguments)
 
 
