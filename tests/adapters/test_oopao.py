@@ -155,11 +155,9 @@ def test_refused_in_one_line(change: dict[str, Any], options: dict[str, Any], me
 def test_images_of_another_size_and_units_of_nothing() -> None:
     wfs = StandIn()
     oopao.attach(wfs, EVERYTHING)
-    with pytest.raises(InputError, match=r"OOPAO's images: expected shape \(9, 10, 10\), got \(9, 8, 8\)"):
+    with refused("OOPAO's images: expected shape (9, 10, 10), got (9, 8, 8)"):
         signal(wfs, np.ones((N, 8, 8)))
-    with pytest.raises(
-        InputError, match=r"got \(8, 10, 10\); attach faintspot again after changing the sensor"
-    ):
+    with refused("got (8, 10, 10); attach faintspot again after changing the sensor"):
         wfs.centroid(images()[1:], 0.0)
     wfs.slopes_units, wfs.initialize_wfs = float("nan"), lambda: None  # type: ignore[method-assign]
     with pytest.raises(InputError, match=r"wfs.slopes_units: expected about 1 .* got nan"):

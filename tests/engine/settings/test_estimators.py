@@ -78,10 +78,11 @@ def mine(path: Path, **options: Any) -> fs.Settings:
     return SETTINGS.replace(estimator=kind(**options))
 
 
-def test_load_set_swap_unload(camera: Camera, tmp_path: Path) -> None:
+def test_load_set_swap_unload(camera: Camera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path)
     assert camera.ask["load"]({"source": str(path)}) == {"estimators": ["mine"], "frame": None}
     assert camera.engine.status()["loaded"] == {"mine": str(path)}
+    monkeypatch.setattr(EstimatorTrial, "elsewhere", EstimatorTrial.here)  # another process was begun once
     camera.assert_measured_with(SETTINGS, camera.shoot())
 
     camera.change(estimator="mine", share=0.5)

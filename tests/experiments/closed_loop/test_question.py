@@ -75,9 +75,7 @@ def test_bad_values_are_named(values: dict[str, Any], message: str) -> None:
 
 
 def test_other_mistakes() -> None:
-    with pytest.raises(
-        InputError, match=r"expected a faintspot\.loop\.simulation\.LoopConfiguration, got str"
-    ):
+    with refused("expected a faintspot.loop.simulation.LoopConfiguration, got str"):
         LoopQuestion("canary")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="learns from a closed loop"):
         LoopQuestion(load_loop("open_loop"), methods=["window+kalman"])
