@@ -392,20 +392,6 @@ def fixed_window(
     return Estimate(found[0], found[1], flux, errors[0], errors[1])
 
 
-def thresholded(g: ArrayLike, threshold_e: float) -> Estimate:
-    """Centre of gravity of what is above a threshold, which is subtracted."""
-    spot = np.maximum(np.asarray(g, np.float64) - threshold_e, 0.0)
-    return Estimate(*naive.centre_of_gravity(spot), flux=float(spot.sum()))
-
-
-def smoothed_brightest(
-    g: ArrayLike, smoothing_px: float, keep: int, rule: str = "subtract_next", reach: int | None = None
-) -> Estimate:
-    """Gaussian smoothing, brightest pixels, centre of gravity."""
-    spot = naive.brightest_pixels(smoothed(g, smoothing_px, smoothing_px, reach), keep, rule)
-    return Estimate(*naive.centre_of_gravity(spot), flux=float(spot.sum()))
-
-
 def gravity_error(
     image: ArrayLike, g: ArrayLike, variance: ArrayLike, excess: float = 1.0, every_pixel: bool = False
 ) -> tuple[float, float]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
@@ -11,11 +13,19 @@ from faintspot.base.errors import InputError
 
 
 @contextmanager
-def refused(*words: str) -> Iterator[None]:
-    """Expect an InputError of one line that holds all these words."""
-    with pytest.raises(InputError) as caught:
+def refused(*words: str, match: str | None = None) -> Iterator[None]:
+    """Expect an InputError of one line that holds all these words and matches a pattern."""
+    with pytest.raises(InputError, match=match) as caught:
         yield
     message = str(caught.value)
     assert "\n" not in message
     for word in words:
         assert word in message, message
+
+
+def assert_each_refused(call: Callable[..., Any], name: str, values: Iterable[Any]) -> None:
+    """Expect that a call refuses each value of an argument, in one line that names it, and any number."""
+    for value in values:
+        is_number = isinstance(value, int | float) and math.isfinite(value)
+        with refused(name, f"{value:g}" if is_number else ""):
+            call(**{name: value})

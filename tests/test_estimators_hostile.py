@@ -21,7 +21,7 @@ from tests.estimator_cases import (
     with_noise_map,
     with_options,
 )
-from tests.refusals import refused
+from tests.refusals import assert_each_refused, refused
 
 import faintspot as fs
 from faintspot.slopes.estimators import estimators
@@ -252,38 +252,29 @@ class TestRefused:
     NOISE = fs.Calibration(dark=0.0, read_noise_e=1.0)
 
     @pytest.mark.parametrize(
-        ("name", "value"),
+        ("name", "values"),
         [
-            ("estimator", "centre"),
-            ("estimator", 3),
-            ("steps", 0),
-            ("steps", 2.5),
-            ("steps", 101),
-            ("threshold_e", -1.0),
-            ("smoothing_px", 0.0),
-            ("smoothing_px", np.nan),
-            ("spot_fwhm_px", 0.0),
-            ("weight_fwhm_px", -2.0),
-            ("weight_fwhm_px", "wide"),
-            ("model_error", -0.1),
-            ("weight_floor", -1e-3),
-            ("search_range_px", 0.0),
-            ("search_range_px", np.inf),
-            ("flux_e", 0.0),
-            ("flux_e", [1.0, np.nan]),
-            ("prior_std_px", 0.0),
-            ("prior_std_px", 1e-300),
-            ("error_scale", 0.0),
-            ("noise_std", "best"),
-            ("keep_brightest", "automatic"),
-            ("rule", "auto"),
+            ("estimator", ["centre", 3]),
+            ("steps", [0, 2.5, 101]),
+            ("threshold_e", [-1.0]),
+            ("smoothing_px", [0.0, np.nan]),
+            ("spot_fwhm_px", [0.0]),
+            ("weight_fwhm_px", [-2.0, "wide"]),
+            ("model_error", [-0.1]),
+            ("weight_floor", [-1e-3]),
+            ("search_range_px", [0.0, np.inf]),
+            ("flux_e", [0.0, [1.0, np.nan]]),
+            ("prior_std_px", [0.0, 1e-300]),
+            ("error_scale", [0.0]),
+            ("noise_std", ["best"]),
+            ("keep_brightest", ["automatic"]),
+            ("rule", ["auto"]),
         ],
     )
-    def test_bad_settings(self, name: str, value: Any) -> None:
+    def test_bad_settings(self, name: str, values: list[Any]) -> None:
         whose = next((each for each, kind in estimators().items() if name in kind.declared()), "tv")
         own: dict[str, Any] = {"noise_std": 1.0} if whose == "tv" else {}
-        with refused(name):
-            fs.Settings(**{"estimator": whose, **own, name: value})
+        assert_each_refused(lambda **bad: fs.Settings(**{"estimator": whose, **own, **bad}), name, values)
 
     @pytest.mark.parametrize("estimator", ["ml", "map"])
     def test_read_noise_must_be_known(self, estimator: str) -> None:

@@ -19,6 +19,7 @@ from tests.adapters.adapter_cases import (
     images,
     noisy,
 )
+from tests.refusals import refused
 
 import faintspot as fs
 from faintspot import InputError, Settings
@@ -161,9 +162,8 @@ def test_a_version_that_was_not_tested_is_said_once(monkeypatch: pytest.MonkeyPa
     ],
 )
 def test_matrices_of_a_calibration_gone_wrong(matrix: np.ndarray, message: str) -> None:
-    with pytest.raises(InputError, match=message) as error:
+    with refused(match=message):
         check_matrix("interaction matrix", matrix)
-    assert "\n" not in str(error.value)
     assert check_matrix("interaction matrix", np.eye(2)).shape == (2, 2)
 
 

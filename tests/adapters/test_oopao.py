@@ -19,6 +19,7 @@ from tests.adapters.adapter_cases import (
     needs,
     noisy,
 )
+from tests.refusals import refused
 
 from faintspot import InputError, Settings
 from faintspot.adapters import oopao
@@ -146,20 +147,17 @@ def test_refused_in_one_line(change: dict[str, Any], options: dict[str, Any], me
         wfs.sh_data["src_0"].weighting_map = np.full((N, SIDE, SIDE), 0.5)
     if "dark" in change:
         wfs.initialize_wfs = lambda: signal(wfs, np.zeros((N, SIDE, SIDE)))  # type: ignore[method-assign,assignment]
-    with pytest.raises(InputError, match=message) as error:
+    with refused(match=message):
         oopao.attach(wfs, EVERYTHING, **options)
-    assert "\n" not in str(error.value)
     assert "centroid" not in vars(wfs)  # OOPAO's own is in its place
 
 
 def test_images_of_another_size_and_units_of_nothing() -> None:
     wfs = StandIn()
     oopao.attach(wfs, EVERYTHING)
-    with pytest.raises(InputError, match=r"OOPAO's images: expected shape \(9, 10, 10\), got \(9, 8, 8\)"):
+    with refused("OOPAO's images: expected shape (9, 10, 10), got (9, 8, 8)"):
         signal(wfs, np.ones((N, 8, 8)))
-    with pytest.raises(
-        InputError, match=r"got \(8, 10, 10\); attach faintspot again after changing the sensor"
-    ):
+    with refused("got (8, 10, 10); attach faintspot again after changing the sensor"):
         wfs.centroid(images()[1:], 0.0)
     wfs.slopes_units, wfs.initialize_wfs = float("nan"), lambda: None  # type: ignore[method-assign]
     with pytest.raises(InputError, match=r"wfs.slopes_units: expected about 1 .* got nan"):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from tests.adapters.adapter_cases import ESTIMATORS, POSITIONS, SIDE, N, images, needs, noisy
 from tests.adapters.test_specula import GRID, TABLES, frame_of
+from tests.refusals import refused
 
 from faintspot import InputError, MissingExtraError
 from faintspot.adapters import pyrtc
@@ -128,9 +129,8 @@ def test_refused_in_one_line() -> None:
     ],
 )
 def test_maps_of_another_system(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message) as error:
+    with refused(match=message):
         measuring().maps(process(**change), frame_of(images()), no_stream)
-    assert "\n" not in str(error.value)
 
 
 def test_frames_of_another_size() -> None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
 import pytest
 from tests.adapters.adapter_cases import needs
+from tests.patience import wait_for
 from tests.shared_data import ROOT
 
 import faintspot as fs
@@ -19,7 +19,7 @@ from faintspot.adapters import pyrtc
 from faintspot.adapters.pyrtc import _Frames, _Measuring
 from faintspot.engine.pixels.pixel_segment import FOLDER
 
-SHAPE, PATIENCE_S = (6, 5), 30.0
+SHAPE = (6, 5)
 FILES = ROOT / "examples" / "pyrtc"
 pyshmem = pytest.importorskip("pyshmem")
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
@@ -39,12 +39,6 @@ def create(name: str, values: Any) -> Any:
     return stream
 
 
-def until(step: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not step():
-        assert time.monotonic() < end
-
-
 def configuration(name: str) -> dict[str, Any]:
     return {"name": "wfs", "width": SHAPE[1], "height": SHAPE[0], "frames": name}
 
@@ -55,7 +49,7 @@ def test_frames_of_a_stream(name: str, dtype: Any) -> None:
     assert not frames.next_into(taken)  # it is not there yet
     first = np.arange(30).reshape(SHAPE).astype(dtype)
     stream = create(name, first)
-    until(lambda: frames.next_into(taken))
+    wait_for(lambda: frames.next_into(taken))
     np.testing.assert_array_equal(taken, first)
     assert not frames.next_into(taken)  # the same is no new frame
     stream.write(first + 1)
@@ -78,7 +72,7 @@ def test_a_stream_that_is_made_anew(name: str) -> None:
     assert frames.next_into(taken)
     first.unlink()
     create(name, np.full(SHAPE, 2, np.uint16))
-    until(lambda: frames.next_into(taken))
+    wait_for(lambda: frames.next_into(taken))
     assert (taken == 2).all()
     frames.close()
 
@@ -93,7 +87,7 @@ def test_frames_of_another_size_are_waited_out(name: str, caplog: pytest.LogCapt
     assert [record.getMessage() for record in caplog.records] == [said]
     wrong.unlink()
     create(name, np.ones(SHAPE, np.uint16))
-    until(lambda: frames.next_into(taken))
+    wait_for(lambda: frames.next_into(taken))
 
 
 def test_frames_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,7 +115,7 @@ def test_pyrtcs_sensor_has_the_frames(name: str) -> None:
     create(name, first)
     try:
         component = ours({**configuration(name), "functions": [], "output_streams": streams})
-        until(lambda: (component.expose(), np.array_equal(component.read(block=False), first))[1])
+        wait_for(lambda: (component.expose(), np.array_equal(component.read(block=False), first))[1])
         component.close(timeout=0.0)
     finally:
         clear_shms(streams.values())

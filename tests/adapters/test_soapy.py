@@ -20,8 +20,9 @@ from tests.adapters.adapter_cases import (
     needs,
     noisy,
 )
+from tests.refusals import refused
 
-from faintspot import InputError, Settings
+from faintspot import Settings
 from faintspot.adapters import soapy
 
 
@@ -101,22 +102,20 @@ def test_attach_and_detach(wfs: StandIn) -> None:
     before = images()
     wfs.measure(before)
     np.testing.assert_array_equal(before, images())  # soapy's images are not changed
-    with pytest.raises(InputError, match=r"soapy's images: expected shape \(9, 10, 10\), got \(9, 4, 4\)"):
+    with refused("soapy's images: expected shape (9, 10, 10), got (9, 4, 4)"):
         wfs.measure(np.ones((N, 4, 4)))
-    with pytest.raises(
-        InputError, match=r"got \(8, 10, 10\); attach faintspot again after changing the sensor"
-    ):
+    with refused("got (8, 10, 10); attach faintspot again after changing the sensor"):
         wfs.measure(images()[1:])
     attached.detach()
     assert wfs.config.centMethod == "own"
     np.testing.assert_array_equal(wfs.measure(before), 0.0)
-    with pytest.raises(InputError, match="expected soapy's ShackHartmann, got SimpleNamespace"):
+    with refused("expected soapy's ShackHartmann, got SimpleNamespace"):
         soapy.attach(SimpleNamespace(), EVERYTHING)
 
 
 def test_a_dark_sensor_keeps_its_own_centroider(wfs: StandIn, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wfs, "getStatic", lambda: wfs.measure(np.zeros((N, SIDE, SIDE))))
-    with pytest.raises(InputError, match="expected flux in the sub-apertures"):
+    with refused("expected flux in the sub-apertures"):
         soapy.attach(wfs, EVERYTHING)
     assert wfs.config.centMethod == "own"
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.adapters.adapter_cases import ESTIMATORS, POSITIONS, SIDE, N, images, needs, noisy
+from tests.refusals import refused
 
 from faintspot import InputError, MissingExtraError
 
@@ -165,16 +166,12 @@ class TestRealTool:
         self.slopes(computer, frame)
         with pytest.raises(InputError, match=r"in_pixels: expected shape \(30, 30\), got \(30, 40\)"):
             self.slopes(computer, np.ones((30, 40)), time=2)
-        with pytest.raises(
-            InputError, match="sn: expected slopes of 9 sub-apertures, got 4 x and 4 y; calibr"
-        ):
+        with refused("sn: expected slopes of 9 sub-apertures, got 4 x and 4 y; calibr"):
             self.slopes(self.made(subapertures, sn=Slopes(slopes=np.zeros(8))), frame)
         broken = Slopes(slopes=np.full(2 * N, np.nan))
         with pytest.raises(InputError, match="sn: expected finite numbers, got 18 NaN or infinite of 18"):
             self.slopes(self.made(subapertures, sn=broken), frame)
-        with pytest.raises(
-            InputError, match=r"filtmat: expected finite numbers .* got 36 NaN or infinite of 36"
-        ):
+        with refused("filtmat: expected finite numbers", "got 36 NaN or infinite of 36"):
             self.made(subapertures, filtmat=np.full((2, 2, 2 * N), np.nan))
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import (
@@ -46,9 +47,8 @@ def test_float32_positions_do_not_lose_digits_of_the_truth() -> None:
     ],
 )
 def test_bad_positions(x: Any, y: Any, truth: Any, words: str) -> None:
-    with pytest.raises(InputError) as error:
+    with refused(words):
         slope_error(x, y, truth)
-    assert words in str(error.value)
 
 
 def test_standard_error_of_r_covers_the_truth() -> None:
@@ -132,9 +132,8 @@ def test_perfect_slopes() -> None:
     [({"valid": [True]}, "valid: expected shape (3,)"), ({"outlier_px": 0}, "outlier_px = 0")],
 )
 def test_bad_statistics(options: dict[str, Any], words: str) -> None:
-    with pytest.raises(InputError) as error:
+    with refused(words):
         slope_statistics(np.ones(3), np.ones(3), np.ones((3, 2)), **options)
-    assert words in str(error.value)
     with pytest.raises(InputError, match="at least one value"):
         slope_statistics([], [], np.ones((0, 2)))
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tests.cli.cli_cases import LAYOUT, Commands, simulated
 from tests.experiments.loop_answer_cases import made_up
@@ -17,20 +18,18 @@ KNOWN = ("--read-noise-e", 3, "--pixels", 8, "--fwhm-px", "1.8", "--flux-e", 200
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few spots and fluxes."""
+def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few spots and fluxes, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tuning, "tune", functools.partial(tuning.tune, realisations=256, steps=1))
 
 
-def test_answer_configuration_and_picture(
-    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_answer_configuration_and_picture(run: Commands) -> None:
     result = run.ok("tune", *KNOWN, "--grid", "4x4", "--budget", "0.1")
     for text in ("brightest pixels", "Cramer-Rao bound", "Recommended: ", "limiting flux", "This rests on"):
         assert text in result.out
     assert max(len(line) for line in result.out.splitlines()) <= 80
-    assert (tmp_path / "faintspot-tune.png").read_bytes().startswith(b"\x89PNG")
+    assert Path("faintspot-tune.png").read_bytes().startswith(b"\x89PNG")
     pipeline = SlopePipeline.from_file("faintspot.toml")
     assert len(pipeline.layout) == 16
     assert pipeline.calibration.read_noise_e == 3.0
@@ -38,11 +37,8 @@ def test_answer_configuration_and_picture(
 
 
 @pytest.mark.slow
-def test_camera_file_and_options_that_count_more(
-    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "camera.toml").write_text(
+def test_camera_file_and_options_that_count_more(run: Commands) -> None:
+    Path("camera.toml").write_text(
         "[camera]\nread_noise_e = 2.0\npixels = 8\n[spot]\nfwhm_px = 1.8\nsubaperture_m = 0.5\n"
         "[star]\nmagnitude = 9.0\nframe_rate_hz = 500\n[tune]\nbudget = 0.2\n"
         "[layout.grid]\nshape = [4, 4]\npixels = 8\n"
@@ -54,10 +50,7 @@ def test_camera_file_and_options_that_count_more(
 
 
 @pytest.mark.slow
-def test_without_a_layout_it_says_what_to_do(
-    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_without_a_layout_it_says_what_to_do(run: Commands) -> None:
     assert "faintspot layout FRAME --pixels 8" in run.ok("tune", *KNOWN).out
     LAYOUT.save("faintspot.toml")
     assert len(SlopePipeline.from_file("faintspot.toml").layout) == 16
@@ -66,10 +59,7 @@ def test_without_a_layout_it_says_what_to_do(
     assert len(SlopePipeline.from_file("faintspot.toml").layout) == 16
 
 
-def test_calibration_of_an_existing_configuration_counts_and_stays(
-    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_calibration_of_an_existing_configuration_counts_and_stays(run: Commands) -> None:
     LAYOUT.save("faintspot.toml")
     Calibration(dark=100.0, gain_e_per_adu=2.0, read_noise_e=4.0).save("faintspot.toml")
     result = run.ok("tune", "--fwhm-px", "1.8", "--flux-e", 200, "--overwrite")
@@ -97,10 +87,7 @@ def test_binned_layout(run: Commands, tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.slow
-def test_from_frames(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import numpy as np
-
-    monkeypatch.chdir(tmp_path)
+def test_from_frames(run: Commands) -> None:
     np.save("frames.npy", simulated())
     LAYOUT.save("layout.toml")
     arguments = ("--recording", "frames.npy", "--config", "layout.toml", "--gain-e-per-adu", 1)
@@ -112,68 +99,45 @@ def test_from_frames(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize(
     ("arguments", "naming"),
     [
-        ((), ("read_noise_e", "--read-noise-e", "[camera]")),
-        (("--read-noise-e", "abc"), ("--read-noise-e",)),
-        (("--read-noise-e", -3, *KNOWN[2:]), ("read_noise_e = -3",)),
-        (KNOWN[:-2], ("magnitude", "flux_e")),
-        ((*KNOWN, "--magnitude", 3), ("--magnitude", "both")),
-        ((*KNOWN, "--budget", "3furlongs"), ("budget", "0.05arcsec")),
-        ((*KNOWN, "--grid", "7-7"), ("--grid", "7x7")),
-        ((*KNOWN, "--grid", "7x7", "--config", "a.toml"), ("--grid", "--config")),
-        ((*KNOWN, "--config", "nothere.toml"), ("nothere.toml",)),
-        ((*KNOWN, "--dark", "dark.fits"), ("--recording",)),
-        ((*KNOWN, "-o", "nofolder/faintspot.toml"), ("nofolder",)),
-        (("--camera", "nothere.toml"), ("nothere.toml",)),
-        (("--camera", "broken.toml"), ("broken.toml", "TOML")),
-        (("--camera", "typo.toml"), ("read_noise", "did you mean read_noise_e")),
-        (("--camera", "table.toml"), ("cameras", "did you mean camera")),
-        (("--camera", "layout.toml"), ("layout.grid.shape",)),
-        (("--recording", "nothere.fits"), ("nothere.fits",)),
+        (("tune",), ("read_noise_e", "--read-noise-e", "[camera]")),
+        (("tune", "--read-noise-e", "abc"), ("--read-noise-e",)),
+        (("tune", "--read-noise-e", -3, *KNOWN[2:]), ("read_noise_e = -3",)),
+        (("tune", *KNOWN[:-2]), ("magnitude", "flux_e")),
+        (("tune", *KNOWN, "--magnitude", 3), ("--magnitude", "both")),
+        (("tune", *KNOWN, "--budget", "3furlongs"), ("budget", "0.05arcsec")),
+        (("tune", *KNOWN, "--grid", "7-7"), ("--grid", "7x7")),
+        (("tune", *KNOWN, "--grid", "7x7", "--config", "a.toml"), ("--grid", "--config")),
+        (("tune", *KNOWN, "--config", "nothere.toml"), ("nothere.toml",)),
+        (("tune", *KNOWN, "--dark", "dark.fits"), ("--recording",)),
+        (("tune", *KNOWN, "-o", "nofolder/faintspot.toml"), ("nofolder",)),
+        (("tune", "--camera", "nothere.toml"), ("nothere.toml",)),
+        (("tune", "--camera", "broken.toml"), ("broken.toml", "TOML")),
+        (("tune", "--camera", "typo.toml"), ("read_noise", "did you mean read_noise_e")),
+        (("tune", "--camera", "table.toml"), ("cameras", "did you mean camera")),
+        (("tune", "--camera", "layout.toml"), ("layout.grid.shape",)),
+        (("tune", "--recording", "nothere.fits"), ("nothere.fits",)),
+        (("loop", "tune", "nothere"), ("nothere", "shipped")),
+        (("loop", "tune", "canary", "--read-noise-e", 3), ("--read-noise-e",)),
+        (("loop", "tune", "canary", "--magnitude", 9, "--flux-e", 10), ("--magnitude", "both")),
+        (("loop", "tune", "canary", "--magnitudes", "8"), ("--magnitudes 8", "8,14")),
+        (("loop", "tune", "canary", "--strehl", 2), ("strehl = 2",)),
+        (("loop", "tune", "canary", "--methods", "kog"), ("kog",)),
+        (("loop", "tune", "canary", "-o", "nofolder/faintspot.toml"), ("nofolder",)),
     ],
 )
 def test_mistakes_are_named_in_one_line(
-    run: Commands,
-    arguments: tuple[object, ...],
-    naming: tuple[str, ...],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    run: Commands, arguments: tuple[object, ...], naming: tuple[str, ...]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "broken.toml").write_text("read_noise = [\n")
-    (tmp_path / "typo.toml").write_text("[camera]\nread_noise = 3\n")
-    (tmp_path / "table.toml").write_text("[cameras]\nread_noise = 3\n")
-    (tmp_path / "layout.toml").write_text("[layout.grid]\npixels = 8\n")
-    run.refused("tune", *arguments, naming=naming)  # type: ignore[arg-type]
-    assert not (tmp_path / "faintspot.toml").exists()
+    Path("broken.toml").write_text("read_noise = [\n")
+    Path("typo.toml").write_text("[camera]\nread_noise = 3\n")
+    Path("table.toml").write_text("[cameras]\nread_noise = 3\n")
+    Path("layout.toml").write_text("[layout.grid]\npixels = 8\n")
+    run.refused(*arguments, naming=naming)  # type: ignore[arg-type]
+    assert not Path("faintspot.toml").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "naming"),
-    [
-        (("nothere",), ("nothere", "shipped")),
-        (("canary", "--read-noise-e", 3), ("--read-noise-e",)),
-        (("canary", "--magnitude", 9, "--flux-e", 10), ("--magnitude", "both")),
-        (("canary", "--magnitudes", "8"), ("--magnitudes 8", "8,14")),
-        (("canary", "--strehl", 2), ("strehl = 2",)),
-        (("canary", "--methods", "kog"), ("kog",)),
-        (("canary", "-o", "nofolder/faintspot.toml"), ("nofolder",)),
-    ],
-)
-def test_mistakes_about_a_loop_are_named_in_one_line(
-    run: Commands,
-    arguments: tuple[str, ...],
-    naming: tuple[str, ...],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    run.refused("loop", "tune", *arguments, naming=naming)
-    assert not (tmp_path / "faintspot.toml").exists()
-
-
-def test_for_a_loop(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_for_a_loop(run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a made-up answer; how it comes about is tested where it is made."""
-    monkeypatch.chdir(tmp_path)
     asked: dict[str, object] = {}
 
     def made(question: LoopQuestion, folder: str, **options: object) -> LoopAnswer:
@@ -198,9 +162,9 @@ def test_for_a_loop(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert "--methods brightest,window,window+kalman " in result.out
     assert max(len(line) for line in result.out.splitlines()[:-4]) <= 80
     assert "…" not in result.out
-    assert (tmp_path / "faintspot-tune.png").read_bytes().startswith(b"\x89PNG")
+    assert Path("faintspot-tune.png").read_bytes().startswith(b"\x89PNG")
     LAYOUT.save("faintspot.toml")
     assert SlopePipeline.from_file("faintspot.toml").settings.estimator.name == "window"
-    assert (tmp_path / "faintspot-loop.toml").is_file()
+    assert Path("faintspot-loop.toml").is_file()
     run.refused("loop", "tune", "canary", naming=("faintspot.toml", "--overwrite"))
     run.ok("loop", "tune", "canary", "--overwrite")

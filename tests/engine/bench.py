@@ -29,13 +29,8 @@ def make(settings: fs.Settings) -> fs.SlopePipeline:
 
 
 def simulated(n: int) -> NDArray[np.uint16]:
-    frames, _ = frames_of(
-        LAYOUT,
-        n,
-        flux_e=300.0,
-        detector=fs.slopes.simulate.Detector(1.0, offset_adu=100.0, bits=16),
-        rng=np.random.default_rng(8),
-    )
+    detector = fs.slopes.simulate.Detector(1.0, offset_adu=100.0, bits=16)
+    frames, _ = frames_of(LAYOUT, n, flux_e=300.0, detector=detector, rng=np.random.default_rng(8))
     return np.asarray(frames, np.uint16)
 
 

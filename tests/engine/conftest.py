@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
 from typing import Any
 from uuid import uuid4
@@ -10,6 +9,11 @@ from uuid import uuid4
 import pytest
 
 from faintspot.engine.pixels.pixel_segment import FOLDER
+
+try:
+    import pyshmem  # starts a process, which tests that are not slow may not do later
+except ImportError:
+    pyshmem = None
 
 
 @pytest.fixture
@@ -40,9 +44,7 @@ def name() -> Iterator[str]:
     yield chosen
     for path in FOLDER.glob(f"{chosen}*"):
         path.unlink()
-    with contextlib.suppress(ImportError):
-        import pyshmem
-
+    if pyshmem is not None:
         for part in ("in", "slopes", "commands", "truth", "frames"):
             pyshmem.unlink_quiet(f"{chosen}_{part}")
 

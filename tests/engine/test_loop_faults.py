@@ -23,6 +23,7 @@ pytest.importorskip("hcipy")
 pyshmem = pytest.importorskip("pyshmem")
 
 from tests.engine.closed_loop import COMMANDS, PATIENCE_S, Sky, configured, make_engine  # noqa: E402
+from tests.patience import wait_for  # noqa: E402
 
 pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 
@@ -67,11 +68,12 @@ def test_the_clock_jumps(
 
 def frames_until(sky: Sky, condition: Callable[[], bool], pause_s: float = 0.0) -> None:
     """Let frames come until something is so."""
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
+
+    def step() -> None:
         sky.frame()
         time.sleep(pause_s)
+
+    wait_for(condition, step=step)
 
 
 def segments(sky: Sky) -> list[Path]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.experiments.running import Unit, WorkerPool, run_units
@@ -104,9 +105,8 @@ def test_processes_give_the_same() -> None:
 def test_a_process_dies(tmp_path: Path) -> None:
     units = [Unit(unit.key, (str(tmp_path), *unit.arguments)) for unit in UNITS]
     assert values(run_units(die_once, units, MemoryStore(), WorkerPool(1))) == [0, 2, 4, 6]
-    with pytest.raises(InputError, match="died repeatedly") as raised:
+    with refused("died repeatedly"):
         run_units(die, UNITS[:1], MemoryStore(), WorkerPool(1))
-    assert "\n" not in str(raised.value)
 
 
 def test_interruption_does_not_wait_for_units() -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.refusals import refused
 
 from faintspot import InputError
 from faintspot.experiments.store import MemoryStore, ZarrStore, kind_of_store
@@ -89,9 +90,8 @@ def test_damaged(tmp_path: Path) -> None:
     for chunk in (path / "image" / "c").rglob("*"):
         if chunk.is_file():
             chunk.write_bytes(b"rubbish")
-    with pytest.raises(InputError, match="damaged") as raised:
+    with refused("damaged"):
         ZarrStore(path, "study", "one", ["a"]).read("a")
-    assert "\n" not in str(raised.value)
     metadata = json.loads((path / "done" / "zarr.json").read_text())
     metadata["shape"] = "many"
     (path / "done" / "zarr.json").write_text(json.dumps(metadata))

@@ -58,7 +58,7 @@ def test_from_an_empty_folder_to_a_table(tmp_path: Path, name: str) -> None:
         with urllib.request.urlopen(lines[2], timeout=60) as page:
             assert b"<title>faintspot</title>" in page.read()
         end, begun = time.monotonic() + PATIENCE_S, frames_measured(name)
-        while frames_measured(name) < begun + 260:  # each of three methods has turns of 50
+        while frames_measured(name) < begun + 170:  # each of three methods has turns of 50
             assert time.monotonic() < end
             time.sleep(0.1)
         process.send_signal(signal.SIGINT)

@@ -151,6 +151,13 @@ class Client:
         self._writer.close()
 
 
+def next_batch(source: Source) -> Batch:
+    """What a source has read since it was asked before."""
+    batch = source.read()
+    assert batch is not None
+    return batch
+
+
 async def connected(server: LiveServer, **headers: str) -> Client:
     """Open a web socket as the page's own script does, but for these headers; "": without it."""
     host = f"127.0.0.1:{server.port}"

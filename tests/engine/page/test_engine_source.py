@@ -1,23 +1,17 @@
 from __future__ import annotations
 
-from uuid import uuid4
-
 import numpy as np
 import pytest
 
 pytest.importorskip("pyshmem")
 
+from tests.engine.page.cases import next_batch
 from tests.engine.telemetry_cases import LAYOUT, as_written, write, write_images
 
 from faintspot.engine.page.engine_source import EngineSource
 from faintspot.engine.streams.shared_streams import create_stream
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope.simulated_telescope import TRUTH
-
-
-@pytest.fixture
-def name() -> str:
-    return f"fs_test_{uuid4().hex[:12]}"
 
 
 def test_engine_that_comes_goes_and_comes_back(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -27,16 +21,14 @@ def test_engine_that_comes_goes_and_comes_back(name: str, monkeypatch: pytest.Mo
     assert not source.state()["there"]
     for methods in ([], ["none", "tv"]):
         with TelemetryRing.create(name, LAYOUT, methods=methods) as ring:
-            first = source.read()
-            assert first is not None
+            first = next_batch(source)
             assert first.anew
             assert source.methods == methods
             for frame in range(5):
                 write(ring, frame)
             write_images(ring, 3)
             ring.write_change(2, 1, {"noise_std": 2.0}, None)
-            batch = source.read()
-            assert batch is not None
+            batch = next_batch(source)
             assert not batch.anew
             assert batch.records["frame"].tolist() == [0, 1, 2, 3, 4]
             assert as_written(batch.records)
@@ -44,8 +36,7 @@ def test_engine_that_comes_goes_and_comes_back(name: str, monkeypatch: pytest.Mo
             assert batch.picture.frame == 3
             assert batch.picture.raw[0, 0] == 3
             assert [change["changes"] for change in batch.changes] == [{"noise_std": 2.0}]
-            again = source.read()
-            assert again is not None
+            again = next_batch(source)
             assert again.picture is None
             assert not len(again.records)
         source.read()
@@ -60,8 +51,7 @@ def test_page_that_was_too_slow_says_what_it_missed(name: str) -> None:
         source.read()
         for frame in range(20):
             write(ring, frame)
-        batch = source.read()
-        assert batch is not None
+        batch = next_batch(source)
         assert batch.missed + len(batch.records) == 20
         assert batch.records["frame"][-1] == 19
     source.close()
@@ -77,13 +67,11 @@ def test_truth_and_commands_of_streams(name: str) -> None:
         values = dict.fromkeys(TRUTH, 0.0) | {"frame": 7.0, "strehl": 0.5, "rms_nm": 150.0}
         truth.write(np.array(list(values.values())), frame_id=7)
         commands.write(np.array([1.0, -2.0, 3.0]), frame_id=7)
-        batch = source.read()
-        assert batch is not None
+        batch = next_batch(source)
         assert batch.truth == (7, 0.5, 150.0)
         assert batch.commands is not None
         assert batch.commands.tolist() == [1.0, -2.0, 3.0]
-        again = source.read()
-        assert again is not None
+        again = next_batch(source)
         assert again.truth is None
         truth.unlink()
         commands.unlink()

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("zarr")
 
-from tests.engine.page.cases import LAYOUT, N, records
+from tests.engine.page.cases import LAYOUT, N, next_batch, records
 
 from faintspot.base.errors import InputError
 from faintspot.engine.page import recording_source
@@ -58,13 +58,11 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_recording_is_played_at_its_own_pace(night: Path, clock: Clock) -> None:
     source = RecordingSource(night)
     assert source.length_s == pytest.approx((FRAMES - 1) / 100)
-    first = source.read()
-    assert first is not None
+    first = next_batch(source)
     assert first.anew
     assert first.records["frame"].tolist() == [0]
     clock.now += 1.0
-    batch = source.read()
-    assert batch is not None
+    batch = next_batch(source)
     assert not batch.anew
     assert batch.records["frame"].tolist() == list(range(1, 101))
     np.testing.assert_array_equal(batch.records["x"][:, 0], batch.records["frame"])
@@ -72,8 +70,7 @@ def test_recording_is_played_at_its_own_pace(night: Path, clock: Clock) -> None:
     assert batch.picture.frame == 100
     assert batch.picture.raw[0, 0] == 100
     clock.now += 0.5
-    again = source.read()
-    assert again is not None
+    again = next_batch(source)
     assert again.picture is None
     assert len(again.records) == 50
 
@@ -85,9 +82,7 @@ def test_time_bar_speed_and_pause(night: Path, clock: Clock) -> None:
         assert answered(source, {"do": "play", **asked})["ok"]
 
     def read() -> Any:
-        batch = source.read()
-        assert batch is not None
-        return batch
+        return next_batch(source)
 
     read()
     ask(position_s=81.0, speed=4.0)  # across the end of a chunk at 8192 frames
@@ -117,12 +112,10 @@ def test_time_bar_speed_and_pause(night: Path, clock: Clock) -> None:
 def test_changes_are_told_when_they_come(night: Path, clock: Clock) -> None:
     source = RecordingSource(night)
     answered(source, {"do": "play", "position_s": 49.9})
-    batch = source.read()
-    assert batch is not None
+    batch = next_batch(source)
     assert batch.changes == []
     clock.now += 1.0
-    batch = source.read()
-    assert batch is not None
+    batch = next_batch(source)
     assert len(batch.changes) == 1
 
 
@@ -153,35 +146,31 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, night: Path) -> None:
         RecordingSource(tmp_path / "none.zarr")
     with pytest.raises(InputError, match="expected a Zarr store of telemetry"):
         RecordingSource(tmp_path)
-    empty = tmp_path / "empty.zarr"
-    made = records(0, 0)
-    images = image_type(LAYOUT.frame_shape, N, LAYOUT.window)
-    TelemetryStore(empty, made.dtype, images, {"layout": layout_values(LAYOUT), "methods": []})
     with pytest.raises(InputError, match="expected a recording with frames"):
-        RecordingSource(empty)
+        RecordingSource(stored(tmp_path, 0))
+
+
+def stored(folder: Path, frames: int, shape: tuple[int, int] = LAYOUT.frame_shape, **changed: Any) -> Path:
+    """Write a recording of so many frames and one image, with other attributes if there are any."""
+    made, images = records(0, frames), image_type(shape, N, LAYOUT.window)
+    attributes = {"layout": layout_values(LAYOUT), "methods": []}
+    store = TelemetryStore(folder / "night.zarr", made.dtype, images, attributes)
+    if frames:
+        store.append(made, np.zeros(1, images), {"changes": []} | changed)
+    return folder / "night.zarr"
 
 
 def test_recording_of_another_sensor_than_it_says_is_refused(tmp_path: Path) -> None:
-    made = records(0, 5)
-    images = image_type((4, 4), N, LAYOUT.window)
-    attributes = {"layout": layout_values(LAYOUT), "methods": []}
-    TelemetryStore(tmp_path / "night.zarr", made.dtype, images, attributes).append(
-        made, np.zeros(1, images), {"changes": []}
-    )
     with pytest.raises(InputError, match=r"damaged \(raw: expected items of"):
-        RecordingSource(tmp_path / "night.zarr")
+        RecordingSource(stored(tmp_path, 5, (4, 4)))
 
 
 @pytest.mark.parametrize(
     "wrong", [{"layout": {}}, {"layout": 5}, {"changes": [{}]}, {"changes": [{"frame": "x"}]}]
 )
 def test_attributes_that_make_no_sense_are_one_line(tmp_path: Path, wrong: dict[str, Any]) -> None:
-    made, images = records(0, 5), image_type(LAYOUT.frame_shape, N, LAYOUT.window)
-    attributes = {"layout": layout_values(LAYOUT), "methods": []}
-    store = TelemetryStore(tmp_path / "night.zarr", made.dtype, images, attributes)
-    store.append(made, np.zeros(0, images), {"changes": []} | wrong)
     with pytest.raises(InputError, match="the store is damaged"):
-        RecordingSource(tmp_path / "night.zarr")
+        RecordingSource(stored(tmp_path, 5, **wrong))
 
 
 def test_parts_of_a_store_are_those_of_the_whole(night: Path) -> None:

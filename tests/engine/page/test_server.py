@@ -54,6 +54,14 @@ async def closed(client: Client) -> int:
     return client.close_code
 
 
+async def two_friends(server: LiveServer) -> tuple[Client, Client]:
+    """Two clients that have the token."""
+    friends = await connected(server), await connected(server)
+    for client in friends:
+        await asked(client, do="hello", token=server.access.token)
+    return friends
+
+
 def test_page_and_its_files_need_nothing_else() -> None:
     async def check(server: LiveServer) -> None:
         url = f"http://127.0.0.1:{server.port}/"
@@ -184,9 +192,7 @@ def test_a_stranger_who_says_nothing_is_let_go(monkeypatch: pytest.MonkeyPatch) 
 )  # fmt: skip
 def test_garbage_closes_that_client_alone(garbage: str | bytes, caplog: pytest.LogCaptureFixture) -> None:
     async def check(server: LiveServer) -> None:
-        good, bad = await connected(server), await connected(server)
-        for connection in (good, bad):
-            await asked(connection, do="hello", token=server.access.token)
+        good, bad = await two_friends(server)
         await bad.send(garbage)
         assert await closed(bad) in (1008, 1007)
         assert (await asked(good, do="set"))["ok"]
@@ -218,9 +224,7 @@ def test_errors_are_logged_at_the_servers_pace(
 
 def test_huge_message_closes_that_client_alone() -> None:
     async def check(server: LiveServer) -> None:
-        good, bad = await connected(server), await connected(server)
-        for connection in (good, bad):
-            await asked(connection, do="hello", token=server.access.token)
+        good, bad = await two_friends(server)
         await bad.send(json.dumps({"do": "set", "changes": "x" * LARGEST_REQUEST}))
         assert await closed(bad) in (1009, 1006)
         await next_of(good, "now")
@@ -232,9 +236,7 @@ def test_flood_is_answered_one_by_one_and_holds_up_nobody(monkeypatch: pytest.Mo
     monkeypatch.setattr(server_module, "_PAUSE_S", 0.05)
 
     async def check(server: LiveServer) -> None:
-        good, bad = await connected(server), await connected(server)
-        for connection in (good, bad):
-            await asked(connection, do="hello", token=server.access.token)
+        good, bad = await two_friends(server)
         for _ in range(500):
             await bad.send(json.dumps({"do": "set"}))
         for _ in range(20):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from contextlib import ExitStack, closing
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,16 @@ class Source:
             time.sleep(pause_s)
 
 
+@contextmanager
+def path_of(slopes_of: fs.SlopePipeline, source: Source, threads: int) -> Iterator[FramePath]:
+    """A path of several threads that is ready for its first frame."""
+    with ExitStack() as stack:
+        workers = stack.enter_context(closing(Workers(threads - 1))) if threads > 1 else None
+        path = FramePath(slopes_of, source.slots, source.progress, workers=workers)
+        path.warm_up()
+        yield path
+
+
 def assert_same(found: fs.Slopes, expected: fs.Slopes, index: int) -> None:
     for name in SlopeArrays._fields:
         assert np.array_equal(getattr(found, name), getattr(expected, name)[index]), name
@@ -89,10 +100,7 @@ def assert_same(found: fs.Slopes, expected: fs.Slopes, index: int) -> None:
 def test_same_slopes_as_the_pipeline(name: str, threads: int) -> None:
     data, source = frames(4), Source()
     expected = pipeline(name)(data)
-    with ExitStack() as stack:
-        workers = stack.enter_context(closing(Workers(threads - 1))) if threads > 1 else None
-        path = FramePath(pipeline(name), source.slots, source.progress, workers=workers)
-        path.warm_up()
+    with path_of(pipeline(name), source, threads) as path:
         for number, frame in enumerate(data):
             writer = threading.Thread(target=source.write, args=(number, frame, 7, 0.0005))
             writer.start()
@@ -123,10 +131,7 @@ def test_a_product_with_the_slopes_is_begun_while_rows_arrive(
             time.sleep(1e-3)
         store(source.cells, 1, len(frame))
 
-    with ExitStack() as stack:
-        workers = stack.enter_context(closing(Workers(threads - 1))) if threads > 1 else None
-        path = FramePath(pipeline("plain"), source.slots, source.progress, workers=workers)
-        path.warm_up()
+    with path_of(pipeline("plain"), source, threads) as path:
         for number, frame in enumerate(data):
             taken[:] = 0.0
             writer = threading.Thread(target=write, args=(number, frame))
@@ -223,10 +228,7 @@ def test_flux_must_be_known_beforehand() -> None:
 def test_threads_that_sleep_until_rows_are_due_give_the_same_slopes(threads: int) -> None:
     data, source, sensor = frames(12), Source(), pipeline("tv")
     expected = sensor(data)
-    with ExitStack() as stack:
-        workers = stack.enter_context(closing(Workers(threads - 1))) if threads > 1 else None
-        path = FramePath(sensor, source.slots, source.progress, workers=workers)
-        path.warm_up()
+    with path_of(sensor, source, threads) as path:
         last_row = 0
         for number, frame in enumerate(data):
             writer = threading.Thread(target=source.write, args=(number, frame, 12, 0.02))

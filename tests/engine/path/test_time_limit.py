@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-import time
 
 import pytest
+from tests.patience import wait_for
 
 import faintspot as fs
 from faintspot.engine.path.time_limit import call_is_under_way, call_within, end_thread
@@ -35,10 +35,7 @@ def test_what_does_not_come_back() -> None:
     known = set(threading.enumerate())
     with pytest.raises(fs.InputError, match=r"^loop: did not return within 0\.05 s$"):
         call_within(0.05, "loop", forever)
-    end = time.monotonic() + PATIENCE_S
-    while set(threading.enumerate()) - known and time.monotonic() < end:
-        time.sleep(0.01)
-    assert not set(threading.enumerate()) - known
+    wait_for(lambda: not set(threading.enumerate()) - known)
     assert not call_is_under_way()
 
 

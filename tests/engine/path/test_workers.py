@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from tests.patience import LIMIT_S
+from tests.patience import LIMIT_S, wait_for
 
 from faintspot.engine.path.workers import Workers
 
@@ -61,9 +61,7 @@ def test_a_dead_one_is_replaced(workers: Workers) -> None:
     workers.post(deadly)
     waiting = threading.Thread(target=lambda: outcome.append(workers.wait()))
     waiting.start()
-    end = time.monotonic() + LIMIT_S
-    while not workers.replace_dead():
-        assert time.monotonic() < end
+    wait_for(workers.replace_dead)
     waiting.join(LIMIT_S)
     assert outcome == [False]
     assert workers.fault == "MemoryError: no more"

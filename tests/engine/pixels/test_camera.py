@@ -13,6 +13,7 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from tests.refusals import refused
 from tests.simulated import frames_of
 
 from faintspot import Calibration, Layout
@@ -198,9 +199,8 @@ def test_type_of_the_frames(name: str, bits: int | None, dtype: str) -> None:
 )
 def test_bad_options(ring: PixelRing, options: dict[str, Any], text: str) -> None:
     arguments = {"layout": LAYOUT, "frame_rate_hz": 100.0, "n_distinct": 1, **options}
-    with pytest.raises(InputError, match=text.replace(".", r"\.")) as caught:
+    with refused(text):
         Camera(ring=ring, **arguments)
-    assert "\n" not in str(caught.value)
 
 
 def test_bad_motion_and_run(ring: PixelRing) -> None:

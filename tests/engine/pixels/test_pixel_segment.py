@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests import refusals
 
 from faintspot.base.errors import InputError
 from faintspot.engine.pixels.pixel_ring import PixelRing
@@ -19,16 +20,11 @@ pytestmark = [
 SHAPE = (24, 32)
 
 
-def refused(name: str, *texts: str, create: bool = True) -> None:
+def refused(name: str, *texts: str) -> None:
     """Attach and create refuse in one line each."""
     for action in (PixelRing.attach, lambda which: PixelRing.create(which, SHAPE, np.float32)):
-        if action != PixelRing.attach and not create:
-            continue
-        with pytest.raises(InputError) as caught:
+        with refusals.refused(*texts):
             action(name)
-        assert "\n" not in str(caught.value)
-        for text in texts:
-            assert text in str(caught.value)
 
 
 @pytest.mark.parametrize("raw", [b"", b"short", b"x" * 4096, b"fspixels", b"\0" * 100])
@@ -69,7 +65,8 @@ def test_damaged_headers_are_refused(name: str, position: int, text: str) -> Non
 
 
 def test_names(name: str) -> None:
-    refused(name, "no such pixel ring", create=False)
+    with refusals.refused("no such pixel ring"):
+        PixelRing.attach(name)
     for bad in ("", "a/b", "../x", ".hidden", "a b", "x" * 201, "a\n"):
         refused(bad, "name = ")
 
@@ -87,7 +84,7 @@ def test_names(name: str) -> None:
     ],
 )
 def test_sizes_that_cannot_be(name: str, shape: tuple[int, int], dtype: str, slots: int, text: str) -> None:
-    with pytest.raises(InputError, match=text.replace(".", r"\.")):
+    with refusals.refused(text):
         PixelRing.create(name, shape, dtype, slots=slots)
     assert not (FOLDER / name).exists()
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime import sources as realtime_sources
@@ -162,9 +163,8 @@ def test_a_damaged_file(name: str, tmp_path: Path) -> None:
     fits.writeto(tmp_path / "frames.fits", frames.astype(np.int16))
     whole = gzip.compress((tmp_path / "frames.fits").read_bytes())
     path.write_bytes(whole[: len(whole) * 3 // 4])
-    with pytest.raises(InputError, match=path.name) as caught:
+    with refused(match=path.name):
         played(name, path, rows_per_block=None)
-    assert "\n" not in str(caught.value)
     assert not (FOLDER / name).exists()
 
 
@@ -200,10 +200,9 @@ def test_bad_options(name: str, tmp_path: Path, options: dict[str, Any], text: s
     with (
         open_frames([stored(tmp_path, cube(4))]) as source,
         PixelRing.create(name, SHAPE, np.uint16) as ring,
-        pytest.raises(InputError, match=text) as caught,
+        refused(text),
     ):
         Replay(source, ring, **{"frame_rate_hz": 100.0, **options})
-    assert "\n" not in str(caught.value)
 
 
 def test_the_ring_must_fit(name: str, tmp_path: Path) -> None:

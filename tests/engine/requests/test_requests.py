@@ -20,6 +20,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tests.patience import wait_for
+from tests.refusals import refused
 from tests.shared_data import ROOT
 
 from faintspot.base.errors import InputError
@@ -115,10 +117,8 @@ def test_a_request_is_answered(server: ControlServer) -> None:
     ],
 )
 def test_errors_come_back_in_one_line(server: ControlServer, command: str, named: str) -> None:
-    with pytest.raises(InputError) as caught:
+    with refused(named):
         request(server.path, command)
-    assert named in str(caught.value)
-    assert "\n" not in str(caught.value)
     assert is_well(server.path)
 
 
@@ -164,8 +164,7 @@ def test_others_are_answered_while_a_lengthy_command_lasts(path: Path) -> None:
         ]
         for thread in askers:
             thread.start()
-        while not under_way:
-            time.sleep(0.001)
+        wait_for(lambda: under_way)
         assert is_well(path)
         go_on.set()
         for thread in askers:
@@ -284,10 +283,7 @@ def test_clients_that_go_away_are_forgotten(server: ControlServer) -> None:
             with connected(server.path) as connection:
                 connection.sendall(message)
     assert is_well(server.path)
-    end = time.monotonic() + 30
-    while server._connections and time.monotonic() < end:
-        time.sleep(0.01)
-    assert not server._connections
+    wait_for(lambda: not server._connections)
 
 
 def test_many_clients_at_once(server: ControlServer) -> None:

@@ -22,6 +22,8 @@ import pytest
 from click.testing import CliRunner
 from tests.engine.commands import start
 from tests.loop.simulation.loop_cases import faint, plain
+from tests.patience import wait_for
+from tests.refusals import refused
 
 import faintspot
 import faintspot as fs
@@ -164,13 +166,6 @@ def test_a_missing_stream_leaves_the_mirror_flat_and_is_said_once(watched: Watch
     assert watched.lines == [f"stream {name}_commands: is not there; the mirror stays flat"]
 
 
-def wait_for(condition: Any, step: Any) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        step()
-
-
 def test_the_mirror_keeps_its_commands_while_the_stream_is_gone_or_wrong(watched: Watched, name: str) -> None:
     def stream(length: int) -> Any:
         return pyshmem.create(f"{name}_commands", shape=(length,), dtype=np.float32)
@@ -178,16 +173,16 @@ def test_the_mirror_keeps_its_commands_while_the_stream_is_gone_or_wrong(watched
     held, lines = watched.telescope.commands, watched.lines
     first = stream(COMMANDS)
     first.write(np.full(COMMANDS, 30.0), frame_id=7)
-    wait_for(lambda: held.frame == 7, watched.frame)
+    wait_for(lambda: held.frame == 7, step=watched.frame)
     first.unlink()
-    wait_for(lambda: "is not there; the mirror keeps its last commands" in lines[-1], watched.frame)
+    wait_for(lambda: "is not there; the mirror keeps its last commands" in lines[-1], step=watched.frame)
     wrong = stream(COMMANDS - 1)
     wrong.write(np.ones(COMMANDS - 1), frame_id=8)
-    wait_for(lambda: "holds (53,) float32, expected (54,)" in lines[-1], watched.frame)
+    wait_for(lambda: "holds (53,) float32, expected (54,)" in lines[-1], step=watched.frame)
     assert held.state
     wrong.unlink()
     again = stream(COMMANDS)
-    wait_for(lambda: "54 commands (float32)" in lines[-1], watched.frame)
+    wait_for(lambda: "54 commands (float32)" in lines[-1], step=watched.frame)
     watched.frame()  # nothing is published yet
     assert watched.truth["command_frame"] == 7
     np.testing.assert_array_equal(held.commands_nm, 30.0)
@@ -231,7 +226,7 @@ def test_a_writer_that_dies_in_the_middle_is_survived(watched: Watched, name: st
     pyshmem.unlink(f"{name}_commands")
     successor = pyshmem.create(f"{name}_commands", shape=(COMMANDS,), dtype=np.float64)
     successor.write(np.full(COMMANDS, 2.0), frame_id=6)
-    wait_for(lambda: watched.telescope.commands.frame == 6, watched.frame)
+    wait_for(lambda: watched.telescope.commands.frame == 6, step=watched.frame)
     successor.unlink()
 
 
@@ -287,10 +282,8 @@ def test_magnitude_and_seeing_are_converted() -> None:
     ],
 )
 def test_bad_orders(changes: dict[str, Any], text: str) -> None:
-    with pytest.raises(InputError) as caught:
+    with refused(text):
         Conditions.of(CONFIGURATION).ordered(CONFIGURATION, {"wind_factor": 3.0, **changes})
-    assert text in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_bad_order_changes_nothing(watched: Watched) -> None:
@@ -312,7 +305,7 @@ def test_commands_over_the_socket(watched: Watched, name: str, monkeypatch: pyte
             request(path, "set", changes=[])
         said = CliRunner().invoke(telescope_set, ["wind_factor=2", "--name", name])
         assert "50 photons, r0 0.1 to 0.2 m, winds x 2" in said.output
-        wait_for(lambda: request(path, "status")["truth"] is not None, lambda: None)
+        wait_for(lambda: request(path, "status")["truth"] is not None)
         said = CliRunner().invoke(telescope_status, ["--name", name])
         for text in ("canary", "1000 a second", "is not there", "Strehl ratio 0."):
             assert text in said.output

@@ -1,20 +1,16 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.experiments.experiment_cases import small
 
-from faintspot.base.config.options import option
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, default_methods, method_kind
 from faintspot.loop.simulation.simulation import simulate_loop
-from faintspot.slopes.estimators import registry
 from faintspot.slopes.estimators.base import Estimator
-from faintspot.slopes.estimators.registry import estimators, register
+from faintspot.slopes.estimators.registry import estimators
 
 NAMES = (*estimators(), "ml_weighted", "map_predicted_weighted", "trained_predicted", "tv_uncorrected")
 
@@ -58,34 +54,13 @@ def test_defaults_suit_the_configuration() -> None:
     assert "tv_uncorrected" in default_methods(small().replace("control", mode="open"))
 
 
-@pytest.fixture
-def peak() -> Iterator[type[Estimator]]:
-    """An estimator of one's own, for as long as a test lasts."""
-
-    @register
-    @dataclass(frozen=True, eq=False, kw_only=True)
-    class Peak(Estimator):
-        power: float = option(2.0, "Of each pixel.", low=1.0, high=9.0)
-
-        name: ClassVar[str] = "peak"
-        label: ClassVar[str] = "power of the flux"
-
-        def tuned(self, scene: Any) -> dict[str, list[float]]:
-            return {"power": [2.0, 1.5, 3.0, 4.0, 5.0]}
-
-        def locate(self, images: Any, sensor: Any, prior: Any) -> Any:
-            flux = np.maximum(images, 0.0).astype(float) ** self.power + 1e-9
-            line = np.arange(images.shape[-1]) - 0.5 * (images.shape[-1] - 1)
-            total = flux.sum(axis=(1, 2))
-            return np.stack([(flux.sum(axis=axis) @ line) / total for axis in (1, 2)], axis=1)
-
-    yield Peak
-    del registry._kinds["peak"]
-
-
-def test_an_estimator_of_ones_own_is_an_method(peak: type[Estimator]) -> None:
-    assert "peak" in default_methods(small())
-    kind = method_kind("peak_uncorrected")
+def test_an_estimator_of_ones_own_is_an_method(
+    own_estimator: type[Estimator], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    powers = [2.0, 1.5, 3.0, 4.0, 5.0]
+    monkeypatch.setattr(own_estimator, "tuned", lambda self, scene: {"power": powers})
+    assert "own" in default_methods(small())
+    kind = method_kind("own_uncorrected")
     tuned = kind.tuned(BRIGHT)
     # Two steps beyond each end, as far as the option goes.
     assert tuned["power"].values == pytest.approx((1.125, 1.5, 2.0, 3.0, 4.0, 5.0, 6.25, 7.8125))

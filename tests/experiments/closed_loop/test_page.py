@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from tests.experiments.result_cases import made_up_budget, made_up_magnitude
 
-from faintspot.base.errors import InputError
 from faintspot.base.report.page import html_of
 from faintspot.experiments.closed_loop.page import loop_page, loop_sections, loop_warnings, write_loop_report
 from faintspot.experiments.closed_loop.verdict import NOWHERE, LoopResults
@@ -69,8 +68,3 @@ def test_few_realisations_are_warned_of() -> None:
 def test_sections_have_different_names() -> None:
     names = [section.name for section in loop_sections(LoopResults(made_up_magnitude()))]
     assert len(set(names)) == len(names)
-
-
-def test_an_empty_folder_is_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no results of a loop"):
-        write_loop_report(tmp_path, tmp_path / "report.html")

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.experiments.planner_cases import answered
+from tests.simulated import frames_of
 
 from faintspot import Calibration, InputError, Layout, SlopePipeline
 from faintspot.base.statistics import slope_error
@@ -13,7 +14,7 @@ from faintspot.experiments.planner import text as answer_text
 from faintspot.experiments.planner.answer import Answer
 from faintspot.experiments.planner.figures import tune_figure
 from faintspot.slopes.estimators import estimators
-from faintspot.slopes.simulate import Detector, sensor_frames
+from faintspot.slopes.simulate import Detector
 
 LAYOUT = Layout.grid((4, 4), pixels=12)
 
@@ -28,15 +29,8 @@ def test_the_configuration_gives_the_error_that_was_promised(name: str, tmp_path
     answer = with_layout(answered(), name)
     answer.save(tmp_path / "faintspot.toml")
     pipeline = SlopePipeline.from_file(tmp_path / "faintspot.toml")
-    frames, truth = sensor_frames(
-        LAYOUT.corners,
-        LAYOUT.window,
-        LAYOUT.frame_shape,
-        64,
-        flux_e=200.0,
-        detector=Detector(read_noise_e=3.0),
-        rng=np.random.default_rng(8),
-    )
+    camera = Detector(read_noise_e=3.0)
+    frames, truth = frames_of(LAYOUT, 64, flux_e=200.0, detector=camera, rng=np.random.default_rng(8))
     slopes = pipeline(frames)
     found = slope_error(slopes.x, slopes.y, truth)
     # Two samples of 512 and 1024 spots: 3 % and 2 %.

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from tests.experiments.planner_cases import CAMERA, QUICK, answered
 from faintspot.base.errors import InputError
 from faintspot.experiments import Question, tune
 from faintspot.experiments.planner.tuning import _ranked
-from faintspot.slopes.estimators import Estimator, Scene, estimators, option, registry
+from faintspot.slopes.estimators import Estimator, Scene, estimators, registry
 
 
 def test_every_method_is_scored_on_the_same_spots() -> None:
@@ -100,26 +100,8 @@ def test_of_equal_methods_the_one_that_knows_least_then_the_cheapest_is_taken() 
     assert _ranked(results, blocks, {"smoothed": 1.3, "ml": 1.0}) == ("tv", "ml", "map")
 
 
-def test_an_estimator_of_somebody_else_takes_part(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In plain NumPy, of another package: it is in the table without another change."""
-
-    @dataclass(frozen=True, eq=False, kw_only=True)
-    class OwnEstimator(Estimator):
-        power: Any = option(1.0, "Of the pixels.", low=0.1, high=10.0, per_subaperture=False)
-
-        name: ClassVar[str] = "own"
-        label: ClassVar[str] = "somebody's own"
-
-        def tuned(self, scene: Scene) -> dict[str, list[float]]:
-            return {"power": [1.0, 2.0]}
-
-        def locate(self, images: Any, sensor: Any, prior: Any) -> Any:
-            flux = np.maximum(images, 0.0) ** self.power
-            y, x = (np.arange(size) - (size - 1) / 2 for size in images.shape[1:])
-            total = flux.sum(axis=(1, 2))
-            return np.stack([flux.sum(axis=1) @ x / total, flux.sum(axis=2) @ y / total], axis=1)
-
-    monkeypatch.setattr(registry, "_kinds", {**estimators(), "own": OwnEstimator})
+@pytest.mark.usefixtures("own_estimator")
+def test_an_estimator_of_somebody_else_takes_part() -> None:
     answer = tune(Question(**{**CAMERA, "flux_e": 2000.0}), realisations=256, steps=1)
     assert answer["own"].settings.power == 2.0
     assert answer["own"].statistics.error.value < answer["centroid"].statistics.error.value

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ from faintspot.experiments.methods import (
 )
 from faintspot.experiments.study.cell import realisations
 from faintspot.experiments.study.cell_methods import CellMethods, position_table
-from faintspot.slopes.estimators import Estimator, Need, Scene, Sensor, option, registry
+from faintspot.slopes.estimators import Estimator
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.estimators.registry import estimator_named
@@ -152,7 +151,8 @@ def test_candidates_in_a_cell() -> None:
     assert len(still.candidates("weighted")) > 1
 
 
-def test_an_estimator_of_somebody_else(plugin: type[Estimator]) -> None:
+@pytest.mark.usefixtures("own_estimator")
+def test_an_estimator_of_somebody_else() -> None:
     """It tunes an option of its own, is told the spot's width, and is measured like any other."""
     specification = StudySpecification(
         "s", [Sweep("a", flux_e=1000, pixels=10)], realisations=200, estimators=["own"], fixed_k=[]
@@ -168,29 +168,3 @@ def test_an_estimator_of_somebody_else(plugin: type[Estimator]) -> None:
     measured = fs.experiments.measure_cell(cell, specification)
     assert measured["chosen_candidate"][0, 0] in (1.0, 2.0)
     assert measured["error"][0, 0] < 0.3
-
-
-@pytest.fixture
-def plugin(monkeypatch: pytest.MonkeyPatch) -> type[Estimator]:
-    """An estimator in plain NumPy: the centre of gravity of a power of the pixels."""
-
-    @dataclass(frozen=True, eq=False, kw_only=True)
-    class OwnEstimator(Estimator):
-        power: Any = option(1.0, "Of the pixels.", low=0.1, high=10.0, per_subaperture=False)
-
-        name: ClassVar[str] = "own"
-        label: ClassVar[str] = "somebody's own"
-        needs: ClassVar[frozenset[Need]] = frozenset({Need.WIDTH})
-
-        def tuned(self, scene: Scene) -> dict[str, list[float]]:
-            return {"power": [1.0, 2.0]}
-
-        def locate(self, images: Any, sensor: Sensor, prior: Any) -> Any:
-            assert np.isfinite(sensor.spot_fwhm_px).all()
-            flux = np.maximum(images, 0.0) ** self.power
-            y, x = (np.arange(size) - (size - 1) / 2 for size in images.shape[1:])
-            total = flux.sum(axis=(1, 2))
-            return np.stack([flux.sum(axis=1) @ x / total, flux.sum(axis=2) @ y / total], axis=1)
-
-    monkeypatch.setattr(registry, "_kinds", {**registry.estimators(), "own": OwnEstimator})
-    return OwnEstimator

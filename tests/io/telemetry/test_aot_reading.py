@@ -290,9 +290,8 @@ def frames_of_lines(system: Any) -> None:
     ],
 )
 def test_refused(tmp_path: Path, change: Callable[[Any], None], naming: str) -> None:
-    with pytest.raises(fs.InputError, match=naming) as error:
+    with refused(match=naming):
         read_aot(example(tmp_path / "e.fits", change))
-    assert "\n" not in str(error.value)
 
 
 def test_subapertures_outside_the_frame_are_refused(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.cli.cli_cases import Commands
+from tests.simulated import frames_of
 from tests.slopes.recorded.recorded_cases import Page
 
 import faintspot as fs
@@ -29,18 +30,14 @@ DARK_ADU, FRAMES = 20.0, 300
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Frames whose spots are displaced by up to 0.3 px and move; one pixel is hot."""
-    frames, _ = fs.slopes.simulate.sensor_frames(
-        LAYOUT.corners,
-        LAYOUT.window,
-        LAYOUT.frame_shape,
-        FRAMES,
-        flux_e=200.0,
-        psf=STAR.psf(TRUE),
-        position_range_px=0.3,
-        jitter_px=0.2,
-        detector=fs.slopes.simulate.Detector(1.0, offset_adu=DARK_ADU),
-        rng=np.random.default_rng(1),
-    )
+    star: dict[str, Any] = {
+        "flux_e": 200.0,
+        "psf": STAR.psf(TRUE),
+        "position_range_px": 0.3,
+        "jitter_px": 0.2,
+    }
+    detector = fs.slopes.simulate.Detector(1.0, offset_adu=DARK_ADU)
+    frames, _ = frames_of(LAYOUT, FRAMES, **star, detector=detector, rng=np.random.default_rng(1))
     frames[:, 14, 25] = 1e4
     folder = tmp_path_factory.mktemp("sodium")
     np.save(folder / "frames.npy", frames)

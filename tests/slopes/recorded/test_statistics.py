@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.base.flags import SubapertureFlag
 from faintspot.slopes.recorded import statistics
 from faintspot.slopes.recorded.statistics import MeasuredSlopes
@@ -137,6 +137,5 @@ def test_error_ratio_and_flux_gain() -> None:
 )
 def test_methods_that_do_not_fit_are_refused_in_one_line(change: dict[str, np.ndarray]) -> None:
     arrays = {name: np.zeros((2, 3)) for name in ("x", "y", "flux", "flags", "iterations")} | change
-    with pytest.raises(InputError, match="TV") as error:
+    with refused("TV"):
         MeasuredSlopes("TV", **arrays)
-    assert "\n" not in str(error.value)

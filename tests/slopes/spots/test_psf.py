@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.slopes.spots.psf import PSF
@@ -111,9 +112,8 @@ def test_files_that_are_no_psf(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", a=1)
     np.savez(tmp_path / "dark.npz", samples=np.zeros((7, 7)), oversampling=2)
     for name in ("text.npz", "other.npz", "dark.npz", "absent.npz"):
-        with pytest.raises(InputError, match=name) as error:
+        with refused(match=name):
             PSF.load(tmp_path / name)
-        assert "\n" not in str(error.value)
     with pytest.raises(InputError, match="cannot be written"):
         PSF.analytic(radius_px=4).save(tmp_path / "no" / "psf.npz")
 
@@ -135,9 +135,8 @@ def test_files_that_are_no_psf(tmp_path: Path) -> None:
     ],
 )
 def test_refused_in_one_line(samples: Any, oversampling: int, index: Any, words: str) -> None:
-    with pytest.raises(InputError, match=words) as error:
+    with refused(match=words):
         PSF(samples, oversampling, index)
-    assert "\n" not in str(error.value)
 
 
 def test_images_refuse_what_does_not_fit() -> None:

@@ -147,9 +147,8 @@ def test_spots_at_one_phase_teach_nothing() -> None:
     ],
 )
 def test_refused_in_one_line(images: Any, options: Any, words: Any) -> None:
-    with pytest.raises(InputError, match=words) as error:
+    with refused(match=words):
         learn_psf_from_images(images, **options)
-    assert "\n" not in str(error.value)
 
 
 def test_wrong_scope() -> None:

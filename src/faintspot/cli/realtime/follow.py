@@ -23,6 +23,6 @@ def follow(config: str, name: str) -> None:
     Example:
       faintspot realtime follow --config faintspot.toml
     """
-    from faintspot.engine.background.sodium import follow_repeatedly
+    from faintspot.engine.background.sodium import SodiumFollower
 
-    follow_repeatedly(name, config, click.echo)
+    SodiumFollower(name, config).run(click.echo)

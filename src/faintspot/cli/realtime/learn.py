@@ -84,9 +84,9 @@ def learn(
 def _learn_repeatedly(name: str, config: str, every_s: float) -> None:
     """Learn from a running engine again and again."""
     require_linux("realtime learn --every")
-    from faintspot.engine.background.learning import learn_repeatedly
+    from faintspot.engine.background.learning import BackgroundLearning
 
-    learn_repeatedly(name, config, every_s, click.echo)
+    BackgroundLearning(name, config, every_s).run(click.echo)
 
 
 def _learn_from(

@@ -142,19 +142,6 @@ class BackgroundLearning(BackgroundProcess):
             )
 
 
-def learn_repeatedly(name: str, config: str | Path, every_s: float, say: Callable[[str], None]) -> None:
-    """Learn from a running engine again and again until it ends; `say` takes a line each time.
-
-    A learning that takes five minutes of processor time ends this process.
-
-    Raises
-    ------
-    InputError
-        See `BackgroundLearning`.
-    """
-    BackgroundLearning(name, config, every_s).run(say)
-
-
 @contextmanager
 def background_learning(
     engine: Engine, config: str | Path, every_s: float, say: Callable[[str], None]

@@ -200,19 +200,6 @@ def _as_values(sodium: KnownSodium, before: SodiumProfile) -> dict[str, Any]:
     }
 
 
-def follow_repeatedly(name: str, config: str | Path, say: Callable[[str], None]) -> None:
-    """Follow the sodium layer of a running engine until it ends; `say` takes a line for each new profile.
-
-    A fit that takes two minutes of processor time ends this process.
-
-    Raises
-    ------
-    InputError
-        See `SodiumFollower`.
-    """
-    SodiumFollower(name, config).run(say)
-
-
 @contextmanager
 def background_sodium(engine: Engine, config: str | Path, say: Callable[[str], None]) -> Iterator[None]:
     """Run the process that follows the profile within a context; `say` takes a line if it ends."""

@@ -165,17 +165,13 @@ def gains_section(dataset: xarray.Dataset) -> Section:
     return Section("gains", title, tables=[table])
 
 
-def gains_by_mode(
-    dataset: xarray.Dataset, level_px: float = LEVEL_PX
-) -> dict[Configuration, dict[str, Gain | None]]:
-    """Return the flux gain of TV over no denoising at one R, by configuration and mode.
+def gains_by_mode(dataset: xarray.Dataset) -> dict[Configuration, dict[str, Gain | None]]:
+    """Return the flux gain of TV over no denoising at R = `LEVEL_PX`, by configuration and mode.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         Results of a study.
-    level_px : float
-        R at which the flux that both methods need is compared, px.
 
     Returns
     -------
@@ -187,7 +183,7 @@ def gains_by_mode(
     table: dict[Configuration, dict[str, Gain | None]] = {}
     for mode in dataset["mode"].values:
         for configuration, curve in study_curves(dataset, str(mode)).items():
-            gain = gain_at_error(curve, level_px, rng, **TV_OVER_NO_TV) if curve.has(TV, NO_TV) else None
+            gain = gain_at_error(curve, LEVEL_PX, rng, **TV_OVER_NO_TV) if curve.has(TV, NO_TV) else None
             table.setdefault(configuration, {})[str(mode)] = gain
     return {key: gains for key, gains in table.items() if any(gain is not None for gain in gains.values())}
 

@@ -64,11 +64,7 @@ def make_controller(
 
 
 def learnt_control(
-    configuration: LoopConfiguration,
-    method: Method,
-    seed: int,
-    simulate: Simulate,
-    learns_on: LoopConfiguration | None = None,
+    configuration: LoopConfiguration, method: Method, seed: int, simulate: Simulate
 ) -> tuple[Method, LearntControl | None]:
     """Return the learnt controller of a method (None for the integrator), and the adapted method.
 
@@ -81,8 +77,6 @@ def learnt_control(
     seed : int
     simulate : function
         `simulate_loop`, which makes the telemetry.
-    learns_on : LoopConfiguration, optional
-        Of the loop that telemetry is taken from. Default: the same.
 
     Raises
     ------
@@ -93,9 +87,8 @@ def learnt_control(
         return method, None
     if configuration.control.mode != CLOSED:
         raise InputError(f"method.control = {method.control!r}: expected {INTEGRATOR!r} in open loop")
-    site_loop = configuration if learns_on is None else learns_on
     learnt = _learnt(
-        replace(site_loop, name="-", run=RunLength()),
+        replace(configuration, name="-", run=RunLength()),
         _TelemetryMethod.of(method),
         method.control,
         method.noise_scale,

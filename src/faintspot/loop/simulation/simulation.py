@@ -97,7 +97,6 @@ def simulate_loop(
     realisation: int = 0,
     progress: Callable[[int, int], None] | None = None,
     disabled_errors: DisabledErrors | None = None,
-    learns_on: LoopConfiguration | None = None,
 ) -> LoopRecord:
     """Run the loop once.
 
@@ -119,8 +118,6 @@ def simulate_loop(
         Called with the number of frames done and that of all, after every frame.
     disabled_errors : DisabledErrors, optional
         What is left out of what spoils the Strehl ratio.
-    learns_on : LoopConfiguration, optional
-        Of the loop that control learns from where it does. Default: the same, with other air.
 
     Returns
     -------
@@ -147,7 +144,7 @@ def simulate_loop(
     number = int(number_between("realisation", realisation, 0, integer=True))
     switches = DisabledErrors() if disabled_errors is None else disabled_errors
     ready = [
-        learnt_control(switches.configuration(configuration), method, start, simulate_loop, learns_on)
+        learnt_control(switches.configuration(configuration), method, start, simulate_loop)
         for method in map(switches.method, methods)
     ]
     arguments = configuration, ready, numbers, start, number, switches

@@ -84,26 +84,23 @@ class Wavefront:
         """Return the rms of each frame's wavefront over the disk, (n_frames,)."""
         return total(self.coefficients, tilt=tilt)
 
-    def sheet(self, coefficients: Floats | None = None, *, points: int = 201, tilt: bool = True) -> Floats:
-        """Return a wavefront as a map over the disk, (points, points), NaN outside.
+    def sheet(self, *, points: int = 201, tilt: bool = True) -> Floats:
+        """Return the mean wavefront as a map over the disk, (points, points), NaN outside.
 
         Parameters
         ----------
-        coefficients : (k,) array, optional
-            Default: those of the mean wavefront.
         points : int
             Points along the diameter; rows go along y, columns along x, the outermost at the disk's edge.
         tilt : bool
             Whether to include tip and tilt.
         """
-        values = self.mean if coefficients is None else coefficients
         line = np.linspace(-1, 1, points)
         y, x = np.meshgrid(line, line, indexing="ij")
         inside = np.hypot(x, y) <= 1
         sheet = np.full((points, points), np.nan)
         sheet[inside] = 0.0
         start = 0 if tilt else _TILTS
-        for j, value in zip(self.modes[start:], values[start:], strict=True):
+        for j, value in zip(self.modes[start:], self.mean[start:], strict=True):
             sheet[inside] += value * zernike(int(j), x[inside], y[inside])
         return sheet
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.simulated import frames_of
 
 from faintspot.base.statistics import slope_error
 from faintspot.slopes.estimators.algorithms.noise import pixel_noise, suggested_strength
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.simulate import Detector, sensor_frames, subapertures
+from faintspot.slopes.simulate import Detector, subapertures
 
 
 @pytest.mark.parametrize("read_noise_e", [1.0, 3.0])
@@ -42,15 +43,8 @@ def test_suggested_strength_gains_and_the_full_noise_gains_less() -> None:
     The full noise of pixels (sqrt of read noise^2 + flux / pixels) is worse than the suggested strength.
     """
     layout = Layout.grid((6, 6), pixels=16)
-    frames, truth = sensor_frames(
-        layout.corners,
-        layout.window,
-        layout.frame_shape,
-        100,
-        flux_e=50.0,
-        detector=Detector(0.1),
-        rng=np.random.default_rng(3),
-    )
+    rng = np.random.default_rng(3)
+    frames, truth = frames_of(layout, 100, flux_e=50.0, detector=Detector(0.1), rng=rng)
 
     def error(settings: Settings) -> tuple[float, float]:
         slopes = SlopePipeline(layout, settings)(frames)

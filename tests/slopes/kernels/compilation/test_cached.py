@@ -12,7 +12,7 @@ from numba.core.caching import CacheImpl
 
 from faintspot.base.errors import CacheWarning
 from faintspot.slopes.kernels.compilation import cached
-from faintspot.slopes.kernels.compilation.cached import cache_folder, kernel_cache
+from faintspot.slopes.kernels.compilation.cached import kernel_cache
 
 
 @pytest.fixture(autouse=True)
@@ -62,7 +62,6 @@ def test_no_folder_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     dispatcher(tmp_path, monkeypatch)  # says it no more: a warning is an error
     assert "\n" not in str(said[0].message)
     assert compiled(1) == 2
-    assert cache_folder() is None
 
 
 def test_a_folder_that_goes_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,13 +89,6 @@ def test_damaged_files_are_compiled_anew(
     mended = dispatcher(tmp_path, monkeypatch)
     assert mended(1) == 2
     assert hits(mended) == 1
-
-
-def test_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
-    folder = cache_folder()
-    assert folder is not None
-    assert folder.is_relative_to(tmp_path)
 
 
 def test_says_once_that_it_compiles(

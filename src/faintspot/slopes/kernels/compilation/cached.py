@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
@@ -27,14 +26,6 @@ def kernel_cache(function: Callable[..., Any], stamp: Any) -> Any:
     except RuntimeError:  # neither in NUMBA_CACHE_DIR, nor beside the sources, nor in the user's folder
         _warn_once("no folder for them can be written")
         return NullCache()
-
-
-def cache_folder() -> Path | None:
-    """Return the folder of the compiled kernels, or None if there is none."""
-    try:
-        return Path(FunctionCache(kernel_cache).cache_path)
-    except RuntimeError:
-        return None
 
 
 class _KernelCache(FunctionCache):
