@@ -18,7 +18,7 @@ from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.cli.layout import grid as layout_grid
 from faintspot.cli.layout import options as layout_options
 from faintspot.cli.layout.completing import completed
-from faintspot.cli.layout.darks import measured_darks, with_measured_pixels
+from faintspot.cli.layout.darks import clearer_frame, measured_darks, with_measured_pixels
 from faintspot.cli.layout.describing import describe, describe_settings, doubts_of
 from faintspot.cli.layout.options import plain
 from faintspot.cli.shared.commands import SectionedCommand, option
@@ -217,7 +217,9 @@ def command(
         if grid is not None:
             found = layout_grid.illuminated(source.description, mean, grid, calibration, options)
         else:
-            found = _found(source.description, mean, options)
+            clearer, unused = clearer_frame(mean, calibration)
+            found = _found(source.description, clearer, options)
+            stated += unused
         kept = layout_options.kept(len(found.layout), exclude)
         if isinstance(found, FoundLayout):
             found = found[kept]
