@@ -19,3 +19,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "faintspot.toml").write_text(CONFIGURATION)
     return tmp_path
+
+
+@pytest.fixture
+def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw nothing, which takes most of a second, where the picture is not what is tested."""
+    monkeypatch.setattr(
+        "faintspot.slopes.recorded.layout_picture.layout_picture", lambda *given, **named: None
+    )

@@ -52,14 +52,6 @@ def frames(geometry: str = "square", n_frames: int = 3) -> NDArray[Any]:
 DOUBTS = pytest.mark.filterwarnings("ignore::faintspot.base.errors.DoubtWarning")
 
 
-@pytest.fixture
-def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw nothing, which takes most of a second, where the picture is not what is tested."""
-    monkeypatch.setattr(
-        "faintspot.slopes.recorded.layout_picture.layout_picture", lambda *given, **named: None
-    )
-
-
 def is_png(path: Path) -> bool:
     content = path.read_bytes()
     return content.startswith(b"\x89PNG\r\n") and len(content) > 5000

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.cli.layout import grid as layout_grid
 from faintspot.cli.layout import options as layout_options
-from faintspot.cli.layout.darks import measured_darks, with_measured_pixels
+from faintspot.cli.layout.completing import completed
+from faintspot.cli.layout.darks import clearer_frame, measured_darks, with_measured_pixels
 from faintspot.cli.layout.describing import describe, describe_settings, doubts_of
 from faintspot.cli.layout.options import plain
 from faintspot.cli.shared.commands import SectionedCommand, option
@@ -27,6 +28,7 @@ from faintspot.cli.shared.output import picture_file
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.slopes.camera.binning import binned
 from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.camera.colour_mosaic import mosaic_contrast
 from faintspot.slopes.camera.hot_pixels import find_hot_pixels
 from faintspot.slopes.camera.saturation import LargestValues
 from faintspot.slopes.pipeline import configuration
@@ -225,8 +227,11 @@ def command(
         hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
         mean[tuple(hot.T)] = np.nan
         factor, shown = factor or 1, mean
+        if grid is None:
+            shown, unused = clearer_frame(mean, calibration)
+            stated += unused
         if factor > 1:
-            shown, options = binned(mean, factor).astype(np.float64), layout_options.binned(options, factor)
+            shown, options = binned(shown, factor).astype(np.float64), layout_options.binned(options, factor)
         found: FoundLayout | KnownGrid
         if grid is not None:
             found = layout_grid.illuminated(source.description, shown, grid, calibration, options)
@@ -241,7 +246,7 @@ def command(
         else:
             layout = replace(found.layout[kept], **optics, doubts=(found.doubt,) if found.doubt else ())
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
-    calibration, notes = _completed(calibration, found, layout, mean, hot)
+    calibration, notes = completed(calibration, found, layout, mean, hot)
     if source.note:
         notes.append(f"  {source.description}: {source.note}")
     if calibration.saturation_adu is None and values.saturation_adu is not None:
@@ -306,7 +311,7 @@ def _found(description: str, mean: NDArray[np.float64], options: dict[str, Any])
     """Find the layout, and say in an error where, and which option changes it."""
     bad = np.isnan(mean)
     try:
-        return find_layout(np.where(bad, 0, mean), bad_pixels=bad, **options)
+        found = find_layout(np.where(bad, 0, mean), bad_pixels=bad, **options)
     except InputError as error:
         text = str(error)
         for name, option in _OPTIONS.items():
@@ -314,6 +319,14 @@ def _found(description: str, mean: NDArray[np.float64], options: dict[str, Any])
         if "found no" in text:
             text += "; --grid is for an array that is known, such as quad cells"
         raise InputError(f"{description}: {text}") from None
+    grid = found.lenslets
+    if (contrast := mosaic_contrast(mean, grid.spots, grid.pitch_px, grid.spot_px)) > 1:
+        raise InputError(
+            f"{description}: pixels of even and odd rows and columns differ by a factor of {contrast:.2g} in "
+            "the spots, as in raw frames of a colour camera (Bayer mosaic); --bin 2 (bin = 2 in [layout]) "
+            "sums them, --flat with a flat field in the same light corrects them"
+        )
+    return found
 
 
 def _mean_frame(source: FrameSource, calibration: Calibration) -> tuple[NDArray[np.float64], LargestValues]:
@@ -331,30 +344,3 @@ def _mean_frame(source: FrameSource, calibration: Calibration) -> tuple[NDArray[
     mean = np.divide(total, count, where=count > 0, out=np.full(source.shape, np.nan))
     electrons: NDArray[np.float64] = (mean - dark) * electrons_per_adu
     return electrons, values
-
-
-def _completed(
-    calibration: Calibration,
-    found: FoundLayout | KnownGrid,
-    layout: Layout,
-    mean: NDArray[np.float64],
-    hot: NDArray[np.int64],
-) -> tuple[Calibration, list[str]]:
-    """Add the frame's background as dark level where none is known, and hot pixels; say so."""
-    notes = []
-    edges = layout.images(mean)[:, [0, -1]]
-    if isinstance(found, KnownGrid) and (len(found.unlit) or layout_grid.is_quad_cell(layout)):
-        edges = found.unlit if len(found.unlit) else np.zeros(1)
-    level = float(np.nanmedian(edges)) * calibration.em_gain / calibration.gain_e_per_adu
-    spread = float(np.nanmedian(np.abs(edges - np.nanmedian(edges))))
-    if calibration.dark is None and level > spread > 0:
-        estimated = (*calibration.estimated, "dark")
-        calibration = replace(calibration, dark=float(f"{level:.7g}"), estimated=estimated)
-        notes.append(
-            f"  dark {calibration.dark:g} ADU, the frame's background; --dark gives the camera's own"
-        )
-    if len(hot):
-        estimated = (*calibration.estimated, "bad_pixels")
-        calibration = replace(calibration.with_bad_pixels(hot), estimated=estimated)
-        notes.append(f"  {len(hot)} hot pixels masked")
-    return calibration, notes

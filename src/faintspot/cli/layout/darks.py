@@ -1,10 +1,12 @@
-"""Noise of each pixel, and pixels that blink or are hot, from the frames of `faintspot layout --dark`."""
+"""Noise of each pixel, pixels that blink or are hot, and use, of the dark of `faintspot layout`."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
 
 from faintspot.cli.layout.options import is_number
 from faintspot.io.frames import open_frames
@@ -13,6 +15,7 @@ from faintspot.slopes.camera.dark_frames import FEWEST_FRAMES, DarkPixels
 from faintspot.slopes.camera.photon_transfer import measure_detector
 
 _MOST_NUMBERS = 1 << 27  # read at a time
+_MAD_TO_STD = 1.4826
 
 
 def measured_darks(location: str | None) -> DarkPixels | None:
@@ -43,3 +46,41 @@ def with_measured_pixels(
         calibration = calibration.with_bad_pixels(found)
         notes.append(f"  {len(pixels.blinking)} pixels that blink and {len(pixels.hot)} hot ones masked")
     return calibration, notes
+
+
+def clearer_frame(
+    mean: NDArray[np.float64], calibration: Calibration
+) -> tuple[NDArray[np.float64], list[str]]:
+    """Return the frame with or without the structure of its dark, whichever shows spots better.
+
+    Spots are found above their own background, so that a dark helps only where it takes off a pattern. A
+    noisy one, or one that was taken with light, adds one.
+
+    Parameters
+    ----------
+    mean : (h, w) array
+        Calibrated frame, NaN in bad pixels.
+    calibration : Calibration
+
+    Returns
+    -------
+    (h, w) array
+    list of str
+        A line on a dark that is not used.
+    """
+    if not isinstance(calibration.dark, np.ndarray):
+        return mean, []
+    dark, electrons_per_adu = calibration.maps((mean.shape[0], mean.shape[1]))
+    without = mean + (dark - np.nanmedian(dark)) * electrons_per_adu
+    if _roughness(mean) <= _roughness(without):
+        return mean, []
+    return without, [
+        "  the sub-apertures were found without the dark, which adds noise or structure as large as spots"
+    ]
+
+
+def _roughness(image: NDArray[np.float64]) -> float:
+    """Return the standard deviation of structures as large as spots, between these."""
+    filled = np.where(np.isfinite(image), image, np.nanmedian(image))
+    band = scipy.ndimage.gaussian_filter(filled, 1.0) - scipy.ndimage.gaussian_filter(filled, 4.0)
+    return _MAD_TO_STD * float(np.median(np.abs(band - np.median(band))))

@@ -1,1 +1,5 @@
-"""Camera: `calibration`; its measurement (`dark_frames`, `photon_transfer`, `hot_pixels`); `detector`."""
+"""Camera: `calibration`, `detector`, and their measurement.
+
+`dark_frames` and `photon_transfer` measure the detector; `hot_pixels`, `background` and `colour_mosaic`
+look at frames of spots.
+"""

@@ -13,7 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.slopes.camera.binning import binned, binned_calibration
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.algorithms.noise import pixel_noise
-from faintspot.slopes.estimators.algorithms.spot_width import SeenSpots, seen_spots
+from faintspot.slopes.estimators.algorithms.spot_width import SeenSpots, like_most, seen_spots
 from faintspot.slopes.estimators.spot_tables import gaussian_psf
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
@@ -65,7 +65,8 @@ def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[Any
     Spots of the width, flux, noise and displacements that the frames show are simulated. The settings of the
     smallest slope error are taken: a centre of gravity under a weight that follows the spot or, where the
     flux is too low for that, under a fixed window, with slopes reduced to those of least squares. In windows
-    narrower than 4 px it is the plain centre of gravity.
+    narrower than 4 px it is the plain centre of gravity. Lenslets with reflections or other structures that
+    are no spots do not count.
 
     Parameters
     ----------
@@ -88,6 +89,8 @@ def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[Any
     if min(layout.window) < _FEWEST_PX:
         sums = images.sum(axis=(-2, -1))
         return FirstSettings(Settings("centroid"), noise, max(float(np.median(sums)), 0.0))
+    usual = like_most(images)
+    images, layout = images[:, usual], layout[usual]
     spots = _seen(images)
     if spots is None:
         side = _rounded(_WIDTH_OF_WINDOW * min(layout.window))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.refusals import refused
 
-from faintspot.slopes.estimators.algorithms.spot_width import seen_spots
+from faintspot.slopes.estimators.algorithms.spot_width import like_most, seen_spots
 from faintspot.slopes.simulate import Detector, subapertures
 
 
@@ -40,3 +40,25 @@ def test_without_spots() -> None:
         seen_spots(np.ones((5, 8, 3)))
     with refused("images"):
         seen_spots(np.full((5, 8, 8), np.nan))
+
+
+@pytest.mark.parametrize("flux_e", [30.0, 500.0, 1e5])
+def test_structures_are_unlike_most_spots(flux_e: float) -> None:
+    """A bright gradient, a wide patch and a flare are left out, and almost no spot."""
+    images, _ = subapertures(
+        60,
+        shape=(20, 20),
+        flux_e=flux_e,
+        profile="gaussian",
+        size=1.5,
+        position_range_px=3.0,
+        detector=Detector(1.0),
+        rng=np.random.default_rng(1),
+    )
+    row, column = np.mgrid[:20, :20]
+    images[3] += 0.2 * flux_e * column
+    images[17] += 0.2 * flux_e * np.exp(-0.5 * ((column - 9.0) ** 2 + (row - 11.0) ** 2) / 6.0**2)
+    images[40, 5:9, 5:9] += flux_e
+    kept = like_most(images[None])
+    assert not kept[[3, 17, 40]].any()
+    assert np.count_nonzero(kept) >= 55

@@ -298,3 +298,26 @@ def test_reference_frame_is_illuminated_all_over() -> None:
     assert grid.pitch_px == pytest.approx(29.67, rel=0.001)
     assert 282 <= len(grid.cells) <= 287
     assert grid.cells.max(axis=0).tolist() == [16, 16]
+
+
+@pytest.mark.parametrize(
+    ("width_px", "photons", "seed"), [(0.5, 8, 2), (0.6, 15, 3), (0.8, 8, 2), (0.7, 60, 1)]
+)
+def test_sharp_spots_over_a_clipped_background_are_no_hot_pixels(
+    width_px: float, photons: float, seed: int
+) -> None:
+    """Half of them look like hot pixels: most neighbours are 0. 30 real ones are as bright as spots."""
+    rng = np.random.default_rng(seed)
+    side, pitch = 258, 17.0
+    nodes = (side - 1) / 2 + pitch * (np.arange(14) - 6.5)
+    x, y = (axis.ravel() + rng.normal(0, 0.3, 196) for axis in np.meshgrid(nodes, nodes))
+    pixel = np.arange(side)
+    rows = np.exp(-0.5 * ((pixel - y[:, None]) / width_px) ** 2)
+    columns = np.exp(-0.5 * ((pixel - x[:, None]) / width_px) ** 2)
+    image = photons / (2 * np.pi * width_px**2) * rows.T @ columns
+    image[tuple(rng.integers(0, side, (2, 30)))] += photons
+    frame = np.clip(np.round(rng.poisson(image) + rng.normal(0, 0.2, image.shape)), 0, None).astype(np.uint16)
+    found = find_lenslets(frame)
+    assert found.doubt == ""
+    assert len(found.cells) >= 195
+    assert found.pitch_px == pytest.approx(pitch, rel=0.005)

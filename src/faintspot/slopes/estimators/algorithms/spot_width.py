@@ -11,6 +11,10 @@ from faintspot.base.checks import image_stack
 from faintspot.base.errors import InputError
 
 _NARROWEST_PX, _WIDEST = 0.5, 0.75  # full width at half maximum; the latter of the window's side
+# Squared flux and width of a spot relative to the median of the lenslets, and standard deviations of the
+# former: what is beyond is no spot.
+_MOST_SQUARED_FLUX, _WIDEST_SPOT, _OUTLYING = 9.0, 1.6, 6.0
+_MAD_TO_STD = 1.4826
 _AREA_OF_SQUARED_FWHM = np.pi / (2 * np.log(2))  # noise-equivalent area of a Gaussian spot
 
 
@@ -69,3 +73,36 @@ def _along(images: NDArray[np.float64]) -> tuple[float, float]:
     if not _NARROWEST_PX < width < _WIDEST * side:
         raise InputError("images: expected spots whose width can be measured, found none")
     return width, float(correlation[0]) / len(images)
+
+
+def like_most(images: ArrayLike) -> NDArray[np.bool_]:
+    """Return which lenslets show a spot like most others, and no reflection or other extended structure.
+
+    Left out are lenslets whose autocorrelation is far above that of most others, as that of bright
+    structures is, or wider. Where spots are lost in the noise, only the former can be told.
+
+    Parameters
+    ----------
+    images : (n_frames, n, ny, nx) array
+        Images of n lenslets.
+
+    Returns
+    -------
+    (n,) array of bool
+    """
+    stack: NDArray[np.float64] = image_stack("images", images).astype(np.float64)
+    stack = stack - np.median(stack[..., [0, -1], :])
+    reach = max(2, min(stack.shape[-2:]) // 2 + 1)
+    correlation = np.zeros((reach, stack.shape[1]))
+    for along in (stack, stack.swapaxes(2, 3)):
+        for lag in range(1, reach + 1):
+            correlation[lag - 1] += np.einsum("fnyx,fnyx->n", along[..., :-lag], along[..., lag:])
+    power = correlation[0]
+    typical = max(float(np.median(power)), 0.0)
+    scatter = _MAD_TO_STD * float(np.median(np.abs(power - np.median(power))))
+    kept = power <= _MOST_SQUARED_FLUX * typical + _OUTLYING * scatter
+    if typical > scatter:
+        below = correlation < 0.5 * power
+        width = np.where(below.any(axis=0), below.argmax(axis=0), reach)
+        kept &= width <= np.ceil(_WIDEST_SPOT * np.median(width[kept]))
+    return np.asarray(kept)

@@ -64,6 +64,11 @@ class Fit:
     shape: tuple[int, ...]
 
     @property
+    def lit(self) -> int:
+        """Number of illuminated lenslets."""
+        return int(np.count_nonzero(self.illuminated.nodes))
+
+    @property
     def unexplained(self) -> tuple[int, int]:
         """Number of bright spots far from illuminated nodes, and of dark nodes enclosed by these."""
         lit = self.illuminated.nodes

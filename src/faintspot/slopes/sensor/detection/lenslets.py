@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, number_between, one_of, real_array
 from faintspot.base.errors import InputError
-from faintspot.slopes.sensor.detection.fits import FEWEST, best_fit
+from faintspot.slopes.sensor.detection.fits import FEWEST, Fit, best_fit
 from faintspot.slopes.sensor.detection.lattice import RATIOS, SMALLEST_PITCH_PX, Lattice, robust_std
-from faintspot.slopes.sensor.neighbours import as_rows
+from faintspot.slopes.sensor.neighbours import as_rows, as_tree
 from faintspot.slopes.sensor.region import PupilRegion, Rectangle
 
 _MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %
 _SMALLEST_GIVEN_PITCH_PX = 4
+# Distance from a node (pitches) within which a hot pixel may be a sharp spot, and standard deviations by
+# which there must be more of these than of hot pixels by chance; and which part of them must be.
+_ON_NODE, _BEYOND_CHANCE, _MOSTLY = 0.2, 5.0, 0.7
 
 
 @dataclass(frozen=True)
@@ -131,10 +134,19 @@ def find_lenslets(
     part = Rectangle.given(roi, frames.shape[-2:])
     corner = complex(part.x0, part.y0)
     circle = None if pupil is None else PupilRegion.given(pupil).moved(-corner)
-    image = _clean_image(frames[part.slices], bad[part.slices])
+    raw = _mean_image(frames[part.slices], bad[part.slices])
+    hot = _hot_pixels(raw) & ~bad[part.slices]
     geometries = tuple(RATIOS) if geometry == "auto" else (geometry,)
-    pitch_range_px = _pitch_range(pitch_px, image.shape)
-    fit = best_fit(image, geometries, pitch_range_px, illuminated_fraction, circle)
+    pitch_range_px = _pitch_range(pitch_px, raw.shape)
+
+    def fitted(bad: NDArray[np.bool_]) -> tuple[NDArray[np.float64], Fit | None]:
+        image = np.where(bad, _median_of_good(raw, bad), raw)
+        return image, best_fit(image, geometries, pitch_range_px, illuminated_fraction, circle)
+
+    image, fit = fitted(bad[part.slices] | hot)
+    if fit is not None and (on_lattice := _hot_on_lattice(hot, fit)).any():
+        sharp = fitted((bad[part.slices] | hot) & ~on_lattice)[1]
+        fit = sharp if sharp is not None and sharp.lit >= fit.lit else fit
     if fit is None:
         raise InputError(_nothing_found(image, pitch_range_px, geometry))
     lattice, spots, illuminated = fit.lattice, fit.spots, fit.illuminated
@@ -216,17 +228,33 @@ def _checked(frame: Any, bad_pixels: Any) -> tuple[NDArray[Any], NDArray[np.bool
     return frames, bad
 
 
-def _clean_image(frames: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the mean frame, float64, with bad and hot pixels replaced by the median around them."""
+def _mean_image(frames: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the mean frame, float64, with bad pixels replaced by the median around them."""
     if min(frames.shape[-2:]) < 2 * SMALLEST_PITCH_PX:
         raise InputError(f"frame: expected at least 10 x 10 pixels, got shape {frames.shape}")
     if bad.mean() > 0.5:
         raise InputError(f"bad_pixels: {bad.sum()} of {bad.size} pixels are bad, expected at most half")
     if bad.any():
         frames = np.where(bad, np.median(frames[..., ~bad]).astype(frames.dtype), frames)
-    image = _robust_mean(finite_array("frame", frames))
-    bad = bad | _hot_pixels(image)
-    return np.asarray(np.where(bad, _median_of_good(image, bad), image))
+    return _robust_mean(finite_array("frame", frames))
+
+
+def _hot_on_lattice(hot: NDArray[np.bool_], fit: Fit) -> NDArray[np.bool_]:
+    """Return the hot pixels near nodes of a lattice, if there are so many that they must be sharp spots.
+
+    Hot pixels are anywhere. Spots below 1 px look like them where the background is cut off at 0.
+    """
+    y, x = np.nonzero(hot)
+    expected = fit.lattice.positions(fit.spots.cells) + fit.spots.drifts
+    distance = as_tree(expected).query(as_rows(x + 1j * y))[0]
+    near = distance < _ON_NODE * fit.lattice.pitch_px
+    by_chance = np.pi * _ON_NODE**2 / (1.0 if fit.lattice.geometry == "square" else np.sqrt(0.75))
+    surplus = np.count_nonzero(near) - by_chance * len(x)
+    spots = np.zeros_like(hot)
+    significant = surplus > _BEYOND_CHANCE * np.sqrt(max(by_chance * len(x), 1.0))
+    if significant and surplus > _MOSTLY * np.count_nonzero(near):
+        spots[y[near], x[near]] = True
+    return spots
 
 
 def _robust_mean(frames: NDArray[Any]) -> NDArray[np.float64]:

@@ -1,0 +1,101 @@
+"""Frames with light that is no spot: reflections, a background that varies, a colour mosaic."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+PITCH_PX = 24.0
+
+
+class Frame(NamedTuple):
+    """A frame in ADU, and x, y of its spots (n, 2)."""
+
+    pixels: NDArray[np.uint8]
+    spots: Floats
+
+
+def gaussian(shape: tuple[int, int], x: float, y: float, std: float) -> Floats:
+    """Return a Gaussian with peak 1."""
+    rows, columns = (
+        np.exp(-0.5 * ((np.arange(n) - at) / std) ** 2) for n, at in zip(shape, (y, x), strict=True)
+    )
+    return np.outer(rows, columns)
+
+
+def flat_frame(reflection_e: float) -> Frame:
+    """Return 221 spots of FWHM 4.7 px and 1000 ADU, without aberration, under one reflection."""
+    rng = np.random.default_rng(2)
+    side = round(17 * PITCH_PX + 60)
+    centre = (side - 1) / 2
+    shape = side, side
+    row, column = np.mgrid[-8:9, -8:9].reshape(2, -1)
+    lit = np.hypot(row, column) <= 8.3
+    spots = centre + PITCH_PX * np.stack([column, row], axis=1)[lit]
+    electrons = sum(2000 / (2 * np.pi * 4) * gaussian(shape, x, y, 2.0) for x, y in spots)
+    electrons = electrons + reflection_e * gaussian(shape, centre + 8, centre - 6, 20.0)
+    adu = (rng.poisson(electrons + 10) + rng.normal(0, 3, shape)) / 2 + 20
+    return Frame(np.clip(np.round(adu), 0, 255).astype(np.uint8), spots)
+
+
+def eye_frame(seed: int, n: int = 15) -> Frame:
+    """Return an aberrated eye: speckled spots of 5 px with haloes, haze, and reflections of cornea and lens.
+
+    Half of a spot's flux is in its core, the rest in a halo of 8 px (standard deviation).
+    """
+    rng = np.random.default_rng(seed)
+    side = round(n * PITCH_PX + 50)
+    centre = (side - 1) / 2
+    shape = side, side
+    offset = np.arange(n) - (n - 1) / 2
+    cells = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
+    cells = cells[np.hypot(*cells.T) <= n / 2 - 0.3]
+    u, v = (2 * cells / n).T
+    coma = 1.5 * (3 * (u**2 + v**2) - 2)
+    displacement = np.stack([2.5 * u + 1.2 * v + coma * u, -v + 1.2 * u + coma * v], axis=1)
+    spots = centre + PITCH_PX * cells + displacement
+    flux = 1500 * np.exp(-0.8 * (u**2 + v**2)) * rng.lognormal(0, 0.35, len(cells))
+    electrons = np.zeros(shape)
+    for (x, y), electrons_of_spot in zip(spots, flux, strict=True):
+        for std in (5.0 / 2.3548, 8.0):
+            electrons += 0.5 * electrons_of_spot / (2 * np.pi * std**2) * gaussian(shape, x, y, std)
+    speckle = np.square(scipy.ndimage.gaussian_filter(rng.standard_normal((2, side, side)), (0, 1.1, 1.1)))
+    electrons *= 0.55 + 0.45 * speckle.sum(axis=0) / speckle.sum(axis=0).mean()
+    electrons += 40 * gaussian(shape, centre + 60, centre - 40, 120.0) + 10 * np.arange(side) / side
+    for right, down, peak, std in ((15, -20, 900, 22), (-80, 40, 250, 12), (60, 70, 150, 30)):
+        electrons += peak * gaussian(shape, centre + right, centre + down, std)
+    adu = 0.5 * (rng.poisson(electrons) + rng.normal(0, 2, shape)) + 6
+    return Frame(np.clip(np.round(adu), 0, 255).astype(np.uint8), spots)
+
+
+def narrow_centroid(images: Floats) -> Floats:
+    """Return x, y of the centre of gravity of the 9 x 9 px around the peak of each image, above its rim."""
+    smooth = scipy.ndimage.gaussian_filter(images, (0, 1.5, 1.5))[:, 4:-4, 4:-4]
+    offset = np.arange(-4, 5)
+    found = np.empty((len(images), 2))
+    for i, image in enumerate(images):
+        row, column = np.unravel_index(smooth[i].argmax(), smooth[i].shape)
+        part = image[row : row + 9, column : column + 9]
+        rim = np.concatenate([part[0], part[-1], part[1:-1, 0], part[1:-1, -1]])
+        part = np.maximum(part - np.median(rim), 0.0)
+        total = max(part.sum(), 1e-9)
+        found[i] = column + 4 + (part @ offset).sum() / total, row + 4 + (offset @ part).sum() / total
+    return found
+
+
+def mosaic_frames(gains: tuple[float, float, float, float]) -> NDArray[np.uint16]:
+    """Return a frame of 9 x 9 spots of FWHM 3.5 px through filters of a Bayer mosaic."""
+    rng = np.random.default_rng(1)
+    shape, centre = (220, 220), 109.5
+    electrons = sum(
+        5000 / (2 * np.pi * 1.5**2) * gaussian(shape, centre + 20.3 * column, centre + 20.3 * row, 1.5)
+        for row in range(-4, 5)
+        for column in range(-4, 5)
+    )
+    mosaic = np.tile(np.reshape(gains, (2, 2)), (110, 110))
+    return (rng.poisson(electrons * mosaic + 5) + rng.normal(100, 2, shape)).round().astype(np.uint16)
