@@ -51,7 +51,7 @@ def recording(frames: int = 700) -> Any:
         commands=np.array(sent, np.float32)[kept],
         slopes=slopes_px,
         valid=np.ones((len(kept), 9), bool),
-        flags=np.repeat(np.uint8([[0, 0, 0, 0, 0, 0, 0, 0, 1]]), len(kept), axis=0),
+        flags=np.tile(np.array([0] * 8 + [1], np.uint8), (len(kept), 1)),
         standard_error_x=error,
         standard_error_y=error,
         covariance_xy=-0.4 * error**2,
