@@ -366,33 +366,58 @@ def doubtful(
             least[s] = min(np.hypot(*each) for each, _ in away)
     several = np.sort(usual[~np.isnan(usual)])
     typical = float(several[(len(several) - 1) // 2]) if several.size else 0.0
-    flags = np.zeros(n, np.int64)
+    flags, second = np.zeros(n, np.int64), np.zeros(n, bool)
+    least_px = min(0.1 * pitch, 0.3)
     for s in np.flatnonzero(measured.measured).tolist():
+        beside = {i for *pair, _ in in_line(layout, s) for i in pair if measured.measured[i]}
+        brightest = float(max((measured.flux[i] for i in beside), default=0.0))
+        excess, both = float(measured.flux[s]) - brightest, float(measured.flux[s]) + brightest
+        saturated = int(measured.flags[s]) & int(Flag.SATURATED)
+        second[s] = not saturated and 0 < brightest < measured.flux[s] / 1.25 and excess > 4 * both**0.5
         whole = half - np.broadcast_to(fwhm, (n, 2))[s] / 2
         if np.any((np.abs(places[s]) > whole) & (whole > half / 2)):
             flags[s] |= int(Flag.AT_SEARCH_LIMIT)
-        if pitch and least[s] > min(0.1 * pitch, 0.3) and usual[s] > 4.5 * typical:
+        if pitch and least[s] > least_px and usual[s] > (1.5 if second[s] else 4.5) * typical:
             flags[s] |= int(Flag.UNLIKE_NEIGHBOURS)
+    valid = measured.measured & (flags == 0)
+    for s in np.flatnonzero((flags & int(Flag.UNLIKE_NEIGHBOURS) != 0) & ~second).tolist():
+        deviations = [
+            float(np.hypot(*(slopes[s] - 2 * slopes[a] + slopes[b])))
+            for a, b in continued(layout, s)
+            if valid[a] and valid[b]
+        ]
+        agree = np.count_nonzero(np.array(deviations) <= max(least_px, 2.0 * 6**0.5 * typical))
+        if deviations and 2 * agree >= len(deviations):
+            flags[s] &= ~int(Flag.UNLIKE_NEIGHBOURS)
     return flags
+
+
+def _steps(layout: fs.Layout, s: int) -> list[Floats]:
+    """Steps to the neighbours of s."""
+    away = layout.centres - layout.centres[s]
+    return [step for step in away if 0 < np.hypot(*step) < 1.6 * (layout.pitch_px or 0.0)]
+
+
+def _at(layout: fs.Layout, s: int, step: Floats) -> int | None:
+    """Sub-aperture at a step from s."""
+    away = np.hypot(*(layout.centres - layout.centres[s] - step).T)
+    return int(away.argmin()) if away.min() < 0.3 * (layout.pitch_px or 0.0) else None
+
+
+def continued(layout: fs.Layout, s: int) -> list[tuple[int, int]]:
+    """Neighbours of s, each with the one behind it."""
+    pairs = [(_at(layout, s, step), _at(layout, s, 2 * step)) for step in _steps(layout, s)]
+    return [(a, b) for a, b in pairs if a is not None and b is not None]
 
 
 def in_line(layout: fs.Layout, s: int) -> list[tuple[int, int, float]]:
     """Two sub-apertures in line with s, and the weight of the first of them: both sides, else one."""
-
-    def at(step: Floats) -> int | None:
-        away = np.hypot(*(layout.centres - layout.centres[s] - step).T)
-        return int(away.argmin()) if away.min() < 0.3 * (layout.pitch_px or 0.0) else None
-
-    steps = [
-        step
-        for step in (layout.centres - layout.centres[s])
-        if 0 < np.hypot(*step) < 1.6 * (layout.pitch_px or 0.0)
-    ]
-    opposite = {frozenset((at(step), at(-step))) for step in steps} - {None}
+    opposite = {frozenset((_at(layout, s, step), _at(layout, s, -step))) for step in _steps(layout, s)}
+    opposite -= {None}
     both = [tuple(pair) for pair in opposite if None not in pair]
     found: list[Any] = [(a, b, 0.5) for a, b in both]
     if len(both) < 2:
-        found += [(at(step), at(2 * step), 2.0) for step in steps if at(2 * step) is not None]
+        found += [(a, b, 2.0) for a, b in continued(layout, s)]
     return found
 
 

@@ -20,7 +20,13 @@ from faintspot.slopes.kernels.driver.doubtful import Expected
 from faintspot.slopes.kernels.driver.groups import Task
 from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, LEAST_DIFFERENCE_PX, lines_of, neighbours_of
+from faintspot.slopes.sensor.neighbours import (
+    LEAST_DIFFERENCE,
+    LEAST_DIFFERENCE_PX,
+    continued,
+    lines_of,
+    neighbours_of,
+)
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.score import Score
 
@@ -208,10 +214,12 @@ class Plan:
         half = 0.5 * np.array(sensor.window[::-1])
         edge = np.where(fwhm < half, half - 0.5 * fwhm, np.inf)
         pitch = layout.pitch_px
+        neighbours = neighbours_of(layout.cells, layout.geometry, diagonal=True)
         return Expected(
             np.ascontiguousarray(sensor.zero.T, np.float32),
             np.ascontiguousarray(edge.T, np.float32),
-            *lines_of(neighbours_of(layout.cells, layout.geometry, diagonal=True)),
+            *lines_of(neighbours),
+            continued(neighbours),
             np.float32(np.inf if pitch is None else min(LEAST_DIFFERENCE * pitch, LEAST_DIFFERENCE_PX)),
         )
 

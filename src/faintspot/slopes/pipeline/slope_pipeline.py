@@ -23,8 +23,8 @@ from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.kernels.compilation.host import lanes_for
 from faintspot.slopes.kernels.compilation.simd import Lanes
-from faintspot.slopes.kernels.driver.dark import flag_dark, scratch_size
-from faintspot.slopes.kernels.driver.doubtful import flag_doubtful
+from faintspot.slopes.kernels.driver.dark import scratch_size
+from faintspot.slopes.kernels.driver.doubtful import check_slopes
 from faintspot.slopes.kernels.driver.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
 from faintspot.slopes.kernels.parallel import most_threads, run_groups, thread_scratch
 from faintspot.slopes.pipeline import configuration
@@ -41,7 +41,6 @@ from faintspot.slopes.spots.score import Score
 
 _KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
 _SMALL_TYPES = (np.dtype(np.uint8), *_KERNEL_TYPES)
-_flag_doubtful = Direct(flag_doubtful)
 _FLUX_COST = 0.1  # of summing the pixels of a sub-aperture, in units of `Estimator.cost`
 
 
@@ -133,6 +132,8 @@ class SlopePipeline:
         """Settings and tables computed before the first frame."""
         self.light_test = light_test(self.binned_layout, maps, self.plan.typical_fwhm_px)
         """Test for sub-apertures without flux."""
+        self._scratch_size = scratch_size(len(self.layout), *self.binned_layout.window)
+        self._checks = {dtype: _checks(dtype, self.light_test.lanes) for dtype in _KERNEL_TYPES}
 
     @property
     def width(self) -> int:
@@ -389,11 +390,8 @@ class SlopePipeline:
             Slopes of the frames; changed.
         frames : (n, h, w) array, uint16 or float32, contiguous
         """
-        scratch = np.empty(scratch_size(len(self.binned_layout), *self.binned_layout.window), np.float32)
-        flag_dark_in = _flag_dark(frames.dtype, self.light_test.lanes)
-        flag_dark_in(self.light_test, frames, results, scratch)
-        n = len(self.layout)
-        _flag_doubtful(results.x, results.y, results.flags, self.plan.expected, scratch[:n])
+        scratch = np.empty(self._scratch_size, np.float32)
+        self._checks[frames.dtype](self.light_test, frames, results, self.plan.expected, scratch)
 
     def source(self, frames: NDArray[Any], dtype: DTypeLike) -> Source:
         """Return the frames in the form that kernels read.
@@ -426,9 +424,9 @@ class SlopePipeline:
 
 
 @cache
-def _flag_dark(dtype: np.dtype[Any], lanes: Lanes) -> Direct:
-    """Return `flag_dark` for frames of a type, and windows whose pixels are in so many lanes."""
-    return Direct(flag_dark)
+def _checks(dtype: np.dtype[Any], lanes: Lanes) -> Direct:
+    """Return `check_slopes` for frames of a type, and windows whose pixels are in so many lanes."""
+    return Direct(check_slopes)
 
 
 def kernel_frames(array: NDArray[Any]) -> NDArray[Any]:

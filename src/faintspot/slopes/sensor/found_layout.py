@@ -119,8 +119,9 @@ def _unlike(grid: LensletGrid) -> NDArray[np.bool_]:
         np.zeros((2, n), np.float32),
         np.full((2, n), np.inf, np.float32),
         *lines_of(neighbours_of(grid.cells, grid.geometry, diagonal=True)),
+        np.zeros((n, 0, 2), np.int64),
         np.float32(LEAST_DIFFERENCE * grid.pitch_px),
     )
     x, y = np.ascontiguousarray(x[None]), np.ascontiguousarray(y[None])
-    flag_doubtful(x, y, flags, expected, np.empty(n, np.float32))
+    flag_doubtful(x, y, np.zeros_like(x), flags, expected, np.empty(n, np.float32))
     return np.asarray(flags[0] != 0)

@@ -48,10 +48,9 @@ def lines_of(neighbours: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[
         Whether both are on the same side, the nearer one first.
     """
     n, count = neighbours.shape
-    behind = np.vstack([neighbours, np.full(count, n)])[neighbours, np.arange(count)]
     opposite = neighbours.reshape(n, count // 2, 2)
     few = (opposite < n).all(axis=2).sum(axis=1) < 2
-    same_side = np.stack([neighbours, behind], axis=2)
+    same_side = continued(neighbours)
     same_side[~few] = n
     lines = np.concatenate([opposite, same_side], axis=1)
     outside = np.broadcast_to(np.arange(lines.shape[1]) >= count // 2, lines.shape[:2])
@@ -60,6 +59,13 @@ def lines_of(neighbours: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[
     order = np.argsort(~complete, axis=1, kind="stable")[:, : max(complete.sum(axis=1).max(), 1)]
     taken = np.take_along_axis(lines, order[:, :, None], axis=1)
     return np.ascontiguousarray(taken), np.ascontiguousarray(np.take_along_axis(outside, order, axis=1))
+
+
+def continued(neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return each neighbour and the one behind it, (n, m, 2), from the table that `neighbours_of` returns."""
+    n, count = neighbours.shape
+    behind = np.vstack([neighbours, np.full(count, n)])[neighbours, np.arange(count)]
+    return np.ascontiguousarray(np.stack([neighbours, behind], axis=2))
 
 
 def as_rows(at: NDArray[np.complex128]) -> NDArray[np.float64]:

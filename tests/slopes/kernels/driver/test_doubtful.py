@@ -58,6 +58,7 @@ class TestAgainstOracle:
         wild = rng.random((2, n)) < 0.1
         arrays.x[0], arrays.y[0] = rng.normal(0.0, np.where(wild, 4.0, rng.choice([0.05, 0.5, 3.0])))
         arrays.flags[0] = rng.choice([0, 0, 0, Flag.NO_FLUX, Flag.SATURATED], n)
+        arrays.flux[0] = rng.uniform(300.0, 400.0, n) * rng.choice([0.0, 1.0, 1.0, 1.0, 1.4, 2.0], n)
         before = arrays.flags.copy()
         pipeline.flag_doubtful(arrays, np.zeros((1, *layout.frame_shape), np.float32))
         slopes = fs.Slopes(*(array[0] for array in arrays))
@@ -76,6 +77,31 @@ class TestAgainstOracle:
         pipeline = fs.SlopePipeline(layout, fs.Settings("centroid"))
         pipeline.flag_doubtful(arrays, np.zeros((1, *layout.frame_shape), np.float32))
         assert np.flatnonzero(arrays.flags[0] & Flag.UNLIKE_NEIGHBOURS).tolist() == [0, 12]
+
+
+class TestSecondSpots:
+    """A reflection within the window, which pulls the slope by less than displacements differ."""
+
+    @pytest.mark.parametrize(("flux", "flagged"), [(1.0, False), (1.6, True)])
+    def test_flux_decides(self, flux: float, flagged: bool) -> None:
+        arrays = SlopeArrays(*(np.zeros((1, N), kind) for kind in RESULT_TYPES))
+        arrays.x[0], arrays.y[0] = np.random.default_rng(1).uniform(-0.25, 0.25, (2, N))
+        arrays.flux[0] = 1000.0
+        middle = number_of(6, 6)
+        arrays.x[0, middle], arrays.flux[0, middle] = 0.55, 1000.0 * flux
+        pipeline = fs.SlopePipeline(LAYOUT, fs.Settings("brightest"))
+        pipeline.flag_doubtful(arrays, np.zeros((1, *LAYOUT.frame_shape), np.float32))
+        assert (arrays.flags[0] != 0).tolist() == [flagged and s == middle for s in range(N)]
+
+
+def test_spots_between_wrong_ones_stay_valid() -> None:
+    """Each of its four lines has a wrong spot; those that it continues on one side have none."""
+    arrays = SlopeArrays(*(np.zeros((1, N), kind) for kind in RESULT_TYPES))
+    wrong = [number_of(*cell) for cell in ((5, 6), (6, 5), (5, 5), (5, 7))]
+    arrays.x[0, wrong] = 5.0, -4.0, 3.0, -6.0
+    pipeline = fs.SlopePipeline(LAYOUT, fs.Settings("brightest"))
+    pipeline.flag_doubtful(arrays, np.zeros((1, *LAYOUT.frame_shape), np.float32))
+    assert np.flatnonzero(arrays.flags[0]).tolist() == sorted(wrong)
 
 
 @pytest.mark.parametrize("estimator", ["brightest", "tv", "smoothed", "ml", "matched", "weighted"])

@@ -7,16 +7,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.base.flags import UNMEASURED, SubapertureFlag
+from faintspot.base.flags import INVALID, UNMEASURED, SubapertureFlag
 from faintspot.slopes.kernels.compilation.compiling import compiled
+from faintspot.slopes.kernels.driver.dark import flag_dark
 
-_UNMEASURED = int(UNMEASURED)
+_UNMEASURED, _INVALID = int(UNMEASURED), int(INVALID)
 UNLIKE_NEIGHBOURS = int(SubapertureFlag.UNLIKE_NEIGHBOURS)
 AT_SEARCH_LIMIT = int(SubapertureFlag.AT_SEARCH_LIMIT)
+SATURATED = int(SubapertureFlag.SATURATED)
 
 TYPICAL = 4.5
 """Times the median over the sub-apertures that a spot is off what its neighbours say: by chance, of normally
 distributed displacements, 1 in 1000 of 7 x 7 sub-apertures, 1 in 2000 of 40 x 40."""
+
+SUSPECT, LIKE = 1.5, 2.0
+"""Likewise where the flux shows a second spot in the window; and for one that lines of valid ones confirm."""
+_SECOND_SPOT = 1.25
+"""Flux over that of the brightest neighbour, from which a window holds a second spot."""
+_SURELY = 4.0
+"""Photon noise by which that excess exceeds zero."""
 
 
 class Expected(NamedTuple):
@@ -30,45 +39,116 @@ class Expected(NamedTuple):
     """(n, m, 2) int64: two sub-apertures in line with each, n where there is none; see `outside`."""
     outside: Any
     """(n, m) bool: whether both are on the same side, the nearer one first, rather than opposite."""
+    behind: Any
+    """(n, m, 2) int64: a neighbour of each and the one behind it, n where there is none; m may be 0."""
     least: Any
     """Smaller differences from a line never count, px."""
 
 
 @compiled
-def flag_doubtful(x: Any, y: Any, flags: Any, expected: Any, differences: Any) -> None:
+def check_slopes(test: Any, frames: Any, slopes: Any, expected: Any, scratch: Any) -> None:
+    """Flag dark sub-apertures and doubtful spots of frames; see `flag_dark` and `flag_doubtful`."""
+    flag_dark(test, frames, slopes, scratch)
+    flag_doubtful(slopes.x, slopes.y, slopes.flux, slopes.flags, expected, scratch)
+
+
+@compiled
+def flag_doubtful(x: Any, y: Any, flux: Any, flags: Any, expected: Any, differences: Any) -> None:
     """Add AT_SEARCH_LIMIT and UNLIKE_NEIGHBOURS to the flags of measured slopes, each (n_frames, n).
 
-    Displacements that change evenly from one neighbour to the next are alike. `differences` is scratch, (n,)
-    float32.
+    Displacements that change evenly from one neighbour to the next are alike. `differences` is scratch, at
+    least n numbers of float32.
     """
-    zero, edge = expected.zero, expected.edge
+    zero, edge, n = expected.zero, expected.edge, x.shape[1]
     for f in range(x.shape[0]):
-        largest = np.float32(0.0)
-        for s in range(x.shape[1]):
+        largest, second_spots = np.float32(0.0), 0
+        for s in range(n):
             differences[s] = -1.0
             if flags[f, s] & _UNMEASURED:
                 continue
             if abs(x[f, s] + zero[0, s]) > edge[0, s] or abs(y[f, s] + zero[1, s]) > edge[1, s]:
                 flags[f, s] |= AT_SEARCH_LIMIT
             differences[s], least = _difference(f, s, x, y, flags, expected)
-            largest = max(largest, least)
-        if largest > expected.least:
-            limit = TYPICAL * _median(differences)
-            for s in range(x.shape[1]):
-                if differences[s] > limit and _difference(f, s, x, y, flags, expected)[1] > expected.least:
-                    flags[f, s] |= UNLIKE_NEIGHBOURS
+            if least > expected.least:
+                largest = max(largest, differences[s])
+                second_spots += _has_second_spot(f, s, flux, flags, expected)
+        if second_spots > 0 or _exceeds(differences, n, np.float32(1.0 / TYPICAL) * largest):
+            _flag_unlike(f, x, y, flux, flags, expected, differences)
 
 
 @compiled
-def _median(values: Any) -> Any:
-    """Return the median of the non-negative values, by bisection to 2^-16 of the largest."""
+def _flag_unlike(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, differences: Any) -> None:
+    """Add UNLIKE_NEIGHBOURS to the flags of a frame; take it from spots whose neighbours were wrong."""
+    n = x.shape[1]
+    median = _median(differences, n)
+    for s in range(n):
+        if not differences[s] > SUSPECT * median:
+            continue
+        is_far = differences[s] > TYPICAL * median or _has_second_spot(f, s, flux, flags, expected)
+        if is_far and _difference(f, s, x, y, flags, expected)[1] > expected.least:
+            flags[f, s] |= UNLIKE_NEIGHBOURS
+    for s in range(n):
+        if not flags[f, s] & UNLIKE_NEIGHBOURS or _has_second_spot(f, s, flux, flags, expected):
+            continue
+        if _is_continued(f, s, x, y, flags, expected, LIKE * median):
+            differences[s] = -2.0
+    for s in range(n):
+        if differences[s] == -2.0:
+            flags[f, s] &= ~UNLIKE_NEIGHBOURS
+
+
+@compiled
+def _has_second_spot(f: Any, s: Any, flux: Any, flags: Any, expected: Any) -> Any:
+    """Return whether a window has clearly more flux than all its neighbours, and none of it saturated."""
+    if flags[f, s] & SATURATED:
+        return False
+    lines, n, brightest = expected.lines, flux.shape[1], np.float32(0.0)
+    for k in range(lines.shape[1]):
+        for i in range(2):
+            other = lines[s, k, i]
+            if other < n and not flags[f, other] & _UNMEASURED:
+                brightest = max(brightest, flux[f, other])
+                if not flux[f, s] > _SECOND_SPOT * brightest:
+                    return False
+    excess, both = flux[f, s] - brightest, flux[f, s] + brightest
+    return brightest > 0.0 and excess * excess > _SURELY * _SURELY * both
+
+
+@compiled
+def _is_continued(f: Any, s: Any, x: Any, y: Any, flags: Any, expected: Any, limit: Any) -> Any:
+    """Return whether a slope continues at least half of the lines of two valid ones beside it."""
+    agree = total = 0
+    for k in range(expected.behind.shape[1]):
+        a, b = expected.behind[s, k, 0], expected.behind[s, k, 1]
+        if b == x.shape[1] or (flags[f, a] | flags[f, b]) & _INVALID:
+            continue
+        away_x, away_y = x[f, s] - 2.0 * x[f, a] + x[f, b], y[f, s] - 2.0 * y[f, a] + y[f, b]
+        away = away_x * away_x + away_y * away_y
+        agree += away <= expected.least * expected.least or away <= 6.0 * limit * limit
+        total += 1
+    return total > 0 and 2 * agree >= total
+
+
+@compiled
+def _exceeds(values: Any, n: Any, limit: Any) -> Any:
+    """Return whether a limit is at least the median of the first n values, without the negative ones."""
+    above = below = 0
+    for s in range(n):
+        above += values[s] > limit
+        below += (values[s] >= 0.0) & (values[s] <= limit)
+    return limit > 0.0 and below >= above
+
+
+@compiled
+def _median(values: Any, n: Any) -> Any:
+    """Return the median of the first n values without the negative ones, to 2^-16 of the largest."""
     least, most = np.float32(0.0), np.float32(0.0)
-    for s in range(values.shape[0]):
+    for s in range(n):
         most = max(most, values[s])
     for _ in range(16):
         middle = np.float32(0.5) * (least + most)
         above = below = 0
-        for s in range(values.shape[0]):
+        for s in range(n):
             above += values[s] > middle
             below += (values[s] >= 0.0) & (values[s] <= middle)
         if above > below:
