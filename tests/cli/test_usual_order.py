@@ -35,8 +35,9 @@ def test_large_tilts_and_lost_spots(
     tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch, coarse_pictures: None
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for name, args in {"flat": (0.0,), "large": (7.0,), "lost": (2.0, (0, 3, 17, 30, 48))}.items():
-        np.save(f"{name}.npy", frame(*args))
+    np.save("flat.npy", frame(0.0))
+    np.save("large.npy", frame(7.0))
+    np.save("lost.npy", frame(2.0, lost=(0, 3, 17, 30, 48)))
     run.ok("layout", "flat.npy", "-o", "f.toml")
     for name, tilt_px, lost in (("large", 7.0, 0), ("lost", 2.0, 5)):
         run.ok("slopes", f"{name}.npy", "-c", "f.toml", "-o", f"{name}.npz")
