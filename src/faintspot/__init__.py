@@ -69,7 +69,7 @@ _HOMES = {
     "Wavefront": "faintspot.slopes.wavefront",
     "brightest_pixels": "faintspot.slopes.estimators.algorithms.brightest",
     "centre_of_gravity": "faintspot.slopes.estimators.algorithms.centroid",
-    "control": "faintspot.loop.control",
+    "control": "faintspot.loop",
     "cramer_rao": "faintspot.slopes.spots.bounds",
     "cramer_rao_covariance": "faintspot.slopes.spots.bounds",
     "fit_wavefront": "faintspot.slopes.wavefront",
