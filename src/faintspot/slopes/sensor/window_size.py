@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -14,13 +15,15 @@ SMALLEST_WINDOW, LARGEST_WINDOW = 2, 64
 
 def window_size(name: str, value: Any, factor: int = 1) -> tuple[int, int]:
     """Return height and width of a window, from one number or two; its frames are binned by `factor`."""
-    try:
-        window = pair_of_numbers(name, value, SMALLEST_WINDOW * factor, LARGEST_WINDOW * factor)
-    except InputError as error:
-        larger = np.size(value) > 0 and np.max(value) > LARGEST_WINDOW * factor
+    window, largest = (
+        pair_of_numbers(name, value, SMALLEST_WINDOW * factor, math.inf),
+        LARGEST_WINDOW * factor,
+    )
+    if max(window) > largest:
+        needed = math.ceil(max(window) / LARGEST_WINDOW)
         raise InputError(
-            f"{error}{f'; bin = {factor + 1} allows larger windows' if larger else ''}"
-        ) from None
+            f"{name} = {max(window)}: expected at most {largest}; bin = {needed} allows larger windows"
+        )
     if any(side % factor for side in window):
         raise InputError(f"{name}: expected multiples of bin = {factor}, got {window[0]} x {window[1]}")
     return window
