@@ -15,15 +15,13 @@ SMALLEST_WINDOW, LARGEST_WINDOW = 2, 64
 
 def window_size(name: str, value: Any, factor: int = 1) -> tuple[int, int]:
     """Return height and width of a window, from one number or two; its frames are binned by `factor`."""
-    window, largest = (
-        pair_of_numbers(name, value, SMALLEST_WINDOW * factor, math.inf),
-        LARGEST_WINDOW * factor,
-    )
+    window, largest = pair_of_numbers(name, value, -math.inf, math.inf), LARGEST_WINDOW * factor
     if max(window) > largest:
         needed = math.ceil(max(window) / LARGEST_WINDOW)
         raise InputError(
             f"{name} = {max(window)}: expected at most {largest}; bin = {needed} allows larger windows"
         )
+    numbers_between(name, window, SMALLEST_WINDOW * factor, largest)
     if any(side % factor for side in window):
         raise InputError(f"{name}: expected multiples of bin = {factor}, got {window[0]} x {window[1]}")
     return window
