@@ -11,11 +11,12 @@ from faintspot.base.checks import numbers_between
 from faintspot.base.errors import InputError
 
 SMALLEST_WINDOW, LARGEST_WINDOW = 2, 64
+_ABSURD = 2**31  # beyond which a whole number may not fit its type
 
 
 def window_size(name: str, value: Any, factor: int = 1) -> tuple[int, int]:
     """Return height and width of a window, from one number or two; its frames are binned by `factor`."""
-    window, largest = pair_of_numbers(name, value, -math.inf, math.inf), LARGEST_WINDOW * factor
+    window, largest = pair_of_numbers(name, value, -_ABSURD, _ABSURD), LARGEST_WINDOW * factor
     if max(window) > largest:
         needed = math.ceil(max(window) / LARGEST_WINDOW)
         raise InputError(
