@@ -201,10 +201,13 @@ class PredictiveControl:
         """Return a summary of one line."""
         gain, delay = self.centroid_gain, self.delay_frames
         left, plain = self.model.left
-        return (
+        parts = [
             f"delay {delay.value:.2f} +- {delay.error:.2f} frames, centroid gain {gain.value:.3f} +- "
-            f"{gain.error:.3f}; {self.model.description}; residual {left / plain:.2f} of an integrator's"
-        )
+            f"{gain.error:.3f}",
+            self.model.description,  # not in files
+            f"residual, noise included, {left / plain:.2f} of an integrator's",
+        ]
+        return "; ".join(part for part in parts if part)
 
 
 def learn(recording: Recording, start: Identified | None = None) -> PredictiveControl:
