@@ -94,7 +94,7 @@ def test_exported_matrices(
 
         file = loadmat(tmp_path / "controller.mat")
     line = CommandDelayLine(36, 2)
-    alone = control.model.controller(control._plant, line)
+    alone = control.model.controller(control._learnt.plant, line)
     state, held = np.zeros(len(file["state_of_state"])), np.zeros((int(file["delay_frames"].item()), 36))
     error = np.sqrt(control.model.arrays["variance_px2"])
     for slopes in recording.slopes[:300]:
@@ -114,7 +114,7 @@ def test_exported_matrices(
 def test_export_refuses_other_endings(control: PredictiveControl, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"\.npz, \.mat, \.fits"):
         control.export(tmp_path / "controller.csv")
-    assert set(state_space(control.model, control._plant, 1.0, 1.0)) >= {"command_of_slopes"}
+    assert set(state_space(control.model, control._learnt.plant, 1.0, 1.0)) >= {"command_of_slopes"}
 
 
 def test_learn_again_continues(control: PredictiveControl, recording: Recording) -> None:

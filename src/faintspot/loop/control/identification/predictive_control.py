@@ -57,8 +57,8 @@ class _Loop:
     integrator_gain: float
     sent_after_frames: int
 
-    @property
     def plant(self) -> LoopPlant:
+        """Return the loop for which controllers are made."""
         frames = max(1, round(float(self.delay[0])))
         return LoopPlant(self.interaction, make_reconstructor(self.interaction), frames, _LEAK)
 
@@ -70,10 +70,14 @@ class PredictiveControl:
     called with every frame, in order. Made by `learn`; not by hand.
     """
 
-    def __init__(self, loop: _Loop, model: ControlModel, identified: Identified | None = None) -> None:
-        self._loop, self._plant = loop, loop.plant
-        self.model, self._identified = model, identified
+    def __init__(self, loop: _Loop, learnt: LearntControl) -> None:
+        self._loop, self._learnt = loop, learnt
         self.reset()
+
+    @property
+    def model(self) -> ControlModel:
+        """Model of the filter and of its fallback."""
+        return self._learnt.model
 
     @property
     def delay_frames(self) -> Measured:
@@ -102,11 +106,9 @@ class PredictiveControl:
 
     def reset(self) -> None:
         """Start again with a flat mirror, without the memory of earlier frames."""
-        limit = self._loop.largest_command
-        self._line = CommandDelayLine(self._plant.interaction.shape[1], self._plant.delay_frames, limit)
-        self._controller = LearntControl(self._plant, self.model).controller(
-            self._line, plain_frames=_MEASURED_FRAMES
-        )
+        plant, limit = self._learnt.plant, self._loop.largest_command
+        self._line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames, limit)
+        self._controller = self._learnt.controller(self._line, plain_frames=_MEASURED_FRAMES)
 
     def __call__(self, slopes: ArrayLike, standard_errors: ArrayLike | None = None) -> Floats:
         """Return the command to send after a frame.
@@ -141,7 +143,7 @@ class PredictiveControl:
         """
         if recording.sent_after_frames is None:
             recording = replace(recording, sent_after_frames=self._loop.sent_after_frames)
-        again = learn(recording, self._identified)
+        again = learn(recording, self._learnt.identified)
         latest = self._loop.sign * self._line.latest
         self.__dict__.update(again.__dict__)
         self._line.hold(self._loop.sign * latest)
@@ -173,7 +175,8 @@ class PredictiveControl:
         try:
             plain = {name: array.item() if array.ndim == 0 else array for name, array in values.items()}
             loop = _Loop(**plain)
-            return cls(loop, ControlModel.load(path, loop.plant))
+            plant = loop.plant()
+            return cls(loop, LearntControl(plant, ControlModel.load(path, plant)))
         except (ValueError, TypeError, IndexError):
             raise InputError(f"{path}: expected {_CONTENTS}, got arrays of another shape") from None
 
@@ -193,8 +196,9 @@ class PredictiveControl:
         InputError
             When the sensor has more than 300 slopes, or the file cannot be written.
         """
-        matrices: dict[str, Any] = state_space(self.model, self._plant, self._loop.scale, self._loop.sign)
-        matrices["delay_frames"] = np.array(self._plant.delay_frames)
+        plant = self._learnt.plant
+        matrices: dict[str, Any] = state_space(self.model, plant, self._loop.scale, self._loop.sign)
+        matrices["delay_frames"] = np.array(plant.delay_frames)
         write_matrices(path, {**matrices, "largest_command": np.array(self._loop.largest_command)})
 
     def summary(self) -> str:
@@ -264,25 +268,31 @@ def _learnt(ready: Prepared, delay: LoopDelay, start: Identified | None) -> Pred
         ready.sign,
         np.array([delay.delay_frames, delay.delay_error, gain, delay.gain_error]),
         np.zeros((0, 6)),
-        _largest_command(loop, seen),
+        math.inf,
         math.nan,
         ready.sent_after_frames,
     )
+    plant = described.plant()
     learnt = learn_controller(
-        KALMAN, described.plant, seen.telemetry, site_of_loop(loop), loop.frame_rate_hz, start=start
+        KALMAN, plant, seen.telemetry, site_of_loop(loop), loop.frame_rate_hz, start=start
     )
     # The fallback is the integrator that has run, whatever the gain found.
     plain = ready.loop_gain * gain if math.isfinite(ready.loop_gain) else learnt.model.plain_gain
-    model, identified = replace(learnt.model, plain_gain=plain), learnt.identified
-    described = replace(described, integrator_gain=learnt.model.plain_gain / gain)
+    described = replace(
+        described,
+        largest_command=_largest_command(loop, seen, plant),
+        integrator_gain=learnt.model.plain_gain / gain,
+    )
+    identified = learnt.identified
     if identified is not None and identified.is_layered:
         described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
-    return PredictiveControl(described, model, identified)
+    model = replace(learnt.model, plain_gain=plain)
+    return PredictiveControl(described, replace(learnt, model=model))
 
 
-def _largest_command(loop: Recording, seen: OpenLoop) -> float:
+def _largest_command(loop: Recording, seen: OpenLoop, plant: LoopPlant) -> float:
     """Return the stroke limit: the loop's, or 5 sigma of what the recorded wavefront asks for."""
-    asked = seen.telemetry.open_loop_px @ make_reconstructor(loop.interaction_matrix).matrix.T
+    asked = seen.telemetry.open_loop_px @ plant.reconstructor.matrix.T
     static = np.abs(loop.commands.mean(axis=0))
     limit = float((static + _MOST_SIGMAS * asked.std(axis=0)).max())
     return limit if loop.largest_command is None else min(limit, loop.largest_command)
