@@ -30,6 +30,7 @@ from faintspot.slopes.camera.binning import binned
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.colour_mosaic import mosaic_contrast
 from faintspot.slopes.camera.hot_pixels import find_hot_pixels
+from faintspot.slopes.camera.mean_frame import MeanFrame
 from faintspot.slopes.camera.saturation import LargestValues
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, first_settings
@@ -331,16 +332,13 @@ def _found(description: str, mean: NDArray[np.float64], options: dict[str, Any])
 
 def _mean_frame(source: FrameSource, calibration: Calibration) -> tuple[NDArray[np.float64], LargestValues]:
     """Return the mean of the first frames in electrons, NaN where none is finite, and the largest values."""
-    values = LargestValues()
-    total, count = np.zeros(source.shape), np.zeros(source.shape, int)
+    frames, values = MeanFrame(source.shape), LargestValues()
     for _, block in source.blocks(0, min(_MOST_FRAMES, source.n_frames), _FIRST_FRAMES):
         values.add(block)
-        finite = np.isfinite(block)
-        total += np.where(finite, block, 0).sum(axis=0, dtype=np.float64)
-        count += finite.sum(axis=0)
-    if not count.any():
+        frames.add(block)
+    mean = frames.mean
+    if np.isnan(mean).all():
         raise InputError(f"{source.description}: expected a frame with spots, every pixel is NaN or infinite")
     dark, electrons_per_adu = calibration.maps(source.shape)
-    mean = np.divide(total, count, where=count > 0, out=np.full(source.shape, np.nan))
     electrons: NDArray[np.float64] = (mean - dark) * electrons_per_adu
     return electrons, values

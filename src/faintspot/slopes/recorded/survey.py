@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.io.frames import FrameSource
+from faintspot.slopes.camera.mean_frame import MeanFrame
 from faintspot.slopes.camera.saturation import LargestValues
 
 _LOOKS, _FRAMES = 20, 50  # stretches of frames over the whole recording
@@ -40,15 +41,11 @@ def _stretches(source: FrameSource) -> Iterator[NDArray[np.generic]]:
 
 def survey(source: FrameSource) -> Survey:
     """Look at frames all over a recording, up to 1000 of them."""
-    total, count = np.zeros(source.shape), np.zeros(source.shape, np.int64)
-    values, looked = LargestValues(), 0
+    frames, values, looked = MeanFrame(source.shape), LargestValues(), 0
     with suppress(InputError):  # of a damaged frame, which is reported when it is measured
         for block in _stretches(source):
-            finite = np.isfinite(block)
-            total += np.where(finite, block, 0).sum(axis=0, dtype=np.float64)
-            count += finite.sum(axis=0)
+            frames.add(block)
             if looked < _FRAMES_FOR_SATURATION:
                 values.add(block)
             looked += len(block)
-    mean = np.divide(total, count, where=count > 0, out=np.full(source.shape, np.nan))
-    return Survey(mean, values.saturation_adu)
+    return Survey(frames.mean, values.saturation_adu)

@@ -11,6 +11,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.flags import KEEPABLE, SubapertureFlag
 from faintspot.base.validity import leave_out
 from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.camera.mean_frame import MeanFrame
 from faintspot.slopes.pipeline.light import MeanLight
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
@@ -46,19 +47,12 @@ def usable_subapertures(
     for flag in _DOUBTFUL:
         flags[2 * np.count_nonzero(found & flag, axis=0) > len(found)] |= int(flag)
     light = MeanLight(layout, pipeline.light_test.maps, pipeline.plan.typical_fwhm_px)
-    significance = light.significances(_mean(frames))
+    mean = MeanFrame(layout.frame_shape)
+    mean.add(frames)
+    significance = light.significances(mean.mean)
     if np.median(significance) > _CLEARLY_LIT:
         flags[significance < 1.0] |= int(SubapertureFlag.NO_FLUX)
     usable, line = leave_out(flags)
     if not usable.any():
         raise InputError(f"frames: expected spots in the sub-apertures, {line}")
     return usable, line
-
-
-def _mean(frames: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the mean of the finite values of each pixel, NaN without any."""
-    finite = np.isfinite(frames)
-    count = finite.sum(axis=0)
-    total = np.sum(frames, axis=0, where=finite, dtype=np.float64)
-    mean: NDArray[np.float64] = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
-    return mean
