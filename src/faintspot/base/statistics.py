@@ -19,6 +19,8 @@ scale with the errors' own spread, which would forgive a worse estimator more.""
 FEWEST_PIECES = 3  # of fewer blocks or realisations, drawing again says nothing
 DRAWS = 2000
 SEED = 20150611  # of the resampling, when no generator is given: the same numbers give the same interval
+MAD_TO_STD = 1.4826
+"""Standard deviation of a normal distribution in units of its median absolute deviation."""
 _LEVEL = 0.95
 _NORMAL = 1.959964
 

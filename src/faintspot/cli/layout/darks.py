@@ -8,6 +8,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
+from faintspot.base.statistics import MAD_TO_STD
 from faintspot.cli.layout.options import is_number
 from faintspot.io.frames import open_frames
 from faintspot.slopes.camera.calibration import Calibration
@@ -15,7 +16,6 @@ from faintspot.slopes.camera.dark_frames import FEWEST_FRAMES, DarkPixels
 from faintspot.slopes.camera.photon_transfer import measure_detector
 
 _MOST_NUMBERS = 1 << 27  # read at a time
-_MAD_TO_STD = 1.4826
 
 
 def measured_darks(location: str | None) -> DarkPixels | None:
@@ -83,4 +83,4 @@ def _roughness(image: NDArray[np.float64]) -> float:
     """Return the standard deviation of structures as large as spots, between these."""
     filled = np.where(np.isfinite(image), image, np.nanmedian(image))
     band = scipy.ndimage.gaussian_filter(filled, 1.0) - scipy.ndimage.gaussian_filter(filled, 4.0)
-    return _MAD_TO_STD * float(np.median(np.abs(band - np.median(band))))
+    return MAD_TO_STD * float(np.median(np.abs(band - np.median(band))))

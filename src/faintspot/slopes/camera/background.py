@@ -6,6 +6,8 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
+from faintspot.base.statistics import MAD_TO_STD
+
 Floats = NDArray[np.float64]
 
 _COVERED, _MOST_COVERED = 3.0, 0.42  # radius of a spot in its standard deviations; at most, in pitches
@@ -15,7 +17,6 @@ _SMOOTHED, _LEAST_SMOOTHED_PX = 0.5, 6.0
 _MATTERS = 0.05  # of the flux of a spot, under its noise-equivalent area
 _PART = 0.02  # of the lenslets, in which it must matter
 _CERTAIN = 5.0  # standard deviations
-_MAD_TO_STD = 1.4826
 
 
 def smooth_background(frame: Floats, spots: Floats, pitch_px: float, spot_px: float) -> Floats:
@@ -67,7 +68,7 @@ def varies(frame: Floats, levels: Floats, flux: float, pitch_px: float, spot_px:
         Distance of lenslets, and standard deviation of the spot shape.
     """
     differences = np.diff(frame, axis=1)
-    noise = _MAD_TO_STD * float(np.nanmedian(np.abs(differences))) / np.sqrt(2.0)
+    noise = MAD_TO_STD * float(np.nanmedian(np.abs(differences))) / np.sqrt(2.0)
     # Twice smoothed, and half of the pixels used.
     certain = _CERTAIN * noise * 0.5 / _smoothing_px(pitch_px)
     matters = max(_MATTERS * flux / (4 * np.pi * spot_px**2), certain)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.camera.hot_pixels import find_hot_pixels
 
 Floats = NDArray[np.float64]
@@ -17,7 +18,6 @@ FEWEST_FRAMES = 10
 """Number of dark frames from which on blinking pixels are looked for."""
 
 _OUTLYING = 3.0  # scaled median absolute deviations: variances beyond are left out of the distribution's fit
-_MAD_TO_STD = 1.4826
 _TRIALS = 20_000  # pixels without blinking that are simulated
 _SURELY = 5.0  # standard deviations below the simulated mean: one false alarm among millions of pixels
 _LEAST_EXCESS = 2.0  # times the typical variance, below which blinking does not matter
@@ -79,7 +79,7 @@ def shrunk_variance(variance: Floats, degrees: int) -> tuple[Floats, float]:
         return variance, 0.0
     logarithm = np.log(positive)
     middle = np.median(logarithm)
-    spread = _MAD_TO_STD * np.median(np.abs(logarithm - middle))
+    spread = MAD_TO_STD * np.median(np.abs(logarithm - middle))
     logarithm = logarithm[np.abs(logarithm - middle) <= _OUTLYING * spread]
     half_degrees = 0.5 * degrees
     centre = float(logarithm.mean()) - float(digamma(half_degrees)) + math.log(half_degrees)

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between, real_array
 from faintspot.base.errors import InputError
+from faintspot.base.statistics import MAD_TO_STD
 
-_MAD_TO_STD = 1.4826
 _SHARPNESS = 4.0  # excess over the spread of the neighbours; at most 3 for a Nyquist-sampled spot
 
 
@@ -47,7 +47,7 @@ def find_hot_pixels(frame: ArrayLike, *, threshold: float = 8.0) -> NDArray[np.i
     ring = np.ones((3, 3), bool)
     ring[1, 1] = False
     excess = image - median_filter(image, footprint=ring, mode="mirror")
-    noise = _MAD_TO_STD * np.median(np.abs(excess - np.median(excess)))
+    noise = MAD_TO_STD * np.median(np.abs(excess - np.median(excess)))
     second_largest = rank_filter(image, -2, footprint=ring, mode="mirror")
     spread = second_largest - minimum_filter(image, footprint=ring, mode="mirror")
     return np.argwhere((excess > level * noise) & (excess > _SHARPNESS * spread) & ~not_finite)

@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
+from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.camera.dark_frames import DarkPixels, dark_pixels
 from faintspot.slopes.camera.transfer_curve import Curve, Line, fit_line, halves_of, photon_transfer, within
 from faintspot.slopes.sensor.layout import Layout
@@ -183,7 +184,7 @@ def _measure_dark(darks: Floats) -> tuple[_Dark, _Value]:
     read_noise = math.sqrt(float(np.median(variance)) * degrees / float(chi2.median(degrees)))
     # Variance of the median of many variances: 1.25 times that of their mean.
     relative = 1.25 * math.sqrt(2 / (degrees * level.size))
-    spread = 1.25 * 1.4826 * float(np.median(np.abs(level - np.median(level)))) / math.sqrt(level.size)
+    spread = 1.25 * MAD_TO_STD * float(np.median(np.abs(level - np.median(level)))) / math.sqrt(level.size)
     dark = _Dark(level, float(np.median(level)), spread, dark_pixels(level, residuals))
     return dark, _Value(read_noise, 0.5 * relative * read_noise)
 

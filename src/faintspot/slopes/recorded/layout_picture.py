@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.files import write_atomically
 from faintspot.base.report.drawing import colour_bar, limits_of, new_figure, png, styled
+from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.sensor.layout import Layout
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ def _stretch(array: Floats, inside: Floats) -> FuncNorm:
 
     good = array[np.isfinite(array)]
     sky = float(np.median(good)) if good.size else 0.0
-    noise = 1.4826 * float(np.median(np.abs(good - sky))) if good.size else 0.0
+    noise = MAD_TO_STD * float(np.median(np.abs(good - sky))) if good.size else 0.0
     low, high = limits_of(inside, percent=99.5)
     low, high = min(low, sky - 2 * noise), max(high, sky + 5 * noise)
     if not high > low:

@@ -17,13 +17,11 @@ from numpy.typing import NDArray
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
 from faintspot.base.flags import NO_FLAG, SubapertureFlag
-from faintspot.base.statistics import Estimate, absolute_errors, slope_statistics
+from faintspot.base.statistics import MAD_TO_STD, Estimate, absolute_errors, slope_statistics
 from faintspot.base.validity import are_valid
 
 Floats = NDArray[np.float64]
 
-GAUSSIAN_MAD = 1.4826
-"""Standard deviation of a Gaussian in units of its median absolute deviation."""
 
 ARRAYS = ("x", "y", "flux", "flags", "iterations")
 _BLOCK_NUMBERS = 1 << 22  # numbers worked on at a time: bounds the memory of the double-precision copies
@@ -337,7 +335,7 @@ def median_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
 def robust_std_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
     """Return 1.4826 times the median absolute deviation of each column's valid values; NaN below two."""
     middle = np.nan_to_num(median_over_valid(values, valid))
-    spread = GAUSSIAN_MAD * median_over_valid(np.abs(values - middle), valid)
+    spread = MAD_TO_STD * median_over_valid(np.abs(values - middle), valid)
     measured: Floats = np.where(valid.sum(axis=0) >= 2, spread, np.nan)
     return measured
 

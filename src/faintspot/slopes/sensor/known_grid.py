@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
+from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.sensor.binning import magnified_layout
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.region import PupilRegion, Rectangle
@@ -163,6 +164,6 @@ def _dark_level(flux: NDArray[np.float64]) -> float:
     between = (ordered.sum() * number / len(flux) - lower) ** 2 / (number * (len(flux) - number))
     split = int(np.argmax(between)) + 1
     level = float(np.median(ordered[:split]))
-    scatter = 1.4826 * float(np.median(np.abs(ordered[:split] - level)))
+    scatter = MAD_TO_STD * float(np.median(np.abs(ordered[:split] - level)))
     apart = float(np.median(ordered[split:])) - level
     return level if min(split, len(flux) - split) >= 4 and apart > _APART * scatter else np.nan

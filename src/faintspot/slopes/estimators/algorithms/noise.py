@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import image_stack, number_between, numbers_between
 from faintspot.base.errors import InputError
-
-_MAD_TO_STD = 1.4826  # for a normal distribution
+from faintspot.base.statistics import MAD_TO_STD
 
 
 def suggested_strength(
@@ -76,4 +75,4 @@ def pixel_noise(images: ArrayLike) -> float:
     edges = stack[..., [0, -1], :].astype(np.float64)
     several_frames = edges.ndim == 4 and len(edges) > 1
     differences = np.diff(edges, axis=0 if several_frames else -1)
-    return float(_MAD_TO_STD * np.median(np.abs(differences - np.median(differences))) / np.sqrt(2.0))
+    return float(MAD_TO_STD * np.median(np.abs(differences - np.median(differences))) / np.sqrt(2.0))

@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import image_stack
 from faintspot.base.errors import InputError
+from faintspot.base.statistics import MAD_TO_STD
 
 _NARROWEST_PX, _WIDEST = 0.5, 0.75  # full width at half maximum; the latter of the window's side
 # Squared flux and width of a spot relative to the median of the lenslets, and standard deviations of the
 # former: what is beyond is no spot.
 _MOST_SQUARED_FLUX, _WIDEST_SPOT, _OUTLYING = 9.0, 1.6, 6.0
-_MAD_TO_STD = 1.4826
 _AREA_OF_SQUARED_FWHM = np.pi / (2 * np.log(2))  # noise-equivalent area of a Gaussian spot
 
 
@@ -99,7 +99,7 @@ def like_most(images: ArrayLike) -> NDArray[np.bool_]:
             correlation[lag - 1] += np.einsum("fnyx,fnyx->n", along[..., :-lag], along[..., lag:])
     power = correlation[0]
     typical = max(float(np.median(power)), 0.0)
-    scatter = _MAD_TO_STD * float(np.median(np.abs(power - np.median(power))))
+    scatter = MAD_TO_STD * float(np.median(np.abs(power - np.median(power))))
     kept = power <= _MOST_SQUARED_FLUX * typical + _OUTLYING * scatter
     if typical > scatter:
         below = correlation < 0.5 * power

@@ -16,6 +16,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
+from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.sensor.detection.lattice import Lattice
 from faintspot.slopes.sensor.detection.nodes import SEARCH, NodeFlux
 from faintspot.slopes.sensor.neighbours import links_of
@@ -180,7 +181,7 @@ def _spans(cells: NDArray[np.int64]) -> bool:
 def _log_scatter(flux: NDArray[np.float64]) -> float:
     """Return the robust standard deviation of the logarithm of the flux, limited to plausible values."""
     logs = np.log(np.maximum(flux, 1e-300))
-    return float(np.clip(1.4826 * np.median(np.abs(logs - np.median(logs))), *_SCATTER))
+    return float(np.clip(MAD_TO_STD * np.median(np.abs(logs - np.median(logs))), *_SCATTER))
 
 
 def _least_cost(evidence: NDArray[np.float64], links: NDArray[np.int64], cost: float) -> NDArray[np.bool_]:

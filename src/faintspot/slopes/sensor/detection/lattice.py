@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.sensor.neighbours import neighbours_of
 
 RATIOS = {"square": 1j, "hexagonal": complex(np.exp(1j * np.pi / 3))}
@@ -109,5 +110,5 @@ class Lattice:
 
 def robust_std(values: NDArray[Any]) -> float:
     """Return the standard deviation from the median absolute deviation; the ordinary one if that is 0."""
-    deviation = 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    deviation = MAD_TO_STD * float(np.median(np.abs(values - np.median(values))))
     return deviation if deviation > 1e-9 * float(np.ptp(values)) else float(values.std())
