@@ -27,7 +27,7 @@ from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPl
 from faintspot.loop.control.identification.model import LearntControl
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.phase import residual_phase
-from faintspot.loop.control.telemetry import OpenLoopTelemetry, make_telemetry
+from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop
 from faintspot.loop.simulation.control import slope_turbulence
 from faintspot.loop.simulation.simulation import measure_gains
@@ -244,7 +244,7 @@ class Run:
     def telemetry(self, first: int, last: int) -> OpenLoopTelemetry:
         """Return the telemetry of some frames."""
         slopes, errors, held = (each[first:last] for each in (self.slopes, self.errors, self._held))
-        return make_telemetry(slopes, errors, held, np.zeros_like(held), None)
+        return OpenLoopTelemetry(slopes - held, np.square(errors), np.isfinite(errors).astype(np.float64))
 
 
 def rivals(

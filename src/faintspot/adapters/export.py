@@ -79,7 +79,7 @@ def export_fits(
         images |= _weights(pipeline)
     if control is not None:
         control.check_fits(len(pipeline.layout))
-        gain = control.options.centroid_gain
+        gain = control.centroid_gain
         images["INTERACTION_MATRIX"] = control.interaction * gain
         images["CONTROL_MATRIX"] = control.reconstructor.matrix / gain
     primary = fits.PrimaryHDU()

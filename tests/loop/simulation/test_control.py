@@ -10,8 +10,10 @@ import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, NOISE_SCALE, method_kind
 from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR
+from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.open_loop import open_loop_of
 from faintspot.loop.simulation import LoopConfiguration, Method, simulate_loop
-from faintspot.loop.simulation.control import learnt_control, telemetry_of
+from faintspot.loop.simulation.control import learnt_control, recorded_loop
 from faintspot.loop.simulation.methods import PRIOR
 from faintspot.loop.simulation.simulation import DisabledErrors
 from faintspot.loop.simulation.telescope.model import prepare
@@ -79,8 +81,8 @@ def test_the_filter_s_certainty_is_the_estimator_s_prior() -> None:
 def test_telemetry_knows_what_was_expected() -> None:
     """Of an estimator whose prior is so narrow that it gives nothing else: open-loop slopes are -I latest."""
     method = replace(_method(), settings=fs.Settings("map", prior_std_px=1e-3))
-    record = simulate_loop(FAINT.replace("run", frames=100, settle_frames=20), [method])
-    telemetry = telemetry_of(record, method)
+    record = simulate_loop(FAINT.replace("run", frames=350, settle_frames=20), [method])
+    telemetry = open_loop_of(recorded_loop(record, method), LoopDelay(2.0, 0.0, 1.0, 0.0)).telemetry
     assert np.isfinite(telemetry.open_loop_px).all()
     assert telemetry.trust.max() < 0.1
 

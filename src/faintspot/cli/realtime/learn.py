@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -98,7 +99,8 @@ def _learn_from(
     from faintspot.loop.control.base import ASSUMED
     from faintspot.loop.control.configuration import load_control, prior_std_px, save_control
     from faintspot.loop.control.identification.learning import learn_controller
-    from faintspot.loop.telemetry.recording import site_of, telemetry_of_recording
+    from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
+    from faintspot.loop.telemetry.recording import recorded_loop, site_of
     from faintspot.slopes.pipeline.settings import Settings
     from faintspot.slopes.sensor.layout import Layout
 
@@ -107,12 +109,14 @@ def _learn_from(
         raise InputError(f"{config}: expected a table [control], which calibrate writes")
     layout, night = Layout.load(config), read_telemetry(store, images=False)
     prior = prior_std_px(Settings.load(config), layout)
-    telemetry, rate_hz = telemetry_of_recording(night, control, prior)
+    loop = recorded_loop(night, control, layout, prior)
+    _, delay, unknown = known_delay(loop)
+    telemetry, rate_hz = open_loop_of(loop, delay).telemetry, loop.frame_rate_hz
     known = site_of(layout, layers), rate_hz, ASSUMED if layers else winds
     with progress_bar("Filter", "steps") as show:
         learnt = learn_controller(kind, control.plant, telemetry, *known, progress=show)
     path = derived(config, ".model.npz")
-    learnt.model.save(path)
+    replace(learnt.model, centroid_gain=delay.gain).save(path)
     save_control(config, controller=kind, model=path.name)
     left, left_out = learnt.model.left, leave_out(night.flags)[1]
     if left_out:
@@ -121,4 +125,5 @@ def _learn_from(
         f"{len(telemetry)} frames at {rate_hz:.0f} a second: {kind} leaves {left[0] / left[1]:.2f} of the "
         f"phase variance that the integrator with gain {learnt.model.plain_gain:g} leaves"
     )
+    click.echo(f"{unknown}; the centroid gain of [control] is used" if unknown else delay.gain_summary)
     click.echo(f"{learnt.model.description}; {path} and [control] of {config} written")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,9 @@ from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
 from faintspot.io.telemetry.recording import Telemetry, stored_names
 from faintspot.loop.control.configuration import Control, load_control, prior_std_px
 from faintspot.loop.control.identification.model import KALMAN
+from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
 from faintspot.loop.control.identification.relearning import FEWEST_FRAMES, RelearntControl, relearn
-from faintspot.loop.telemetry.recording import CLOSED, site_of, telemetry_of_recording
+from faintspot.loop.telemetry.recording import CLOSED, recorded_loop, site_of
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
 
@@ -109,11 +111,20 @@ class BackgroundLearning(BackgroundProcess):
         arrays = {field: records[field] for field in stored_names(records.dtype)}
         images: dict[str, Any] = dict.fromkeys(("image_frame", "raw", "denoised"), np.zeros(0))
         recording = Telemetry(**arrays, **images, changes=[], attributes=dict(self._reader.description))
-        telemetry, rate_hz = telemetry_of_recording(recording, self._control, self._prior_std_px())
+        loop = recorded_loop(recording, self._control, self._layout, self._prior_std_px())
+        _, delay, unknown = known_delay(loop)
+        if unknown:
+            delay = replace(delay, gain=self._control.model.centroid_gain)
         anew = self._last is None or self._count % _FROM_NOTHING_EVERY == 0
         start = None if anew or self._last is None else self._last.learnt.identified
         self._last = relearnt = relearn(
-            self._control.plant, self._control.model, telemetry, self._site, rate_hz, start
+            self._control.plant,
+            self._control.model,
+            open_loop_of(loop, delay).telemetry,
+            self._site,
+            loop.frame_rate_hz,
+            start,
+            None if unknown else delay,
         )
         self._count += 1
         self._report(relearnt)

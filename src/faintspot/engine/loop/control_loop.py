@@ -17,7 +17,7 @@ from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.timing import Latencies
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.compiled import CompiledIntegrator, true_slopes
+from faintspot.loop.control.compiled import MEAN_SQUARE, CompiledIntegrator, true_slopes
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.kalman.compiled import CompiledKalman
@@ -81,7 +81,7 @@ class ControlLoop:
         self._statistics = np.zeros(2)
         self._true_slopes = Direct(true_slopes)
         self._removed_modes = control.removed_modes
-        self._centroid_gain = float(control.options.centroid_gain)
+        self._configured_gain = float(control.options.centroid_gain)
         self.guard = Guard(control, layout)
         self.closed, self.opened_because = False, _AT_START
         self.closed_again_because = ""
@@ -107,7 +107,7 @@ class ControlLoop:
         if not self.closed or self._begins or self._removed_modes or not on.begins:
             return parts
         try:
-            parts = on.controller.begin_product(self._threads, 1.0 / self._centroid_gain)
+            parts = on.controller.begin_product(self._threads, 1.0 / on.centroid_gain)
         except Exception as error:  # nothing raises in the frame path
             self._fail(error)
         return parts
@@ -137,7 +137,7 @@ class ControlLoop:
             slopes.standard_error_x,
             slopes.standard_error_y,
             slopes.covariance_xy,
-            self._centroid_gain,
+            self._on.centroid_gain,
             self._slopes,
             self._errors,
             self._covariance,
@@ -145,6 +145,8 @@ class ControlLoop:
         )
         if self._removed_modes:
             self._removed_modes.remove(slopes.flags, self._slopes, self._statistics)
+        # The guard's limits do not depend on what a controller has learnt.
+        self._statistics[MEAN_SQUARE] *= (self._on.centroid_gain / self._configured_gain) ** 2
         if self._flattened:
             self._flattened = False
             line.hold(np.zeros_like(line.latest))
@@ -184,7 +186,9 @@ class ControlLoop:
         if self.closed and not self._begins and successor.is_settling:
             std = on.controller.prior_std_px if prior is not None and on.takes_prior else None
             mean = self._slopes if prior is None else prior.mean_px.reshape(-1).astype(np.float64)
-            successor.follow(self._line, self._slopes, self._errors, self._covariance, mean, std)
+            per_px = on.centroid_gain / successor.ready.centroid_gain
+            covariance = per_px**2 * self._covariance
+            successor.follow(self._line, per_px * self._slopes, per_px * self._errors, covariance, mean, std)
             return
         if self._successor is successor:  # else a newer one has come
             self._successor = None

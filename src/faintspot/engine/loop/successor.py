@@ -32,6 +32,8 @@ class PreparedController(NamedTuple):
     """Whether it uses the width of the prior of the slopes."""
     completes: bool
     """Whether a part of each frame's work, which need not delay the command, waits for `expected`."""
+    centroid_gain: float
+    """Centroid gain by which its slopes are divided."""
     begins: bool
     """Whether it can begin its command while slopes are measured, by `begin_product`."""
 
@@ -47,6 +49,7 @@ class PreparedController(NamedTuple):
             control.prediction == CONTROLLER,
             isinstance(controller, (Guarded, CompiledKalman)),
             isinstance(controller, (LargeGuarded, CompiledKalman)),
+            control.centroid_gain,
             isinstance(controller, (CompiledIntegrator, LargeGuarded)),
         )
 
@@ -89,7 +92,7 @@ class ControllerSuccessor:
         line : CommandDelayLine
             To the mirror.
         slopes, errors, covariance : (2 n,), (2 n,) and (n,) arrays
-            As for `Controller.update`.
+            As for `Controller.update`, divided by this controller's centroid gain.
         expected, prior : (2 n,) array
             Mean and standard deviation of the estimator's prior; None: it had none.
         """

@@ -244,6 +244,12 @@ class Control:
         return LoopPlant(self.controlled, self.reconstructor, options.delay_frames, options.leak)
 
     @property
+    def centroid_gain(self) -> float:
+        """Centroid gain by which slopes are divided: the configured one times that in a learnt model."""
+        learnt = 1.0 if self.options.controller == INTEGRATOR else float(self.model.centroid_gain)
+        return self.options.centroid_gain * learnt
+
+    @property
     def prediction(self) -> str:
         """Source of predictions: NONE, CONTROLLER or STREAM."""
         usual = CONTROLLER if self.options.controller == KALMAN else NONE

@@ -57,36 +57,6 @@ class OpenLoopTelemetry:
         )
 
 
-def make_telemetry(
-    slopes_px: Floats,
-    standard_error_px: Floats,
-    held_px: Floats,
-    expected_px: Floats,
-    prior_std_px: Floats | None,
-    covariance_xy_px2: Floats | None = None,
-) -> OpenLoopTelemetry:
-    """Return telemetry of residual slopes, (frames, m).
-
-    Parameters
-    ----------
-    slopes_px, standard_error_px : (frames, m) array
-        In true pixels; infinite error: not measured.
-    held_px : (frames, m) array
-        What the mirror added to the slopes.
-    expected_px, prior_std_px : (frames, m) array
-        Prior of an estimator whose slopes and errors are those of the posterior; None: it has none.
-    covariance_xy_px2 : (frames, m / 2) array, optional
-        Covariance of the errors of x and y; that of an estimator with a prior is not used, as the frame's own
-        is not known. Default: 0.
-    """
-    slopes, variance, trust = without_prior(slopes_px, standard_error_px, expected_px, prior_std_px)
-    covariance = None
-    if covariance_xy_px2 is not None and prior_std_px is None and covariance_xy_px2.any():
-        measured = np.isfinite(variance).reshape(len(variance), 2, -1).all(axis=1)
-        covariance = np.where(measured, covariance_xy_px2, 0.0)
-    return OpenLoopTelemetry(slopes - held_px, variance, trust, covariance)
-
-
 def without_prior(
     slopes_px: Floats, standard_error_px: Floats, expected_px: Floats, prior_std_px: Floats | None
 ) -> tuple[Floats, Floats, Floats]:

@@ -20,13 +20,16 @@ from faintspot.loop.control.identification.learning import (
     LoopPlant,
     learn_controller,
 )
+from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import Integrator
-from faintspot.loop.control.telemetry import OpenLoopTelemetry, make_telemetry
+from faintspot.loop.control.telemetry import OpenLoopTelemetry, without_prior
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED, ControlParameters, RunLength
 from faintspot.loop.simulation.methods import PRIOR, Method
 from faintspot.loop.simulation.record import LoopRecord
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 
 if TYPE_CHECKING:
     from faintspot.loop.simulation.telescope.model import LoopOptics
@@ -163,40 +166,56 @@ def _learnt(
         usual = _learnt(configuration, method, kind, 1.0, seed, simulate)
         return replace(usual, model=usual.model.with_noise(noise_scale))
     optics, control = prepare(configuration), configuration.control
-    telemetry = _telemetry(_without_assumed(configuration), method, seed, simulate)
+    telemetry, gain = _telemetry(_without_assumed(configuration), method, seed, simulate)
     site = slope_turbulence(configuration, optics.sensor.layout.cells)
     plant = LoopPlant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
-    return learn_controller(kind, plant, telemetry, site, control.frame_rate_hz, control.winds, noise_scale)
+    known = site, control.frame_rate_hz, control.winds, noise_scale
+    learnt = learn_controller(kind, plant, telemetry, *known)
+    return replace(learnt, model=replace(learnt.model, centroid_gain=gain))
 
 
 @lru_cache(maxsize=8)
 def _telemetry(
     configuration: LoopConfiguration, method: _TelemetryMethod, seed: int, simulate: Simulate
-) -> OpenLoopTelemetry:
-    """Run the loop with an integrator in turbulence that is never scored."""
+) -> tuple[OpenLoopTelemetry, float]:
+    """Run the loop with an integrator in turbulence that is never scored; return also the centroid gain."""
     frames = configuration.control.telemetry_frames
     run = configuration.replace("run", frames=frames, settle_frames=0)
     record = simulate(run, [method.method], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)
-    return telemetry_of(record, method.method)
+    loop = recorded_loop(record, method.method)
+    delay = LoopDelay(record.delay_frames, 0.0, 1.0, 0.0)
+    if method.method.correct_gain and not method.method.true_slopes:
+        _, delay, _ = known_delay(loop)
+    return open_loop_of(loop, delay).telemetry, delay.gain
 
 
-def telemetry_of(record: LoopRecord, method: Method) -> OpenLoopTelemetry:
-    """Return the telemetry of a run of one method with the integrator."""
-    divisor = float(record.centroid_gain[0]) if record.corrected[0] else 1.0
-    mirror_px = record.commands.astype(np.float64) @ record.interaction_matrix.T
-    expected = np.zeros_like(mirror_px)
-    if method.predict_prior:  # what acts less the latest command, which acts so many frames later
-        later = record.delay_frames - 1
-        expected[: len(mirror_px) - later] = mirror_px[: len(mirror_px) - later] - mirror_px[later:]
-    telemetry = make_telemetry(
-        record.slopes_px.astype(np.float64) / divisor,
-        record.standard_error_px.astype(np.float64) / divisor,
-        mirror_px,
-        expected,
-        prior_std_px(method, mirror_px.shape[1]),
-        record.covariance_xy_px2.astype(np.float64) / divisor**2,
+def recorded_loop(record: LoopRecord, method: Method) -> Recording:
+    """Return what a telescope records of a run of one method with the integrator, freed of its prior."""
+    delay = record.delay_frames
+    sent = record.commands[delay:].astype(np.float64)  # computed from each frame
+    slopes, errors = (
+        values[: len(sent)].astype(np.float64) for values in (record.slopes_px, record.standard_error_px)
     )
-    return telemetry.part(_SETTLE_FRAMES, record.frames - record.delay_frames)
+    expected, prior = np.zeros_like(slopes), prior_std_px(method, slopes.shape[1])
+    if method.predict_prior:  # what acts less the latest command, which acts so many frames later
+        acting = record.commands.astype(np.float64) @ record.interaction_matrix.T
+        expected = acting[: len(sent)] - acting[delay - 1 :][: len(sent)]
+    slopes, variance, _ = without_prior(slopes, errors, expected, prior)
+    recording = Recording(
+        np.where(np.isfinite(variance), slopes, np.nan),
+        sent,
+        record.interaction_matrix,
+        record.cells,
+        record.frame_rate_hz,
+        subaperture_m=record.subaperture_m,
+        pixel_scale_arcsec=record.pixel_scale_rad / ARCSEC,
+        delay_frames=delay,
+        standard_errors=np.sqrt(variance),
+        covariance_xy=record.covariance_xy_px2[: len(sent)].astype(np.float64),
+        prior_std=prior,
+        slope_unit="px",
+    )
+    return recording.part(slice(_SETTLE_FRAMES, None))
 
 
 def _has_prior(method: Method) -> bool:

@@ -92,13 +92,13 @@ def write_engine_files(
     usual = {"gain": loop.gain, "leak": loop.leak, "delay_frames": loop.delay_frames}
     measured = {"interaction_matrix": INTERACTION, "reference_slopes": REFERENCE, "centroid_gain": 1.0}
     seed = configuration.run.seed
-    if method.correct_gain:
-        pipeline = make_pipeline(configuration, optics.sensor, method)
-        measured["centroid_gain"] = float(measure_gains(configuration, [pipeline], seed=seed)[0])
     _, learnt = learnt_control(configuration, method, seed, simulate_loop)
     if learnt is not None:
-        learnt.model.save(folder / MODEL)
-        measured |= {"controller": control, "model": MODEL}
+        replace(learnt.model, centroid_gain=1.0).save(folder / MODEL)
+        measured |= {"controller": control, "model": MODEL, "centroid_gain": learnt.model.centroid_gain}
+    elif method.correct_gain:
+        pipeline = make_pipeline(configuration, optics.sensor, method)
+        measured["centroid_gain"] = float(measure_gains(configuration, [pipeline], seed=seed)[0])
     save_control(path, **{**usual, **before, **measured})
     return path
 

@@ -35,7 +35,8 @@ class Method:
     predict_prior : bool
         Whether estimators that take a prior are given the slopes that the loop predicts.
     correct_gain : bool
-        Whether slopes are divided by the centroid gain measured at the run's flux.
+        Whether slopes are divided by their centroid gain: for the integrator that measured at the run's
+        flux, for control that learns the one learnt from telemetry.
     true_slopes : bool
         Whether slopes are the wavefront's true mean gradients instead of measured ones.
     control : str

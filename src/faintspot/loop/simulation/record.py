@@ -20,7 +20,7 @@ class LoopRecord(Stored):
     FORMAT: ClassVar[int] = 3
 
     slopes_px: NDArray[np.float32]
-    """(frames, 2 n): all x, then all y, from the reference, before division by the centroid gain."""
+    """(frames, 2 n): all x, then all y, from the reference, before division by a centroid gain."""
     valid: NDArray[np.bool_]
     """(frames, n)"""
     standard_error_px: NDArray[np.float32]
@@ -44,7 +44,7 @@ class LoopRecord(Stored):
     centroid_gain: NDArray[np.float64]
     """(methods,): centroid gain of each method at the run's flux."""
     corrected: NDArray[np.bool_]
-    """(methods,): whether slopes were divided by the centroid gain."""
+    """(methods,): whether slopes were divided by the centroid gain: this one, or one that control learnt."""
     labels: tuple[str, ...]
     """Labels of the methods."""
     method_settings: tuple[str, ...]

@@ -189,6 +189,7 @@ class _Loop:
         self.configuration = configuration = disabled_errors.configuration(configuration)
         self.sodium = _known_sodium(configuration, seed, realisation)
         self.methods = methods = tuple(self._with_spots(method) for method, _ in ready)
+        self.learnt = [learnt for _, learnt in ready]
         self.schedule, self.disabled_errors = schedule, disabled_errors
         self.seed, self.realisation = seed, realisation
         self.telescope_model = TelescopeModel(
@@ -254,7 +255,11 @@ class _Loop:
             detector=self.telescope_model.detector,
         )
         gains = np.where([method.true_slopes for method in self.methods], 1.0, gains)
-        return gains, np.where([method.correct_gain for method in self.methods], gains, 1.0)
+        divisors = np.where([method.correct_gain for method in self.methods], gains, 1.0)
+        for number, learnt in enumerate(self.learnt):
+            if learnt is not None:  # from its telemetry, as at a telescope
+                divisors[number] = learnt.model.centroid_gain
+        return gains, divisors
 
     def run(self, progress: Callable[[int, int], None] | None) -> _Loop:
         """Simulate all frames."""

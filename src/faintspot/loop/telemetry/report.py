@@ -16,9 +16,10 @@ from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES
 from faintspot.loop.control.identification.measured import Measured, outer_scale_and_r0, wind_errors, winds_of
 from faintspot.loop.control.identification.open_loop import (
     OpenLoop,
-    measured_delay,
+    known_delay,
     open_loop_of,
     site_of_loop,
+    with_axes_of,
 )
 from faintspot.loop.control.identification.recording import Recording, prepared
 from faintspot.loop.telemetry.choices import Choice, advice, compared_choices
@@ -161,15 +162,16 @@ def _loop(report: LoopReport) -> LoopDelay:
 def _delay(loop: Recording) -> tuple[list[Measured], LoopDelay]:
     """Return delay and gain as reported and as used."""
     names, assumed = (("delay", "frames"), ("centroid gain", "")), loop.delay_frames
-    try:
-        fit, used = measured_delay(loop)
-    except InputError as error:
-        used = LoopDelay(assumed or 2.0, math.nan, 1.0, math.nan)
-        remarks = f"{error}; {used.delay_frames:g} is used", f"{error}; 1 is used"
+    fit, used, unknown = known_delay(loop)
+    if unknown:
+        remarks = f"{unknown}; {used.delay_frames:g} is used", f"{unknown}; 1 is used"
         return [Measured(*name, remark=text) for name, text in zip(names, remarks, strict=True)], used
     remark = "given" if assumed is not None else f"{used.delay_frames:g} is used" if used is not fit else ""
+    used = with_axes_of(loop, used)
     gain = Measured(*names[1], used.gain, used.gain_error, f"for a delay of {used.delay_frames:.3g} frames")
-    return [Measured(*names[0], fit.delay_frames, fit.delay_error, remark), gain], used
+    of_axes = used.measured_y_to_x, used.y_to_x_error
+    axes = Measured("centroid gain of y to x", "", *of_axes, f"{used.y_to_x:.3g} is used")
+    return [Measured(*names[0], fit.delay_frames, fit.delay_error, remark), gain, axes], used
 
 
 def _saturated(loop: Recording) -> Measured:
@@ -200,7 +202,7 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
         for name in ("noise", "turbulence", "vibrations", "spectra", "choices"):
             report.parts[name].missing = report.parts[name].missing or f"{error}."
         return None
-    report.noise_px = loop.unit * delay.gain * np.sqrt(open_loop.variance)
+    report.noise_px = loop.unit * delay.gains(len(loop.cells)) * np.sqrt(open_loop.variance)
     report.noise_error_px = 0.5 * report.noise_px * open_loop.variance_error
     rms = float(np.sqrt(np.square(report.noise_px).mean()))
     spread = 0.5 * rms * float(open_loop.variance_error.mean()) / math.sqrt(len(open_loop.variance))

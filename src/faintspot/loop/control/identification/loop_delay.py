@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,8 @@ _GAINS = 0.1, 1.6
 _START_GAIN = 0.6
 _MODEL_ERROR = 0.05  # frames: spectra of real slopes differ from the theory
 _GAIN_ERROR = 0.03  # absolute and relative, likewise
+_AXES_ERROR = 0.03  # of the gain of y relative to x, likewise
+_SURE = 3.0  # standard errors
 _SPEEDS_M_PER_S = (1.0, 3.0, 6.0, 10.0, 15.0, 22.0, 32.0)
 _DIRECTIONS = 4  # of half a turn: opposite winds have the same spectrum
 _MOST_SUBAPERTURES, _MOST_MODES = 40, 36
@@ -48,6 +51,25 @@ class LoopDelay:
     gain: float
     """Centroid gain relative to the interaction matrix."""
     gain_error: float
+    y_to_x: float = 1.0
+    """Gain of y relative to x that is used; `gain` is their geometric mean."""
+    measured_y_to_x: float = math.nan
+    y_to_x_error: float = math.nan
+
+    @property
+    def gain_summary(self) -> str:
+        """Return the centroid gain in words."""
+        return f"centroid gain {self.gain:.3f} +- {self.gain_error:.3f}"
+
+    def row(self) -> Floats:
+        """Return delay, gain and gain of y relative to x as measured, each with its standard error, (6,)."""
+        axes = self.measured_y_to_x, self.y_to_x_error
+        return np.array([self.delay_frames, self.delay_error, self.gain, self.gain_error, *axes])
+
+    def gains(self, n: int) -> Floats:
+        """Return the centroid gain of each slope of n sub-apertures, (2 n,)."""
+        root = math.sqrt(self.y_to_x)
+        return np.repeat([self.gain / root, self.gain * root], n)
 
 
 def loop_delay(
@@ -80,24 +102,10 @@ def loop_delay(
         When there are fewer than 3 sub-apertures, because vibrations change tip and tilt, or fewer than 8
         pieces of 128 consecutive frames, half overlapping.
     """
-    n = len(site.positions_m)
-    if n < FEWEST_SUBAPERTURES:
-        raise InputError(
-            f"recording: expected {FEWEST_SUBAPERTURES} sub-apertures or more, as vibrations hide it in tip "
-            f"and tilt, got {n}"
-        )
-    kept = np.arange(n)[:: math.ceil(n / _MOST_SUBAPERTURES)]
-    columns = np.concatenate([kept, kept + n])
-    site = replace(site, positions_m=site.positions_m[kept])
-    window = np.hanning(_WINDOW + 2)[1:-1]
-    window /= np.linalg.norm(window)
-    basis = _modes(site)
-    slopes, sent = ((values - values.mean(axis=0))[:, columns] @ basis for values in (slopes_px, sent_px))
-    products, pieces = _products(slopes, sent, run, window)
-    fits = _Fits(products, _turbulence(site, rate_hz, window, basis), pieces)
+    fits = _Fits.of_loop(slopes_px, sent_px, run, site, rate_hz)
     if delay_frames is not None:
         gain, gain_error, _ = fits.of(delay_frames, _UPDATES)
-        return LoopDelay(delay_frames, 0.0, gain, gain_error)
+        return LoopDelay(delay_frames, 0.0, gain, math.hypot(gain_error, _model_error(gain)))
     fits.of(2.0, _UPDATES)
     whole = min(range(1, _MOST_DELAY + 1), key=lambda delay: fits.of(delay, _FEW_UPDATES)[-1])
     delays = np.arange(max(whole - 1.0, 1.0), min(whole + 1.0, _MOST_DELAY) + 0.5 * _STEP, _STEP)
@@ -109,7 +117,42 @@ def loop_delay(
         math.sqrt(float(weight @ (delays - delay) ** 2)), _STEP / math.sqrt(12), _MODEL_ERROR
     )
     of_delay = math.sqrt(float(weight @ (values[:, 0] - gain) ** 2))
-    return LoopDelay(delay, delay_error, gain, math.hypot(of_delay, float(weight @ values[:, 1])))
+    gain_error = math.hypot(of_delay, float(weight @ values[:, 1]), _model_error(gain))
+    return LoopDelay(delay, delay_error, gain, gain_error)
+
+
+def with_axes(
+    delay: LoopDelay,
+    slopes_px: Floats,
+    sent_px: Floats,
+    run: NDArray[np.int64],
+    site: SlopeTurbulence,
+    rate_hz: float,
+) -> LoopDelay:
+    """Return delay and centroid gain with the gain of y relative to x, used if it differs from 1 for sure.
+
+    Parameters as for `loop_delay`, which has found `delay`.
+    """
+    gains, errors = np.transpose(
+        [
+            _Fits.of_loop(slopes_px, sent_px, run, site, rate_hz, axis).of(delay.delay_frames, _UPDATES)[:2]
+            for axis in (0, 1)
+        ]
+    )
+    ratio = float(gains[1] / gains[0])
+    error = ratio * math.hypot(*(errors / gains), _AXES_ERROR)
+    found = replace(delay, measured_y_to_x=ratio, y_to_x_error=error)
+    if abs(math.log(ratio)) < _SURE * error / ratio:
+        return found
+    # Both axes together tell the gain better than each alone.
+    alike = slopes_px / replace(found, gain=1.0, y_to_x=ratio).gains(len(site.positions_m))
+    fit = loop_delay(alike, sent_px, run, site, rate_hz, delay.delay_frames)
+    return replace(found, gain=fit.gain, gain_error=fit.gain_error, y_to_x=ratio)
+
+
+def _model_error(gain: float) -> float:
+    """Return the error of a gain as spectra of real slopes differ from the theory."""
+    return _GAIN_ERROR * math.hypot(1, gain)
 
 
 class _Fits:
@@ -122,6 +165,33 @@ class _Fits:
         each = np.trace(parts, axis1=2, axis2=3).real.sum(axis=1)
         self._strength = level / each / len(parts)
         self._gain = _START_GAIN
+
+    @classmethod
+    def of_loop(
+        cls,
+        slopes_px: Floats,
+        sent_px: Floats,
+        run: NDArray[np.int64],
+        site: SlopeTurbulence,
+        rate_hz: float,
+        axis: int | None = None,
+    ) -> Self:
+        """Return the fits of a loop, of slopes along both axes or one; see `loop_delay`."""
+        n = len(site.positions_m)
+        if n < FEWEST_SUBAPERTURES:
+            raise InputError(
+                f"recording: expected {FEWEST_SUBAPERTURES} sub-apertures or more, as vibrations hide it in "
+                f"tip and tilt, got {n}"
+            )
+        kept = np.arange(n)[:: math.ceil(n / _MOST_SUBAPERTURES)]
+        columns = np.concatenate([kept, kept + n])
+        site = replace(site, positions_m=site.positions_m[kept])
+        window = np.hanning(_WINDOW + 2)[1:-1]
+        window /= np.linalg.norm(window)
+        basis = _modes(site, axis)
+        slopes, sent = ((values - values.mean(axis=0))[:, columns] @ basis for values in (slopes_px, sent_px))
+        products, pieces = _products(slopes, sent, run, window)
+        return cls(products, _turbulence(site, rate_hz, window, basis), pieces)
 
     def of(self, delay: float, updates: int) -> tuple[float, float, float]:
         """Return gain, its standard error, and the misfit: minus the logarithm of the likelihood."""
@@ -151,22 +221,23 @@ class _Fits:
         misfit = float(
             np.linalg.slogdet(model)[1].sum() + (np.linalg.inv(model) * measured.swapaxes(1, 2)).sum().real
         )
-        error = math.hypot(
-            1 / math.sqrt(2 * self._independent * max(curvature, 1e-300)), _GAIN_ERROR * math.hypot(1, gain)
-        )
+        error = 1 / math.sqrt(2 * self._independent * max(curvature, 1e-300))
         return gain, error, self._independent * float(misfit)
 
 
-def _modes(site: SlopeTurbulence) -> Floats:
+def _modes(site: SlopeTurbulence, axis: int | None) -> Floats:
     """Return an orthonormal basis (2 n, modes) without tip and tilt, where vibrations are.
 
-    From those with the most turbulence to those with the least.
+    Of slopes along both axes or one; from those with the most turbulence to those with the least.
     """
     n = len(site.positions_m)
-    without = np.kron(np.eye(2), np.eye(n) - 1 / n)
+    axes = np.eye(2) if axis is None else np.diag(np.eye(2)[axis])
+    without = np.kron(axes, np.eye(n) - 1 / n)
     covariance = replace(site, pixel_scale_rad=1.0).covariance_px2()  # the same modes in any unit
-    vectors = np.linalg.eigh(without @ covariance @ without)[1][:, ::-1][:, : 2 * n - 2]
-    return np.asarray(vectors[:, np.unique(np.geomspace(1, 2 * n - 2, _MOST_MODES).astype(int)) - 1])
+    modes = int(axes.trace()) * (n - 1)
+    vectors = np.linalg.eigh(without @ covariance @ without)[1][:, ::-1][:, :modes]
+    most = _MOST_MODES * modes // (2 * n - 2)
+    return np.asarray(vectors[:, np.unique(np.geomspace(1, modes, most).astype(int)) - 1])
 
 
 def _products(slopes: Floats, sent: Floats, run: NDArray[np.int64], window: Floats) -> tuple[Complex, int]:

@@ -55,12 +55,14 @@ _NOISE = "variance_px2", "covariance_xy_px2"
 _SQUARE = {"now_px2", "ahead_px2"}
 _OF_LAYERS = {"first", "second", "driving_px2"}
 _OF_ALL = ("plain_gain", "noise_factor", "left", "phase_of_commands")
+_GAIN = "centroid_gain"
 _COVARIANCE = -1e8, 1e8  # px^2: of slopes of 1e4 px
 _RANGES = {
     "gains": (0.0, 2.0),
     "gain": (0.0, 1.0),
     "plain_gain": (0.0, 2.0),
     "noise_factor": (1e-6, 1e6),
+    _GAIN: (1e-3, 1e3),
     "variance_px2": (1e-12, 1e8),
     "now_px2": _COVARIANCE,
     "ahead_px2": _COVARIANCE,
@@ -138,6 +140,8 @@ class ControlModel:
     phase_of_commands: Floats
     """(commands, commands): matrix of the measure that compares both; see `phase_of_commands`."""
     description: str = ""
+    centroid_gain: float = 1.0
+    """Centroid gain of the slopes, by which they are divided before they come to the controller."""
     covariance: Floats | None = None
     """(states, states) px^2: as from `steady_covariance`, where it is known already."""
 
@@ -242,7 +246,7 @@ class ControlModel:
         InputError
             When it cannot be written.
         """
-        numbers = {name: np.asarray(getattr(self, name), np.float64) for name in _OF_ALL}
+        numbers = {name: np.asarray(getattr(self, name), np.float64) for name in (*_OF_ALL, _GAIN)}
         kind = _LOCAL if self.is_local else self.kind
         save_arrays(path, {"kind": np.array(kind), **numbers, **self.arrays, **others})
 
@@ -257,7 +261,8 @@ class ControlModel:
         """
         contents = "what control has learnt"
         kind = one_of("kind", str(read_arrays(path, contents, ("kind",))["kind"]), list(_OF_KIND))
-        numbers = _checked(read_arrays(path, contents, (*_OF_ALL, *_OF_KIND[kind])), plant)
+        names = *_OF_ALL, *_OF_KIND[kind], _GAIN
+        numbers = _checked(read_arrays(path, contents, names, optional=(_GAIN,)), plant)
         learnt, plain = numbers["left"]
         return cls(
             KALMAN if kind == _LOCAL else kind,
@@ -266,6 +271,7 @@ class ControlModel:
             float(numbers["noise_factor"]),
             (float(learnt), float(plain)),
             numbers["phase_of_commands"],
+            centroid_gain=float(numbers.get(_GAIN, 1.0)),
         )
 
     def check(self, plant: LoopPlant) -> None:
@@ -276,7 +282,7 @@ class ControlModel:
         InputError
             One line.
         """
-        numbers = {name: getattr(self, name) for name in _OF_ALL}
+        numbers = {name: getattr(self, name) for name in (*_OF_ALL, _GAIN)}
         _checked({**self.arrays, **numbers}, plant)
 
 

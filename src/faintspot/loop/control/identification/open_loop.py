@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay, loop_delay
+from faintspot.loop.control.identification.loop_delay import (
+    FEWEST_SUBAPERTURES,
+    LoopDelay,
+    loop_delay,
+    with_axes,
+)
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
@@ -31,20 +37,17 @@ class OpenLoop:
     """(frames, 2 n)"""
     run: NDArray[np.int64]
     """(frames,): numbers of runs without a gap."""
+    variance: Floats
+    """(2 n,): variance of the noise; of known standard errors the median."""
     variance_error: Floats
-    """(2 n,): relative standard error of the noise's variance."""
-
-    @property
-    def variance(self) -> Floats:
-        """(2 n,): variance of the noise."""
-        return np.asarray(np.min(self.telemetry.variance_px2, axis=0))
+    """(2 n,): relative standard error of the measured variance."""
 
     def scaled(self, gain: float) -> OpenLoop:
         """Return the same with residual slopes multiplied by a gain."""
         telemetry, residual = self.telemetry, gain * self.residual
         slopes = telemetry.open_loop_px + residual - self.residual
-        scaled = OpenLoopTelemetry(slopes, gain**2 * telemetry.variance_px2, telemetry.trust)
-        return replace(self, telemetry=scaled, residual=residual)
+        scaled = replace(telemetry.scaled(gain**2), open_loop_px=slopes)
+        return replace(self, telemetry=scaled, residual=residual, variance=gain**2 * self.variance)
 
 
 def site_of_loop(loop: Recording) -> SlopeTurbulence:
@@ -70,8 +73,7 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
     """
     if not loop.is_closed or not np.ptp(loop.commands, axis=0).any():
         raise InputError("commands: expected those of a closed loop, got constant ones")
-    slopes, mirror = np.nan_to_num(loop.slopes), loop.commands @ loop.interaction_matrix.T
-    context = runs_of(loop.frame), site_of_loop(loop), loop.frame_rate_hz
+    slopes, mirror, *context = _of_fit(loop)
     fit = loop_delay(slopes, mirror, *context, loop.delay_frames)
     nearest = float(round(fit.delay_frames))
     if loop.delay_frames is None and abs(fit.delay_frames - nearest) < max(
@@ -81,8 +83,34 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
     return fit, fit
 
 
+def with_axes_of(loop: Recording, delay: LoopDelay) -> LoopDelay:
+    """Return delay and centroid gain with the gain of y relative to x; see `with_axes`."""
+    return with_axes(delay, *_of_fit(loop))
+
+
+def _of_fit(loop: Recording) -> tuple[Floats, Floats, NDArray[np.int64], SlopeTurbulence, float]:
+    """Return what delay and gain are fitted to: slopes, those of the commands, runs, geometry and rate."""
+    slopes, mirror = np.nan_to_num(loop.slopes), loop.commands @ loop.interaction_matrix.T
+    return slopes, mirror, runs_of(loop.frame), site_of_loop(loop), loop.frame_rate_hz
+
+
+def known_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay, str]:
+    """Return delay and gain as measured and as used, and why they could not be measured, if so.
+
+    Then the delay is the stated one, or 2 frames, and the gain 1; the latter also for estimators with a
+    prior, whose slopes are not in proportion to the displacement.
+    """
+    assumed = LoopDelay(loop.delay_frames or 2.0, math.nan, 1.0, math.nan)
+    if loop.prior_std is not None:
+        return assumed, assumed, "recording: the estimator had a prior"
+    try:
+        return *measured_delay(loop), ""
+    except InputError as error:
+        return assumed, assumed, str(error)
+
+
 def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:
-    """Return open-loop slopes, with the noise from deviations from a parabola in time.
+    """Return open-loop slopes, with the noise from deviations from a parabola in time if it is not stated.
 
     Raises
     ------
@@ -97,23 +125,36 @@ def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:
         rows = rows[runs == np.bincount(runs).argmax()]
     if len(rows) < FEWEST_FRAMES:
         raise InputError(f"{len(rows)} frames with known commands, expected {FEWEST_FRAMES}")
-    frame = loop.frame[rows] - loop.frame[rows[0]]
+    frame, gains = loop.frame[rows] - loop.frame[rows[0]], delay.gains(loop.slopes.shape[1] // 2)
     grid = np.full((2, int(frame[-1]) + 1, loop.slopes.shape[1]), np.nan)
-    grid[:, frame] = loop.slopes[rows] / delay.gain
+    grid[:, frame] = loop.slopes[rows] / gains
     grid[1, frame] -= mirror[rows]
     with np.errstate(invalid="ignore"):
         grid -= np.nansum(grid, axis=1, keepdims=True) / np.isfinite(grid).sum(axis=1, keepdims=True)
     residual, atmosphere = grid
     measured = np.isfinite(atmosphere)
     variance, count = _noise_variance(atmosphere)
-    variance = np.maximum(variance, _LEAST_SIGNAL * float(np.nanvar(atmosphere)))
-    telemetry = OpenLoopTelemetry(
-        np.where(measured, atmosphere, 0.0), np.where(measured, variance, np.inf), measured.astype(np.float64)
-    )
+    least = _LEAST_SIGNAL * float(np.nanvar(atmosphere))
+    of_frames = usual = np.maximum(variance, least)
+    if loop.standard_errors is not None:
+        of_frames = np.full(measured.shape, np.inf)
+        of_frames[frame] = np.maximum(np.square(loop.standard_errors[rows] / gains), least)
+        usual = np.median(of_frames[frame], axis=0)
+        measured &= np.isfinite(of_frames)
+    of_frames = np.where(measured, of_frames, np.inf)
+    trust = measured.astype(np.float64)
+    if loop.prior_std is not None:
+        trust = np.square(loop.prior_std) / (np.square(loop.prior_std) + of_frames)
+    covariance = None
+    if loop.covariance_xy is not None and loop.prior_std is None and loop.covariance_xy[rows].any():
+        covariance = np.zeros((len(measured), measured.shape[1] // 2))
+        covariance[frame] = loop.covariance_xy[rows] / delay.gain**2
+        covariance[~measured.reshape(len(measured), 2, -1).all(axis=1)] = 0.0
+    telemetry = OpenLoopTelemetry(np.where(measured, atmosphere, 0.0), of_frames, trust, covariance)
     runs = np.repeat(runs_of(frame), np.diff(frame, append=frame[-1] + 1))
     # Products of Gaussian noise with its deviation from a parabola have this variance.
     error = np.sqrt(2.5 / np.maximum(count, 1))
-    return OpenLoop(telemetry, np.where(measured, residual, 0.0), runs, error)
+    return OpenLoop(telemetry, np.where(measured, residual, 0.0), runs, usual, error)
 
 
 def _held(loop: Recording, delay: LoopDelay) -> tuple[Floats, NDArray[np.bool_]]:

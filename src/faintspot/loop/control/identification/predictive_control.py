@@ -24,6 +24,7 @@ from faintspot.loop.control.identification.open_loop import (
     measured_delay,
     open_loop_of,
     site_of_loop,
+    with_axes_of,
 )
 from faintspot.loop.control.identification.recording import Prepared, Recording, prepared
 from faintspot.loop.control.identification.state_space import state_space, write_matrices
@@ -45,12 +46,12 @@ class _Loop:
     """(2 n, commands): in slopes divided by the rms of the recording's and by their centroid gain."""
     standard_error: Floats
     """(2 n,): of such slopes."""
-    scale: float
-    """Such slopes in a unit of the user's."""
+    scale: Floats
+    """(2 n,): such slopes in a unit of the user's."""
     sign: float
     """-1 where the user's commands are subtracted from the turbulence."""
     delay: Floats
-    """(4,): delay in frames, centroid gain, and their standard errors, at 0, 2 and 1, 3."""
+    """(6,): delay in frames, centroid gain, and that of y relative to x, each with its standard error."""
     winds: Floats
     """(layers, 6): speed, direction and share, each with its standard error."""
     largest_command: float
@@ -88,6 +89,11 @@ class PredictiveControl:
     def centroid_gain(self) -> Measured:
         """Gain of the slopes in the running loop, relative to the interaction matrix."""
         return Measured("centroid gain", "", float(self._loop.delay[2]), float(self._loop.delay[3]))
+
+    @property
+    def gain_of_y_to_x(self) -> Measured:
+        """Centroid gain of y relative to x; used where it differs from 1 by more than 3 standard errors."""
+        return Measured("centroid gain of y to x", "", float(self._loop.delay[4]), float(self._loop.delay[5]))
 
     @property
     def winds(self) -> tuple[Wind, ...]:
@@ -254,7 +260,8 @@ def learn(recording: Recording, start: Identified | None = None) -> PredictiveCo
     ready = prepared(recording)
     loop = ready.recording
     measured, used = measured_delay(loop)
-    return _learnt(ready, replace(used, delay_error=measured.delay_error), start)
+    used = with_axes_of(loop, replace(used, delay_error=measured.delay_error))
+    return _learnt(ready, used, start)
 
 
 def _learnt(ready: Prepared, delay: LoopDelay, start: Identified | None) -> PredictiveControl:
@@ -264,9 +271,9 @@ def _learnt(ready: Prepared, delay: LoopDelay, start: Identified | None) -> Pred
     described = _Loop(
         loop.interaction_matrix,
         np.sqrt(seen.variance),
-        1 / (loop.unit * gain),
+        1 / (loop.unit * delay.gains(len(loop.cells))),
         ready.sign,
-        np.array([delay.delay_frames, delay.delay_error, gain, delay.gain_error]),
+        delay.row(),
         np.zeros((0, 6)),
         math.inf,
         math.nan,

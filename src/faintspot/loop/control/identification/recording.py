@@ -19,6 +19,7 @@ _MOST_SENT_AFTER = 5  # frames
 _CLEAR = 0.5  # correlation of an integrator's steps with its slopes, above which their rows are known
 _UNRELATED = 0.1  # correlation below which commands are not those of the loop
 _STEPS_FOR_TEST = 200  # fewest of them
+_PER_FRAME = ("slopes", "commands", "frame", "standard_errors", "covariance_xy")
 _OPTIONAL = (
     "subaperture_m",
     "pixel_scale_arcsec",
@@ -62,6 +63,12 @@ class Recording:
     Default: found from the steps of the commands, which follow the slopes."""
     frame: Any = None
     """(frames,): number of each frame; missing ones were lost. Default: none was lost."""
+    standard_errors: Any = None
+    """(frames, 2 n): of the slopes. Default: their noise is measured, the same in all frames."""
+    covariance_xy: Any = None
+    """(frames, n): covariance of the errors of x and y. Default: 0."""
+    prior_std: Any = None
+    """(2 n,): width of the estimator's prior, of which the slopes have been freed. Default: it had none."""
     largest_command: float | None = None
     outer_scale_m: float | None = None
     science_wavelength_m: float = 1.65e-6
@@ -94,6 +101,9 @@ class Recording:
             if getattr(self, name) is not None:
                 array = finite_array(name, getattr(self, name), minimum_dimensions=2).astype(np.float64)
                 values[name] = array.reshape(len(array), -1)
+        for name in ("standard_errors", "covariance_xy", "prior_std"):
+            if getattr(self, name) is not None:
+                values[name] = real_array(name, getattr(self, name)).astype(np.float64)
         for name, value in values.items():
             object.__setattr__(self, name, value)
         self._check_shapes()
@@ -103,6 +113,11 @@ class Recording:
             raise InputError(
                 f"commands: expected {len(self.slopes)} frames, as of the slopes, got {len(self.commands)}"
             )
+        frames, slopes = self.slopes.shape
+        shapes = {"standard_errors": (frames, slopes), "covariance_xy": (frames, slopes // 2)}
+        for name, shape in {**shapes, "prior_std": (slopes,)}.items():
+            if getattr(self, name) is not None and getattr(self, name).shape != shape:
+                raise InputError(f"{name}: expected shape {shape}, got {getattr(self, name).shape}")
         if self.commands is None or self.interaction_matrix is None:
             return
         expected = self.slopes.shape[1], self.commands.shape[1]
@@ -110,10 +125,25 @@ class Recording:
             shape = self.interaction_matrix.shape
             raise InputError(f"interaction_matrix: expected shape {expected}, got {shape}")
 
-    def part(self, rows: slice) -> Recording:
+    def part(self, rows: slice | NDArray[np.bool_]) -> Recording:
         """Return some of the frames."""
-        commands = None if self.commands is None else self.commands[rows]
-        return replace(self, slopes=self.slopes[rows], commands=commands, frame=self.frame[rows])
+        arrays = {name: getattr(self, name) for name in _PER_FRAME}
+        return replace(self, **{name: array[rows] for name, array in arrays.items() if array is not None})
+
+    def scaled(self, unit: float) -> Recording:
+        """Return the same loop with slopes in another unit, so many of the present one."""
+        powers = {
+            "slopes": 1,
+            "interaction_matrix": 1,
+            "standard_errors": 1,
+            "covariance_xy": 2,
+            "prior_std": 1,
+        }
+        arrays = {name: getattr(self, name) for name in powers}
+        scaled = {name: array / unit ** powers[name] for name, array in arrays.items() if array is not None}
+        scale = self.pixel_scale_arcsec
+        scaled["pixel_scale_arcsec"] = None if scale is None else scale * unit
+        return replace(self, unit=self.unit * unit, **scaled)
 
 
 class Prepared(NamedTuple):
@@ -140,15 +170,8 @@ def prepared(recording: Recording) -> Prepared:
     spread = float(slopes.std()) if slopes.size else 0.0
     if not spread > 1e-12 * float(np.abs(slopes).max(initial=0.0)):
         raise InputError(f"{recording.name}: expected slopes that vary, got constant ones")
-    matrix, scale = recording.interaction_matrix, recording.pixel_scale_arcsec
-    scaled = replace(
-        recording,
-        slopes=recording.slopes / spread,
-        interaction_matrix=None if matrix is None else matrix / spread,
-        pixel_scale_arcsec=None if scale is None else scale * spread,
-        unit=recording.unit * spread,
-    )
-    if recording.commands is None or matrix is None or not recording.is_closed:
+    scaled = recording.scaled(spread)
+    if recording.commands is None or recording.interaction_matrix is None or not recording.is_closed:
         return Prepared(scaled, 1.0, 0, math.inf)
     return _with_convention(scaled)
 
@@ -179,9 +202,7 @@ def _with_convention(loop: Recording) -> Prepared:
     usable = rows < len(loop.frame)
     usable[usable] = loop.frame[rows[usable]] == loop.frame[usable] + sent
     moved = replace(
-        loop,
-        slopes=loop.slopes[usable],
-        frame=loop.frame[usable],
+        loop.part(usable),
         commands=sign * loop.commands[rows[usable]],
         remarks=tuple(remarks),
         sent_after_frames=0,

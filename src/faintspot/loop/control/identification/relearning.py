@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.learning import KALMAN, LearntControl, LoopPlant, learn_controller
+from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import SETTLE_FRAMES, ControlModel
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
@@ -28,7 +29,10 @@ FEWEST_FRAMES = math.ceil(_FEWEST_BLOCKS * _BLOCK_FRAMES / JUDGED_PART) + 1
 
 @dataclass(frozen=True, eq=False)
 class RelearntControl:
-    """New filter, and the residual phase variance that it and others would have left on the same frames."""
+    """New filter, and the residual phase variance that it and others would have left on the same frames.
+
+    All are computed for the centroid gain that was found.
+    """
 
     learnt: LearntControl
     residual: float
@@ -36,19 +40,29 @@ class RelearntControl:
     by_integrator: float
     error: float
     """Standard error of `by_running` minus `residual`."""
+    delay: LoopDelay | None = None
+    """Centroid gain that was found, relative to that of the slopes; None: it was not measured."""
+    gain_changed: bool = False
+    """Whether it differs from the running filter's beyond its error."""
 
     @property
     def is_better(self) -> bool:
-        """Whether the new filter leaves less than the running one, beyond the error, and the integrator."""
-        gain = self.by_running - self.residual
-        return gain > STANDARD_ERRORS * self.error and self.residual < self.by_integrator
+        """Whether the new filter leaves less than the integrator, and than the running one beyond the error.
+
+        A running filter with another centroid gain would leave more than computed: it is always replaced.
+        """
+        saved = self.by_running - self.residual
+        return (self.gain_changed or saved > STANDARD_ERRORS * self.error) and (
+            self.residual < self.by_integrator
+        )
 
     def summary(self) -> str:
         """Return a summary of one line."""
         part, error = self.residual / self.by_running, self.error / self.by_running
         of_integrator = self.residual / self.by_integrator
+        gain = "" if self.delay is None else f"{self.delay.gain_summary}, "
         return (
-            f"{self.learnt.model.description}; phase variance {part:.3f} +- {error:.3f} of the running "
+            f"{gain}{self.learnt.model.description}; phase variance {part:.3f} +- {error:.3f} of the running "
             f"filter's, {of_integrator:.2f} of the integrator's"
         )
 
@@ -60,6 +74,7 @@ def relearn(
     site: SlopeTurbulence,
     rate_hz: float,
     start: Identified | None = None,
+    delay: LoopDelay | None = None,
 ) -> RelearntControl:
     """Learn from the first part of telemetry, and judge on the rest by replay; nothing else is changed.
 
@@ -78,6 +93,8 @@ def relearn(
         Frames per second.
     start : Identified, optional
         Turbulence that was found before, from which the search starts: faster, but finds no new layer.
+    delay : LoopDelay, optional
+        With the centroid gain of the telemetry. Default: that of the running filter, not measured again.
 
     Raises
     ------
@@ -95,9 +112,15 @@ def relearn(
     by_integrator = plant.replayed_integrators([new.plain_gain], replayed, phase)[0]
     residuals = *(model.replayed(plant, replayed, phase) for model in (new, running)), by_integrator
     by_new, by_running, by_integrator = (squares[first - begin :] for squares in residuals)
+    gain = running.centroid_gain if delay is None else delay.gain
+    changed = delay is not None and abs(gain - running.centroid_gain) > STANDARD_ERRORS * delay.gain_error
+    if changed and by_running.mean() < by_new.mean():  # the turbulence known before fits better
+        new, by_new = replace(running, plain_gain=new.plain_gain), by_running
     means = float(by_new.mean()), float(by_running.mean()), float(by_integrator.mean())
-    scored = replace(new, left=(means[0], means[2]))  # by which the engine chooses what begins
-    return RelearntControl(replace(learnt, model=scored), *means, _error_of_mean(by_running - by_new))
+    # By the residuals the engine chooses what begins.
+    scored = replace(new, left=(means[0], means[2]), centroid_gain=gain)
+    error = _error_of_mean(by_running - by_new)
+    return RelearntControl(replace(learnt, model=scored), *means, error, delay, changed)
 
 
 def _error_of_mean(values: Floats) -> float:

@@ -20,7 +20,9 @@ Floats = NDArray[np.float64]
 _ENDINGS = (".npz", ".mat", ".fits")
 
 
-def state_space(model: ControlModel, plant: LoopPlant, scale: float, sign: float) -> dict[str, Floats]:
+def state_space(
+    model: ControlModel, plant: LoopPlant, scale: Floats | float, sign: float
+) -> dict[str, Floats]:
     """Return the matrices of a frame's command and of the next state, without the guard.
 
     With the slopes s of a frame, the commands u that the mirror holds during it, and the state x, 0 first::
@@ -33,7 +35,7 @@ def state_space(model: ControlModel, plant: LoopPlant, scale: float, sign: float
     model : ControlModel
         Kalman filter of a small sensor.
     plant : LoopPlant
-    scale : float
+    scale : float or (2 n,) array
         The model's slopes in a unit of s.
     sign : float
         -1 where commands are subtracted from the turbulence.
