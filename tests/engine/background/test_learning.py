@@ -51,7 +51,8 @@ def outdated(model: ControlModel) -> ControlModel:
 class Run:
     """A loop on known open-loop slopes, whose records go into telemetry."""
 
-    def __init__(self, name: str, model: ControlModel) -> None:
+    def __init__(self, name: str, model: ControlModel, centroid_gain: float = 1.0) -> None:
+        self._gain = centroid_gain
         self.loop = ControlLoop(Control(INTERACTION, None, OPTIONS, model), LAYOUT)
         self.ring = TelemetryRing.create(name, LAYOUT, commands=INTERACTION.shape[1])
         self._sent, self._number = [np.zeros(INTERACTION.shape[1])] * 2, 0
@@ -61,10 +62,10 @@ class Run:
         """Let frames come; return the commands."""
         sent = []
         for number in range(self._number, self._number + count):
-            seen = (OPEN_LOOP[number] + INTERACTION @ self._sent.pop(0)).astype(np.float32)
+            seen = self._gain * (OPEN_LOOP[number] + INTERACTION @ self._sent.pop(0)).astype(np.float32)
             arrays = [np.zeros(9, kind) for kind in RESULT_TYPES]
             arrays[:2] = np.split(seen, 2)
-            arrays[-3:-1] = [np.full(9, NOISE_PX, np.float32)] * 2
+            arrays[-3:-1] = [np.full(9, self._gain * NOISE_PX, np.float32)] * 2
             slopes = Slopes(*arrays)
             self.loop.take_turn(None)
             sent.append(self.loop.follow(slopes, number).copy())
@@ -96,6 +97,26 @@ def test_a_new_filter_goes_on_from_the_mirror(name: str, model: ControlModel) ->
     with pytest.raises(InputError, match="first"):
         run.loop.renew(replace(model, arrays={**model.arrays, "first": np.eye(3)}))
     for each in (run, other):
+        each.ring.close()
+
+
+def test_a_learnt_centroid_gain(name: str, model: ControlModel) -> None:
+    """Slopes are half as large: a filter that knows it sends the same commands, also after it took over."""
+    knowing = replace(model, centroid_gain=0.5)
+    other, run, late = Run(name, model), Run(f"{name}_2", knowing, 0.5), Run(f"{name}_3", model, 0.5)
+    expected = other.frames(100)
+    before = other.loop.guard.residual_px
+    expected = np.vstack([expected, other.frames(SETTLE_FRAMES + 100)])
+    np.testing.assert_allclose(run.frames(100), expected[:100], rtol=1e-3, atol=1e-3)
+    guard = run.loop.guard.residual_px  # its limits are those of slopes as configured
+    assert guard == pytest.approx(0.5 * before, rel=1e-3)
+    wrong = late.frames(100)
+    late.loop.renew(knowing)
+    after = late.frames(SETTLE_FRAMES + 100)
+    largest = np.abs(expected).max()
+    assert np.abs(wrong - expected[:100]).max() > 0.2 * largest
+    np.testing.assert_allclose(after[-85:], expected[-85:], atol=0.02 * largest)
+    for each in (run, other, late):
         each.ring.close()
 
 

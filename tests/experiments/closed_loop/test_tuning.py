@@ -26,7 +26,7 @@ PLAN = LoopPlan(fluxes=3, frames=30, settle_frames=10, realisations=2, search=SE
 
 
 def question(**asked: Any) -> LoopQuestion:
-    loop = small().replace("control", telemetry_frames=200)
+    loop = small().replace("control", telemetry_frames=700)
     return LoopQuestion(loop, magnitudes=(9.0, 11.0), **{"methods": ("window+kalman",), **asked})
 
 

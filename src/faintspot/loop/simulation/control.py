@@ -21,7 +21,7 @@ from faintspot.loop.control.identification.learning import (
     learn_controller,
 )
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
+from faintspot.loop.control.identification.open_loop import measured_delay, open_loop_of
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.telemetry import OpenLoopTelemetry, without_prior
@@ -185,7 +185,12 @@ def _telemetry(
     loop = recorded_loop(record, method.method)
     delay = LoopDelay(record.delay_frames, 0.0, 1.0, 0.0)
     if method.method.correct_gain and not method.method.true_slopes:
-        _, delay, _ = known_delay(loop)
+        try:
+            _, delay = measured_delay(loop)
+        except InputError as error:
+            raise InputError(
+                f"control.telemetry_frames = {frames}: too few for the centroid gain ({error})"
+            ) from None
     return open_loop_of(loop, delay).telemetry, delay.gain
 
 

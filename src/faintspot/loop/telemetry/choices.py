@@ -60,13 +60,28 @@ class Choice:
     """Strehl ratio, including the fitting error."""
     strehl: Measured
     gain: float = math.nan
-    """Gain of an integrator."""
+    """Gain of an integrator, on slopes as measured."""
+    modal_gains: tuple[float, float] | None = None
+    """Smallest and largest gain of an integrator with one for each mode, likewise."""
+
+    @property
+    def gain_text(self) -> str:
+        """The gain, or the range of gains, in words; empty for a filter."""
+        if self.modal_gains is not None:
+            return " to ".join(f"{gain:.2f}" for gain in self.modal_gains)
+        return f"{self.gain:.2f}" if math.isfinite(self.gain) else ""
 
     def as_values(self) -> dict[str, Any]:
         """Return plain values."""
         names = ("residual", "less", "total", "strehl")
         gain = self.gain if math.isfinite(self.gain) else None
-        return {"name": self.name, "gain": gain, **{name: getattr(self, name).as_values() for name in names}}
+        of_modes = {} if self.modal_gains is None else {"modal_gains": list(self.modal_gains)}
+        return {
+            "name": self.name,
+            "gain": gain,
+            **of_modes,
+            **{name: getattr(self, name).as_values() for name in names},
+        }
 
 
 def compared_choices(
@@ -118,7 +133,9 @@ def compared_choices(
             learn_controller(kind, plant, first, site, loop.frame_rate_hz).model for kind in (MODAL, KALMAN)
         )
         choices.append(compare(BEST, *integrators([learnt.plain_gain]), gain=learnt.plain_gain))
-        choices.append(compare(MODES, learnt_left(modal)))
+        gains = modal.arrays["gains"]
+        modes = compare(MODES, learnt_left(modal))
+        choices.append(replace(modes, modal_gains=(float(gains.min()), float(gains.max()))))
         expected = math.nan
         if identified is not None:
             expected = _expected_left(identified, plant, delay.gain**2 * open_loop.variance, phase)
@@ -280,8 +297,10 @@ def _signed_root(name: str, unit: str, square: float, error: float) -> Measured:
 
 
 def _at_gain(choice: Choice, gain: float) -> Choice:
-    """Return a choice whose integrator's gain is that of slopes as measured."""
-    return replace(choice, gain=choice.gain / gain)
+    """Return a choice whose integrator's gains are those of slopes as measured."""
+    modal = choice.modal_gains
+    of_modes = None if modal is None else (modal[0] / gain, modal[1] / gain)
+    return replace(choice, gain=choice.gain / gain, modal_gains=of_modes)
 
 
 def advice(choices: list[Choice]) -> str:
@@ -307,8 +326,8 @@ def _residual(choice: Choice) -> float:
 
 
 def _recommended(choice: Choice) -> str:
-    if math.isfinite(choice.gain):
-        return f"an integrator with a gain of {choice.gain:.2f}"
-    return (
-        "an integrator with a gain for each mode" if choice.name == MODES else "the predictive Kalman filter"
-    )
+    if choice.modal_gains is not None:
+        return f"an integrator with a gain for each mode, {choice.gain_text}"
+    if choice.gain_text:
+        return f"an integrator with a gain of {choice.gain_text}"
+    return "the predictive Kalman filter"

@@ -83,8 +83,7 @@ def _choices_table(report: LoopReport) -> Table:
     }
     rows = []
     for choice, *values in zip(report.choices, *shown.values(), strict=True):
-        gain = f"{choice.gain:.2f}" if np.isfinite(choice.gain) else "–"
-        rows.append([choice.name, gain, *map(_with_interval, values)])
+        rows.append([choice.name, choice.gain_text or "–", *map(_with_interval, values)])
     texts = ["choices.table", *(["choices.strehl"] if _STREHL in shown else [])]
     return Table(["control", "gain", *shown], rows, " ".join(_TEXT[name] for name in texts))
 

@@ -169,8 +169,8 @@ def _delay(loop: Recording) -> tuple[list[Measured], LoopDelay]:
     remark = "given" if assumed is not None else f"{used.delay_frames:g} is used" if used is not fit else ""
     used = with_axes_of(loop, used)
     gain = Measured(*names[1], used.gain, used.gain_error, f"for a delay of {used.delay_frames:.3g} frames")
-    of_axes = used.measured_y_to_x, used.y_to_x_error
-    axes = Measured("centroid gain of y to x", "", *of_axes, f"{used.y_to_x:.3g} is used")
+    of_axes = used.measured_x_to_y, used.x_to_y_error
+    axes = Measured("centroid gain of x relative to y", "", *of_axes, f"{used.x_to_y:.3g} is used")
     return [Measured(*names[0], fit.delay_frames, fit.delay_error, remark), gain, axes], used
 
 

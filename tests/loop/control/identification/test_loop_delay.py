@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.loop.control.control_cases import FRAME_S, INTERACTION, LAYERS, PLANT, TURBULENCE, telemetry
 from tests.loop.telemetry.loop_cases import AIR, RATE_HZ, recorded
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.loop_delay import LoopDelay, loop_delay
+from faintspot.loop.control.identification.loop_delay import LoopDelay, loop_delay, with_axes
 
 
 def found(delay: int, gain: float, given: float | None = None, frames: int | None = None) -> LoopDelay:
@@ -40,3 +41,22 @@ def test_gain_for_a_known_delay(gain: float) -> None:
 def test_too_few_frames() -> None:
     with pytest.raises(InputError, match="expected 576 consecutive frames, got 300"):
         found(2, 1.0, frames=300)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("of_x", "of_y"), [(0.4, 0.6), (0.6, 0.4), (0.5, 0.5)])
+def test_gains_of_x_and_y(of_x: float, of_y: float) -> None:
+    """Their ratio is used where it differs from 1 by three of its errors, of 5 % here; otherwise 1 is."""
+    gains = np.repeat([of_x, of_y], 9)
+    atmosphere = telemetry(1500, 0.0, model=LAYERS).open_loop_px
+    rng = np.random.default_rng(4)
+    slopes, commands = np.zeros_like(atmosphere), np.zeros((1500, 12))
+    for frame in range(2, 1500):
+        seen = gains * (atmosphere[frame] + INTERACTION @ commands[frame - 2])
+        slopes[frame] = seen + 0.1 * rng.standard_normal(18)
+        commands[frame] = 0.99 * commands[frame - 1] - 0.3 * PLANT.reconstructor.matrix @ slopes[frame]
+    context = slopes, commands @ INTERACTION.T, np.zeros(1500, np.int64), TURBULENCE, 1 / FRAME_S
+    seen = with_axes(loop_delay(*context, 2.0), *context)
+    assert abs(seen.measured_x_to_y - of_x / of_y) < 3 * seen.x_to_y_error < 0.2
+    np.testing.assert_allclose(seen.gains(9), gains, rtol=0.15)
+    assert (seen.x_to_y == 1.0) == (of_x == of_y)

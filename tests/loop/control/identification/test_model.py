@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -113,3 +114,18 @@ def test_what_is_refused(learnt: dict[str, LearntControl], tmp_path: Path) -> No
     refused("kind = 'pid': expected one of", kalman)
     np.savez(path, kind="kalman")
     refused("model.npz", kalman)
+
+
+def test_centroid_gain_in_the_file(learnt: dict[str, LearntControl], tmp_path: Path) -> None:
+    """Slopes are divided by it and by the configured one; the integrator knows the latter only."""
+    path = tmp_path / "model.npz"
+    replace(learnt["kalman"].model, centroid_gain=0.4).save(path)
+    control = Control(INTERACTION, None, ControlOptions(controller="kalman", centroid_gain=0.5), path)
+    assert control.centroid_gain == pytest.approx(0.2)
+    assert control.with_controller("integrator").centroid_gain == 0.5
+    arrays = dict(np.load(path))
+    np.savez(path, **{name: array for name, array in arrays.items() if name != "centroid_gain"})
+    assert ControlModel.load(path, PLANT).centroid_gain == 1.0
+    np.savez(path, **{**arrays, "centroid_gain": 0.0})
+    with pytest.raises(InputError, match="centroid_gain"):
+        ControlModel.load(path, PLANT)

@@ -10,6 +10,8 @@ import pytest
 from tests.loop.telemetry.loop_cases import recorded
 
 from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
 from faintspot.loop.control.identification.recording import Recording, prepared
 
 
@@ -69,8 +71,38 @@ def test_commands_of_another_loop() -> None:
         ({"frame": np.zeros(2550)}, "frame: expected 2550 increasing numbers"),
         ({"sent_after_frames": -1}, "sent_after_frames"),
         ({"frame_rate_hz": 0.0}, "frame_rate_hz"),
+        ({"standard_errors": np.ones((2550, 25))}, r"standard_errors: expected shape \(2550, 50\)"),
+        ({"prior_std": np.ones(25)}, r"prior_std: expected shape \(50,\)"),
     ],
 )
 def test_refusals(change: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         prepared(replace(recorded(), **change))
+
+
+def test_standard_errors_of_frames() -> None:
+    """They take the place of the measured noise, in the unit of the prepared slopes; infinite ones too."""
+    loop = recorded()
+    errors = np.where(np.arange(2550)[:, None] % 2, 0.2, 0.4) * np.ones(50)
+    errors[100, 7] = np.inf
+    ready = prepared(
+        replace(loop, standard_errors=errors, covariance_xy=0.01 * np.ones((2550, 25)))
+    ).recording
+    found = open_loop_of(ready, LoopDelay(2.0, 0.0, 0.5, 0.0)).telemetry
+    np.testing.assert_allclose(np.sqrt(found.variance_px2) * 0.5 * ready.unit, errors[2:], rtol=1e-9)
+    expected = np.full((2548, 25), 0.01)
+    expected[98, 7] = 0.0
+    np.testing.assert_allclose(found.covariances_px2 * 0.25 * ready.unit**2, expected, rtol=1e-9)
+    assert found.trust.min() == found.trust[98, 7] == 0.0
+
+
+def test_a_gain_that_cannot_be_known() -> None:
+    """Of few frames, and of an estimator with a prior."""
+    loop = recorded()
+    for short, reason in (
+        (loop.part(slice(0, 300)), "expected 576 consecutive frames, got 300"),
+        (replace(loop, prior_std=np.full(50, 0.3)), "the estimator had a prior"),
+    ):
+        _, used, unknown = known_delay(replace(short, delay_frames=3.0))
+        assert (used.delay_frames, used.gain) == (3.0, 1.0)
+        assert reason in unknown

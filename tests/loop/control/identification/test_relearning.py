@@ -10,6 +10,7 @@ from tests.loop.control.control_cases import FRAME_S, LAYERS, PLANT, TURBULENCE,
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import ASSUMED
 from faintspot.loop.control.identification.learning import KALMAN, learn_controller
+from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import LearntControl
 from faintspot.loop.control.identification.relearning import relearn
 
@@ -47,3 +48,15 @@ def test_a_filter_that_is_as_good_stays(now: LearntControl) -> None:
 def test_too_few_frames_are_refused(now: LearntControl) -> None:
     with pytest.raises(InputError, match="frames to judge a filter, got 300"):
         relearn(PLANT, now.model, FRAMES.part(0, 300), TURBULENCE, RATE_HZ)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("gain", "taken"), [(0.5, True), (0.97, False)])
+def test_another_centroid_gain_is_taken(now: LearntControl, gain: float, taken: bool) -> None:
+    """A filter for the same turbulence is replaced if its gain is wrong beyond the error."""
+    found = relearn(
+        PLANT, now.model, FRAMES, TURBULENCE, RATE_HZ, now.identified, LoopDelay(2.0, 0.0, gain, 0.03)
+    )
+    assert found.is_better == found.gain_changed == taken
+    assert found.learnt.model.centroid_gain == gain
+    assert f"centroid gain {gain:.3f}" in found.summary()

@@ -30,7 +30,7 @@ _GAINS = 0.1, 1.6
 _START_GAIN = 0.6
 _MODEL_ERROR = 0.05  # frames: spectra of real slopes differ from the theory
 _GAIN_ERROR = 0.03  # absolute and relative, likewise
-_AXES_ERROR = 0.03  # of the gain of y relative to x, likewise
+_AXES_ERROR = 0.03  # of the gain of x relative to y, likewise
 _SURE = 3.0  # standard errors
 _SPEEDS_M_PER_S = (1.0, 3.0, 6.0, 10.0, 15.0, 22.0, 32.0)
 _DIRECTIONS = 4  # of half a turn: opposite winds have the same spectrum
@@ -51,10 +51,10 @@ class LoopDelay:
     gain: float
     """Centroid gain relative to the interaction matrix."""
     gain_error: float
-    y_to_x: float = 1.0
-    """Gain of y relative to x that is used; `gain` is their geometric mean."""
-    measured_y_to_x: float = math.nan
-    y_to_x_error: float = math.nan
+    x_to_y: float = 1.0
+    """Gain of x relative to y that is used; `gain` is their geometric mean."""
+    measured_x_to_y: float = math.nan
+    x_to_y_error: float = math.nan
 
     @property
     def gain_summary(self) -> str:
@@ -62,14 +62,14 @@ class LoopDelay:
         return f"centroid gain {self.gain:.3f} +- {self.gain_error:.3f}"
 
     def row(self) -> Floats:
-        """Return delay, gain and gain of y relative to x as measured, each with its standard error, (6,)."""
-        axes = self.measured_y_to_x, self.y_to_x_error
+        """Return delay, gain and gain of x relative to y as measured, each with its standard error, (6,)."""
+        axes = self.measured_x_to_y, self.x_to_y_error
         return np.array([self.delay_frames, self.delay_error, self.gain, self.gain_error, *axes])
 
     def gains(self, n: int) -> Floats:
         """Return the centroid gain of each slope of n sub-apertures, (2 n,)."""
-        root = math.sqrt(self.y_to_x)
-        return np.repeat([self.gain / root, self.gain * root], n)
+        root = math.sqrt(self.x_to_y)
+        return np.repeat([self.gain * root, self.gain / root], n)
 
 
 def loop_delay(
@@ -129,7 +129,7 @@ def with_axes(
     site: SlopeTurbulence,
     rate_hz: float,
 ) -> LoopDelay:
-    """Return delay and centroid gain with the gain of y relative to x, used if it differs from 1 for sure.
+    """Return delay and centroid gain with the gain of x relative to y, used if it differs from 1 for sure.
 
     Parameters as for `loop_delay`, which has found `delay`.
     """
@@ -139,15 +139,15 @@ def with_axes(
             for axis in (0, 1)
         ]
     )
-    ratio = float(gains[1] / gains[0])
+    ratio = float(gains[0] / gains[1])
     error = ratio * math.hypot(*(errors / gains), _AXES_ERROR)
-    found = replace(delay, measured_y_to_x=ratio, y_to_x_error=error)
+    found = replace(delay, measured_x_to_y=ratio, x_to_y_error=error)
     if abs(math.log(ratio)) < _SURE * error / ratio:
         return found
     # Both axes together tell the gain better than each alone.
-    alike = slopes_px / replace(found, gain=1.0, y_to_x=ratio).gains(len(site.positions_m))
+    alike = slopes_px / replace(found, gain=1.0, x_to_y=ratio).gains(len(site.positions_m))
     fit = loop_delay(alike, sent_px, run, site, rate_hz, delay.delay_frames)
-    return replace(found, gain=fit.gain, gain_error=fit.gain_error, y_to_x=ratio)
+    return replace(found, gain=fit.gain, gain_error=fit.gain_error, x_to_y=ratio)
 
 
 def _model_error(gain: float) -> float:

@@ -84,7 +84,7 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
 
 
 def with_axes_of(loop: Recording, delay: LoopDelay) -> LoopDelay:
-    """Return delay and centroid gain with the gain of y relative to x; see `with_axes`."""
+    """Return delay and centroid gain with the gain of x relative to y; see `with_axes`."""
     return with_axes(delay, *_of_fit(loop))
 
 

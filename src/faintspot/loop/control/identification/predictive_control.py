@@ -51,7 +51,7 @@ class _Loop:
     sign: float
     """-1 where the user's commands are subtracted from the turbulence."""
     delay: Floats
-    """(6,): delay in frames, centroid gain, and that of y relative to x, each with its standard error."""
+    """(6,): delay in frames, centroid gain, and that of x relative to y, each with its standard error."""
     winds: Floats
     """(layers, 6): speed, direction and share, each with its standard error."""
     largest_command: float
@@ -91,9 +91,11 @@ class PredictiveControl:
         return Measured("centroid gain", "", float(self._loop.delay[2]), float(self._loop.delay[3]))
 
     @property
-    def gain_of_y_to_x(self) -> Measured:
-        """Centroid gain of y relative to x; used where it differs from 1 by more than 3 standard errors."""
-        return Measured("centroid gain of y to x", "", float(self._loop.delay[4]), float(self._loop.delay[5]))
+    def gain_of_x_to_y(self) -> Measured:
+        """Centroid gain of x relative to y; used where it differs from 1 by more than 3 standard errors."""
+        return Measured(
+            "centroid gain of x relative to y", "", float(self._loop.delay[4]), float(self._loop.delay[5])
+        )
 
     @property
     def winds(self) -> tuple[Wind, ...]:

@@ -107,7 +107,7 @@ class ControlParameters:
     """"closed", or "open": the sensor does not see the mirror."""
     largest_condition: float = number(30.0, 1.0, 1e6)
     """Largest condition number of the reconstructor; weaker modes are not controlled."""
-    telemetry_frames: int = number(2000, 200, 1_000_000, whole=True)
+    telemetry_frames: int = number(2000, 260, 1_000_000, whole=True)
     """Length of the closed loop with an integrator from which other controllers learn; never scored."""
     winds: str = LEARNT
     """Winds of a predictive model: "learnt" from telemetry, "assumed" (those of the atmosphere) or "none"."""
