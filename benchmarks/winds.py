@@ -113,7 +113,7 @@ def drifting(case: Case, learnt: LearntControl, realisation: int) -> Drifted:
         if run.frame % every == later and found is not None and found.is_better:
             running, line = found.learnt.model, CommandDelayLine(len(run.line.latest), run.line.delay_frames)
             successor = ControllerSuccessor(
-                PreparedController(KALMAN, found.learnt.controller(line), line, False, True, True, False)
+                PreparedController(KALMAN, found.learnt.controller(line), line, False, True, True, 1.0, False)
             )
     run.strehl[:SETTLE], change[:SETTLE] = np.nan, 0.0
     largest = float((at_handover * change).max()), float((change - at_handover * change).max())

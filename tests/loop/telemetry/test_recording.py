@@ -71,7 +71,7 @@ def open_loop(night: Any, control: Control, prior: np.ndarray | None = None) -> 
 def without_mean(first: int, lost: np.ndarray) -> np.ndarray:
     """Return the open-loop slopes from a frame on, 0 where lost, without the mean of the others."""
     slopes = np.where(lost, np.nan, OPEN_LOOP[first:])
-    return np.nan_to_num(slopes - np.nanmean(slopes, axis=0))
+    return np.asarray(np.nan_to_num(slopes - np.nanmean(slopes, axis=0)))
 
 
 def test_open_loop_slopes_of_a_closed_loop() -> None:

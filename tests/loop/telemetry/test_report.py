@@ -200,10 +200,11 @@ def test_a_single_sub_aperture() -> None:
 
 @pytest.mark.slow
 def test_the_unit_of_the_slopes_does_not_matter(report: LoopReport) -> None:
-    """All numbers but those in the slopes' unit are the same, in 1e-6 of it; a power of two rounds nothing."""
+    """All numbers but those in the slopes' unit are the same, in 2**-20 of it, which rounds nothing."""
     unit = 2.0**-20
     kept = np.delete(np.arange(2550), slice(1000, 1020))
     loop = recorded()
+    assert loop.pixel_scale_arcsec is not None
     other = report_of_loop(
         replace(
             loop,

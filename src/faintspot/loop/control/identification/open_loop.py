@@ -73,13 +73,13 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
     """
     if not loop.is_closed or not np.ptp(loop.commands, axis=0).any():
         raise InputError("commands: expected those of a closed loop, got constant ones")
-    slopes, mirror, *context = _of_fit(loop)
-    fit = loop_delay(slopes, mirror, *context, loop.delay_frames)
+    fitted = _of_fit(loop)
+    fit = loop_delay(*fitted, loop.delay_frames)
     nearest = float(round(fit.delay_frames))
     if loop.delay_frames is None and abs(fit.delay_frames - nearest) < max(
         _WHOLE_FRAMES, 2 * fit.delay_error
     ):
-        return fit, loop_delay(slopes, mirror, *context, nearest)
+        return fit, loop_delay(*fitted, nearest)
     return fit, fit
 
 
