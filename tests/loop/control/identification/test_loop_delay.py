@@ -46,17 +46,17 @@ def test_too_few_frames() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("of_x", "of_y"), [(0.4, 0.6), (0.6, 0.4), (0.5, 0.5)])
 def test_gains_of_x_and_y(of_x: float, of_y: float) -> None:
-    """Their ratio is used where it differs from 1 by three of its errors, of 5 % here; otherwise 1 is."""
+    """Their ratio is used where it differs from 1 by three of its errors, of 10 % here; else 1 is."""
     gains = np.repeat([of_x, of_y], 9)
-    atmosphere = telemetry(1500, 0.0, model=LAYERS).open_loop_px
+    atmosphere = telemetry(4000, 0.0, model=LAYERS).open_loop_px
     rng = np.random.default_rng(4)
-    slopes, commands = np.zeros_like(atmosphere), np.zeros((1500, 12))
-    for frame in range(2, 1500):
+    slopes, commands = np.zeros_like(atmosphere), np.zeros((4000, 12))
+    for frame in range(2, 4000):
         seen = gains * (atmosphere[frame] + INTERACTION @ commands[frame - 2])
         slopes[frame] = seen + 0.1 * rng.standard_normal(18)
         commands[frame] = 0.99 * commands[frame - 1] - 0.3 * PLANT.reconstructor.matrix @ slopes[frame]
-    context = slopes, commands @ INTERACTION.T, np.zeros(1500, np.int64), TURBULENCE, 1 / FRAME_S
+    context = slopes, commands @ INTERACTION.T, np.zeros(4000, np.int64), TURBULENCE, 1 / FRAME_S
     seen = with_axes(loop_delay(*context, 2.0), *context)
-    assert abs(seen.measured_x_to_y - of_x / of_y) < 3 * seen.x_to_y_error < 0.2
+    assert abs(seen.measured_x_to_y - of_x / of_y) < 3 * seen.x_to_y_error < 0.5
     np.testing.assert_allclose(seen.gains(9), gains, rtol=0.15)
     assert (seen.x_to_y == 1.0) == (of_x == of_y)
