@@ -14,6 +14,7 @@ from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import open_loop_of
 from faintspot.loop.simulation import LoopConfiguration, Method, simulate_loop
 from faintspot.loop.simulation.control import learnt_control, recorded_loop
+from faintspot.loop.simulation.engine_files import fixed_window
 from faintspot.loop.simulation.methods import PRIOR
 from faintspot.loop.simulation.simulation import DisabledErrors
 from faintspot.loop.simulation.telescope.model import prepare
@@ -101,6 +102,26 @@ def test_true_slopes_have_no_prior() -> None:
     record = simulate_loop(short, [_method("kalman")], disabled_errors=DisabledErrors(true_slopes=True))
     assert np.isfinite(record.commands).all()
     assert record.mean_strehl() > 0.5
+
+
+@pytest.mark.slow
+def test_the_centroid_gain_is_learnt() -> None:
+    """From telemetry, within 20 % of that measured on typical spots; slopes of the run are divided by it."""
+    loop = FAINT.replace("camera", photons_per_subaperture=200.0)
+    method = Method("window", fixed_window(loop), control="kalman")
+    with pytest.raises(InputError, match=r"telemetry_frames = 400: too few for the centroid gain"):
+        simulate_loop(loop, [method])
+    loop = loop.replace("control", telemetry_frames=1500)
+    _, learnt = learnt_control(loop, method, loop.run.seed, simulate_loop)
+    record = simulate_loop(loop, [method])
+    assert learnt is not None
+    assert learnt.model.centroid_gain == pytest.approx(float(record.centroid_gain[0]), rel=0.2)
+    assert learnt.model.centroid_gain < 0.9
+    assert record.mean_strehl() > simulate_loop(loop, [replace(method, control=INTEGRATOR)]).mean_strehl()
+    uncorrected = replace(method, correct_gain=False)
+    _, learnt = learnt_control(loop, uncorrected, loop.run.seed, simulate_loop)
+    assert learnt is not None
+    assert learnt.model.centroid_gain == 1.0
 
 
 def test_names_of_methods_say_their_control() -> None:
