@@ -63,7 +63,7 @@ def command(
       faintspot telemetry loop.npz --controller controller.npz
     """
     from faintspot.loop.control.configuration import load_control
-    from faintspot.loop.control.identification.predictive_control import learn
+    from faintspot.loop.control.identification.predictive_control import learn, learn_observed
     from faintspot.loop.telemetry.page import page_of_loop
     from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
     from faintspot.loop.telemetry.report import report_of_loop
@@ -95,7 +95,7 @@ def command(
         click.echo(report.advice)
     if controller is not None:
         click.echo("controller ...", err=True)
-        control = learn(loop)
+        control = learn(loop) if report.observed is None else learn_observed(report.observed)
         control.save(controller)
         click.echo(f"{controller}: {control.summary()}")
     click.echo(f"{page}: open it in a browser; {numbers} has the numbers")

@@ -20,6 +20,7 @@ from faintspot.loop.control.identification.open_loop import (
     open_loop_of,
     site_of_loop,
 )
+from faintspot.loop.control.identification.predictive_control import ObservedLoop
 from faintspot.loop.control.identification.recording import Recording, prepared
 from faintspot.loop.telemetry.choices import Choice, advice, compared_choices
 from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
@@ -59,6 +60,10 @@ class LoopReport:
     turbulence: Identified | None = None
     spectra: ModalSpectra | None = None
     choices: list[Choice] = field(default_factory=list)
+    delay: LoopDelay | None = None
+    """Delay and centroid gain that were measured and are used."""
+    observed: ObservedLoop | None = None
+    """From which a controller can be learnt; None if delay or turbulence are unknown."""
 
     @property
     def advice(self) -> str:
@@ -101,7 +106,7 @@ def report_of_loop(loop: Recording, progress: Callable[[str], None] = lambda _: 
     InputError
         When the slopes do not vary, or commands and slopes are not of one loop.
     """
-    loop = prepared(loop).recording
+    ready = prepared(loop)
     titles = {
         "frames": "Frames",
         "loop": "Loop",
@@ -111,7 +116,7 @@ def report_of_loop(loop: Recording, progress: Callable[[str], None] = lambda _: 
         "spectra": "Spectra",
         "choices": "Other choices of control",
     }
-    report = LoopReport(loop, {name: Part(title) for name, title in titles.items()})
+    report = LoopReport(ready.recording, {name: Part(title) for name, title in titles.items()})
     _frames(report)
     progress("delay")
     delay = _loop(report)
@@ -119,7 +124,9 @@ def report_of_loop(loop: Recording, progress: Callable[[str], None] = lambda _: 
     open_loop = _noise(report, delay)
     if open_loop is not None:
         progress("turbulence")
-        _turbulence(report, open_loop, delay)
+        identification = _turbulence(report, open_loop, delay)
+        if report.delay is not None and identification is not None:
+            report.observed = ObservedLoop(ready, report.delay, open_loop, identification)
         progress("other choices")
         _choices(report, open_loop, delay)
     return report
@@ -153,13 +160,14 @@ def _loop(report: LoopReport) -> LoopDelay:
         for name in ("loop", "turbulence", "vibrations", "spectra", "choices"):
             report.parts[name].missing = why
         return LoopDelay(1.0, 0.0, 1.0, 0.0)
-    values, delay = _delay(loop)
+    values, delay = _delay(report)
     part.values = [*values, *part.values]
     return delay
 
 
-def _delay(loop: Recording) -> tuple[list[Measured], LoopDelay]:
+def _delay(report: LoopReport) -> tuple[list[Measured], LoopDelay]:
     """Return delay and gain as reported and as used."""
+    loop = report.loop
     names, assumed = (("delay", "frames"), ("centroid gain", "")), loop.delay_frames
     try:
         fit, used = measured_delay(loop)
@@ -167,6 +175,7 @@ def _delay(loop: Recording) -> tuple[list[Measured], LoopDelay]:
         used = LoopDelay(assumed or 2.0, math.nan, 1.0, math.nan)
         remarks = f"{error}; {used.delay_frames:g} is used", f"{error}; 1 is used"
         return [Measured(*name, remark=text) for name, text in zip(names, remarks, strict=True)], used
+    report.delay = replace(used, delay_error=fit.delay_error)
     remark = "given" if assumed is not None else f"{used.delay_frames:g} is used" if used is not fit else ""
     gain = Measured(*names[1], used.gain, used.gain_error, f"for a delay of {used.delay_frames:.3g} frames")
     return [Measured(*names[0], fit.delay_frames, fit.delay_error, remark), gain], used
@@ -221,24 +230,26 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
     return None if report.parts["turbulence"].missing else open_loop
 
 
-def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> None:
+def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> Identification | None:
+    """Report the turbulence; return its identification, None if it is unknown."""
     loop = report.loop
     part, site = report.parts["turbulence"], site_of_loop(loop)
     try:
-        identified = Identification(open_loop.telemetry, site, loop.frame_rate_hz).layers()
+        identification = Identification(open_loop.telemetry, site, loop.frame_rate_hz)
+        identified = identification.layers()
     except InputError as error:
         part.missing = report.parts["vibrations"].missing = report.parts["spectra"].missing = str(error)
-        return
+        return None
     report.turbulence = identified
     report.spectra = modal_spectra(open_loop.telemetry, identified)
     _vibrations(report, identified)
     if len(loop.cells) < FEWEST_SUBAPERTURES:
         part.missing = f"Fewer than {FEWEST_SUBAPERTURES} sub-apertures show neither winds nor r0."
-        return
+        return identification
     report.parts["noise"].values += recorded_discrepancy(loop, open_loop, identified)
     if loop.subaperture_m is None:
         part.missing = "Without subaperture_m (or diameter_m) neither r0 nor winds are known."
-        return
+        return identification
     r0 = Measured("r0 at 500 nm", "m", remark="pixel_scale_arcsec is unknown")
     if loop.pixel_scale_arcsec is not None:
         rows = open_loop.telemetry.trust.any(axis=1)
@@ -257,6 +268,7 @@ def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> No
     else:
         part.values.append(r0)
     part.values += _winds(identified, r0)
+    return identification
 
 
 def _winds(identified: Identified, r0: Measured) -> list[Measured]:

@@ -7,7 +7,7 @@ import pytest
 from tests.loop.telemetry.loop_cases import AIR, RATE_HZ, recorded
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.loop_delay import LoopDelay, loop_delay
+from faintspot.loop.control.identification.loop_delay import DelayFits, LoopDelay
 
 
 def found(delay: int, gain: float, given: float | None = None, frames: int | None = None) -> LoopDelay:
@@ -16,7 +16,8 @@ def found(delay: int, gain: float, given: float | None = None, frames: int | Non
     assert loop.interaction_matrix is not None
     held = loop.commands @ loop.interaction_matrix.T
     run = np.zeros(len(held), np.int64)
-    return loop_delay(loop.slopes[:frames], held[:frames], run[:frames], AIR, RATE_HZ, given)
+    fits = DelayFits(loop.slopes[:frames], held[:frames], run[:frames], AIR, RATE_HZ)
+    return fits.best() if given is None else fits.of(given)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay, loop_delay
+from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, DelayFits, LoopDelay
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
@@ -48,11 +48,14 @@ class OpenLoop:
 
 
 def site_of_loop(loop: Recording) -> SlopeTurbulence:
-    """Return the geometry; unknown scales are 1 m and 1 arcsec, which only r0 and winds depend on."""
+    """Return the geometry; an unknown pixel scale is 1 arcsec, an unknown sub-aperture the unit of length."""
+    unit = "m" if loop.subaperture_m else "sub-apertures"
     side, scale = loop.subaperture_m or 1.0, (loop.pixel_scale_arcsec or 1.0) * ARCSEC
     outer = loop.outer_scale_m or OUTER_SCALE_M
     positions = np.asarray(loop.cells[:, ::-1] * side, np.float64)
-    return SlopeTurbulence(positions, side, scale, 0.15, outer, np.ones(1), np.zeros((1, 2)))
+    return SlopeTurbulence(
+        positions, side, scale, 0.15, outer, np.ones(1), np.zeros((1, 2)), length_unit=unit
+    )
 
 
 def runs_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -71,14 +74,14 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
     if not loop.is_closed or not np.ptp(loop.commands, axis=0).any():
         raise InputError("commands: expected those of a closed loop, got constant ones")
     slopes, mirror = np.nan_to_num(loop.slopes), loop.commands @ loop.interaction_matrix.T
-    context = runs_of(loop.frame), site_of_loop(loop), loop.frame_rate_hz
-    fit = loop_delay(slopes, mirror, *context, loop.delay_frames)
+    fits = DelayFits(slopes, mirror, runs_of(loop.frame), site_of_loop(loop), loop.frame_rate_hz)
+    if loop.delay_frames is not None:
+        given = fits.of(loop.delay_frames)
+        return given, given
+    fit = fits.best()
     nearest = float(round(fit.delay_frames))
-    if loop.delay_frames is None and abs(fit.delay_frames - nearest) < max(
-        _WHOLE_FRAMES, 2 * fit.delay_error
-    ):
-        return fit, loop_delay(slopes, mirror, *context, nearest)
-    return fit, fit
+    is_whole = abs(fit.delay_frames - nearest) < max(_WHOLE_FRAMES, 2 * fit.delay_error)
+    return fit, fits.of(nearest) if is_whole else fit
 
 
 def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.layers import Identified
+from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.measured import Measured, Wind, winds_of
@@ -38,7 +38,7 @@ _CONTENTS = "a predictive controller"
 
 
 @dataclass(frozen=True, eq=False)
-class _Loop:
+class LoopOfControl:
     """Loop of a controller, with conversions from the user's unit and sign."""
 
     interaction: Floats
@@ -56,6 +56,8 @@ class _Loop:
     largest_command: float
     integrator_gain: float
     sent_after_frames: int
+    length_unit: str = "m"
+    """Of the winds per second."""
 
     def plant(self) -> LoopPlant:
         """Return the loop for which controllers are made."""
@@ -70,7 +72,7 @@ class PredictiveControl:
     called with every frame, in order. Made by `learn`; not by hand.
     """
 
-    def __init__(self, loop: _Loop, learnt: LearntControl) -> None:
+    def __init__(self, loop: LoopOfControl, learnt: LearntControl) -> None:
         self._loop, self._learnt = loop, learnt
         self.reset()
 
@@ -92,7 +94,7 @@ class PredictiveControl:
     @property
     def winds(self) -> tuple[Wind, ...]:
         """Layers that were found, the strongest first; none if the filter knows no winds."""
-        return tuple(Wind.of(row) for row in self._loop.winds)
+        return tuple(Wind.of(row, f"{self._loop.length_unit}/s") for row in self._loop.winds)
 
     @property
     def integrator_gain(self) -> float:
@@ -109,6 +111,13 @@ class PredictiveControl:
         plant, limit = self._learnt.plant, self._loop.largest_command
         self._line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames, limit)
         self._controller = self._learnt.controller(self._line, plain_frames=_MEASURED_FRAMES)
+
+    def prepare(self) -> None:
+        """Compute what does not need the next slopes, so that the next call is shorter.
+
+        Call it once a command was sent. Without it the next call does this first; commands are the same.
+        """
+        self._controller.expected()
 
     def __call__(self, slopes: ArrayLike, standard_errors: ArrayLike | None = None) -> Floats:
         """Return the command to send after a frame.
@@ -145,7 +154,8 @@ class PredictiveControl:
             recording = replace(recording, sent_after_frames=self._loop.sent_after_frames)
         again = learn(recording, self._learnt.identified)
         latest = self._loop.sign * self._line.latest
-        self.__dict__.update(again.__dict__)
+        self._loop, self._learnt = again._loop, again._learnt
+        self.reset()
         self._line.hold(self._loop.sign * latest)
         self._controller.begin()
         return self
@@ -169,12 +179,12 @@ class PredictiveControl:
         InputError
             When the file cannot be read, or has numbers out of range.
         """
-        names = _Loop.__dataclass_fields__
+        names = LoopOfControl.__dataclass_fields__
         arrays = read_arrays(path, _CONTENTS, [f"loop_{name}" for name in names])
         values: Mapping[str, Any] = {name: arrays[f"loop_{name}"] for name in names}
         try:
             plain = {name: array.item() if array.ndim == 0 else array for name, array in values.items()}
-            loop = _Loop(**plain)
+            loop = LoopOfControl(**plain)
             plant = loop.plant()
             return cls(loop, LearntControl(plant, ControlModel.load(path, plant)))
         except (ValueError, TypeError, IndexError):
@@ -182,6 +192,8 @@ class PredictiveControl:
 
     def export(self, path: str | Path) -> None:
         """Write the filter as plain matrices, at the noise of the recording and without the guard.
+
+        Of more than 300 slopes those of the state are sparse.
 
         The names are those of `state_space`, with `delay_frames` and `largest_command`; slopes and commands
         are in the unit and of the sign of the recording.
@@ -194,10 +206,10 @@ class PredictiveControl:
         Raises
         ------
         InputError
-            When the sensor has more than 300 slopes, or the file cannot be written.
+            When the file cannot be written.
         """
         plant = self._learnt.plant
-        matrices: dict[str, Any] = state_space(self.model, plant, self._loop.scale, self._loop.sign)
+        matrices = state_space(self.model, plant, self._loop.scale, self._loop.sign)
         matrices["delay_frames"] = np.array(plant.delay_frames)
         write_matrices(path, {**matrices, "largest_command": np.array(self._loop.largest_command)})
 
@@ -252,16 +264,28 @@ def learn(recording: Recording, start: Identified | None = None) -> PredictiveCo
         absent = "commands" if recording.commands is None else "interaction_matrix"
         raise InputError(f"{absent}: expected an array, got none")
     ready = prepared(recording)
-    loop = ready.recording
-    measured, used = measured_delay(loop)
-    return _learnt(ready, replace(used, delay_error=measured.delay_error), start)
+    measured, used = measured_delay(ready.recording)
+    delay = replace(used, delay_error=measured.delay_error)
+    return learn_observed(ObservedLoop(ready, delay, open_loop_of(ready.recording, delay)), start)
 
 
-def _learnt(ready: Prepared, delay: LoopDelay, start: Identified | None) -> PredictiveControl:
-    """Return the controller for a delay and a centroid gain."""
-    loop, gain = ready.recording, delay.gain
-    seen = open_loop_of(loop, delay)
-    described = _Loop(
+@dataclass(frozen=True, eq=False)
+class ObservedLoop:
+    """Recording, and what has been measured from it."""
+
+    ready: Prepared
+    delay: LoopDelay
+    """Delay and centroid gain that are used, with their errors."""
+    seen: OpenLoop
+    identification: Identification | None = None
+    """Of its open-loop slopes, if made already."""
+
+
+def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> PredictiveControl:
+    """Learn as `learn` from a recording whose delay and open-loop slopes are known."""
+    ready, delay, seen = observed.ready, observed.delay, observed.seen
+    loop, gain, site = ready.recording, delay.gain, site_of_loop(ready.recording)
+    described = LoopOfControl(
         loop.interaction_matrix,
         np.sqrt(seen.variance),
         1 / (loop.unit * gain),
@@ -271,10 +295,17 @@ def _learnt(ready: Prepared, delay: LoopDelay, start: Identified | None) -> Pred
         math.inf,
         math.nan,
         ready.sent_after_frames,
+        site.length_unit,
     )
     plant = described.plant()
     learnt = learn_controller(
-        KALMAN, plant, seen.telemetry, site_of_loop(loop), loop.frame_rate_hz, start=start
+        KALMAN,
+        plant,
+        seen.telemetry,
+        site,
+        loop.frame_rate_hz,
+        start=start,
+        identification=observed.identification,
     )
     # The fallback is the integrator that has run, whatever the gain found.
     plain = ready.loop_gain * gain if math.isfinite(ready.loop_gain) else learnt.model.plain_gain
