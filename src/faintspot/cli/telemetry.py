@@ -50,8 +50,9 @@ def command(
 ) -> None:
     """Report noise, turbulence, vibrations and control of a recorded loop, of any system.
 
-    FILE is a store of `faintspot realtime record`, an AOT file (FITS), a TOML file that names arrays, or a
-    NumPy or CSV file with slopes. Writes a page and, beside it, the same numbers as JSON. Every value has a
+    FILE is a store of `faintspot realtime record`, an AOT file (FITS), a telemetry session of pyRTC, a TOML
+    file that names arrays, or a NumPy or CSV file with slopes. Writes a page and, beside it, the same numbers
+    as JSON. Every value has a
     95 % interval. It replays other gains and a predictive filter on the recorded turbulence. Takes a minute.
 
     \b
@@ -89,7 +90,7 @@ def command(
     numbers = derived(page, ".json")
     write_atomically(numbers, json.dumps(report.as_values(), indent=1))
     write_atomically(page, page_of_loop(report))
-    for remark in loop.remarks:
+    for remark in report.loop.remarks:
         click.echo(remark)
     if report.advice:
         click.echo(report.advice)

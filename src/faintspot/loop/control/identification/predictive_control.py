@@ -106,11 +106,20 @@ class PredictiveControl:
         """Whether the filter drives the mirror; else the integrator does."""
         return self._controller.chosen == 0
 
-    def reset(self) -> None:
-        """Start again with a flat mirror, without the memory of earlier frames."""
+    def reset(self, command: ArrayLike | None = None) -> None:
+        """Start again, without the memory of earlier frames.
+
+        Parameters
+        ----------
+        command : (commands,) array, optional
+            What the mirror holds. Default: it is flat.
+        """
         plant, limit = self._learnt.plant, self._loop.largest_command
         self._line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames, limit)
         self._controller = self._learnt.controller(self._line, plain_frames=_MEASURED_FRAMES)
+        if command is not None:
+            self._line.hold(self._loop.sign * np.asarray(command, np.float64))
+            self._controller.begin()
 
     def prepare(self) -> None:
         """Compute what does not need the next slopes, so that the next call is shorter.
@@ -155,9 +164,7 @@ class PredictiveControl:
         again = learn(recording, self._learnt.identified)
         latest = self._loop.sign * self._line.latest
         self._loop, self._learnt = again._loop, again._learnt
-        self.reset()
-        self._line.hold(self._loop.sign * latest)
-        self._controller.begin()
+        self.reset(latest)
         return self
 
     def save(self, path: str | Path) -> None:
@@ -317,7 +324,8 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> P
     identified = learnt.identified
     if identified is not None and identified.is_layered:
         described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
-    model = replace(learnt.model, plain_gain=plain)
+    description = "; ".join([learnt.model.description, *loop.remarks])
+    model = replace(learnt.model, plain_gain=plain, description=description)
     return PredictiveControl(described, replace(learnt, model=model))
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, number_between, real_array
 from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.cell_order import order_remark
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 Floats = NDArray[np.float64]
@@ -134,7 +135,8 @@ def prepared(recording: Recording) -> Prepared:
     Raises
     ------
     InputError
-        When the slopes do not vary, or the commands have nothing to do with them.
+        When the slopes do not vary, are in another order than the cells, or the commands have nothing to do
+        with them.
     """
     slopes = recording.slopes[np.isfinite(recording.slopes)]
     spread = float(slopes.std()) if slopes.size else 0.0
@@ -157,7 +159,8 @@ def _with_convention(loop: Recording) -> Prepared:
     """Return a closed loop whose commands add, in the rows of the frames that they were computed from."""
     if not np.ptp(loop.commands, axis=0).any():
         return Prepared(loop, 1.0, 0, math.inf)
-    stated, remarks = loop.sent_after_frames, list(loop.remarks)
+    wrong_order = order_remark(loop.interaction_matrix, loop.cells)
+    stated, remarks = loop.sent_after_frames, [*loop.remarks, *([wrong_order] if wrong_order else [])]
     correlations, gains = _steps_on_slopes(loop)
     clearest = int(np.argmax(np.abs(correlations)))
     largest = float(np.abs(correlations[clearest]))
