@@ -43,7 +43,14 @@ def test_known_orders_are_named(rows: np.ndarray, cells: np.ndarray, message: st
 
 def test_shuffled_cells() -> None:
     shuffled = np.random.default_rng(1).permutation(CELLS)
-    assert "check that row and column of each" in order_remark(ZONAL, shuffled)
+    with pytest.raises(InputError, match="check that row and column of each"):
+        order_remark(ZONAL, shuffled)
+
+
+def test_a_few_exchanged_cells_are_remarked() -> None:
+    cells = CELLS.copy()
+    cells[[6, 7, 17, 18]] = cells[[17, 18, 6, 7]]
+    assert "check that row and column of each" in order_remark(ZONAL, cells)
 
 
 def test_large_sensors_are_judged_by_a_part() -> None:

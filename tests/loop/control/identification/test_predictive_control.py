@@ -110,7 +110,7 @@ def test_learn_again_continues(control: PredictiveControl, recording: Recording)
     ("change", "message"),
     [
         ({"commands": None}, "commands: expected an array"),
-        ({"is_closed": False}, "expected those of a closed loop"),
+        ({"is_closed": False}, "expected a closed loop, got an open one"),
         ({"commands": np.zeros((2550, 36))}, "expected those of a closed loop"),
     ],
 )

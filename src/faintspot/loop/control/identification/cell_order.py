@@ -20,6 +20,7 @@ _FITS = 0.7
 """Least `smoothness` of a right order: of mirrors in order .8 to 1; of wrong orders 0 to .3, of two pairs of
 lenslets exchanged .6 to .8. Few modes of polynomials have the smallest of the first, and up to .65 of the
 second."""
+_WRONG = 0.4  # below which nothing is learnt
 _MOST_SUBAPERTURES, _FEWEST_SUBAPERTURES = 60, 9
 _FEWEST_MODES = 5  # without tip and tilt: fewer need not be those with the most turbulence
 _LEAST = 1e-3  # of the largest singular value, that counts as a mode of the mirror
@@ -27,12 +28,12 @@ _OUTER_SCALE = 40.0  # sub-apertures
 
 
 def order_remark(interaction: Floats, cells: Cells) -> str:
-    """Return a remark of one line if the cells are not in the order of the slopes; else nothing.
+    """Return a remark of one line if some cells may not be in the order of the slopes; else nothing.
 
     Raises
     ------
     InputError
-        When the slopes are in an order that is known.
+        When they are not.
     """
     n = len(cells)
     if n < _FEWEST_SUBAPERTURES or not np.any(interaction):
@@ -52,13 +53,17 @@ def order_remark(interaction: Floats, cells: Cells) -> str:
     best = max(fits, key=lambda name: fits[name])
     if fits[best] >= _FITS:
         raise InputError(
-            f"cells: the interaction matrix fits slopes {best} ({fits[best]:.2f} of 1, as given {stated:.2f}); give "
-            "slopes as all x, then all y, and row and column of each sub-aperture in that order"
+            f"cells: the interaction matrix fits slopes {best} ({fits[best]:.2f} of 1, as given "
+            f"{stated:.2f}); give slopes as all x, then all y, and row and column of each sub-aperture in "
+            "that order"
         )
-    return (
+    remark = (
         f"cells: with sub-apertures in this order the mirror makes no smooth wavefronts ({stated:.2f} of 1, "
         f"expected {_FITS:g}); check that row and column of each are in the order of the slopes"
     )
+    if stated < _WRONG:
+        raise InputError(remark)
+    return remark
 
 
 def smoothness(interaction: Floats, cells: Cells) -> float:

@@ -24,7 +24,8 @@ _WINDOW = 128  # frames
 _FEWEST_PIECES = 8
 _MOST_DELAY = 5
 _STEP = 0.1  # of fractional delays
-_GAINS = 0.1, 1.6
+GAINS = 0.1, 1.6
+"""Limits of the search for the centroid gain."""
 _START_GAIN = 0.6
 _MODEL_ERROR = 0.05  # frames: spectra of real slopes differ from the theory
 _GAIN_ERROR = 0.03  # absolute and relative, likewise
@@ -148,7 +149,7 @@ class DelayFits:
             both = (self._flat @ matrices.swapaxes(1, 2).ravel() for matrices in (explained, inverse))
             strength = strength * np.maximum(np.divide(*both), 1e-9) ** _POWER
             curvature, slope = (float((inverse * matrix).sum()) for matrix in (squared, crossed))
-            gain = float(np.clip(0.5 * slope / max(curvature, 1e-300), *_GAINS))
+            gain = float(np.clip(0.5 * slope / max(curvature, 1e-300), *GAINS))
         self._strength, self._gain = np.maximum(strength, 1e-12 * strength.max()), gain
         model, measured = self._model(strength), self._measured(gain, crossed, squared)
         misfit = float(np.linalg.slogdet(model)[1].sum() + (np.linalg.inv(model) * measured).sum())

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, DelayFits, LoopDelay
+from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, GAINS, DelayFits, LoopDelay
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
@@ -19,6 +19,7 @@ Floats = NDArray[np.float64]
 FEWEST_FRAMES = 200
 _MOST_LOST = 0.3  # of the frames; with more, the longest run without a gap is used
 _WHOLE_FRAMES = 0.1  # closer to a whole number of frames than this, a delay is taken for that
+_LEAST_MEASURED = 0.5  # of a frame's slopes: the others count as 0 for delay and gain
 _LEAST_SIGNAL = 1e-6  # of the slopes' variance, that their noise is taken to have
 
 
@@ -69,19 +70,32 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
     Raises
     ------
     InputError
-        When the loop is not closed, or too short.
+        When the loop is not closed, too short, or the gain cannot be told.
     """
-    if not loop.is_closed or not np.ptp(loop.commands, axis=0).any():
+    if not loop.is_closed:
+        raise InputError(
+            "recording: expected a closed loop, got an open one (loop = open, is_closed = False)"
+        )
+    if not np.ptp(loop.commands, axis=0).any():
         raise InputError("commands: expected those of a closed loop, got constant ones")
-    slopes, mirror = np.nan_to_num(loop.slopes), loop.commands @ loop.interaction_matrix.T
-    fits = DelayFits(slopes, mirror, runs_of(loop.frame), site_of_loop(loop), loop.frame_rate_hz)
+    rows = np.isfinite(loop.slopes).mean(axis=1) >= _LEAST_MEASURED
+    if not rows.any():
+        raise InputError("recording: expected frames with most slopes measured, got none")
+    slopes, mirror = np.nan_to_num(loop.slopes[rows]), loop.commands[rows] @ loop.interaction_matrix.T
+    fits = DelayFits(slopes, mirror, runs_of(loop.frame[rows]), site_of_loop(loop), loop.frame_rate_hz)
     if loop.delay_frames is not None:
         given = fits.of(loop.delay_frames)
         return given, given
     fit = fits.best()
     nearest = float(round(fit.delay_frames))
     is_whole = abs(fit.delay_frames - nearest) < max(_WHOLE_FRAMES, 2 * fit.delay_error)
-    return fit, fits.of(nearest) if is_whole else fit
+    used = fits.of(nearest) if is_whole else fit
+    if not min(GAINS) < used.gain < max(GAINS):
+        raise InputError(
+            f"centroid gain: cannot be known from this recording ({used.gain:.2g}, a limit of the search); keep "
+            "the integrator, and record more frames, or check that slopes, commands and matrix are of one loop"
+        )
+    return fit, used
 
 
 def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:

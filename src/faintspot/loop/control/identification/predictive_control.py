@@ -251,18 +251,18 @@ def learn(recording: Recording, start: Identified | None = None) -> PredictiveCo
 
     Examples
     --------
-    A loop of 3 x 3 sub-apertures and 12 actuators on slopes that change at random:
+    A loop of 2 x 4 sub-apertures and 12 actuators on slopes that change at random:
 
     >>> import numpy as np
     >>> from faintspot.loop.control import Recording, learn
     >>> rng = np.random.default_rng(1)
-    >>> matrix = rng.standard_normal((18, 12))
-    >>> turbulence = np.cumsum(rng.standard_normal((800, 18)), axis=0)
-    >>> slopes, commands = np.zeros((800, 18)), np.zeros((800, 12))
+    >>> matrix = rng.standard_normal((16, 12))
+    >>> turbulence = np.cumsum(rng.standard_normal((800, 16)), axis=0)
+    >>> slopes, commands = np.zeros((800, 16)), np.zeros((800, 12))
     >>> for k in range(2, 800):
     ...     slopes[k] = turbulence[k] - turbulence[k].mean() + matrix @ commands[k - 2]
     ...     commands[k] = 0.99 * commands[k - 1] - 0.3 * np.linalg.pinv(matrix) @ slopes[k]
-    >>> recording = Recording(slopes, commands, matrix, np.ones((3, 3)), frame_rate_hz=250)
+    >>> recording = Recording(slopes, commands, matrix, np.ones((2, 4)), frame_rate_hz=250)
     >>> control = learn(recording)
     >>> control(slopes[0]).shape
     (12,)

@@ -44,7 +44,7 @@ class Recording:
     """
 
     slopes: Any
-    """(frames, 2 n): residual slopes in any unit, all x, then all y; NaN where not measured."""
+    """(frames, 2 n): residual slopes in any unit, all x, then all y; NaN (or infinite) where not measured."""
     commands: Any
     """(frames, commands): one row for each frame; see `sent_after_frames`."""
     interaction_matrix: Any
@@ -76,6 +76,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         slopes = real_array("slopes", self.slopes, minimum_dimensions=2).astype(np.float64)
+        slopes[np.isinf(slopes)] = np.nan
         if slopes.ndim == 3:  # (frames, n, 2) or (frames, 2, n)
             slopes = (slopes if slopes.shape[1] == 2 else slopes.swapaxes(1, 2)).reshape(len(slopes), -1)
         if slopes.ndim != 2 or slopes.shape[1] % 2:
@@ -139,7 +140,9 @@ def prepared(recording: Recording) -> Prepared:
         with them.
     """
     slopes = recording.slopes[np.isfinite(recording.slopes)]
-    spread = float(slopes.std()) if slopes.size else 0.0
+    if not slopes.size:
+        raise InputError(f"{recording.name}: expected slopes, got none that were measured")
+    spread = float(slopes.std())
     if not spread > 1e-12 * float(np.abs(slopes).max(initial=0.0)):
         raise InputError(f"{recording.name}: expected slopes that vary, got constant ones")
     matrix, scale = recording.interaction_matrix, recording.pixel_scale_arcsec
@@ -225,6 +228,8 @@ def cells_of(stated: Any, n: int) -> NDArray[np.int64]:
             )
         return np.argwhere(np.ones((side, side)))
     cells = finite_array("cells", stated)
+    if cells.shape == (n, 2) and len(np.unique(cells, axis=0)) < n:
+        raise InputError(f"cells: expected {n} sub-apertures in different places, got some twice")
     if cells.shape == (n, 2):
         return cells.astype(np.int64)
     if cells.ndim == 2 and np.count_nonzero(cells > 0) == n:  # a mask
