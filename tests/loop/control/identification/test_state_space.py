@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
-from typing import Any
+from types import ModuleType, SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -71,6 +73,54 @@ def test_the_lines_of_the_manual(
         np.testing.assert_allclose(run["control"](slopes), SIGN * line.latest, rtol=0, atol=tolerance)
         limited += int(np.abs(line.latest).max() == LIMIT)
     assert 0 < limited < 200
+
+
+class Shared:
+    """Stand-in for pyMilk's SHM: slopes of a loop that the commands close."""
+
+    def __init__(self, name: str, loop: MilkLoop) -> None:
+        self._name, self._loop = name, loop
+
+    def get_data(self, check: bool = False) -> np.ndarray:
+        return self._loop.slopes() if check else np.zeros((4, 3), np.float32)
+
+    def set_data(self, command: np.ndarray) -> None:
+        self._loop.send(command)
+
+
+class MilkLoop:
+    """Loop whose commands are those of the filter, within float32."""
+
+    def __init__(self, model: ControlModel) -> None:
+        self._line = CommandDelayLine(12, 2, LIMIT)
+        self._alone, self._rows = model.controller(PLANT, self._line), iter(telemetry(100).open_loop_px)
+        self.frames = 0
+
+    def slopes(self) -> np.ndarray:
+        residual = next(self._rows) + INTERACTION @ self._line.acting
+        self._alone.update(residual, np.sqrt(NOISE_PX2))
+        return np.asarray(residual / SCALE)[:, None]
+
+    def send(self, command: np.ndarray) -> None:
+        assert command.shape == (4, 3)
+        np.testing.assert_allclose(command.ravel(), SIGN * self._line.latest, rtol=0, atol=1e-6)
+        self.frames += 1
+
+
+@pytest.mark.parametrize("model", ["dense"], indirect=True)
+def test_the_lines_for_milk(model: ControlModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("astropy.io.fits")
+    monkeypatch.chdir(tmp_path)
+    exported(model, Path("controller.fits"))
+    loop = MilkLoop(model)
+    interface = SimpleNamespace(SHM=lambda name: Shared(name, loop))
+    for name in ("pyMilk", "pyMilk.interfacing", "pyMilk.interfacing.isio_shmlib"):
+        monkeypatch.setitem(sys.modules, name, cast(ModuleType, interface))
+    page = (ROOT / "docs" / "adapters" / "streams.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    with pytest.raises(StopIteration):
+        exec(block, {})
+    assert loop.frames == 100
 
 
 @pytest.mark.parametrize("ending", ["npz", "mat", "fits"])

@@ -186,8 +186,10 @@ def _products(slopes: Floats, sent: Floats, run: NDArray[np.int64], window: Floa
         if run[start - lags] == run[start + length - 1]
     ]
     if len(starts) < _FEWEST_PIECES:
+        gaps = f" with {len(np.unique(run)) - 1} gaps" if run[0] != run[-1] else ""
         raise InputError(
             f"recording: expected {length * (_FEWEST_PIECES + 1) // 2} consecutive frames, got {len(slopes)}"
+            f"{gaps}"
         )
     total: Floats | float = 0.0
     for first in range(0, len(starts), _BATCH):

@@ -92,8 +92,9 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
     used = fits.of(nearest) if is_whole else fit
     if not min(GAINS) < used.gain < max(GAINS):
         raise InputError(
-            f"centroid gain: cannot be known from this recording ({used.gain:.2g}, a limit of the search); keep "
-            "the integrator, and record more frames, or check that slopes, commands and matrix are of one loop"
+            f"centroid gain: cannot be known from this recording ({used.gain:.2g}, a limit of the search); "
+            "keep the integrator, and record more frames, or check that slopes, commands and matrix are of "
+            "one loop"
         )
     return fit, used
 
