@@ -22,7 +22,11 @@ def session(folder: Path, signal: Any = range(10), wfc: Any = range(10), **other
     for name, frames, numbers in (("signal", SLOPES, signal), ("wfc", COMMANDS, wfc)):
         (folder / name).mkdir()
         kept = np.array(numbers, np.uint64)
-        arrays = {"frames": frames[kept], "frame_ids": 100 + kept, "timestamps": 5.0 + 0.004 * kept}
+        arrays: dict[str, Any] = {
+            "frames": frames[kept],
+            "frame_ids": 100 + kept,
+            "timestamps": 5.0 + 0.004 * kept,
+        }
         for kind, array in arrays.items():
             np.save(folder / name / f"{kind}.npy", array)
         streams.append({"name": name, **{f"{kind}_file": f"{name}/{kind}.npy" for kind in arrays}, **other})

@@ -19,7 +19,7 @@ def modal(modes: int) -> np.ndarray:
     """Return the matrix of as many modes, smooth ones first, in another unit."""
     x, y = (CORNERS - 2.5).T
     shapes = np.array([x**i * y**j for i in range(4) for j in range(4 - i) if i + j][:modes]).T
-    return 1e-6 * ZONAL @ shapes
+    return np.asarray(1e-6 * ZONAL @ shapes)
 
 
 @pytest.mark.parametrize("matrix", [ZONAL, -1e5 * ZONAL, modal(9), modal(2)])

@@ -44,7 +44,7 @@ def order_remark(interaction: Floats, cells: Cells) -> str:
     axes = np.roll(np.arange(2 * n), n)
     pairs = np.concatenate([np.arange(0, 2 * n, 2), np.arange(1, 2 * n, 2)])
     by_columns = cells[np.lexsort((cells[:, 0], cells[:, 1]))]
-    others = {
+    others: dict[str, list[tuple[Floats, Cells]]] = {
         "by columns, or with y before x": [(interaction, by_columns), (interaction[axes], cells)],
         "with x and y of each sub-aperture in turn": [(interaction[pairs], cells)],
         "with y, or rows, counted upwards": [(interaction, cells * [-1, 1])],
