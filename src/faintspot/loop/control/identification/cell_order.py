@@ -47,7 +47,7 @@ def order_remark(interaction: Floats, cells: Cells) -> str:
     others: dict[str, list[tuple[Floats, Cells]]] = {
         "by columns, or with y before x": [(interaction, by_columns), (interaction[axes], cells)],
         "with x and y of each sub-aperture in turn": [(interaction[pairs], cells)],
-        "with y, or rows, counted upwards": [(interaction, cells * [-1, 1])],
+        "with y, or rows, counted upwards": [(interaction, cells * np.array([-1, 1]))],
     }
     fits = {name: max(smoothness(*order) for order in orders) for name, orders in others.items()}
     best = max(fits, key=lambda name: fits[name])
