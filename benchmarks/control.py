@@ -245,7 +245,7 @@ def _control(across: int, rng: np.random.Generator) -> tuple[PredictiveControl, 
     none = np.zeros((commands, 0))
     reconstructor = Reconstructor(interaction.T, none, none, interaction.T)
     learnt = LearntControl(LoopPlant(interaction, reconstructor, 2, 0.01), model)
-    return PredictiveControl(loop, learnt), 0.1 * rng.standard_normal(m)
+    return PredictiveControl(loop, learnt), np.asarray(0.1 * rng.standard_normal(m))
 
 
 def learning_table() -> Table:

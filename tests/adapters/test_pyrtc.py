@@ -227,7 +227,7 @@ def test_a_loop_with_the_predictive_filter(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(pyrtc, "_pyrtc", lambda: SimpleNamespace(Loop=LoopStandIn))
     signals = [np.ones(4, np.float32), None, np.ones((4, 1), np.float32)]
     loop = pyrtc.loop.__wrapped__()({"signals": signals})
-    with pytest.raises(InputError, match="loop.controller: expected the file"):
+    with pytest.raises(InputError, match=r"loop\.controller: expected the file"):
         loop.predictive_filter()
     loop.controller = ControllerStandIn()
     for _ in signals:
