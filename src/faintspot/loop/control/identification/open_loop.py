@@ -83,13 +83,12 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
         raise InputError("recording: expected frames with most slopes measured, got none")
     slopes, mirror = np.nan_to_num(loop.slopes[rows]), loop.commands[rows] @ loop.interaction_matrix.T
     fits = DelayFits(slopes, mirror, runs_of(loop.frame[rows]), site_of_loop(loop), loop.frame_rate_hz)
-    if loop.delay_frames is not None:
-        given = fits.of(loop.delay_frames)
-        return given, given
-    fit = fits.best()
+    fit = used = fits.best() if loop.delay_frames is None else fits.of(loop.delay_frames)
     nearest = float(round(fit.delay_frames))
-    is_whole = abs(fit.delay_frames - nearest) < max(_WHOLE_FRAMES, 2 * fit.delay_error)
-    used = fits.of(nearest) if is_whole else fit
+    if loop.delay_frames is None and abs(fit.delay_frames - nearest) < max(
+        _WHOLE_FRAMES, 2 * fit.delay_error
+    ):
+        used = fits.of(nearest)
     if not min(GAINS) < used.gain < max(GAINS):
         raise InputError(
             f"centroid gain: cannot be known from this recording ({used.gain:.2g}, a limit of the search); "
