@@ -2,7 +2,8 @@
 
 Of the 4.2 m telescope, 72 slopes, every controller as it is; for more slopes the compiled Kalman filter with
 its guard, as the engine and the simulation run it. For 7 x 7 to 80 x 80 sub-apertures the integrator and the
-filter for large sensors, with the bytes that a command needs and the time of reading as many.
+filter for large sensors, with the bytes that a command needs and the time of reading as many. A frame of
+`PredictiveControl` for 7 x 7 to 40 x 40, as a loop in Python calls it.
 
 Learning the Kalman filter from telemetry of the 4.2 m telescope: seconds of processor time, from nothing, and
 again from the turbulence known before, which is then judged on frames not learnt from.
@@ -24,6 +25,8 @@ from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import CompiledIntegrator
 from faintspot.loop.control.identification.learning import KALMAN, LoopPlant, learn_controller
+from faintspot.loop.control.identification.model import ControlModel, LearntControl
+from faintspot.loop.control.identification.predictive_control import LoopOfControl, PredictiveControl
 from faintspot.loop.control.identification.relearning import relearn
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.guarded import Guarded
@@ -42,6 +45,9 @@ _NOISE_PX = 0.5
 _SIZES = (72, 54), (160, 97), (640, 400)
 _PHOTONS, _LEARNING, _LEARNT = 20.0, (2010, 8100), 4000
 """Realisation and frames of the telemetry to learn from; frames learnt from at first."""
+_GOALS_US = {7: 50, 16: 200, 40: 2000}
+"""Microseconds of a frame, called from Python, for sub-apertures across the pupil."""
+_MOST_SLOPES = 300  # of a filter in which each slope corrects all others
 _ACROSS, _LAYERS = (7, 20, 40, 80), 3
 _FEWEST_TIMES, _SECONDS = 40, 3.0
 
@@ -141,10 +147,8 @@ def large_table() -> Table:
 def _of_size(across: int) -> list[Row]:
     """Return the rows of a sensor; matrices are random, which does not change the time."""
     rng = np.random.default_rng(1)
-    place = np.argwhere(np.ones((across, across))) - 0.5 * (across - 1)
-    cells = place[np.hypot(*place.T) <= 0.5 * across]
-    n, commands = len(cells), int(1.04 * len(cells))
-    interaction = rng.standard_normal((2 * n, commands), np.float32).astype(np.float64) / n
+    cells, interaction = _random_sensor(across, rng)
+    n, commands = len(cells), interaction.shape[1]
     line = CommandDelayLine(commands, 2, 1.0)
     integrator = CompiledIntegrator(line, interaction, interaction.T, 0.3, 0.01)
     rows = [_timed(f"{across} x {across}, integrator", integrator, 4 * interaction.size, 2 * n)]
@@ -156,6 +160,14 @@ def _of_size(across: int) -> list[Row]:
     same = np.zeros((commands, commands))  # the residuals compare as equal: the guard keeps the filter
     guarded = LargeGuarded(line, interaction, reconstructor, same, arrays, 0.3, 0.01)
     return [*rows, _timed(f"{across} x {across}, prediction", guarded, 4 * interaction.size, 2 * n)]
+
+
+def _random_sensor(across: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the sub-apertures of a round pupil, and an interaction matrix."""
+    place = np.argwhere(np.ones((across, across))) - 0.5 * (across - 1)
+    cells = place[np.hypot(*place.T) <= 0.5 * across]
+    n, commands = len(cells), int(1.04 * len(cells))
+    return cells, rng.standard_normal((2 * n, commands), np.float32).astype(np.float64) / n
 
 
 def random_filter(cells: NDArray[np.float64], rng: np.random.Generator) -> dict[str, Any]:
@@ -196,6 +208,46 @@ def _timed(name: str, controller: Controller, bytes_read: int, slopes: int) -> R
     return Row(name, {key: float(value) for key, value in values.items()})
 
 
+def call_table() -> Table:
+    """Time `PredictiveControl` as a user's loop calls it: slopes to command, then `prepare`."""
+    rng, rows = np.random.default_rng(1), []
+    with pinned():
+        for across, goal_us in _GOALS_US.items():
+            control, slopes = _control(across, rng)
+            times: list[NDArray[np.float64]] = []
+            begun = time.perf_counter()
+            while len(times) < _FEWEST_TIMES or time.perf_counter() - begun < _SECONDS:
+                marks = [time.perf_counter()]
+                for step in (partial(control, slopes), control.prepare):
+                    step()
+                    marks.append(time.perf_counter())
+                times.append(1e6 * np.diff(marks))
+            command, rest = np.array(times[2:]).T
+            p50, p99 = np.percentile(command, (50, 99))
+            values = {"best us": command.min(), "p50": p50, "p99": p99, "after it": rest.min()}
+            name = f"{across} x {across}, {len(slopes)} slopes"
+            values = {key: float(value) for key, value in values.items()}
+            rows.append(Row(name, values, f"p50 < {goal_us} us", bool(p50 < goal_us)))
+    return Table("control-call", "A frame of `PredictiveControl`, from Python, one core", rows)
+
+
+def _control(across: int, rng: np.random.Generator) -> tuple[PredictiveControl, NDArray[np.float64]]:
+    """Return a controller with random matrices, and slopes that its filter goes on with."""
+    cells, interaction = _random_sensor(across, rng)
+    m, commands = interaction.shape
+    alone = np.eye(m)[None]
+    dense = {"first": 1.5 * alone, "second": -0.6 * alone, "driving_px2": 0.1 * alone}
+    dense |= {"variance_px2": np.ones(m), "covariance_xy_px2": np.zeros(m // 2)}
+    arrays = dense if m <= _MOST_SLOPES else random_filter(cells, rng)
+    model = ControlModel(KALMAN, arrays, 0.3, 1.0, (1.0, 2.0), np.eye(commands))
+    measured = np.array([2.0, 0.1, 1.0, 0.1])
+    loop = LoopOfControl(interaction, np.ones(m), 1.0, 1.0, measured, np.zeros((0, 6)), 1.0, 0.3, 0)
+    none = np.zeros((commands, 0))
+    reconstructor = Reconstructor(interaction.T, none, none, interaction.T)
+    learnt = LearntControl(LoopPlant(interaction, reconstructor, 2, 0.01), model)
+    return PredictiveControl(loop, learnt), np.asarray(0.1 * rng.standard_normal(m))
+
+
 def learning_table() -> Table:
     """Time the learning of a Kalman filter."""
     case = Case(_PHOTONS, 0.0)
@@ -224,4 +276,4 @@ def learning_table() -> Table:
 
 def run() -> list[Table]:
     """Time control."""
-    return [small_table(), sizes_table(), large_table(), learning_table()]
+    return [small_table(), sizes_table(), large_table(), call_table(), learning_table()]

@@ -188,3 +188,50 @@ def test_signals_are_pyrtcs_own() -> None:
     # The same pixels are summed in float32.
     np.testing.assert_allclose(found[1], found[0], atol=1e-5)
     assert np.ptp(found[0]) > 1.0
+
+
+class LoopStandIn:
+    """Stand-in of pyRTC's Loop: signals in a list, None where its input is stale."""
+
+    def __init__(self, conf: dict[str, Any]) -> None:
+        self.flat, self.signals = np.zeros((3, 1), np.float32), list(conf["signals"])
+        self.sent: list[np.ndarray] = []
+
+    def _read_signal(self) -> Any:
+        return self.signals.pop(0)
+
+    def read_stream(self, name: str, *, block: bool) -> np.ndarray:
+        assert (name, block) == ("wfc", False)
+        return np.full((3, 1), 7.0, np.float32)
+
+    def send_to_wfc(self, command: np.ndarray, slopes: Any) -> None:
+        self.sent.append(command)
+
+
+class ControllerStandIn:
+    """Controller that adds the sum of the slopes to its command."""
+
+    def reset(self, command: np.ndarray) -> None:
+        self.command = command.astype(np.float64)
+
+    def __call__(self, slopes: np.ndarray) -> np.ndarray:
+        self.command = self.command + slopes.sum()
+        return self.command
+
+    def prepare(self) -> None:
+        self.is_prepared = True
+
+
+def test_a_loop_with_the_predictive_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It starts from the mirror as it is; without a signal nothing is sent."""
+    monkeypatch.setattr(pyrtc, "_pyrtc", lambda: SimpleNamespace(Loop=LoopStandIn))
+    signals = [np.ones(4, np.float32), None, np.ones((4, 1), np.float32)]
+    loop = pyrtc.loop.__wrapped__()({"signals": signals})
+    with pytest.raises(InputError, match=r"loop\.controller: expected the file"):
+        loop.predictive_filter()
+    loop.controller = ControllerStandIn()
+    for _ in signals:
+        loop.predictive_filter()
+    assert [command.tolist() for command in loop.sent] == [[11.0] * 3, [15.0] * 3]
+    assert loop.sent[0].dtype == np.float32
+    assert loop.controller.is_prepared

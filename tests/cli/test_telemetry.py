@@ -16,6 +16,7 @@ pytest.importorskip("zarr")
 
 from tests.engine import telemetry_cases
 from tests.engine.telemetry_cases import FIELDS, LAYOUT, SETTINGS, Engine, N
+from tests.loop.telemetry.loop_cases import recorded
 
 from faintspot.engine.pixels.pixel_segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
@@ -63,3 +64,20 @@ def test_what_does_not_fit_together(folder: Path, run: Commands) -> None:
     run.refused("telemetry", naming=("expected FILE or --engine",))
     run.refused("telemetry", "night.zarr", "--seconds", "3", naming=("expected --engine",))
     run.refused("telemetry", "--engine", "nobody", naming=("start the engine first",))
+
+
+@pytest.mark.slow
+def test_controllers_that_cannot_be_learnt(folder: Path, run: Commands) -> None:
+    """The report is there; the reason is one line."""
+    loop = recorded()
+    values = {"slopes": loop.slopes[:300], "commands": loop.commands[:300], "cells": loop.cells}
+    known = {"interaction_matrix": loop.interaction_matrix, "frame_rate_hz": 250.0, "slope_unit": "px"}
+    np.savez("loop.npz", **values, **known)
+    told = run("telemetry", "loop.npz", "--controller", "controller.npz")
+    assert told.code == 2
+    reason = "keep the integrator: recording: expected 576 consecutive frames, got 300"
+    assert f"controller.npz: not written, {reason}" in told.err
+    assert Path("loop.html").exists()
+    assert not Path("controller.npz").exists()
+    np.savez("loop.npz", **values, **known, loop="open")
+    run.refused("telemetry", "loop.npz", "--controller", "controller.npz", naming=("closed loop",))

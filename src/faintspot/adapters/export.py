@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import write_atomically
+from faintspot.io.arrays.fits_units import write_images
 from faintspot.io.optional_packages import load_fits
 from faintspot.io.references import read_reference
 from faintspot.loop.control.configuration import Control, load_control
@@ -71,7 +70,7 @@ def export_fits(
     path = Path(output)
     if path.suffix.lower() != ".fits":
         raise InputError(f"{path}: expected a name ending in .fits")
-    fits = load_fits()
+    load_fits()
     control = load_control(configuration_file)
     pipeline = _pipeline(configuration_file, reference, control)
     images: Images = {"CORNERS": pipeline.layout.corners.astype(np.int32)}
@@ -82,17 +81,11 @@ def export_fits(
         gain = control.centroid_gain
         images["INTERACTION_MATRIX"] = control.interaction * gain
         images["CONTROL_MATRIX"] = control.reconstructor.matrix / gain
-    primary = fits.PrimaryHDU()
-    primary.header["CREATOR"] = "faintspot"
-    units = [primary]
-    for name, values in images.items():
-        kept = values if values.dtype.kind == "i" else values.astype(np.float32)
-        units.append(fits.ImageHDU(kept, name=name))
-        if name in _UNITS:
-            units[-1].header["BUNIT"] = _UNITS[name]
-    stream = io.BytesIO()
-    fits.HDUList(units).writeto(stream, checksum=True)
-    write_atomically(path, stream.getvalue())
+    kept = {
+        name: values if values.dtype.kind == "i" else values.astype(np.float32)
+        for name, values in images.items()
+    }
+    write_images(path, kept, _UNITS)
     return tuple(images)
 
 

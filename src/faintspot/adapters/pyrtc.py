@@ -1,4 +1,4 @@
-"""The slope pipeline in pyRTC: `FaintspotSlopes`, a slopes process, and `FaintspotCamera`, a sensor.
+"""faintspot in pyRTC: `FaintspotSlopes`, a slopes process, `FaintspotCamera`, a sensor, and `FaintspotLoop`.
 
 ::
 
@@ -22,6 +22,7 @@ from faintspot.adapters.base import CALIBRATION_FLUX_E, FLUX_FRAMES, ToolSlopes,
 from faintspot.adapters.checks import check_version
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.engine.streams.stream import Follower
+from faintspot.loop.control import PredictiveControl
 
 TESTED = "2.1.0"
 _MOMENT_S = 0.1
@@ -31,7 +32,7 @@ PREDICTED = "predicted"
 
 
 def __getattr__(name: str) -> Any:
-    made = {"FaintspotSlopes": slopes_process, "FaintspotCamera": camera}
+    made = {"FaintspotSlopes": slopes_process, "FaintspotCamera": camera, "FaintspotLoop": loop}
     if name in made:
         return made[name]()
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -128,6 +129,51 @@ def camera() -> Any:
 
     FaintspotCamera.__module__, FaintspotCamera.__qualname__ = __name__, "FaintspotCamera"
     return FaintspotCamera
+
+
+@functools.cache
+def loop() -> Any:
+    """Return the class `FaintspotLoop`, a `Loop` of pyRTC with the function `predictive_filter`.
+
+    Its configuration is that of a `Loop`, and
+
+    controller : str
+        File of a `faintspot.control.PredictiveControl`. Default: the attribute `controller` is set later.
+
+    Raises
+    ------
+    MissingExtraError
+        When pyRTC is not installed.
+    """
+    tool: Any = _pyrtc().Loop
+
+    class FaintspotLoop(tool):  # type: ignore[misc]
+        """A pyRTC loop whose commands come from a predictive controller."""
+
+        EXTRA_CONFIG_KEYS = ("controller",)
+
+        def __init__(self, conf: Any) -> None:
+            name = conf.get("controller")
+            self.controller = None if name is None else PredictiveControl.load(name)
+            self._starts = True
+            super().__init__(conf)
+
+        def predictive_filter(self) -> None:
+            """Send the command for the next signal; the first time from the mirror as it is."""
+            if self.controller is None:
+                raise InputError("loop.controller: expected the file of a predictive controller, got none")
+            slopes = self._read_signal()
+            if slopes is None:
+                return
+            if self._starts:
+                self.controller.reset(np.ravel(self.read_stream("wfc", block=False)))
+                self._starts = False
+            command = self.controller(np.ravel(slopes))
+            self.send_to_wfc(command.astype(self.flat.dtype), slopes=slopes)
+            self.controller.prepare()
+
+    FaintspotLoop.__module__, FaintspotLoop.__qualname__ = __name__, "FaintspotLoop"
+    return FaintspotLoop
 
 
 class _Frames:

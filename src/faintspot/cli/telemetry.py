@@ -50,9 +50,10 @@ def command(
 ) -> None:
     """Report noise, turbulence, vibrations and control of a recorded loop, of any system.
 
-    FILE is a store of `faintspot realtime record`, an AOT file (FITS), a TOML file that names arrays, or a
-    NumPy or CSV file with slopes. Writes a page and, beside it, the same numbers as JSON. Every value has a
-    95 % interval. It replays other gains and a predictive filter on the recorded turbulence. Takes a minute.
+    FILE is a store of `faintspot realtime record`, an AOT file (FITS), a telemetry session of pyRTC, a TOML
+    file that names arrays, or a NumPy or CSV file with slopes. Writes a page and, beside it, the same numbers
+    as JSON. Every value has a 95 % interval. It replays other gains and a predictive filter on the recorded
+    turbulence. Takes a minute.
 
     \b
     Examples:
@@ -63,7 +64,7 @@ def command(
       faintspot telemetry loop.npz --controller controller.npz
     """
     from faintspot.loop.control.configuration import load_control
-    from faintspot.loop.control.identification.predictive_control import learn
+    from faintspot.loop.control.identification.predictive_control import learn, learn_observed
     from faintspot.loop.telemetry.page import page_of_loop
     from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
     from faintspot.loop.telemetry.report import report_of_loop
@@ -85,20 +86,25 @@ def command(
             _record(engine, recording, _SECONDS if seconds is None else seconds)
         assert recording is not None
         loop = read_recorded_loop(recording, system, config)
+    if controller is not None and not loop.is_closed:
+        raise InputError("--controller: expected the recording of a closed loop, got an open one")
     report = report_of_loop(loop, lambda step: click.echo(f"{step} ...", err=True))
     numbers = derived(page, ".json")
     write_atomically(numbers, json.dumps(report.as_values(), indent=1))
     write_atomically(page, page_of_loop(report))
-    for remark in loop.remarks:
+    for remark in report.loop.remarks:
         click.echo(remark)
     if report.advice:
         click.echo(report.advice)
+    click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
     if controller is not None:
         click.echo("controller ...", err=True)
-        control = learn(loop)
+        try:
+            control = learn(loop) if report.observed is None else learn_observed(report.observed)
+        except InputError as error:
+            raise InputError(f"{controller}: not written, keep the integrator: {error}") from None
         control.save(controller)
         click.echo(f"{controller}: {control.summary()}")
-    click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
 
 
 def _record(engine: str, store: Path, seconds: float) -> None:

@@ -1,14 +1,20 @@
-"""Header-and-data units of FITS files, read without their data."""
+"""Header-and-data units of FITS files: read without their data; images written."""
 
 from __future__ import annotations
 
+import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from faintspot.base.errors import InputError
+from faintspot.base.files import write_atomically
 from faintspot.io.arrays.streams import open_plain_or_gzip
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_fits
@@ -40,6 +46,38 @@ class Unit:
             raise ValueError("negative size")
         name = str(header.get("EXTNAME", "PRIMARY" if index == 0 else index))
         return cls(index, name, header, compressed, shape, data_start)
+
+
+def write_images(
+    path: str | Path, images: Mapping[str, ArrayLike], units: Mapping[str, str] = MappingProxyType({})
+) -> None:
+    """Write arrays to a FITS file, each as an image of its own.
+
+    Parameters
+    ----------
+    path : path
+    images : mapping
+        Arrays by the names of their units.
+    units : mapping
+        Physical units (BUNIT) of some of them.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+    MissingExtraError
+        When astropy is not installed.
+    """
+    fits, stream = load_fits(), io.BytesIO()
+    primary = fits.PrimaryHDU()
+    primary.header["CREATOR"] = "faintspot"
+    hdus = [primary]
+    for name, values in images.items():
+        hdus.append(fits.ImageHDU(np.atleast_1d(values), name=name))
+        if name in units:
+            hdus[-1].header["BUNIT"] = units[name]
+    fits.HDUList(hdus).writeto(stream, checksum=True)
+    write_atomically(path, stream.getvalue())
 
 
 def units_of(path: Path) -> Iterator[Unit]:

@@ -16,6 +16,7 @@ from faintspot.base.toml_files import check_keys, parse_file
 from faintspot.base.validity import leave_out
 from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.frames import read_array
+from faintspot.io.telemetry.pyrtc_session import holds_session, read_session
 from faintspot.io.telemetry.recording import read_telemetry
 from faintspot.loop.control.configuration import load_control
 from faintspot.loop.control.identification.recording import Recording
@@ -52,8 +53,8 @@ def read_recorded_loop(
     Parameters
     ----------
     path : path
-        A store of `faintspot realtime record`, an AOT file, a TOML file that names arrays, or a NumPy or CSV
-        file with slopes.
+        A store of `faintspot realtime record`, an AOT file, a telemetry session of pyRTC, a TOML file that
+        names arrays, or a NumPy or CSV file with slopes.
     system : path, optional
         TOML with values that the recording lacks, or that replace its own.
     configuration : path, optional
@@ -71,6 +72,8 @@ def read_recorded_loop(
         values = _of_toml(path)
     elif path.suffix in _TABLES:
         values = _of_table(path)
+    elif holds_session(path):
+        values = read_session(path)
     elif path.is_dir() and holds_telemetry(path):
         values = _of_store(path, configuration)
     else:

@@ -21,6 +21,7 @@ from faintspot.loop.control.identification.open_loop import (
     site_of_loop,
     with_axes_of,
 )
+from faintspot.loop.control.identification.predictive_control import ObservedLoop
 from faintspot.loop.control.identification.recording import Recording, prepared
 from faintspot.loop.telemetry.choices import Choice, advice, compared_choices
 from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
@@ -60,6 +61,10 @@ class LoopReport:
     turbulence: Identified | None = None
     spectra: ModalSpectra | None = None
     choices: list[Choice] = field(default_factory=list)
+    delay: LoopDelay | None = None
+    """Delay and centroid gain that were measured and are used."""
+    observed: ObservedLoop | None = None
+    """From which a controller can be learnt; None if delay or turbulence are unknown."""
 
     @property
     def advice(self) -> str:
@@ -102,7 +107,7 @@ def report_of_loop(loop: Recording, progress: Callable[[str], None] = lambda _: 
     InputError
         When the slopes do not vary, or commands and slopes are not of one loop.
     """
-    loop = prepared(loop).recording
+    ready = prepared(loop)
     titles = {
         "frames": "Frames",
         "loop": "Loop",
@@ -112,7 +117,7 @@ def report_of_loop(loop: Recording, progress: Callable[[str], None] = lambda _: 
         "spectra": "Spectra",
         "choices": "Other choices of control",
     }
-    report = LoopReport(loop, {name: Part(title) for name, title in titles.items()})
+    report = LoopReport(ready.recording, {name: Part(title) for name, title in titles.items()})
     _frames(report)
     progress("delay")
     delay = _loop(report)
@@ -120,7 +125,9 @@ def report_of_loop(loop: Recording, progress: Callable[[str], None] = lambda _: 
     open_loop = _noise(report, delay)
     if open_loop is not None:
         progress("turbulence")
-        _turbulence(report, open_loop, delay)
+        identification = _turbulence(report, open_loop, delay)
+        if report.delay is not None and identification is not None:
+            report.observed = ObservedLoop(ready, report.delay, open_loop, identification)
         progress("other choices")
         _choices(report, open_loop, delay)
     return report
@@ -154,13 +161,14 @@ def _loop(report: LoopReport) -> LoopDelay:
         for name in ("loop", "turbulence", "vibrations", "spectra", "choices"):
             report.parts[name].missing = why
         return LoopDelay(1.0, 0.0, 1.0, 0.0)
-    values, delay = _delay(loop)
+    values, delay = _delay(report)
     part.values = [*values, *part.values]
     return delay
 
 
-def _delay(loop: Recording) -> tuple[list[Measured], LoopDelay]:
+def _delay(report: LoopReport) -> tuple[list[Measured], LoopDelay]:
     """Return delay and gain as reported and as used."""
+    loop = report.loop
     names, assumed = (("delay", "frames"), ("centroid gain", "")), loop.delay_frames
     fit, used, unknown = known_delay(loop)
     if unknown:
@@ -168,6 +176,7 @@ def _delay(loop: Recording) -> tuple[list[Measured], LoopDelay]:
         return [Measured(*name, remark=text) for name, text in zip(names, remarks, strict=True)], used
     remark = "given" if assumed is not None else f"{used.delay_frames:g} is used" if used is not fit else ""
     used = with_axes_of(loop, used)
+    report.delay = replace(used, delay_error=fit.delay_error)
     gain = Measured(*names[1], used.gain, used.gain_error, f"for a delay of {used.delay_frames:.3g} frames")
     of_axes = used.measured_x_to_y, used.x_to_y_error
     axes = Measured("centroid gain of x relative to y", "", *of_axes, f"{used.x_to_y:.3g} is used")
@@ -223,24 +232,26 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
     return None if report.parts["turbulence"].missing else open_loop
 
 
-def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> None:
+def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> Identification | None:
+    """Report the turbulence; return its identification, None if it is unknown."""
     loop = report.loop
     part, site = report.parts["turbulence"], site_of_loop(loop)
     try:
-        identified = Identification(open_loop.telemetry, site, loop.frame_rate_hz).layers()
+        identification = Identification(open_loop.telemetry, site, loop.frame_rate_hz)
+        identified = identification.layers()
     except InputError as error:
         part.missing = report.parts["vibrations"].missing = report.parts["spectra"].missing = str(error)
-        return
+        return None
     report.turbulence = identified
     report.spectra = modal_spectra(open_loop.telemetry, identified)
     _vibrations(report, identified)
     if len(loop.cells) < FEWEST_SUBAPERTURES:
         part.missing = f"Fewer than {FEWEST_SUBAPERTURES} sub-apertures show neither winds nor r0."
-        return
+        return identification
     report.parts["noise"].values += recorded_discrepancy(loop, open_loop, identified)
     if loop.subaperture_m is None:
         part.missing = "Without subaperture_m (or diameter_m) neither r0 nor winds are known."
-        return
+        return identification
     r0 = Measured("r0 at 500 nm", "m", remark="pixel_scale_arcsec is unknown")
     if loop.pixel_scale_arcsec is not None:
         rows = open_loop.telemetry.trust.any(axis=1)
@@ -259,6 +270,7 @@ def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> No
     else:
         part.values.append(r0)
     part.values += _winds(identified, r0)
+    return identification
 
 
 def _winds(identified: Identified, r0: Measured) -> list[Measured]:

@@ -52,6 +52,8 @@ class SlopeTurbulence:
         Side of the square in which a slope is the mean gradient, in sub-apertures. 1: centres of gravity of
         all flux. Near the diffraction limit windows see the least-squares tilt, which varies as the mean
         gradient in a smaller square does.
+    length_unit : str
+        "m", or what lengths are multiples of where they are unknown in metres.
     """
 
     positions_m: Floats
@@ -62,6 +64,7 @@ class SlopeTurbulence:
     fraction: Floats
     wind_m_per_s: Floats
     averaged: float = 1.0
+    length_unit: str = "m"
 
     def covariance_px2(self, later_s: float = 0.0) -> Floats:
         """Return E[slopes at t + later_s, slopes at t], (2 n, 2 n) px^2: all x, then all y."""

@@ -8,7 +8,7 @@ from tests.loop.control.control_cases import FRAME_S, INTERACTION, LAYERS, PLANT
 from tests.loop.telemetry.loop_cases import AIR, RATE_HZ, recorded
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.loop_delay import LoopDelay, loop_delay, with_axes
+from faintspot.loop.control.identification.loop_delay import DelayFits, LoopDelay, with_axes
 
 
 def found(delay: int, gain: float, given: float | None = None, frames: int | None = None) -> LoopDelay:
@@ -17,7 +17,8 @@ def found(delay: int, gain: float, given: float | None = None, frames: int | Non
     assert loop.interaction_matrix is not None
     held = loop.commands @ loop.interaction_matrix.T
     run = np.zeros(len(held), np.int64)
-    return loop_delay(loop.slopes[:frames], held[:frames], run[:frames], AIR, RATE_HZ, given)
+    fits = DelayFits(loop.slopes[:frames], held[:frames], run[:frames], AIR, RATE_HZ)
+    return fits.best() if given is None else fits.of(given)
 
 
 @pytest.mark.slow
@@ -56,7 +57,7 @@ def test_gains_of_x_and_y(of_x: float, of_y: float) -> None:
         slopes[frame] = seen + 0.1 * rng.standard_normal(18)
         commands[frame] = 0.99 * commands[frame - 1] - 0.3 * PLANT.reconstructor.matrix @ slopes[frame]
     context = slopes, commands @ INTERACTION.T, np.zeros(4000, np.int64), TURBULENCE, 1 / FRAME_S
-    seen = with_axes(loop_delay(*context, 2.0), *context)
+    seen = with_axes(DelayFits(*context).of(2.0), *context)
     assert abs(seen.measured_x_to_y - of_x / of_y) < 3 * seen.x_to_y_error < 0.5
     np.testing.assert_allclose(seen.gains(9), gains, rtol=0.15)
     assert (seen.x_to_y == 1.0) == (of_x == of_y)

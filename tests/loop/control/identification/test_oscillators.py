@@ -11,7 +11,7 @@ from tests.loop.control.driven import driven, oscillator
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn_controller
-from faintspot.loop.control.identification.loop_delay import loop_delay
+from faintspot.loop.control.identification.loop_delay import DelayFits
 from faintspot.loop.control.identification.open_loop import site_of_loop
 from faintspot.loop.control.identification.oscillators import fitted_oscillators
 from faintspot.loop.control.identification.recording import Recording
@@ -66,4 +66,4 @@ def test_the_learnt_filter_beats_the_best_integrator() -> None:
 def test_delay_is_not_told() -> None:
     run = np.zeros(_FRAMES, np.int64)
     with pytest.raises(InputError, match="expected 3 sub-apertures"):
-        loop_delay(_seen(4), np.zeros((_FRAMES, 2)), run, _SITE, _RATE_HZ)
+        DelayFits(_seen(4), np.zeros((_FRAMES, 2)), run, _SITE, _RATE_HZ)

@@ -65,9 +65,11 @@ def test_commands_of_another_loop() -> None:
     ("change", "message"),
     [
         ({"slopes": np.ones((2550, 50))}, "expected slopes that vary"),
+        ({"slopes": np.full((2550, 50), np.nan)}, "expected slopes, got none that were measured"),
         ({"interaction_matrix": np.ones((36, 50))}, r"interaction_matrix: expected shape \(50, 36\)"),
         ({"commands": np.ones((10, 36))}, "commands: expected 2550 frames"),
         ({"cells": np.ones((3, 3))}, "cells: expected shape"),
+        ({"cells": np.ones((25, 2))}, "cells: expected 25 sub-apertures in different places"),
         ({"frame": np.zeros(2550)}, "frame: expected 2550 increasing numbers"),
         ({"sent_after_frames": -1}, "sent_after_frames"),
         ({"frame_rate_hz": 0.0}, "frame_rate_hz"),

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,8 +78,10 @@ class Identified:
         if self.oscillators:
             return ", ".join(f"{mode.mode} at {mode.frequency_hz:.1f} Hz" for mode in self.oscillators)
         winds, shares = self.turbulence.wind_m_per_s, self.turbulence.fraction
+        per_s = f"{self.turbulence.length_unit}/s"
         layers = [
-            f"{math.hypot(x, y):.1f} m/s to {math.degrees(math.atan2(y, x)) % 360:.0f} degrees ({part:.0%})"
+            f"{math.hypot(x, y):.1f} {per_s} to {math.degrees(math.atan2(y, x)) % 360:.0f} degrees "
+            f"({part:.0%})"
             for (x, y), part in sorted(zip(winds, shares, strict=True), key=lambda layer: -layer[1])
         ]
         shaking = [f"{line.mode} shakes at {line.frequency_hz:.1f} Hz" for line in self.vibrations]
@@ -118,6 +120,14 @@ class Identification:
         self._vibrations = find_vibrations(records.modes(), rate_hz, records.slopes.shape[1])
         self._likelihood = LayerLikelihood(records, rate_hz, self._vibrations)
         self._records = records
+        self._anywhere: dict[float, tuple[LayerLikelihood, Layers]] = {}
+        self._selected: dict[float, tuple[Layers, Floats]] = {}
+
+    def among(self, averaged: Sequence[float]) -> Identification:
+        """Return the identification with other values of `averaged`; fits are shared."""
+        other = copy.copy(self)
+        other._averaged = tuple(averaged)
+        return other
 
     def layers(self, start: Identified | None = None) -> Identified:
         """Return layers with winds fitted to the telemetry, from earlier ones on, if any.
@@ -130,7 +140,9 @@ class Identification:
             likelihood = self._likelihood.averaging(start.turbulence.averaged)
             return self._identified(likelihood, *likelihood.selected(start.parameters()))
         likelihood, _ = self._best
-        layers, errors = likelihood.selected(likelihood.peaks())
+        if likelihood.averaged not in self._selected:
+            self._selected[likelihood.averaged] = likelihood.selected(likelihood.peaks())
+        layers, errors = self._selected[likelihood.averaged]
         # Winds from anywhere are not quite the turbulence, so neighbouring values are tried with layers, too.
         index = self._averaged.index(likelihood.averaged)
         for averaged in (*self._averaged[max(index - 1, 0) : index], *self._averaged[index + 1 : index + 2]):
@@ -150,15 +162,19 @@ class Identification:
         """Return isotropic turbulence: winds of several speeds, equally from all directions."""
         return self._identified(*self._best, is_layered=False)
 
-    @cached_property
+    @property
     def _best(self) -> tuple[LayerLikelihood, Layers]:
         """The likelihood with the best of `averaged` for winds from anywhere, and these."""
         speeds = np.array(_SPEEDS_M_PER_S)
         still = replace(self._site, fraction=np.ones(len(speeds)), wind_m_per_s=np.outer(speeds, [1.0, 0.0]))
         winds = still.from_anywhere().wind_m_per_s
-        likelihoods = [self._likelihood.averaging(averaged) for averaged in self._averaged]
-        fits = [(likelihood, likelihood.of_winds(winds[None])) for likelihood in likelihoods]
-        return min(fits, key=lambda fit: fit[1].criterion)
+        for averaged in self._averaged:
+            if averaged not in self._anywhere:
+                likelihood = self._likelihood.averaging(averaged)
+                self._anywhere[averaged] = likelihood, likelihood.of_winds(winds[None])
+        return min(
+            (self._anywhere[averaged] for averaged in self._averaged), key=lambda fit: fit[1].criterion
+        )
 
     def _oscillating(self) -> Identified:
         records, none = self._records, np.full((1, 2), np.nan)

@@ -63,6 +63,7 @@ def learn_controller(
     noise_scale: float = 1.0,
     start: Identified | None = None,
     progress: Callable[[int, int], None] | None = None,
+    identification: Identification | None = None,
 ) -> LearntControl:
     """Return a controller of the given kind, learnt from telemetry.
 
@@ -84,6 +85,8 @@ def learn_controller(
         Earlier turbulence of the same site, from which winds are learnt faster.
     progress : callable, optional
         Called with the steps done and their number while filters of many slopes are computed.
+    identification : Identification, optional
+        Of this telemetry, with fits that were made before.
     """
     cells = np.rint(site.positions_m[:, ::-1] / site.subaperture_m).astype(np.int64)
     of_commands = phase_of_commands(plant.interaction, cells)
@@ -93,7 +96,9 @@ def learn_controller(
     plain = ControlModel(kind, {}, gain, 1.0, (math.inf, plain_residual), of_commands)
     if kind == MODAL:
         return LearntControl(plant, _modal(plain, plant, telemetry))
-    identification = Identification(whole, site, rate_hz, AVERAGED[:1])
+    if identification is None:
+        identification = Identification(whole, site, rate_hz)
+    identification = identification.among(AVERAGED[:1])
     tried = []
     earlier = start if start is not None and start.is_layered and winds == LEARNT else None
     if earlier is None:  # else the comparison was made before

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +19,13 @@ from faintspot.loop.control.identification.slope_spectra import SlopeSpectra
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _WINDOW = 128  # frames
 _FEWEST_PIECES = 8
 _MOST_DELAY = 5
 _STEP = 0.1  # of fractional delays
-_GAINS = 0.1, 1.6
+GAINS = 0.1, 1.6
+"""Limits of the search for the centroid gain."""
 _START_GAIN = 0.6
 _MODEL_ERROR = 0.05  # frames: spectra of real slopes differ from the theory
 _GAIN_ERROR = 0.03  # absolute and relative, likewise
@@ -36,6 +35,7 @@ _SPEEDS_M_PER_S = (1.0, 3.0, 6.0, 10.0, 15.0, 22.0, 32.0)
 _DIRECTIONS = 4  # of half a turn: opposite winds have the same spectrum
 _MOST_SUBAPERTURES, _MOST_MODES = 40, 36
 _UPDATES, _FEW_UPDATES, _POWER = 60, 15, 0.9
+_BATCH = 64  # pieces at a time
 _INDEPENDENT = 0.55  # part of half-overlapping pieces
 FEWEST_SUBAPERTURES = 3
 """Fewer show only tip and tilt, in which vibrations cannot be told from turbulence."""
@@ -72,15 +72,10 @@ class LoopDelay:
         return np.repeat([self.gain * root, self.gain / root], n)
 
 
-def loop_delay(
-    slopes_px: Floats,
-    sent_px: Floats,
-    run: NDArray[np.int64],
-    site: SlopeTurbulence,
-    rate_hz: float,
-    delay_frames: float | None = None,
-) -> LoopDelay:
-    """Return delay and centroid gain of a closed loop.
+class DelayFits:
+    """Fits of delay and centroid gain to the cross-spectra of a closed loop.
+
+    The spectra of the model are real, as opposite winds have the same; so only real parts count.
 
     Parameters
     ----------
@@ -93,8 +88,8 @@ def loop_delay(
     site : SlopeTurbulence
         Geometry and outer scale.
     rate_hz : float
-    delay_frames : float, optional
-        Where it is known: then only the gain is estimated.
+    axis : int, optional
+        0: slopes along x alone, 1: along y alone.
 
     Raises
     ------
@@ -102,81 +97,16 @@ def loop_delay(
         When there are fewer than 3 sub-apertures, because vibrations change tip and tilt, or fewer than 8
         pieces of 128 consecutive frames, half overlapping.
     """
-    fits = _Fits.of_loop(slopes_px, sent_px, run, site, rate_hz)
-    if delay_frames is not None:
-        gain, gain_error, _ = fits.of(delay_frames, _UPDATES)
-        return LoopDelay(delay_frames, 0.0, gain, math.hypot(gain_error, _model_error(gain)))
-    fits.of(2.0, _UPDATES)
-    whole = min(range(1, _MOST_DELAY + 1), key=lambda delay: fits.of(delay, _FEW_UPDATES)[-1])
-    delays = np.arange(max(whole - 1.0, 1.0), min(whole + 1.0, _MOST_DELAY) + 0.5 * _STEP, _STEP)
-    values = np.array([fits.of(delay, _FEW_UPDATES) for delay in delays])
-    weight = np.exp(values[:, 2].min() - values[:, 2])
-    weight /= weight.sum()
-    delay, gain = float(weight @ delays), float(weight @ values[:, 0])
-    delay_error = math.hypot(
-        math.sqrt(float(weight @ (delays - delay) ** 2)), _STEP / math.sqrt(12), _MODEL_ERROR
-    )
-    of_delay = math.sqrt(float(weight @ (values[:, 0] - gain) ** 2))
-    gain_error = math.hypot(of_delay, float(weight @ values[:, 1]), _model_error(gain))
-    return LoopDelay(delay, delay_error, gain, gain_error)
 
-
-def with_axes(
-    delay: LoopDelay,
-    slopes_px: Floats,
-    sent_px: Floats,
-    run: NDArray[np.int64],
-    site: SlopeTurbulence,
-    rate_hz: float,
-) -> LoopDelay:
-    """Return delay and centroid gain with the gain of x relative to y, used if it differs from 1 for sure.
-
-    Parameters as for `loop_delay`, which has found `delay`.
-    """
-    gains, errors = np.transpose(
-        [
-            _Fits.of_loop(slopes_px, sent_px, run, site, rate_hz, axis).of(delay.delay_frames, _UPDATES)[:2]
-            for axis in (0, 1)
-        ]
-    )
-    ratio = float(gains[0] / gains[1])
-    error = ratio * math.hypot(*(errors / gains), _AXES_ERROR)
-    found = replace(delay, measured_x_to_y=ratio, x_to_y_error=error)
-    if abs(math.log(ratio)) < _SURE * error / ratio:
-        return found
-    # Both axes together tell the gain better than each alone.
-    alike = slopes_px / replace(found, gain=1.0, x_to_y=ratio).gains(len(site.positions_m))
-    fit = loop_delay(alike, sent_px, run, site, rate_hz, delay.delay_frames)
-    return replace(found, gain=fit.gain, gain_error=fit.gain_error, x_to_y=ratio)
-
-
-def _model_error(gain: float) -> float:
-    """Return the error of a gain as spectra of real slopes differ from the theory."""
-    return _GAIN_ERROR * math.hypot(1, gain)
-
-
-class _Fits:
-    """Most likely gains for delays; strengths are kept from one delay to the next."""
-
-    def __init__(self, products: Complex, parts: Complex, pieces: int) -> None:
-        self._products, self._parts = products, parts
-        self._independent = _INDEPENDENT * pieces
-        level = np.trace(products[:, 0, 0], axis1=1, axis2=2).real.sum()
-        each = np.trace(parts, axis1=2, axis2=3).real.sum(axis=1)
-        self._strength = level / each / len(parts)
-        self._gain = _START_GAIN
-
-    @classmethod
-    def of_loop(
-        cls,
+    def __init__(
+        self,
         slopes_px: Floats,
         sent_px: Floats,
         run: NDArray[np.int64],
         site: SlopeTurbulence,
         rate_hz: float,
         axis: int | None = None,
-    ) -> Self:
-        """Return the fits of a loop, of slopes along both axes or one; see `loop_delay`."""
+    ) -> None:
         n = len(site.positions_m)
         if n < FEWEST_SUBAPERTURES:
             raise InputError(
@@ -190,39 +120,109 @@ class _Fits:
         window /= np.linalg.norm(window)
         basis = _modes(site, axis)
         slopes, sent = ((values - values.mean(axis=0))[:, columns] @ basis for values in (slopes_px, sent_px))
-        products, pieces = _products(slopes, sent, run, window)
-        return cls(products, _turbulence(site, rate_hz, window, basis), pieces)
+        self._products, pieces = _products(slopes, sent, run, window)
+        self._parts = _turbulence(site, rate_hz, window, basis)
+        self._flat = self._parts.reshape(len(self._parts), -1)
+        self._independent = _INDEPENDENT * pieces
+        self._begin()
 
-    def of(self, delay: float, updates: int) -> tuple[float, float, float]:
-        """Return gain, its standard error, and the misfit: minus the logarithm of the likelihood."""
+    def _begin(self) -> None:
+        """Start from equal strengths."""
+        level = np.trace(self._products[:, 0, 0], axis1=1, axis2=2).sum()
+        self._strength = level / np.trace(self._parts, axis1=2, axis2=3).sum(axis=1) / len(self._parts)
+        self._gain = _START_GAIN
+
+    def of(self, delay_frames: float) -> LoopDelay:
+        """Return the gain for a delay that is known."""
+        self._begin()
+        gain, gain_error, _ = self._fit(delay_frames, _UPDATES)
+        return LoopDelay(delay_frames, 0.0, gain, math.hypot(gain_error, _model_error(gain)))
+
+    def gain_of(self, delay_frames: float) -> tuple[float, float]:
+        """Return the gain for a known delay, and its error as far as frames and noise cause it."""
+        self._begin()
+        return self._fit(delay_frames, _UPDATES)[:2]
+
+    def best(self) -> LoopDelay:
+        """Return delay and gain, averaged over the delays that are likely."""
+        self._begin()
+        self._fit(2.0, _UPDATES)
+        whole = min(range(1, _MOST_DELAY + 1), key=lambda delay: self._fit(delay, _FEW_UPDATES)[-1])
+        delays = np.arange(max(whole - 1.0, 1.0), min(whole + 1.0, _MOST_DELAY) + 0.5 * _STEP, _STEP)
+        values = np.array([self._fit(delay, _FEW_UPDATES) for delay in delays])
+        weight = np.exp(values[:, 2].min() - values[:, 2])
+        weight /= weight.sum()
+        delay, gain = float(weight @ delays), float(weight @ values[:, 0])
+        delay_error = math.hypot(
+            math.sqrt(float(weight @ (delays - delay) ** 2)), _STEP / math.sqrt(12), _MODEL_ERROR
+        )
+        of_delay = math.sqrt(float(weight @ (values[:, 0] - gain) ** 2))
+        gain_error = math.hypot(of_delay, float(weight @ values[:, 1]), _model_error(gain))
+        return LoopDelay(delay, delay_error, gain, gain_error)
+
+    def _fit(self, delay: float, updates: int) -> tuple[float, float, float]:
+        """Return gain, its standard error, and the misfit: minus the logarithm of the likelihood.
+
+        Strengths are kept from one delay to the next.
+        """
         first, part = min(int(delay), _MOST_DELAY), delay - min(int(delay), _MOST_DELAY)
         share = {first: 1 - part, first + 1: part}
         lags, weights = list(share), np.array(list(share.values()))
         crossed = np.tensordot(self._products[:, 0, lags], weights, (1, 0))
         within = self._products[:, lags][:, :, lags]
         squared = np.tensordot(within, np.outer(weights, weights), ((1, 2), (0, 1)))
-        crossed = crossed + crossed.conj().swapaxes(1, 2)
+        crossed = crossed + crossed.swapaxes(1, 2)
         strength, gain = self._strength, self._gain
         for _ in range(updates):
-            measured = self._products[:, 0, 0] - gain * crossed + gain**2 * squared
-            inverse = np.linalg.inv(np.tensordot(strength, self._parts, 1))
-            explained = inverse @ measured @ inverse
-            both = (
-                np.einsum("sfij,fji->s", self._parts, matrices, optimize=True).real
-                for matrices in (explained, inverse)
-            )
+            inverse = np.linalg.inv(self._model(strength))
+            explained = inverse @ self._measured(gain, crossed, squared) @ inverse
+            both = (self._flat @ matrices.swapaxes(1, 2).ravel() for matrices in (explained, inverse))
             strength = strength * np.maximum(np.divide(*both), 1e-9) ** _POWER
-            curvature = float((inverse * squared.swapaxes(1, 2)).sum().real)
-            slope = float((inverse * crossed.swapaxes(1, 2)).sum().real)
-            gain = float(np.clip(0.5 * slope / max(curvature, 1e-300), *_GAINS))
+            curvature, slope = (float((inverse * matrix).sum()) for matrix in (squared, crossed))
+            gain = float(np.clip(0.5 * slope / max(curvature, 1e-300), *GAINS))
         self._strength, self._gain = np.maximum(strength, 1e-12 * strength.max()), gain
-        model = np.tensordot(strength, self._parts, 1)
-        measured = self._products[:, 0, 0] - gain * crossed + gain**2 * squared
-        misfit = float(
-            np.linalg.slogdet(model)[1].sum() + (np.linalg.inv(model) * measured.swapaxes(1, 2)).sum().real
-        )
+        model, measured = self._model(strength), self._measured(gain, crossed, squared)
+        misfit = float(np.linalg.slogdet(model)[1].sum() + (np.linalg.inv(model) * measured).sum())
         error = 1 / math.sqrt(2 * self._independent * max(curvature, 1e-300))
-        return gain, error, self._independent * float(misfit)
+        return gain, error, self._independent * misfit
+
+    def _model(self, strength: Floats) -> Floats:
+        return np.asarray((strength @ self._flat).reshape(self._parts.shape[1:]))
+
+    def _measured(self, gain: float, crossed: Floats, squared: Floats) -> Floats:
+        return np.asarray(self._products[:, 0, 0] - gain * crossed + gain**2 * squared)
+
+
+def with_axes(
+    delay: LoopDelay,
+    slopes_px: Floats,
+    sent_px: Floats,
+    run: NDArray[np.int64],
+    site: SlopeTurbulence,
+    rate_hz: float,
+) -> LoopDelay:
+    """Return delay and centroid gain with the gain of x relative to y, used if it differs from 1 for sure.
+
+    Parameters as for `DelayFits`, which has found `delay`.
+    """
+    loop = sent_px, run, site, rate_hz
+    gains, errors = np.transpose(
+        [DelayFits(slopes_px, *loop, axis).gain_of(delay.delay_frames) for axis in (0, 1)]
+    )
+    ratio = float(gains[0] / gains[1])
+    error = ratio * math.hypot(*(errors / gains), _AXES_ERROR)
+    found = replace(delay, measured_x_to_y=ratio, x_to_y_error=error)
+    if abs(math.log(ratio)) < _SURE * error / ratio:
+        return found
+    # Both axes together tell the gain better than each alone.
+    alike = slopes_px / replace(found, gain=1.0, x_to_y=ratio).gains(len(site.positions_m))
+    fit = DelayFits(alike, *loop).of(delay.delay_frames)
+    return replace(found, gain=fit.gain, gain_error=fit.gain_error, x_to_y=ratio)
+
+
+def _model_error(gain: float) -> float:
+    """Return the error of a gain as spectra of real slopes differ from the theory."""
+    return _GAIN_ERROR * math.hypot(1, gain)
 
 
 def _modes(site: SlopeTurbulence, axis: int | None) -> Floats:
@@ -240,27 +240,35 @@ def _modes(site: SlopeTurbulence, axis: int | None) -> Floats:
     return np.asarray(vectors[:, np.unique(np.geomspace(1, modes, most).astype(int)) - 1])
 
 
-def _products(slopes: Floats, sent: Floats, run: NDArray[np.int64], window: Floats) -> tuple[Complex, int]:
+def _products(slopes: Floats, sent: Floats, run: NDArray[np.int64], window: Floats) -> tuple[Floats, int]:
     """Return cross-spectra (frequencies, 1 + lags, 1 + lags, m, m) of slopes and earlier commands."""
-    lags = _MOST_DELAY + 1
-    length, pieces = len(window), 0
-    total: Complex | float = 0.0
-    for start in range(lags, len(slopes) - length + 1, length // 2):
-        if run[start - lags] != run[start + length - 1]:
-            continue
-        parts = [slopes[start : start + length]]
-        parts += [sent[start - lag : start - lag + length] for lag in range(1, lags + 1)]
-        transformed = np.fft.rfft(np.array(parts) * window[:, None], axis=1)[:, _bins(length)]
-        flat = transformed.transpose(1, 0, 2).reshape(transformed.shape[1], -1)
-        total = total + flat[:, :, None] * flat[:, None].conj()
-        pieces += 1
-    if pieces < _FEWEST_PIECES:
+    lags, length, m = _MOST_DELAY + 1, len(window), slopes.shape[1]
+    starts = [
+        start
+        for start in range(lags, len(slopes) - length + 1, length // 2)
+        if run[start - lags] == run[start + length - 1]
+    ]
+    if len(starts) < _FEWEST_PIECES:
+        gaps = f" with {len(np.unique(run)) - 1} gaps" if run[0] != run[-1] else ""
         raise InputError(
             f"recording: expected {length * (_FEWEST_PIECES + 1) // 2} consecutive frames, got {len(slopes)}"
+            f"{gaps}"
         )
-    m = slopes.shape[1]
-    shape = -1, 1 + lags, m, 1 + lags, m
-    return np.asarray(total / pieces).reshape(shape).transpose(0, 1, 3, 2, 4).copy(), pieces
+    total: Floats | float = 0.0
+    for first in range(0, len(starts), _BATCH):
+        pieces = []
+        for start in starts[first : first + _BATCH]:
+            parts = [slopes[start : start + length]]
+            parts += [sent[start - lag : start - lag + length] for lag in range(1, lags + 1)]
+            transformed = np.fft.rfft(np.array(parts) * window[:, None], axis=1)[:, _bins(length)]
+            flat = transformed.transpose(1, 2, 0).reshape(transformed.shape[1], -1)
+            pieces += [flat.real, flat.imag]
+        batch = np.array(pieces).transpose(1, 2, 0)
+        total = total + batch @ batch.swapaxes(1, 2)
+    shape = -1, m, 1 + lags, m, 1 + lags
+    return np.ascontiguousarray(
+        (np.asarray(total) / len(starts)).reshape(shape).transpose(0, 2, 4, 1, 3)
+    ), len(starts)
 
 
 def _bins(length: int) -> NDArray[np.int64]:
@@ -268,7 +276,7 @@ def _bins(length: int) -> NDArray[np.int64]:
     return np.arange(1, length // 2, 2)
 
 
-def _turbulence(site: SlopeTurbulence, rate_hz: float, window: Floats, basis: Floats) -> Complex:
+def _turbulence(site: SlopeTurbulence, rate_hz: float, window: Floats, basis: Floats) -> Floats:
     """Return cross-spectra (speeds + 1, frequencies, m, m) of turbulence from anywhere and of white noise."""
     bins = _bins(len(window))
     spectra = SlopeSpectra(site, 1 / rate_hz, window, bins, max(_SPEEDS_M_PER_S) * len(window) / rate_hz)
@@ -280,4 +288,4 @@ def _turbulence(site: SlopeTurbulence, rate_hz: float, window: Floats, basis: Fl
         full = spectra.matrices(np.mean([spectra.of_wind(wind, tables) for wind in winds], axis=0))
         parts.append(basis.T @ full.real @ basis)
     noise = np.broadcast_to(np.eye(basis.shape[1]), parts[0].shape)
-    return np.array([*parts, noise], np.complex128)
+    return np.array([*parts, noise])

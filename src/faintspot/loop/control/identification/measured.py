@@ -59,11 +59,11 @@ class Wind:
     share: Measured
 
     @classmethod
-    def of(cls, row: Iterable[float]) -> Self:
+    def of(cls, row: Iterable[float], speed_unit: str = "m/s") -> Self:
         """Return the layer of values and errors, as `row` gives them."""
         speed, speed_error, direction, direction_error, share, share_error = map(float, row)
         return cls(
-            Measured("speed", "m/s", speed, speed_error),
+            Measured("speed", speed_unit, speed, speed_error),
             Measured("direction", "degrees", direction, direction_error, "towards, from +x to +y"),
             Measured("share", "", share, share_error),
         )
@@ -85,7 +85,7 @@ def winds_of(identified: Identified) -> list[Wind]:
         across = float(np.hypot(*(errors[number] * (y, x)))) / speed
         direction = math.degrees(math.atan2(y, x)) % 360, math.degrees(across / speed)
         share = turbulence.fraction[number], identified.fraction_error[number]
-        layers.append(Wind.of((speed, along, *direction, *share)))
+        layers.append(Wind.of((speed, along, *direction, *share), f"{turbulence.length_unit}/s"))
     return layers
 
 

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.loop_delay import (
     FEWEST_SUBAPERTURES,
+    GAINS,
+    DelayFits,
     LoopDelay,
-    loop_delay,
     with_axes,
 )
 from faintspot.loop.control.identification.recording import Recording
@@ -25,6 +26,7 @@ Floats = NDArray[np.float64]
 FEWEST_FRAMES = 200
 _MOST_LOST = 0.3  # of the frames; with more, the longest run without a gap is used
 _WHOLE_FRAMES = 0.1  # closer to a whole number of frames than this, a delay is taken for that
+_LEAST_MEASURED = 0.5  # of a frame's slopes: the others count as 0 for delay and gain
 _LEAST_SIGNAL = 1e-6  # of the slopes' variance, that their noise is taken to have
 
 
@@ -51,11 +53,14 @@ class OpenLoop:
 
 
 def site_of_loop(loop: Recording) -> SlopeTurbulence:
-    """Return the geometry; unknown scales are 1 m and 1 arcsec, which only r0 and winds depend on."""
+    """Return the geometry; an unknown pixel scale is 1 arcsec, an unknown sub-aperture the unit of length."""
+    unit = "m" if loop.subaperture_m else "sub-apertures"
     side, scale = loop.subaperture_m or 1.0, (loop.pixel_scale_arcsec or 1.0) * ARCSEC
     outer = loop.outer_scale_m or OUTER_SCALE_M
     positions = np.asarray(loop.cells[:, ::-1] * side, np.float64)
-    return SlopeTurbulence(positions, side, scale, 0.15, outer, np.ones(1), np.zeros((1, 2)))
+    return SlopeTurbulence(
+        positions, side, scale, 0.15, outer, np.ones(1), np.zeros((1, 2)), length_unit=unit
+    )
 
 
 def runs_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -69,18 +74,28 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
     Raises
     ------
     InputError
-        When the loop is not closed, or too short.
+        When the loop is not closed, too short, or the gain cannot be told.
     """
-    if not loop.is_closed or not np.ptp(loop.commands, axis=0).any():
+    if not loop.is_closed:
+        raise InputError(
+            "recording: expected a closed loop, got an open one (loop = open, is_closed = False)"
+        )
+    if not np.ptp(loop.commands, axis=0).any():
         raise InputError("commands: expected those of a closed loop, got constant ones")
-    fitted = _of_fit(loop)
-    fit = loop_delay(*fitted, loop.delay_frames)
+    fits = DelayFits(*_of_fit(loop))
+    fit = used = fits.best() if loop.delay_frames is None else fits.of(loop.delay_frames)
     nearest = float(round(fit.delay_frames))
     if loop.delay_frames is None and abs(fit.delay_frames - nearest) < max(
         _WHOLE_FRAMES, 2 * fit.delay_error
     ):
-        return fit, loop_delay(*fitted, nearest)
-    return fit, fit
+        used = fits.of(nearest)
+    if not min(GAINS) < used.gain < max(GAINS):
+        raise InputError(
+            f"centroid gain: cannot be known from this recording ({used.gain:.2g}, a limit of the search); "
+            "keep the integrator, and record more frames, or check that slopes, commands and matrix are of "
+            "one loop"
+        )
+    return fit, used
 
 
 def with_axes_of(loop: Recording, delay: LoopDelay) -> LoopDelay:
@@ -89,9 +104,18 @@ def with_axes_of(loop: Recording, delay: LoopDelay) -> LoopDelay:
 
 
 def _of_fit(loop: Recording) -> tuple[Floats, Floats, NDArray[np.int64], SlopeTurbulence, float]:
-    """Return what delay and gain are fitted to: slopes, those of the commands, runs, geometry and rate."""
-    slopes, mirror = np.nan_to_num(loop.slopes), loop.commands @ loop.interaction_matrix.T
-    return slopes, mirror, runs_of(loop.frame), site_of_loop(loop), loop.frame_rate_hz
+    """Return what delay and gain are fitted to: slopes, those of the commands, runs, geometry and rate.
+
+    Raises
+    ------
+    InputError
+        When no frame has most of its slopes.
+    """
+    rows = np.isfinite(loop.slopes).mean(axis=1) >= _LEAST_MEASURED
+    if not rows.any():
+        raise InputError("recording: expected frames with most slopes measured, got none")
+    slopes, mirror = np.nan_to_num(loop.slopes[rows]), loop.commands[rows] @ loop.interaction_matrix.T
+    return slopes, mirror, runs_of(loop.frame[rows]), site_of_loop(loop), loop.frame_rate_hz
 
 
 def known_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay, str]:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.layers import Identified
+from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.measured import Measured, Wind, winds_of
@@ -39,7 +39,7 @@ _CONTENTS = "a predictive controller"
 
 
 @dataclass(frozen=True, eq=False)
-class _Loop:
+class LoopOfControl:
     """Loop of a controller, with conversions from the user's unit and sign."""
 
     interaction: Floats
@@ -57,6 +57,8 @@ class _Loop:
     largest_command: float
     integrator_gain: float
     sent_after_frames: int
+    length_unit: str = "m"
+    """Of the winds per second."""
 
     def plant(self) -> LoopPlant:
         """Return the loop for which controllers are made."""
@@ -71,7 +73,7 @@ class PredictiveControl:
     called with every frame, in order. Made by `learn`; not by hand.
     """
 
-    def __init__(self, loop: _Loop, learnt: LearntControl) -> None:
+    def __init__(self, loop: LoopOfControl, learnt: LearntControl) -> None:
         self._loop, self._learnt = loop, learnt
         self.reset()
 
@@ -100,7 +102,7 @@ class PredictiveControl:
     @property
     def winds(self) -> tuple[Wind, ...]:
         """Layers that were found, the strongest first; none if the filter knows no winds."""
-        return tuple(Wind.of(row) for row in self._loop.winds)
+        return tuple(Wind.of(row, f"{self._loop.length_unit}/s") for row in self._loop.winds)
 
     @property
     def integrator_gain(self) -> float:
@@ -112,11 +114,28 @@ class PredictiveControl:
         """Whether the filter drives the mirror; else the integrator does."""
         return self._controller.chosen == 0
 
-    def reset(self) -> None:
-        """Start again with a flat mirror, without the memory of earlier frames."""
+    def reset(self, command: ArrayLike | None = None) -> None:
+        """Start again, without the memory of earlier frames.
+
+        Parameters
+        ----------
+        command : (commands,) array, optional
+            What the mirror holds. Default: it is flat.
+        """
         plant, limit = self._learnt.plant, self._loop.largest_command
         self._line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames, limit)
         self._controller = self._learnt.controller(self._line, plain_frames=_MEASURED_FRAMES)
+        if command is not None:
+            self._line.hold(self._loop.sign * np.asarray(command, np.float64))
+            self._controller.begin()
+
+    def prepare(self) -> None:
+        """Compute what does not need the next slopes, so that the next call is shorter.
+
+        Call it once a command was sent. Without it the next call does this first; commands are the same.
+        """
+        if self.model.is_local:  # a small sensor's filter leaves nothing for later
+            self._controller.expected()
 
     def __call__(self, slopes: ArrayLike, standard_errors: ArrayLike | None = None) -> Floats:
         """Return the command to send after a frame.
@@ -153,9 +172,8 @@ class PredictiveControl:
             recording = replace(recording, sent_after_frames=self._loop.sent_after_frames)
         again = learn(recording, self._learnt.identified)
         latest = self._loop.sign * self._line.latest
-        self.__dict__.update(again.__dict__)
-        self._line.hold(self._loop.sign * latest)
-        self._controller.begin()
+        self._loop, self._learnt = again._loop, again._learnt
+        self.reset(latest)
         return self
 
     def save(self, path: str | Path) -> None:
@@ -177,12 +195,12 @@ class PredictiveControl:
         InputError
             When the file cannot be read, or has numbers out of range.
         """
-        names = _Loop.__dataclass_fields__
+        names = LoopOfControl.__dataclass_fields__
         arrays = read_arrays(path, _CONTENTS, [f"loop_{name}" for name in names])
         values: Mapping[str, Any] = {name: arrays[f"loop_{name}"] for name in names}
         try:
             plain = {name: array.item() if array.ndim == 0 else array for name, array in values.items()}
-            loop = _Loop(**plain)
+            loop = LoopOfControl(**plain)
             plant = loop.plant()
             return cls(loop, LearntControl(plant, ControlModel.load(path, plant)))
         except (ValueError, TypeError, IndexError):
@@ -190,6 +208,8 @@ class PredictiveControl:
 
     def export(self, path: str | Path) -> None:
         """Write the filter as plain matrices, at the noise of the recording and without the guard.
+
+        Of more than 300 slopes those of the state are sparse.
 
         The names are those of `state_space`, with `delay_frames` and `largest_command`; slopes and commands
         are in the unit and of the sign of the recording.
@@ -202,10 +222,10 @@ class PredictiveControl:
         Raises
         ------
         InputError
-            When the sensor has more than 300 slopes, or the file cannot be written.
+            When the file cannot be written.
         """
         plant = self._learnt.plant
-        matrices: dict[str, Any] = state_space(self.model, plant, self._loop.scale, self._loop.sign)
+        matrices = state_space(self.model, plant, self._loop.scale, self._loop.sign)
         matrices["delay_frames"] = np.array(plant.delay_frames)
         write_matrices(path, {**matrices, "largest_command": np.array(self._loop.largest_command)})
 
@@ -240,18 +260,18 @@ def learn(recording: Recording, start: Identified | None = None) -> PredictiveCo
 
     Examples
     --------
-    A loop of 3 x 3 sub-apertures and 12 actuators on slopes that change at random:
+    A loop of 2 x 4 sub-apertures and 12 actuators on slopes that change at random:
 
     >>> import numpy as np
     >>> from faintspot.loop.control import Recording, learn
     >>> rng = np.random.default_rng(1)
-    >>> matrix = rng.standard_normal((18, 12))
-    >>> turbulence = np.cumsum(rng.standard_normal((800, 18)), axis=0)
-    >>> slopes, commands = np.zeros((800, 18)), np.zeros((800, 12))
+    >>> matrix = rng.standard_normal((16, 12))
+    >>> turbulence = np.cumsum(rng.standard_normal((800, 16)), axis=0)
+    >>> slopes, commands = np.zeros((800, 16)), np.zeros((800, 12))
     >>> for k in range(2, 800):
     ...     slopes[k] = turbulence[k] - turbulence[k].mean() + matrix @ commands[k - 2]
     ...     commands[k] = 0.99 * commands[k - 1] - 0.3 * np.linalg.pinv(matrix) @ slopes[k]
-    >>> recording = Recording(slopes, commands, matrix, np.ones((3, 3)), frame_rate_hz=250)
+    >>> recording = Recording(slopes, commands, matrix, np.ones((2, 4)), frame_rate_hz=250)
     >>> control = learn(recording)
     >>> control(slopes[0]).shape
     (12,)
@@ -262,15 +282,27 @@ def learn(recording: Recording, start: Identified | None = None) -> PredictiveCo
     ready = prepared(recording)
     loop = ready.recording
     measured, used = measured_delay(loop)
-    used = with_axes_of(loop, replace(used, delay_error=measured.delay_error))
-    return _learnt(ready, used, start)
+    delay = with_axes_of(loop, replace(used, delay_error=measured.delay_error))
+    return learn_observed(ObservedLoop(ready, delay, open_loop_of(loop, delay)), start)
 
 
-def _learnt(ready: Prepared, delay: LoopDelay, start: Identified | None) -> PredictiveControl:
-    """Return the controller for a delay and a centroid gain."""
-    loop, gain = ready.recording, delay.gain
-    seen = open_loop_of(loop, delay)
-    described = _Loop(
+@dataclass(frozen=True, eq=False)
+class ObservedLoop:
+    """Recording, and what has been measured from it."""
+
+    ready: Prepared
+    delay: LoopDelay
+    """Delay and centroid gain that are used, with their errors."""
+    seen: OpenLoop
+    identification: Identification | None = None
+    """Of its open-loop slopes, if made already."""
+
+
+def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> PredictiveControl:
+    """Learn as `learn` from a recording whose delay and open-loop slopes are known."""
+    ready, delay, seen = observed.ready, observed.delay, observed.seen
+    loop, gain, site = ready.recording, delay.gain, site_of_loop(ready.recording)
+    described = LoopOfControl(
         loop.interaction_matrix,
         np.sqrt(seen.variance),
         1 / (loop.unit * delay.gains(len(loop.cells))),
@@ -280,10 +312,17 @@ def _learnt(ready: Prepared, delay: LoopDelay, start: Identified | None) -> Pred
         math.inf,
         math.nan,
         ready.sent_after_frames,
+        site.length_unit,
     )
     plant = described.plant()
     learnt = learn_controller(
-        KALMAN, plant, seen.telemetry, site_of_loop(loop), loop.frame_rate_hz, start=start
+        KALMAN,
+        plant,
+        seen.telemetry,
+        site,
+        loop.frame_rate_hz,
+        start=start,
+        identification=observed.identification,
     )
     # The fallback is the integrator that has run, whatever the gain found.
     plain = ready.loop_gain * gain if math.isfinite(ready.loop_gain) else learnt.model.plain_gain
@@ -295,7 +334,8 @@ def _learnt(ready: Prepared, delay: LoopDelay, start: Identified | None) -> Pred
     identified = learnt.identified
     if identified is not None and identified.is_layered:
         described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
-    model = replace(learnt.model, plain_gain=plain)
+    description = "; ".join([learnt.model.description, *loop.remarks])
+    model = replace(learnt.model, plain_gain=plain, description=description)
     return PredictiveControl(described, replace(learnt, model=model))
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, number_between, real_array
 from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.cell_order import order_remark
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 Floats = NDArray[np.float64]
@@ -44,7 +45,7 @@ class Recording:
     """
 
     slopes: Any
-    """(frames, 2 n): residual slopes in any unit, all x, then all y; NaN where not measured."""
+    """(frames, 2 n): residual slopes in any unit, all x, then all y; NaN (or infinite) where not measured."""
     commands: Any
     """(frames, commands): one row for each frame; see `sent_after_frames`."""
     interaction_matrix: Any
@@ -82,6 +83,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         slopes = real_array("slopes", self.slopes, minimum_dimensions=2).astype(np.float64)
+        slopes[np.isinf(slopes)] = np.nan
         if slopes.ndim == 3:  # (frames, n, 2) or (frames, 2, n)
             slopes = (slopes if slopes.shape[1] == 2 else slopes.swapaxes(1, 2)).reshape(len(slopes), -1)
         if slopes.ndim != 2 or slopes.shape[1] % 2:
@@ -164,10 +166,13 @@ def prepared(recording: Recording) -> Prepared:
     Raises
     ------
     InputError
-        When the slopes do not vary, or the commands have nothing to do with them.
+        When the slopes do not vary, are in another order than the cells, or the commands have nothing to do
+        with them.
     """
     slopes = recording.slopes[np.isfinite(recording.slopes)]
-    spread = float(slopes.std()) if slopes.size else 0.0
+    if not slopes.size:
+        raise InputError(f"{recording.name}: expected slopes, got none that were measured")
+    spread = float(slopes.std())
     if not spread > 1e-12 * float(np.abs(slopes).max(initial=0.0)):
         raise InputError(f"{recording.name}: expected slopes that vary, got constant ones")
     scaled = recording.scaled(spread)
@@ -180,7 +185,8 @@ def _with_convention(loop: Recording) -> Prepared:
     """Return a closed loop whose commands add, in the rows of the frames that they were computed from."""
     if not np.ptp(loop.commands, axis=0).any():
         return Prepared(loop, 1.0, 0, math.inf)
-    stated, remarks = loop.sent_after_frames, list(loop.remarks)
+    wrong_order = order_remark(loop.interaction_matrix, loop.cells)
+    stated, remarks = loop.sent_after_frames, [*loop.remarks, *([wrong_order] if wrong_order else [])]
     correlations, gains = _steps_on_slopes(loop)
     clearest = int(np.argmax(np.abs(correlations)))
     largest = float(np.abs(correlations[clearest]))
@@ -243,6 +249,8 @@ def cells_of(stated: Any, n: int) -> NDArray[np.int64]:
             )
         return np.argwhere(np.ones((side, side)))
     cells = finite_array("cells", stated)
+    if cells.shape == (n, 2) and len(np.unique(cells, axis=0)) < n:
+        raise InputError(f"cells: expected {n} sub-apertures in different places, got some twice")
     if cells.shape == (n, 2):
         return cells.astype(np.int64)
     if cells.ndim == 2 and np.count_nonzero(cells > 0) == n:  # a mask

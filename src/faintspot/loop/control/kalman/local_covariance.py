@@ -107,13 +107,31 @@ def replies(arrays: Mapping[str, Any], frames: int) -> Iterator[sparse.csr_matri
     frames : int
         For how many frames later the slopes are predicted.
     """
-    onward, slopes = _transition(arrays["near"], arrays["weights"]), 2 * len(arrays["near"])
-    half = onward.shape[0]
+    ahead = slopes_ahead(arrays, frames)
     for gains in arrays["corrections"]:
-        state = _corrections(gains, arrays["around"])
-        for _ in range(frames):
-            state = sparse.vstack([onward @ state, state[:half]], "csr")
-        yield sum(state[start : start + slopes] for start in range(0, half, slopes))
+        yield ahead @ _corrections(gains, arrays["around"])
+
+
+def state_of_state(arrays: Mapping[str, Any]) -> sparse.csr_matrix:
+    """Return the matrix (states, states) from a frame's state to the next; see `steady_covariance`."""
+    onward = _transition(arrays["near"], arrays["weights"])
+    return sparse.vstack([onward, sparse.eye(*onward.shape, dtype=np.float32)], "csr")
+
+
+def state_of_surprise(arrays: Mapping[str, Any]) -> sparse.csr_matrix:
+    """Return the matrix (states, m) that corrects the state at the usual noise."""
+    levels = arrays["corrections"]
+    return _corrections(levels[len(levels) // 2], arrays["around"])
+
+
+def slopes_ahead(arrays: Mapping[str, Any], frames: int) -> sparse.csr_matrix:
+    """Return the matrix (m, states) from a state to the slopes so many frames later."""
+    onward, m, layers = state_of_state(arrays), 2 * len(arrays["near"]), len(arrays["weights"])
+    each = sparse.eye(m, dtype=np.float32)
+    ahead = sparse.hstack([each] * layers + [sparse.csr_matrix((m, m), dtype=np.float32)] * layers, "csr")
+    for _ in range(frames):
+        ahead = ahead @ onward
+    return ahead
 
 
 def _prior(layers: Sequence[SlopeTurbulence], step_s: float) -> Singles:

@@ -1,0 +1,60 @@
+"""Geometry and gaps of recorded loops."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.loop.telemetry.loop_cases import AIR, recorded
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.layers import Identified
+from faintspot.loop.control.identification.measured import winds_of
+from faintspot.loop.control.identification.open_loop import measured_delay, site_of_loop
+from faintspot.loop.control.identification.recording import Recording
+
+
+def test_an_unknown_sub_aperture_is_the_unit_of_length() -> None:
+    assert site_of_loop(recorded()).length_unit == "m"
+    site = site_of_loop(replace(recorded(), subaperture_m=None))
+    assert (site.subaperture_m, site.length_unit) == (1.0, "sub-apertures")
+
+
+def test_winds_have_the_unit_of_length_per_second() -> None:
+    turbulence = replace(AIR, length_unit="sub-apertures")
+    found = Identified(turbulence, 1.0, (), 250.0, True, np.ones((2, 2)), np.ones(2), 0.0)
+    assert [wind.speed.unit for wind in winds_of(found)] == ["sub-apertures/s"] * 2
+    assert "8.5 sub-apertures/s to 21 degrees (70%)" in found.summary()
+
+
+def test_frames_without_slopes_are_gaps() -> None:
+    loop = recorded()
+    slopes = loop.slopes.copy()
+    slopes[300:2300] = np.nan
+    with pytest.raises(InputError, match="expected 576 consecutive frames, got 550 with 1 gaps"):
+        measured_delay(replace(loop, slopes=slopes))
+    slopes[:] = np.nan
+    with pytest.raises(InputError, match="expected frames with most slopes measured"):
+        measured_delay(replace(loop, slopes=slopes))
+
+
+def test_infinite_slopes_count_as_not_measured() -> None:
+    loop = recorded()
+    slopes = loop.slopes.copy()
+    slopes[3, 7] = np.inf
+    read = Recording(slopes, loop.commands, loop.interaction_matrix, loop.cells, 250.0)
+    assert np.isnan(read.slopes[3, 7])
+    assert np.isfinite(np.delete(read.slopes, 3, axis=0)).all()
+
+
+def test_a_gain_at_the_limit_is_not_known() -> None:
+    """Commands act the other way round than the interaction matrix says."""
+    loop = recorded()
+    rng = np.random.default_rng(1)
+    commands = rng.standard_normal((800, 36))
+    slopes = 0.1 * rng.standard_normal((800, 50))
+    slopes[2:] -= commands[:-2] @ loop.interaction_matrix.T
+    still = replace(loop, slopes=slopes, commands=commands, frame=np.arange(800), delay_frames=2.0)
+    with pytest.raises(InputError, match=r"centroid gain: cannot be known .* keep the integrator"):
+        measured_delay(still)

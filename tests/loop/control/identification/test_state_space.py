@@ -1,0 +1,158 @@
+"""Exported matrices, run by the lines of the manual, send the commands of the filter."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from scipy import sparse
+from scipy.io import loadmat
+from tests.loop.control.control_cases import (
+    FRAME_S,
+    INTERACTION,
+    LAYERS,
+    PHASE_OF_COMMANDS,
+    PLANT,
+    TURBULENCE,
+    telemetry,
+)
+from tests.shared_data import ROOT
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification.model import KALMAN, ControlModel
+from faintspot.loop.control.identification.state_space import state_space, write_matrices
+from faintspot.loop.control.kalman.local_predictor import local_filter
+
+MANUAL = ROOT / "docs" / "guide" / "predictive_filter.md"
+NOISE_PX2 = np.full(18, 0.25)
+SCALE, SIGN, LIMIT = 3.0, -1.0, 0.7
+DENSE = {
+    "first": LAYERS.first,
+    "second": LAYERS.second,
+    "driving_px2": LAYERS.driving,
+    "variance_px2": NOISE_PX2,
+    "covariance_xy_px2": np.zeros(9),
+}
+
+
+@pytest.fixture(scope="module", params=["dense", "sparse"])
+def model(request: pytest.FixtureRequest) -> ControlModel:
+    layers = TURBULENCE.layers()
+    arrays: Any = DENSE if request.param == "dense" else local_filter(layers, FRAME_S, NOISE_PX2)
+    return ControlModel(KALMAN, arrays, 0.3, 1.0, (1.0, 2.0), PHASE_OF_COMMANDS)
+
+
+def exported(model: ControlModel, path: Path) -> dict[str, Any]:
+    matrices = state_space(model, PLANT, SCALE, SIGN)
+    written = {**matrices, "delay_frames": np.array(2), "largest_command": np.array(LIMIT)}
+    write_matrices(path, written)
+    return matrices
+
+
+def test_the_lines_of_the_manual(
+    model: ControlModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    exported(model, Path("matrices.npz"))
+    blocks = re.findall(r"```python\n(.*?)```", MANUAL.read_text(encoding="utf-8"), re.DOTALL)
+    (block,) = (block for block in blocks if "np.load" in block and ("csr_matrix" in block) == model.is_local)
+    run: dict[str, Any] = {}
+    exec(block, run)
+    line = CommandDelayLine(12, 2, LIMIT)
+    tolerance = (3e-6 if model.is_local else 1e-6) * LIMIT  # a filter in single precision
+    alone, limited = model.controller(PLANT, line), 0
+    for open_loop in telemetry(200).open_loop_px:
+        slopes = (open_loop + INTERACTION @ line.acting) / SCALE
+        alone.update(SCALE * slopes, np.sqrt(NOISE_PX2))
+        np.testing.assert_allclose(run["control"](slopes), SIGN * line.latest, rtol=0, atol=tolerance)
+        limited += int(np.abs(line.latest).max() == LIMIT)
+    assert 0 < limited < 200
+
+
+class Shared:
+    """Stand-in for pyMilk's SHM: slopes of a loop that the commands close."""
+
+    def __init__(self, name: str, loop: MilkLoop) -> None:
+        self._name, self._loop = name, loop
+
+    def get_data(self, check: bool = False) -> np.ndarray:
+        return self._loop.slopes() if check else np.zeros((4, 3), np.float32)
+
+    def set_data(self, command: np.ndarray) -> None:
+        self._loop.send(command)
+
+
+class MilkLoop:
+    """Loop whose commands are those of the filter, within float32."""
+
+    def __init__(self, model: ControlModel) -> None:
+        self._line = CommandDelayLine(12, 2, LIMIT)
+        self._alone, self._rows = model.controller(PLANT, self._line), iter(telemetry(100).open_loop_px)
+        self.frames = 0
+
+    def slopes(self) -> np.ndarray:
+        residual = next(self._rows) + INTERACTION @ self._line.acting
+        self._alone.update(residual, np.sqrt(NOISE_PX2))
+        return np.asarray(residual / SCALE)[:, None]
+
+    def send(self, command: np.ndarray) -> None:
+        assert command.shape == (4, 3)
+        np.testing.assert_allclose(command.ravel(), SIGN * self._line.latest, rtol=0, atol=1e-6)
+        self.frames += 1
+
+
+@pytest.mark.parametrize("model", ["dense"], indirect=True)
+def test_the_lines_for_milk(model: ControlModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("astropy.io.fits")
+    monkeypatch.chdir(tmp_path)
+    exported(model, Path("controller.fits"))
+    loop = MilkLoop(model)
+    interface = SimpleNamespace(SHM=lambda name: Shared(name, loop))
+    for name in ("pyMilk", "pyMilk.interfacing", "pyMilk.interfacing.isio_shmlib"):
+        monkeypatch.setitem(sys.modules, name, cast(ModuleType, interface))
+    page = (ROOT / "docs" / "adapters" / "streams.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    with pytest.raises(StopIteration):
+        exec(block, {})
+    assert loop.frames == 100
+
+
+@pytest.mark.parametrize("ending", ["npz", "mat", "fits"])
+def test_formats(model: ControlModel, tmp_path: Path, ending: str) -> None:
+    """All hold the same matrices."""
+    path = tmp_path / f"matrices.{ending}"
+    if ending == "fits":
+        fits = pytest.importorskip("astropy.io.fits")
+    matrices = exported(model, path)
+    if ending == "npz":
+        file = dict(np.load(path))
+    elif ending == "mat":
+        file = loadmat(path)
+    else:
+        with fits.open(path) as units:
+            file = {unit.name.lower(): np.array(unit.data) for unit in units[1:]}
+    assert np.ravel(file["delay_frames"]) == [2]
+    for name, matrix in matrices.items():
+        stored = file[name] if name in file else sparse_of(file, name)
+        assert sparse.issparse(stored) == sparse.issparse(matrix)
+        np.testing.assert_allclose(plain(stored), plain(matrix), rtol=1e-6)
+
+
+def sparse_of(file: dict[str, Any], name: str) -> Any:
+    parts = tuple(file[f"{name}_{part}"] for part in ("data", "indices", "indptr"))
+    return sparse.csr_matrix(parts, shape=tuple(file[f"{name}_shape"]))
+
+
+def plain(matrix: Any) -> np.ndarray:
+    return np.asarray(matrix.toarray() if sparse.issparse(matrix) else matrix)
+
+
+def test_other_endings_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"\.npz, \.mat, \.fits"):
+        write_matrices(tmp_path / "matrices.csv", {})
