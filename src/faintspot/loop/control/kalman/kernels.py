@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from faintspot.loop.control.kalman import choice
 from faintspot.loop.control.kalman.choice import BLENDED, CHOSEN, HANDOVER_FRAMES, SENT, choose
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.loop.control.telemetry import LEAST_SHARE, LEAST_VARIANCE_PX2
-from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
+from faintspot.slopes.kernels.compilation.compiling import Direct, _kernel
 from faintspot.slopes.kernels.driver.products import add_products
 
-_compiled = partial(compiled_with, source=__file__)
+# Compiled anew when the guard changes, too.
+_compiled = partial(_kernel, sources=(Path(__file__), Path(choice.__file__)))
 
 # Rows of memory: of slopes, and of commands; the first four are commands and what they add to slopes.
 HELD, HELD_LEARNT, HELD_PLAIN, LATEST_PLAIN, _LEFT_LEARNT, _LEFT_PLAIN, _FOR_PLAIN = range(7)
