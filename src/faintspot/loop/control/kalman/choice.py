@@ -20,13 +20,12 @@ from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
 MEMORY_FRAMES = 100
 FEWEST_FRAMES = 20  # before the first change
 HANDOVER_FRAMES = 10  # after which a controller's own commands are sent
-_TO_PLAIN, _TO_LEARNT = 16.0, 32.0
-"""Sum of the differences, in their standard deviations, after which the other controller takes over."""
+_ENOUGH = 16.0  # sum of the differences, in their standard deviations, for the other one to take over
 _LEAST_DEVIATION, _MOST_DEVIATIONS = 0.03, 5.0  # of a difference, and in one frame
 _SETTLING = 15  # frames after a change whose residuals belong to both
 _MEASURED, _MEASURED_MEMORY = 20, 200  # frames of the integrator's residual: fewest, and memory
 _ALLOWED, _MOST_EXCESS, _IN_ONE_FRAME = 1.1, 16.0, 20.0
-"""Filter's residual in those of the integrator: allowed, and sum of what is above, at most so much a frame."""
+"""Residual of the filter in those of the integrator: allowed; sum of the excess; largest that counts."""
 _LATE, _RUNAWAY = 10, 2.0
 """Frames, and their mean residual in those of the integrator, with which a filter fails for good."""
 _ASSUMED = 4.0  # residual of an integrator that was computed, by which it may be too small
@@ -39,8 +38,8 @@ _PROVEN = 2000  # frames after which the wait is the first one again
 # the integrator, its frames, and of the filter of late; sum of the filter's excess; the integrator's computed
 # residual; frames to wait, now and the next time.
 CHOSEN, SENT, FRAMES, _MEAN, _SQUARE, _EVIDENCE, BLENDED, _SINCE, _BEFORE = range(9)
-_PLAIN, _PLAIN_FRAMES, _OF_LATE, _EXCESS, _COMPUTED, _WAIT, _NEXT_WAIT, _PREFERS = range(9, 17)
-GUARD_NUMBERS = 17
+_PLAIN, _PLAIN_FRAMES, _OF_LATE, _EXCESS, _COMPUTED, _WAIT, _NEXT_WAIT = range(9, 16)
+GUARD_NUMBERS = 16
 
 
 @partial(compiled_with, source=__file__)
@@ -77,7 +76,6 @@ def choose(guard: Any, learnt: Any, plain: Any) -> None:
             guard[CHOSEN], guard[_WAIT] = 1.0, _LONGEST_WAIT if is_runaway else guard[_NEXT_WAIT]
             guard[_NEXT_WAIT] = min(2.0 * guard[_NEXT_WAIT], _LONGEST_WAIT)
             guard[FRAMES] = guard[_MEAN] = guard[_SQUARE] = 0.0
-            guard[_PREFERS] = 1.0
             return
         if guard[_SINCE] > _PROVEN:
             guard[_NEXT_WAIT] = _FIRST_WAIT
@@ -88,10 +86,7 @@ def choose(guard: Any, learnt: Any, plain: Any) -> None:
         guard[_EVIDENCE] = max(0.0, guard[_EVIDENCE] + min(for_other, _MOST_DEVIATIONS))
     if guard[_WAIT] > 0.0:
         guard[_WAIT] -= 1.0
-        if guard[_WAIT] == 0.0 and guard[_PREFERS] == 0.0 and guard[_MEAN] <= 0.0:
-            guard[CHOSEN] = 0.0
-        return
-    if guard[_EVIDENCE] > (_TO_LEARNT if guard[CHOSEN] > 0.0 else _TO_PLAIN):
+    elif guard[_EVIDENCE] > _ENOUGH:
         guard[CHOSEN] = 1.0 - guard[CHOSEN]
 
 
@@ -113,8 +108,7 @@ def prepare(guard: Any, prefers_plain: bool, plain_residual: float, plain_frames
         Frames that the plain controller drives the mirror first, so that its residual is measured.
     """
     guard[CHOSEN] = guard[SENT] = guard[_BEFORE] = float(prefers_plain or plain_frames > 0)
-    guard[_COMPUTED], guard[_PREFERS] = plain_residual, float(prefers_plain)
-    guard[_WAIT], guard[_NEXT_WAIT] = plain_frames, _FIRST_WAIT
+    guard[_COMPUTED], guard[_WAIT], guard[_NEXT_WAIT] = plain_residual, plain_frames, _FIRST_WAIT
 
 
 def restart(guard: Any) -> None:
