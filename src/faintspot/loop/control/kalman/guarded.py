@@ -31,8 +31,9 @@ class Guarded:
     Both send commands in every frame, each to a mirror of its own that exists only in numbers; the slopes
     that each would have had follow from the open-loop slopes. So what they leave can be compared in the same
     frames, and either can take over without a jump in its own state. As long as the difference is within its
-    error, nothing changes. When another controller takes over, the commands sent differ from its own by an
-    offset, which falls from the whole difference to zero in `HANDOVER_FRAMES` equal steps.
+    error, nothing changes. When the learnt controller takes over, the commands sent differ from its own by an
+    offset, which falls from the whole difference to zero in `HANDOVER_FRAMES` equal steps; the plain one
+    continues from the mirror's commands.
 
     Parameters
     ----------
@@ -122,7 +123,20 @@ class Guarded:
             variances.append(float(np.square(self._phase @ (trust * residual)).sum()))
             controller.update(as_estimated(residual, trust, controller), error, covariance)
         self._send()
-        CHOOSE(self._guard, *variances)
+        self._choose(*variances)
+
+    def _choose(self, learnt: float, plain: float) -> bool:
+        """Select a controller by the squared residuals; return whether the plain one takes over.
+
+        It continues from the mirror's commands: its own are as wrong as the model of the loop.
+        """
+        before = self.chosen
+        CHOOSE(self._guard, learnt, plain)
+        takes_over = self.chosen > before
+        if takes_over:
+            self._lines[1].copy_from(self._line)
+            self._guard[SENT], self._guard[BLENDED] = 1.0, 0.0
+        return takes_over
 
     def _send(self) -> None:
         """Send the chosen controller's command, with what is left of the offset."""

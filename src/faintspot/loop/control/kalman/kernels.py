@@ -306,9 +306,24 @@ def go_on(numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) 
     for c in range(wavefronts.shape[1]):
         learnt += wavefronts[0, c] * wavefronts[0, c]
         plain += wavefronts[1, c] * wavefronts[1, c]
+    was_chosen = memory.guard[CHOSEN]
     choose(memory.guard, learnt, plain)
+    if memory.guard[CHOSEN] > was_chosen:
+        _adopt(lines, next_rows, memory.guard)
     _advance(matrices, memory)
     return total
+
+
+@_compiled
+def _adopt(lines: Any, next_rows: Any, guard: Any) -> None:
+    """Let the integrator continue from the mirror's commands; its own are not yet counted as sent."""
+    row, _, of_plain = next_rows
+    length = lines.true.shape[0]
+    for later in range(length):
+        to, of = (of_plain + 1 + later) % length, (row + later) % length
+        for c in range(lines.true.shape[1]):
+            lines.plain[to, c] = lines.true[of, c]
+    guard[SENT], guard[BLENDED] = 1.0, 0.0
 
 
 @_compiled
