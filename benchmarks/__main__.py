@@ -28,6 +28,7 @@ _ORDER = (
     "realtime",
     "realtime_loop",
     "realtime_guard",
+    "guard",
     "validity",
     "telemetry",
     "recorded_tip_tilt",
@@ -45,7 +46,7 @@ _ORDER = (
     "startup",
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
-LONG = {"realtime_sustained", "telemetry", "recorded_tip_tilt", "winds", "large_sensors", "layouts"}
+LONG = {"guard", "realtime_sustained", "telemetry", "recorded_tip_tilt", "winds", "large_sensors", "layouts"}
 """Run only when named, or with --full: 5 minutes to an hour each, one with a recording of its own."""
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _FOLDER = click.option(

@@ -27,7 +27,7 @@ def test_rows_and_sign_are_found(sent: int, sign: float) -> None:
     given = later(replace(loop, commands=sign * loop.commands), sent)
     ready = prepared(given)
     assert (ready.sign, ready.sent_after_frames) == (sign, sent)
-    assert ready.loop_gain == pytest.approx(0.35, rel=0.1)
+    assert ready.loop_gain == pytest.approx(0.35, rel=0.002)
     first = given.frame[0] - loop.frame[0]
     np.testing.assert_array_equal(ready.recording.commands[:100], loop.commands[first : first + 100])
 

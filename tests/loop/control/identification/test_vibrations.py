@@ -7,11 +7,18 @@ import pytest
 from numpy.typing import NDArray
 from tests.loop.control.driven import driven, oscillator
 
-from faintspot.loop.control.identification.vibrations import MODES, Vibration, find_vibrations
+from faintspot.loop.control.identification.vibrations import (
+    MODES,
+    Vibration,
+    find_vibrations,
+    without_passing_grid,
+)
 
 _RATE_HZ, _FRAMES, _SLOPES = 250.0, 3000, 72
 BUMP = oscillator(17.5, 0.12, 0.08)
 """As wide as the maximum that a wind of 12 m/s makes with sub-apertures of .6 m on 3.6 m: 12 / 3.6 Hz."""
+POSITIONS_M = 0.6 * np.argwhere(np.ones((7, 7)))[:, ::-1]
+WIND = np.array([[3.0, 12.1]])
 
 
 def _seen(seed: int, *moving: Vibration) -> NDArray[np.float64]:
@@ -36,3 +43,28 @@ def test_a_weak_line_beside_a_broad_maximum_is_found(frequency_hz: float, dampin
     assert found.frequency_error_hz < 0.5
     # Driven at random for 12 s, its rms differs from the expected one by 15 %.
     assert found.rms_px == pytest.approx(true.rms_px, rel=0.4)
+
+
+def _passing(*moving: Vibration) -> tuple[Vibration, ...]:
+    """Return what is found in tilt while waves of 0.6 m pass over 7 sub-apertures of 0.6 m at 12.1 m/s."""
+    rng, crossing = np.random.default_rng(2), round(4.2 / WIND[0, 1] * _RATE_HZ)
+    waves = rng.standard_normal((2, _FRAMES + crossing - 1)).T @ [1.0, 1j]
+    over_sensor = np.convolve(waves, np.full(crossing, crossing**-0.5), "valid")
+    amplitudes = 0.4 * rng.standard_normal((_FRAMES, len(MODES)))
+    amplitudes[:, 1] += (over_sensor * np.exp(2j * np.pi * 12.1 / 0.6 * np.arange(_FRAMES) / _RATE_HZ)).real
+    amplitudes[:, 1] += driven(rng, _FRAMES, _RATE_HZ, 98, *moving)
+    return find_vibrations(amplitudes, _RATE_HZ, 98)
+
+
+def test_a_layer_that_passes_over_the_grid_is_no_vibration() -> None:
+    found = _passing()
+    assert [line.frequency_hz for line in found] == pytest.approx([20.2], abs=0.5)
+    assert without_passing_grid(found, WIND, POSITIONS_M, 0.6, _RATE_HZ) == ()
+    assert without_passing_grid(found, 1.2 * WIND, POSITIONS_M, 0.6, _RATE_HZ) == found
+    assert without_passing_grid(found, WIND[:, ::-1], POSITIONS_M, 0.6, _RATE_HZ) == found
+
+
+def test_a_vibration_at_the_frequency_of_the_grid_is_kept() -> None:
+    found = _passing(oscillator(20.0, 0.004, 0.3))
+    kept = without_passing_grid(found, WIND, POSITIONS_M, 0.6, _RATE_HZ)
+    assert [line.frequency_hz for line in kept] == pytest.approx([20.0], abs=0.3)

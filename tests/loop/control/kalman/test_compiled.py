@@ -102,7 +102,7 @@ def test_nonsense_is_replaced_by_the_integrator() -> None:
         np.testing.assert_allclose(other.latest, one.latest, rtol=0, atol=2e-3)
         np.testing.assert_allclose(fast.expected().mean_px, slow.expected().mean_px, rtol=0, atol=2e-3)
         assert fast.chosen == slow.chosen
-    assert 49 <= took_over < 200
+    assert 20 <= took_over < 200
     assert np.abs(line.latest).max() <= 0.8
 
 

@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 from faintspot.loop.control.identification.layer_likelihood import LayerLikelihood, Layers
 from faintspot.loop.control.identification.oscillators import fitted_oscillators
 from faintspot.loop.control.identification.slope_records import SlopeRecords
-from faintspot.loop.control.identification.vibrations import Vibration, find_vibrations, with_vibrations
+from faintspot.loop.control.identification.vibrations import (
+    Vibration,
+    find_vibrations,
+    with_vibrations,
+    without_passing_grid,
+)
 from faintspot.loop.control.kalman.slope_model import SlopeModel
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
@@ -202,10 +207,15 @@ class Identification:
             wind_m_per_s=layers.wind_m_per_s,
             averaged=likelihood.averaged,
         )
+        vibrations = self._vibrations
+        if is_layered:
+            site = self._site
+            geometry = site.positions_m, site.subaperture_m, self._rate_hz
+            vibrations = without_passing_grid(vibrations, layers.wind_m_per_s, *geometry)
         return Identified(
             turbulence,
             layers.noise,
-            self._vibrations,
+            vibrations,
             self._rate_hz,
             is_layered,
             errors[:, :2],

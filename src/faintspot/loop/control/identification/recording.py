@@ -217,19 +217,25 @@ def _with_convention(loop: Recording) -> Prepared:
 
 
 def _steps_on_slopes(loop: Recording) -> tuple[Floats, Floats]:
-    """Return correlations of slopes with steps of the commands 0, 1, ... rows later, and regressions."""
+    """Return correlations of slopes with steps of the commands 0, 1, ... rows later, and regressions.
+
+    Steps are regressed on the command before, too, as a leak takes a part of it.
+    """
     reconstructor = make_reconstructor(loop.interaction_matrix)
     controlled = np.nan_to_num(loop.slopes) @ reconstructor.matrix.T @ loop.interaction_matrix.T
     controlled -= controlled.mean(axis=0)
-    steps = np.diff(loop.commands, axis=0, prepend=loop.commands[:1]) @ loop.interaction_matrix.T
-    steps[np.diff(loop.frame, prepend=loop.frame[0] - 1) != 1] = 0.0
+    caused = (loop.commands - loop.commands.mean(axis=0)) @ loop.interaction_matrix.T
+    before = np.vstack([caused[:1], caused[:-1]])
+    steps = caused - before
+    is_first = np.diff(loop.frame, prepend=loop.frame[0] - 1) != 1
+    steps[is_first] = before[is_first] = 0.0
     correlations, regressions = [], []
     for lag in range(_MOST_SENT_AFTER + 1):
-        one, other = controlled[: len(controlled) - lag], steps[lag:]
+        one, other, held = controlled[: len(controlled) - lag], steps[lag:], before[lag:]
         sizes = math.sqrt(float((one * one).sum()) * float((other * other).sum()))
-        product = float((one * other).sum())
-        correlations.append(product / max(sizes, 1e-300))
-        regressions.append(product / max(float((one * one).sum()), 1e-300))
+        correlations.append(float((one * other).sum()) / max(sizes, 1e-300))
+        both = np.stack([one.ravel(), held.ravel()])
+        regressions.append(float((np.linalg.pinv(both @ both.T) @ (both @ other.ravel()))[0]))
     return np.array(correlations), np.array(regressions)
 
 

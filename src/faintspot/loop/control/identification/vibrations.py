@@ -30,6 +30,9 @@ _DAMPING = 1e-6, 0.1
 _MOST_DAMPING = 0.05  # that of telescopes' structures is 0.005 to 0.03
 _LEAST_DAMPING = 1e-3  # of a model: the phase of no vibration is certain for ever
 _START_DAMPING = 3e-3
+_GRID_DAMPING, _GRID_OFF = 0.08, 0.3
+"""Of a layer passing over the grid of sub-apertures: half the damping of a line fitted to its maximum, in
+sides of a sub-aperture in the sensor; largest distance from its frequency, in widths of the maximum."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +154,38 @@ def with_vibrations(
         for matrices, new in zip(layers, added, strict=True):
             matrices.append(new)
     return SlopeModel(*(np.array(matrices) for matrices in layers))
+
+
+def without_passing_grid(
+    vibrations: Sequence[Vibration], winds_m_per_s: Floats, positions_m: Floats, side_m: float, rate_hz: float
+) -> tuple[Vibration, ...]:
+    """Return the vibrations without those that are layers passing over the grid of sub-apertures.
+
+    Waves as long as a sub-aperture (d) move all spots alike, as tip does, unless slopes are exact mean
+    gradients. With a wind v along x they make a maximum at v / d; crossing the sensor takes D / v, so it is
+    v / D wide. Lines that are much narrower are kept.
+
+    Parameters
+    ----------
+    vibrations : sequence of Vibration
+    winds_m_per_s : (layers, 2) array
+    positions_m : (n, 2) array
+        Centres of the sub-apertures.
+    side_m : float
+        Side of a sub-aperture.
+    rate_hz : float
+    """
+    across_m = np.ptp(positions_m, axis=0) + side_m
+    passing_hz, width_hz = np.abs(winds_m_per_s) / side_m, np.abs(winds_m_per_s) / across_m
+    passing_hz = np.abs((passing_hz + 0.5 * rate_hz) % rate_hz - 0.5 * rate_hz)
+    axes_of = dict(zip(MODES, ([0], [1], [0, 1]), strict=True))
+
+    def is_grid(vibration: Vibration) -> bool:
+        axes = axes_of[vibration.mode]
+        near = np.abs(passing_hz[:, axes] - vibration.frequency_hz) < _GRID_OFF * width_hz[:, axes]
+        return bool((near & (vibration.damping > _GRID_DAMPING * side_m / across_m[axes])).any())
+
+    return tuple(vibration for vibration in vibrations if not is_grid(vibration))
 
 
 class _Lines:

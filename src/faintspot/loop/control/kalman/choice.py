@@ -3,6 +3,10 @@
 The controller that drives the mirror has its measured residual. That of the other one is computed, and is as
 wrong as the model of the loop is. So a filter whose measured residual is above that of the integrator while
 it drove the mirror loses the mirror, whatever is computed, and for longer each time.
+
+Both decisions are cumulative sums (Page 1954, Biometrika 41, 100): of frames in which the other controller
+leaves less, and of residuals above those of the integrator. They notice a large change in a few frames and a
+small one in many.
 """
 
 from __future__ import annotations
@@ -14,25 +18,27 @@ from typing import Any
 from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
 
 MEMORY_FRAMES = 100
-CORRELATED_FRAMES = 5  # over which residuals are alike
-FEWEST_FRAMES = 50  # before the first change
-STANDARD_ERRORS = 1.0  # by which one must leave less than the other
+FEWEST_FRAMES = 20  # before the first change
 HANDOVER_FRAMES = 10  # after which a controller's own commands are sent
+_ENOUGH = 16.0  # sum of the differences, in their standard deviations, for the other one to take over
+_LEAST_DEVIATION, _MOST_DEVIATIONS = 0.03, 5.0  # of a difference, and in one frame
 _SETTLING = 15  # frames after a change whose residuals belong to both
 _MEASURED, _MEASURED_MEMORY = 20, 200  # frames of the integrator's residual: fewest, and memory
-_SHORT, _LONG = 50, 200  # frames over which the filter's residual is averaged
-_RUNAWAY, _WORSE, _SLIGHTLY = 16.0, 1.4, 1.1
-"""Residuals in those of the integrator that are too large: in one frame, of late, and for long."""
+_ALLOWED, MOST_EXCESS, _IN_ONE_FRAME = 1.1, 16.0, 20.0
+"""Residual of the filter in those of the integrator: allowed; sum of the excess; largest that counts."""
+_LATE, _RUNAWAY = 10, 2.0
+"""Frames, and their mean residual in those of the integrator, with which a filter fails for good."""
 _ASSUMED = 4.0  # residual of an integrator that was computed, by which it may be too small
 _FIRST_WAIT, _LONGEST_WAIT = 500, 20_000  # frames that the integrator drives the mirror after that
 _PROVEN = 2000  # frames after which the wait is the first one again
 
 # Numbers of the guard: 1 where the plain one's commands go out; the same of the frame before, or another
-# number; frames of late, mean difference, its mean square; frames of the handover that are left; frames since
-# the last change, and what was chosen before it; measured residuals of the integrator, its frames, and of the
-# filter, of late and for long; the integrator's computed residual; frames to wait, now and the next time.
-CHOSEN, SENT, FRAMES, _MEAN, _SQUARE, BLENDED, _SINCE, _BEFORE = range(8)
-_PLAIN, _PLAIN_FRAMES, _LATE, _FOR_LONG, _COMPUTED, _WAIT, _NEXT_WAIT, _PREFERS = range(8, 16)
+# number; frames of late, mean difference, its mean square, evidence for the other controller; frames of the
+# handover that are left; frames since the last change, and what was chosen before it; measured residuals of
+# the integrator, its frames, and of the filter of late; sum of the filter's excess; the integrator's computed
+# residual; frames to wait, now and the next time.
+CHOSEN, SENT, FRAMES, _MEAN, _SQUARE, _EVIDENCE, BLENDED, _SINCE, _BEFORE = range(9)
+_PLAIN, _PLAIN_FRAMES, _OF_LATE, EXCESS, _COMPUTED, _WAIT, _NEXT_WAIT = range(9, 16)
 GUARD_NUMBERS = 16
 
 
@@ -54,36 +60,34 @@ def choose(guard: Any, learnt: Any, plain: Any) -> None:
     guard[_SQUARE] += share * (difference * difference - guard[_SQUARE])
     if guard[_BEFORE] != guard[CHOSEN]:
         guard[_BEFORE], guard[_SINCE] = guard[CHOSEN], 0.0
+        guard[_EVIDENCE] = guard[EXCESS] = guard[_OF_LATE] = 0.0
     guard[_SINCE] += 1.0
-    driving = guard[_SINCE] - _SETTLING
     if guard[CHOSEN] > 0.0:
-        if driving > 0.0:
+        if guard[_SINCE] > _SETTLING:
             guard[_PLAIN_FRAMES] += 1.0
             guard[_PLAIN] += (plain - guard[_PLAIN]) / min(guard[_PLAIN_FRAMES], _MEASURED_MEMORY)
     else:
-        if driving > 0.0:
-            guard[_LATE] += (learnt - guard[_LATE]) / min(driving, _SHORT)
-            guard[_FOR_LONG] += (learnt - guard[_FOR_LONG]) / min(driving, _LONG)
         usual = guard[_PLAIN] if guard[_PLAIN_FRAMES] >= _MEASURED else _ASSUMED * guard[_COMPUTED]
-        worse = driving >= 0.5 * _SHORT and guard[_LATE] > _WORSE * usual
-        worse = worse or (driving >= 0.5 * _LONG and guard[_FOR_LONG] > _SLIGHTLY * usual)
-        if worse or learnt > _RUNAWAY * usual:
-            guard[CHOSEN], guard[_WAIT] = 1.0, guard[_NEXT_WAIT]
+        residual = min(learnt / max(usual, 1e-30), _IN_ONE_FRAME)
+        guard[_OF_LATE] += (residual - guard[_OF_LATE]) / min(guard[_SINCE], _LATE)
+        guard[EXCESS] = max(0.0, guard[EXCESS] + residual - _ALLOWED)
+        if guard[EXCESS] > MOST_EXCESS:
+            is_runaway = guard[_OF_LATE] > _RUNAWAY
+            guard[CHOSEN], guard[_WAIT] = 1.0, _LONGEST_WAIT if is_runaway else guard[_NEXT_WAIT]
             guard[_NEXT_WAIT] = min(2.0 * guard[_NEXT_WAIT], _LONGEST_WAIT)
             guard[FRAMES] = guard[_MEAN] = guard[_SQUARE] = 0.0
-            guard[_PREFERS] = 1.0
             return
-        if driving > _PROVEN:
+        if guard[_SINCE] > _PROVEN:
             guard[_NEXT_WAIT] = _FIRST_WAIT
-    values = min(guard[FRAMES], 2 * MEMORY_FRAMES) / CORRELATED_FRAMES
-    error = STANDARD_ERRORS * math.sqrt(max(0.0, guard[_SQUARE] - guard[_MEAN] * guard[_MEAN]) / values)
+    if guard[FRAMES] >= FEWEST_FRAMES:
+        variance = guard[_SQUARE] - guard[_MEAN] * guard[_MEAN]
+        for_plain = difference / max(math.sqrt(max(0.0, variance)), _LEAST_DEVIATION)
+        for_other = -for_plain if guard[CHOSEN] > 0.0 else for_plain
+        guard[_EVIDENCE] = max(0.0, guard[_EVIDENCE] + min(for_other, _MOST_DEVIATIONS))
     if guard[_WAIT] > 0.0:
         guard[_WAIT] -= 1.0
-        if guard[_WAIT] == 0.0 and guard[_PREFERS] == 0.0 and guard[_MEAN] <= error:
-            guard[CHOSEN] = 0.0
-        return
-    if guard[FRAMES] >= FEWEST_FRAMES and abs(guard[_MEAN]) > error:
-        guard[CHOSEN] = 1.0 if guard[_MEAN] > 0.0 else 0.0
+    elif guard[_EVIDENCE] > _ENOUGH:
+        guard[CHOSEN] = 1.0 - guard[CHOSEN]
 
 
 CHOOSE = Direct(choose)
@@ -104,10 +108,9 @@ def prepare(guard: Any, prefers_plain: bool, plain_residual: float, plain_frames
         Frames that the plain controller drives the mirror first, so that its residual is measured.
     """
     guard[CHOSEN] = guard[SENT] = guard[_BEFORE] = float(prefers_plain or plain_frames > 0)
-    guard[_COMPUTED], guard[_PREFERS] = plain_residual, float(prefers_plain)
-    guard[_WAIT], guard[_NEXT_WAIT] = plain_frames, _FIRST_WAIT
+    guard[_COMPUTED], guard[_WAIT], guard[_NEXT_WAIT] = plain_residual, plain_frames, _FIRST_WAIT
 
 
 def restart(guard: Any) -> None:
-    """Forget the differences of earlier frames; what was measured of both controllers stays."""
-    guard[FRAMES : _SINCE + 1] = 0.0
+    """Forget the differences of earlier frames; what was measured of the integrator stays."""
+    guard[FRAMES : _SINCE + 1] = guard[EXCESS] = 0.0

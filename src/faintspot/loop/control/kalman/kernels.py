@@ -8,17 +8,28 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.loop.control.kalman.choice import BLENDED, CHOSEN, HANDOVER_FRAMES, SENT, choose
+from faintspot.loop.control.kalman import choice
+from faintspot.loop.control.kalman.choice import (
+    BLENDED,
+    CHOSEN,
+    EXCESS,
+    HANDOVER_FRAMES,
+    MOST_EXCESS,
+    SENT,
+    choose,
+)
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.loop.control.telemetry import LEAST_SHARE, LEAST_VARIANCE_PX2
-from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
+from faintspot.slopes.kernels.compilation.compiling import Direct, _kernel
 from faintspot.slopes.kernels.driver.products import add_products
 
-_compiled = partial(compiled_with, source=__file__)
+# Compiled anew when the guard changes, too.
+_compiled = partial(_kernel, sources=(Path(__file__), Path(choice.__file__)))
 
 # Rows of memory: of slopes, and of commands; the first four are commands and what they add to slopes.
 HELD, HELD_LEARNT, HELD_PLAIN, LATEST_PLAIN, _LEFT_LEARNT, _LEFT_PLAIN, _FOR_PLAIN = range(7)
@@ -303,9 +314,24 @@ def go_on(numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) 
     for c in range(wavefronts.shape[1]):
         learnt += wavefronts[0, c] * wavefronts[0, c]
         plain += wavefronts[1, c] * wavefronts[1, c]
+    was_chosen = memory.guard[CHOSEN]
     choose(memory.guard, learnt, plain)
+    if memory.guard[CHOSEN] > was_chosen and memory.guard[EXCESS] > MOST_EXCESS:
+        _adopt(lines, next_rows, memory.guard)
     _advance(matrices, memory)
     return total
+
+
+@_compiled
+def _adopt(lines: Any, next_rows: Any, guard: Any) -> None:
+    """Let the integrator continue from the mirror's commands; the row of its own is not yet sent."""
+    row, _, of_plain = next_rows
+    length = lines.true.shape[0]
+    for later in range(length):
+        to, of = (of_plain + 1 + later) % length, (row + later) % length
+        for c in range(lines.true.shape[1]):
+            lines.plain[to, c] = lines.true[of, c]
+    guard[SENT], guard[BLENDED] = 1.0, 0.0
 
 
 @_compiled

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from faintspot.loop.control.base import Expected
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.integrator import Integrator
-from faintspot.loop.control.kalman.choice import CHOOSE
 from faintspot.loop.control.kalman.guarded import Guarded
 from faintspot.loop.control.kalman.local_covariance import replies
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor
@@ -173,8 +172,8 @@ class LargeGuarded(Guarded):
             learnt, plain = self._compare.several(*self._follow_up(frame))
             self._predictor.correct(frame.open_loop, frame.variance)
             self._predictor.advance()
-            by_learnt, by_plain = float(learnt @ learnt), float(plain @ plain)
-            CHOOSE(self._guard, by_learnt, by_plain)
+            if self._choose(float(learnt @ learnt), float(plain @ plain)):
+                self._caused[_PLAIN] = self._product.several(*self._lines[_PLAIN].rows)
         if frame is not None or self._restarted or self._held_at != self._line.next_row:
             self._follow_mirror(is_new=frame is not None or self._restarted)
 
