@@ -57,6 +57,10 @@ class ForeignLoop(ABC):
         Frames per second.
     subaperture_m : float
         Side of a sub-aperture.
+    unit_arcsec : float
+        Angle of a unit of the slopes, as calibrated.
+    r0_m : float
+        Fried parameter at 500 nm, as given to the package.
     delay_frames : int
         The command computed from frame k acts first during frame k + delay.
     winds : list of (speed, direction)
@@ -73,6 +77,8 @@ class ForeignLoop(ABC):
     sign, is_slow = 1.0, False
     rate_hz: float
     subaperture_m: float
+    unit_arcsec: float
+    r0_m: float
     delay_frames: int
     winds: list[tuple[float, float]]
     own: dict[str, Floats]

@@ -14,6 +14,9 @@ from benchmarks.foreign.base import SETTLE_FRAMES, Control, ForeignLoop, Observe
 EXAMPLES = Path(__file__).parents[2] / "examples"
 _QUANTUM_EFFICIENCY = 0.01 / 40.0
 """For an electron a lenslet: the star's brightness is that of the example."""
+_SEEING_TO_R0 = 0.9759 * 500e-9
+"""m rad: SPECULA's own product of seeing and r0."""
+_ARCSEC = np.pi / 648000
 
 
 def example(name: str) -> Any:
@@ -58,6 +61,9 @@ class SpeculaLoop(ForeignLoop):
         self.own = {"SPECULA's Modalrec and Integrator": np.asarray(np.linalg.pinv(self.interaction))}
         subapertures = found.objs["slopec"].subapdata
         pixels, side = np.asarray(subapertures.idxs), int(subapertures.np_sub)
+        tilt = 2e-9 / (self.subaperture_m * side / 2)  # of the first Zernike mode of Noll, 1 nm rms
+        self.unit_arcsec = abs(tilt / np.median(self.interaction[: len(pixels), 0])) / _ARCSEC
+        self.r0_m = _SEEING_TO_R0 / (self._example.SEEING_ARCSEC * _ARCSEC)
         self.cells = np.stack(np.divmod(pixels[:, 0], side * subapertures.nx), axis=1) // side
         speeds, directions = (list(values) for values in zip(*self.winds, strict=True))
         constant = self._example.constant
