@@ -6,12 +6,16 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from benchmarks.foreign.evaluation import FILTER, Runs
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.reconstructor import make_reconstructor
 
-_STEPS = (0.5, 1.0, 1.5, 2.0)
+Floats = NDArray[np.float64]
+
+_STEPS = 1.0, 2.0
 
 
 def in_magnitudes(
@@ -24,7 +28,8 @@ def in_magnitudes(
     """Return by how many magnitudes the filter is ahead of each control.
 
     Both Strehl ratios are placed on the curve of the integrator, tuned at every flux, for each turbulence. A
-    Strehl ratio beyond the brightest star gives a lower limit, without an error.
+    Strehl ratio beyond the brightest star gives a lower limit, without an error; so does one of another
+    control below the integrator's.
 
     Parameters
     ----------
@@ -49,24 +54,26 @@ def in_magnitudes(
         if (np.array(curve[-1]) >= scores[FILTER]).all():
             break
     ahead = {}
-    ours, is_beyond = _placed(scores[FILTER], np.array(curve), np.array(steps))
+    ours, is_beyond = _placed(scores[FILTER], np.array(curve), steps)
     for name, values in scores.items():
         if name != FILTER:
-            theirs, _ = _placed(values, np.array(curve), np.array(steps))
+            theirs, _ = _placed(values, np.array(curve), steps)
             difference = paired_mean(ours - theirs)
-            ahead[name] = [difference.value, float("nan") if is_beyond else difference.standard_error]
-    return {"ahead": ahead, "steps": steps, "curve": curve, "is_lower_limit": is_beyond}
+            is_limit = is_beyond or np.mean(values) < np.mean(scores[plain])
+            ahead[name] = [difference.value, float("nan") if is_limit else difference.standard_error]
+    return {"ahead": ahead, "steps": steps, "curve": curve}
 
 
-def _placed(values: list[float], curve: Any, steps: Any) -> tuple[Any, bool]:
+def _placed(values: list[float], curve: Floats, steps: list[float]) -> tuple[Floats, bool]:
     """Return the magnitudes at which each turbulence's curve has a Strehl ratio, and whether any is beyond.
 
-    Below the faintest star the first part of the curve is continued.
+    At or below the faintest star they are 0.
     """
-    places = []
-    for value, column in zip(values, np.maximum.accumulate(curve).T, strict=True):
-        place = float(np.interp(value, column, steps))
-        if value < column[0]:
-            place = steps[1] * (value - column[0]) / max(column[1] - column[0], 1e-3)
-        places.append(place)
-    return np.array(places), bool((np.array(values) > curve.max(axis=0)).any())
+    fine = np.linspace(0.0, steps[-1], 401)
+    columns = [PchipInterpolator(steps, column)(fine) for column in np.maximum.accumulate(curve).T]
+    places = [
+        fine[min(int(np.searchsorted(column, value)), len(fine) - 1)]
+        for value, column in zip(values, columns, strict=True)
+    ]
+    is_beyond = any(value > column[-1] for value, column in zip(values, columns, strict=True))
+    return np.array(places), is_beyond

@@ -34,7 +34,8 @@ class Row:
 
 
 def _oopao(case: OopaoCase, folder: Path, brightness: float) -> ForeignLoop:
-    return OopaoLoop(replace(case, flux_e=case.flux_e * brightness), folder)
+    brighter = replace(case, name=f"{case.name}x{brightness:g}", flux_e=case.flux_e * brightness)
+    return OopaoLoop(case if brightness == 1 else brighter, folder)
 
 
 def _specula(flux_e: float, own_slopes: bool, folder: Path, brightness: float) -> ForeignLoop:
