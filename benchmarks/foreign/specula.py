@@ -61,7 +61,8 @@ class SpeculaLoop(ForeignLoop):
         self.own = {"SPECULA's Modalrec and Integrator": np.asarray(np.linalg.pinv(self.interaction))}
         subapertures = found.objs["slopec"].subapdata
         pixels, side = np.asarray(subapertures.idxs), int(subapertures.np_sub)
-        tilt = 2e-9 / (self.subaperture_m * side / 2)  # of the first Zernike mode of Noll, 1 nm rms
+        main = self._example.SYSTEM["main"]
+        tilt = 4e-9 / (main["pixel_pupil"] * main["pixel_pitch"])  # Noll's first Zernike mode, 1 nm rms
         self.unit_arcsec = abs(tilt / np.median(self.interaction[: len(pixels), 0])) / _ARCSEC
         self.r0_m = _SEEING_TO_R0 / (self._example.SEEING_ARCSEC * _ARCSEC)
         self.cells = np.stack(np.divmod(pixels[:, 0], side * subapertures.nx), axis=1) // side
