@@ -22,10 +22,11 @@ import click
 
 from benchmarks import machine
 from benchmarks.foreign import evaluation
-from benchmarks.foreign.evaluation import FILTER, INTEGRATOR, MODAL, Effort
+from benchmarks.foreign.evaluation import INTEGRATOR, MODAL, Effort
 from benchmarks.foreign.magnitudes import in_magnitudes
 from benchmarks.foreign.rows import ROWS, TOOLS, Row, chosen_rows, is_installed
 from benchmarks.results import FOLDER
+from faintspot.loop.telemetry.choices import FILTER
 
 _COLUMNS = (
     "loop",

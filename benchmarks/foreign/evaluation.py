@@ -16,9 +16,10 @@ from benchmarks.foreign import reports, rivals
 from benchmarks.foreign.base import SETTLE_FRAMES, Control, Floats, ForeignLoop, Integrator, Observed
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.telemetry.choices import FILTER, MODES
 
 TUNING_SEED, LEARNING_SEED = 1, 2
-INTEGRATOR, MODAL, FILTER = "integrator", reports.MODES, reports.FILTER
+INTEGRATOR, MODAL = "integrator", MODES
 _IN_LOOP = 2
 """Predictors of the rivals, the best in a replay, that are tried in the loop."""
 _TIMED_FRAMES = 300
@@ -31,7 +32,7 @@ class Effort:
     frames: int = 700
     learning_s: float = 8.0
     seeds: tuple[int, ...] = (3, 4, 5)
-    gains: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0, 1.2)
+    gains: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0, 1.2, 1.5, 1.8)
     with_others: bool = True
     """Whether other controls are compared, and brighter stars tried."""
 

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from benchmarks.foreign.evaluation import FILTER, Runs
+from benchmarks.foreign.evaluation import Runs
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.telemetry.choices import FILTER
 
 Floats = NDArray[np.float64]
 
