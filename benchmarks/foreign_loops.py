@@ -51,7 +51,9 @@ _COLUMNS = (
 @click.option("--tool", type=click.Choice(TOOLS), help="Rows of one package only.")
 @click.option("--rows", "names", help=f"Some rows, with commas: {', '.join(row.name for row in ROWS)}.")
 @click.option("--quick", is_flag=True, help="Two short realisations, 3 s to learn from, one gain, no rivals.")
-@click.option("--others/--no-others", default=True, show_default=True, help="Own controls and pyRTC's, too.")
+@click.option(
+    "--others/--no-others", default=True, show_default=True, help="pyRTC's controls and brighter stars, too."
+)
 @click.option("--again", is_flag=True, help="Run rows anew that the folder has results of.")
 @click.option(
     "--folder",
@@ -93,30 +95,34 @@ def run_command(
             elif path.exists() and not again:
                 _log(f"in {path} already; --again runs it anew")
             else:
-                _write(path, _result(row, effort, kept))
+                _measure(row, effort, kept, path)
     _finish(folder, rows)
 
 
-def _result(row: Row, effort: Effort, cache: Path) -> dict[str, Any]:
-    """Run a row; a failure is its result."""
+def _measure(row: Row, effort: Effort, cache: Path, path: Path) -> None:
+    """Run a row and store its result, first without magnitudes, which take long; a failure is a result."""
     begun = time.perf_counter()
     result: dict[str, Any] = {"name": row.name, "title": row.title, "goal": row.goal}
+
+    def runs(brightness: float) -> evaluation.Runs:
+        return evaluation.Runs(row.make(cache, brightness), effort, cache)
+
+    def store() -> None:
+        result["seconds"] = time.perf_counter() - begun
+        _write(path, result | {"versions": machine.versions()})
+
     try:
-
-        def runs(brightness: float) -> evaluation.Runs:
-            return evaluation.Runs(row.make(cache, brightness), effort, cache)
-
         ready = evaluation.commissioned(runs(1.0), _log)
         result |= (evaluation.turned if row.turned else evaluation.compared)(ready, _log)
         result |= {"learnt": evaluation.learnt(ready), "gains": ready.tried}
+        store()
         if ready.runs.effort.with_others and not row.turned:
             result["magnitudes"] = in_magnitudes(result["scores"], runs, INTEGRATOR, ready.gain, _log)
     except Exception as error:
         traceback.print_exc()
         result["failure"] = f"{type(error).__name__}: {error}".splitlines()[0]
-    result |= {"seconds": time.perf_counter() - begun, "versions": machine.versions()}
+    store()
     _log(f"{row.name}: {result['seconds']:.0f} s")
-    return result
 
 
 def _finish(folder: Path, rows: list[Row]) -> None:

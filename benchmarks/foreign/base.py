@@ -66,9 +66,9 @@ class ForeignLoop(ABC):
     winds : list of (speed, direction)
         As given to the package.
     is_slow : bool
-        Whether other controls are left out, and fewer gains tried.
+        Whether pyRTC and brighter stars are left out, and fewer gains tried.
     own : dict
-        Reconstructors (commands, 2 n) that the package makes of the interaction matrix.
+        Reconstructors (commands, 2 n) that the package makes of the interaction matrix, if not the inverse.
     """
 
     name: str

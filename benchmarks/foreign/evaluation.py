@@ -34,10 +34,10 @@ class Effort:
     seeds: tuple[int, ...] = (3, 4, 5)
     gains: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0, 1.2, 1.5, 1.8)
     with_others: bool = True
-    """Whether other controls are compared, and brighter stars tried."""
+    """Whether pyRTC's predictors are compared, and brighter stars tried."""
 
     def of(self, loop: ForeignLoop) -> Effort:
-        """Return the effort for a loop: half as many gains, and no others, if it is slow."""
+        """Return the effort for a loop: half as many gains, and no pyRTC, if it is slow."""
         return replace(self, gains=self.gains[::2], with_others=False) if loop.is_slow else self
 
 
@@ -181,7 +181,7 @@ def compared(ready: Commissioned, log: Log) -> dict[str, Any]:
     report = reports.reported(recording, dict(scores), loop.r0_m)
     log(f"report: {report['advice']} r0 {report['r0']}")
     chosen = {INTEGRATOR: f"gain {ready.gain:g}", MODAL: "", FILTER: ""}
-    for name, matrix in loop.own.items() if effort.with_others else ():
+    for name, matrix in loop.own.items():
         gain, _ = runs.best_gain(name, matrix)
         own = [runs.integrator(name, matrix, gain, seed, effort.frames).score for seed in effort.seeds]
         scores[name], chosen[name] = own, f"gain {gain:g}"

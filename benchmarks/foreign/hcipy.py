@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 import faintspot as fs
 from benchmarks.foreign.base import IMAGING_M, Floats, SteppedLoop
 from benchmarks.foreign.specula import example
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 
 _SHARES = 0.5, 0.3, 0.2
 _TILT_RAD = 1e-7
@@ -53,7 +54,7 @@ class HcipyLoop(SteppedLoop):
         plus, minus = np.split(np.array(slopes), 2)
         self._flat = np.mean(slopes, axis=0)
         of_tilt = (tilts[0] - tilts[1])[: len(self._flat) // 2].mean() / 2
-        self.unit_arcsec = abs(_TILT_RAD / of_tilt) * 648000 / np.pi
+        self.unit_arcsec = abs(_TILT_RAD / of_tilt) / ARCSEC
         self.interaction = (plus - minus).T / 6e-8
         self.own = {"HCIPy's Tikhonov inverse": system.hcipy.inverse_tikhonov(self.interaction, rcond=0.03)}
         self.cells = self._cells()

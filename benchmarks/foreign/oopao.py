@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 import faintspot as fs
 from benchmarks.foreign.base import IMAGING_M, Control, Floats, SteppedLoop
 from faintspot.loop.control.identification.vibrations import Vibration
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 
 _R0_M = 0.25  # of the turbulence that is simulated; another r0 scales it
 _POKE_M = 2e-8
 _TRUNCATED = 4
 """Singular values that OOPAO's reconstructor leaves out."""
-_ARCSEC = np.pi / 648000
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class OopaoLoop(SteppedLoop):
         self.cells = np.argwhere(self._wfs.valid_subapertures)
         pokes, self._tilt_of_signal = self._calibrate()
         self.interaction = pokes
-        self.unit_arcsec = points / case.diameter_m / self._tilt_of_signal / _ARCSEC
+        self.unit_arcsec = points / case.diameter_m / self._tilt_of_signal / ARCSEC
         with _quiet():
             vault = CalibrationVault(pokes, nTrunc=_TRUNCATED)
         self.own = {"OOPAO's truncated inverse": np.asarray(vault.Mtrunc)}

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from benchmarks.foreign.base import IMAGING_M, Floats, SteppedLoop
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 
 _READ_NOISE_E = 1.0
 _LENSLET_M, _SUBAPERTURE_PX, _FIELD_ARCSEC = 0.6, 12, 1.8
@@ -61,7 +62,7 @@ class SoapyLoop(SteppedLoop):
             magnitude += 2.5 * np.log10(self._flux_e() / flux_e)
         settings = fs.Settings("window", flux_e=flux_e, window_fwhm_px=3.0)
         camera = fs.Calibration(dark=0.0, read_noise_e=_READ_NOISE_E)
-        spot_px = _SENSING_M / _LENSLET_M * 648000 / np.pi / self.unit_arcsec
+        spot_px = _SENSING_M / _LENSLET_M / (self.unit_arcsec * ARCSEC)
         adapter.attach(self._sensor, settings, camera, psf=fs.PSF.analytic(size=spot_px / 2))
         with contextlib.redirect_stdout(io.StringIO()):
             self._system.makeIMat(forceNew=True)
