@@ -34,7 +34,9 @@ def test_scripts_close_their_loops(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("page", "module"), [("oopao", "OOPAO"), ("hcipy", "hcipy"), ("specula", "specula")])
+@pytest.mark.parametrize(
+    ("page", "module"), [("oopao", "OOPAO"), ("hcipy", "hcipy"), ("specula", "specula"), ("soapy", "soapy")]
+)
 def test_predictive_filters_drive_the_mirror(page: str, module: str, tmp_path: Path) -> None:
     pytest.importorskip(module)
     output = _output(page, 2, tmp_path)
