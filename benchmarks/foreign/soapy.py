@@ -85,7 +85,10 @@ class SoapyLoop(SteppedLoop):
     def simulated(self, seed: int, frames: int) -> NDArray[np.float32]:
         """Return the screens of each frame, nm."""
         atmosphere = _simulation(self.winds, self.r0_m, 12.0, seed).atmos
-        return np.array([atmosphere.moveScrns() for _ in range(frames)], np.float32)
+        screens = np.empty((frames, *atmosphere.scrns.shape), np.float32)
+        for screen in screens:
+            screen[:] = atmosphere.moveScrns()  # always the same array
+        return screens
 
     def begin(self, seed: int) -> None:
         """See `SteppedLoop`."""
