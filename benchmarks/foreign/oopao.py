@@ -117,7 +117,7 @@ class OopaoLoop(SteppedLoop):
 
     def _gradients(self) -> Floats:
         """Return mean gradients of the wavefront of the latest frame, x and y."""
-        path_m = self._star.phase * self._star.wavelength
+        path_m = self._star.phase * self._star.wavelength / (2 * np.pi)
         return np.concatenate([self._lenslets(np.gradient(path_m, axis=axis)) for axis in (1, 0)])
 
     def true_gain(self, control: Control, seed: int, frames: int) -> float:
