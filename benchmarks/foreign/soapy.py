@@ -18,6 +18,7 @@ from faintspot.loop.turbulence.slope_covariance import ARCSEC
 _READ_NOISE_E = 1.0
 _LENSLET_M, _SUBAPERTURE_PX, _FIELD_ARCSEC = 0.6, 12, 1.8
 _SENSING_M = 0.65e-6
+_TILT_ARCSEC = 0.02
 _SYSTEM = """
 simName:
 pupilSize: 84
@@ -47,7 +48,7 @@ class SoapyLoop(SteppedLoop):
     """Loop of soapy."""
 
     rate_hz, delay_frames, r0_m, sign = 250.0, 2, 0.2, -1.0
-    subaperture_m, unit_arcsec = _LENSLET_M, _FIELD_ARCSEC / _SUBAPERTURE_PX
+    subaperture_m = _LENSLET_M
     winds = [(6.0, 0.0), (12.0, 90.0), (20.0, 270.0)]  # noqa: RUF012
 
     def __init__(self, flux_e: float, folder: Path) -> None:
@@ -62,10 +63,11 @@ class SoapyLoop(SteppedLoop):
             magnitude += 2.5 * np.log10(self._flux_e() / flux_e)
         settings = fs.Settings("window", flux_e=flux_e, window_fwhm_px=3.0)
         camera = fs.Calibration(dark=0.0, read_noise_e=_READ_NOISE_E)
-        spot_px = _SENSING_M / _LENSLET_M / (self.unit_arcsec * ARCSEC)
+        spot_px = _SENSING_M / _LENSLET_M / (_FIELD_ARCSEC / _SUBAPERTURE_PX * ARCSEC)
         adapter.attach(self._sensor, settings, camera, psf=fs.PSF.analytic(size=spot_px / 2))
         with contextlib.redirect_stdout(io.StringIO()):
             self._system.makeIMat(forceNew=True)
+        self.unit_arcsec = self._tilt_arcsec()
         recon = self._system.recon
         self.interaction = np.array(recon.interaction_matrix.T, np.float64)
         self.own = {"soapy's MVM": np.array(recon.control_matrix.T, np.float64)}
@@ -81,6 +83,15 @@ class SoapyLoop(SteppedLoop):
         flux = float(self._sensor.centSubapArrays.sum() / self._sensor.n_subaps)
         self._sensor.config.photonNoise, self._sensor.config.eReadNoise = True, _READ_NOISE_E
         return flux
+
+    def _tilt_arcsec(self) -> float:
+        """Return the angle of a unit of the slopes, from a small tilt without noise."""
+        screens = np.zeros_like(self._system.atmos.scrns)
+        screens[0] += (
+            np.arange(screens.shape[-1]) * self._system.atmos.pixel_scale * _TILT_ARCSEC * ARCSEC * 1e9
+        )
+        slopes = np.array(self._sensor.frame(screens, iMatFrame=True), np.float64).reshape(2, -1)
+        return float(_TILT_ARCSEC / np.hypot(*slopes.mean(axis=1)))
 
     def simulated(self, seed: int, frames: int) -> NDArray[np.float32]:
         """Return the screens of each frame, nm."""
