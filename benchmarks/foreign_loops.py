@@ -1,9 +1,11 @@
 """Is the learnt filter better in loops that other packages simulate? `python -m benchmarks foreign_loops`
 
-Atmosphere, telescope, sensor, noise and mirror are those of OOPAO, SPECULA and HCIPy. faintspot has slopes
-and commands of 8 s with the tuned integrator, the interaction matrix and the frame rate. Gains are chosen on
-one realisation, the filter learns from a second, and three others are scored. Differences are paired. pyRTC's
-predictors have the slopes and the recording of the filter, tuned in a replay and then in the loop.
+Atmosphere, telescope, sensor, noise and mirror are those of OOPAO, SPECULA, HCIPy and soapy. faintspot has
+slopes and commands of 8 s with the tuned integrator, the interaction matrix and the frame rate. Gains are
+chosen on one realisation, the filter learns from a second, and three others are scored. Differences are
+paired. pyRTC's predictors have the slopes and the recording of the filter, tuned in a replay and then in the
+loop. A difference in magnitudes is one of the guide star: the integrator, tuned at each flux, has the Strehl
+ratio of the other control. The report of the recording is compared with the loop.
 """
 
 from __future__ import annotations
@@ -20,21 +22,27 @@ import click
 
 from benchmarks import machine
 from benchmarks.foreign import evaluation
-from benchmarks.foreign.evaluation import FILTER, INTEGRATOR, Effort
+from benchmarks.foreign.evaluation import INTEGRATOR, MODAL, Effort
+from benchmarks.foreign.magnitudes import in_magnitudes
 from benchmarks.foreign.rows import ROWS, TOOLS, Row, chosen_rows, is_installed
 from benchmarks.results import FOLDER
+from faintspot.loop.telemetry.choices import FILTER
 
 _COLUMNS = (
     "loop",
     "integrator (gain)",
     "own control",
+    "modal gains",
     "best of pyRTC",
     "filter",
     "filter - integrator",
     "filter - pyRTC",
     "goal",
+    "magnitudes: integrator, pyRTC",
     "delay; true",
     "centroid gain; true",
+    "r0; true, m",
+    "report's best; saves",
     "learning, frame, row",
 )
 
@@ -43,7 +51,9 @@ _COLUMNS = (
 @click.option("--tool", type=click.Choice(TOOLS), help="Rows of one package only.")
 @click.option("--rows", "names", help=f"Some rows, with commas: {', '.join(row.name for row in ROWS)}.")
 @click.option("--quick", is_flag=True, help="Two short realisations, 3 s to learn from, one gain, no rivals.")
-@click.option("--others/--no-others", default=True, show_default=True, help="Own controls and pyRTC's, too.")
+@click.option(
+    "--others/--no-others", default=True, show_default=True, help="pyRTC's controls and brighter stars, too."
+)
 @click.option("--again", is_flag=True, help="Run rows anew that the folder has results of.")
 @click.option(
     "--folder",
@@ -85,24 +95,34 @@ def run_command(
             elif path.exists() and not again:
                 _log(f"in {path} already; --again runs it anew")
             else:
-                _write(path, _result(row, effort, kept))
+                _measure(row, effort, kept, path)
     _finish(folder, rows)
 
 
-def _result(row: Row, effort: Effort, cache: Path) -> dict[str, Any]:
-    """Run a row; a failure is its result."""
+def _measure(row: Row, effort: Effort, cache: Path, path: Path) -> None:
+    """Run a row and store its result, first without magnitudes, which take long; a failure is a result."""
     begun = time.perf_counter()
     result: dict[str, Any] = {"name": row.name, "title": row.title, "goal": row.goal}
+
+    def runs(brightness: float) -> evaluation.Runs:
+        return evaluation.Runs(row.make(cache, brightness), effort, cache)
+
+    def store() -> None:
+        result["seconds"] = time.perf_counter() - begun
+        _write(path, result | {"versions": machine.versions()})
+
     try:
-        ready = evaluation.commissioned(evaluation.Runs(row.make(cache), effort, cache), _log)
+        ready = evaluation.commissioned(runs(1.0), _log)
         result |= (evaluation.turned if row.turned else evaluation.compared)(ready, _log)
         result |= {"learnt": evaluation.learnt(ready), "gains": ready.tried}
+        store()
+        if ready.runs.effort.with_others and not row.turned:
+            result["magnitudes"] = in_magnitudes(result["scores"], runs, INTEGRATOR, ready.gain, _log)
     except Exception as error:
         traceback.print_exc()
         result["failure"] = f"{type(error).__name__}: {error}".splitlines()[0]
-    result |= {"seconds": time.perf_counter() - begun, "versions": machine.versions()}
+    store()
     _log(f"{row.name}: {result['seconds']:.0f} s")
-    return result
 
 
 def _finish(folder: Path, rows: list[Row]) -> None:
@@ -126,32 +146,46 @@ def table_of(results: list[dict[str, Any]]) -> str:
     for result in results:
         for part, ahead in result.get("ahead_of_parts", {}).items():
             lines.append(f"\n{result['name']}, {part}: filter - integrator {_signed(ahead[INTEGRATOR])}")
+    right = [result["report"]["is_best"] for result in results if "report" in result]
+    if right:
+        lines.append(f"\nThe report's best control is the best in the loop in {sum(right)} of {len(right)}.")
     total = sum(result["seconds"] for result in results)
     return "\n".join([*lines, f"\n{len(results)} rows, {total / 60:.0f} minutes"])
 
 
 def _cells(result: dict[str, Any]) -> list[str]:
     scores, ahead, chosen = result["scores"], result["ahead"], result["chosen"]
-    learnt = result["learnt"]
+    learnt, report = result["learnt"], result["report"]
     mean = {name: sum(values) / len(values) for name, values in scores.items()}
-    own = [name for name in scores if name not in (INTEGRATOR, FILTER) and not name.startswith("pyRTC")]
+    ours = INTEGRATOR, MODAL, FILTER
+    own = [name for name in scores if name not in ours and not name.startswith("pyRTC")]
     pyrtc = sorted((name for name in scores if name.startswith("pyRTC")), key=lambda name: mean[name])
     best = pyrtc[-1] if pyrtc else None
+    magnitudes = result.get("magnitudes", {}).get("ahead", {})
     delay, error, true_delay = learnt["delay"]
     gain, gain_error, true_gain = learnt["centroid_gain"]
     return [
         f"{result['name']}: {result['title']}",
         f"{mean[INTEGRATOR]:.3f} ({chosen[INTEGRATOR].removeprefix('gain ')})",
         ", ".join(f"{mean[name]:.3f}" for name in own) or "-",
+        f"{mean[MODAL]:.3f}",
         f"{mean[best]:.3f} ({best.removeprefix('pyRTC ')})" if best else "-",
         f"{mean[FILTER]:.3f}",
         _signed(ahead[INTEGRATOR]),
         _signed(ahead[best]) if best else "-",
         "-" if result["goal"] is None else f"{result['goal']:g}",
+        ", ".join(_magnitudes(magnitudes[name]) for name in (INTEGRATOR, best) if name in magnitudes) or "-",
         f"{delay:.2f} ± {error:.2f}; {true_delay}",
         f"{gain:.3f} ± {gain_error:.3f}" + ("" if true_gain != true_gain else f"; {true_gain:.3f}"),
+        "{:.3f} ± {:.3f}; {:.3f}".format(*report["r0"]) if report["r0"] else "-",
+        "{}; {:.3g} ({:.3g} to {:.3g})".format(report["best"], *report["saves"]),
         f"{learnt['learning_s']:.1f} s, {learnt['frame_us']:.0f} us, {result['seconds']:.0f} s",
     ]
+
+
+def _magnitudes(ahead: list[float]) -> str:
+    """Return a difference; without an error it is a lower limit."""
+    return f"> {ahead[0]:.1f}" if ahead[1] != ahead[1] else f"{ahead[0]:.2f} ± {ahead[1]:.2f}"
 
 
 def _signed(difference: list[float]) -> str:

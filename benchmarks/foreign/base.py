@@ -57,14 +57,18 @@ class ForeignLoop(ABC):
         Frames per second.
     subaperture_m : float
         Side of a sub-aperture.
+    unit_arcsec : float
+        Angle of a unit of the slopes, as calibrated.
+    r0_m : float
+        Fried parameter at 500 nm, as given to the package.
     delay_frames : int
         The command computed from frame k acts first during frame k + delay.
     winds : list of (speed, direction)
         As given to the package.
     is_slow : bool
-        Whether other controls are left out, and fewer gains tried.
+        Whether pyRTC and brighter stars are left out, and fewer gains tried.
     own : dict
-        Reconstructors (commands, 2 n) that the package makes of the interaction matrix.
+        Reconstructors (commands, 2 n) that the package makes of the interaction matrix, if not the inverse.
     """
 
     name: str
@@ -73,6 +77,8 @@ class ForeignLoop(ABC):
     sign, is_slow = 1.0, False
     rate_hz: float
     subaperture_m: float
+    unit_arcsec: float
+    r0_m: float
     delay_frames: int
     winds: list[tuple[float, float]]
     own: dict[str, Floats]

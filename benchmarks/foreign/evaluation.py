@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 
 import faintspot as fs
-from benchmarks.foreign import rivals
+from benchmarks.foreign import reports, rivals
 from benchmarks.foreign.base import SETTLE_FRAMES, Control, Floats, ForeignLoop, Integrator, Observed
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.telemetry.choices import FILTER, MODES
 
 TUNING_SEED, LEARNING_SEED = 1, 2
-INTEGRATOR, FILTER = "integrator", "filter"
-_IN_LOOP = 3
+INTEGRATOR, MODAL = "integrator", MODES
+_IN_LOOP = 2
 """Predictors of the rivals, the best in a replay, that are tried in the loop."""
 _TIMED_FRAMES = 300
 
@@ -31,12 +32,12 @@ class Effort:
     frames: int = 700
     learning_s: float = 8.0
     seeds: tuple[int, ...] = (3, 4, 5)
-    gains: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0, 1.2)
+    gains: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0, 1.2, 1.5, 1.8)
     with_others: bool = True
-    """Whether the package's own control and pyRTC's predictors are compared."""
+    """Whether pyRTC's predictors are compared, and brighter stars tried."""
 
     def of(self, loop: ForeignLoop) -> Effort:
-        """Return the effort for a loop: half as many gains, and no others, if it is slow."""
+        """Return the effort for a loop: half as many gains, and no pyRTC, if it is slow."""
         return replace(self, gains=self.gains[::2], with_others=False) if loop.is_slow else self
 
 
@@ -74,10 +75,12 @@ class Runs:
         """Run the loop with an integrator."""
         return self.run(f"{name} {gain:g}", lambda: Integrator(self.loop, reconstructor, gain), seed, frames)
 
-    def best_gain(self, name: str, reconstructor: Floats) -> tuple[float, dict[str, float]]:
+    def best_gain(
+        self, name: str, reconstructor: Floats, start: float | None = None
+    ) -> tuple[float, dict[str, float]]:
         """Return the best gain of an integrator in the turbulence for tuning, uphill, and all scores."""
         gains, tried = self.effort.gains, dict[float, float]()
-        place = len(gains) // 2 - 1
+        place = len(gains) // 2 - 1 if start is None else gains.index(start)
         while True:
             near = gains[max(0, place - 1) : place + 2]
             for gain in near:
@@ -149,12 +152,18 @@ def recording_of(loop: ForeignLoop, observed: Observed) -> Any:
     rows = slice(SETTLE_FRAMES, None)
     slopes, commands = observed.slopes[rows], observed.commands[rows]
     return fs.control.Recording(
-        slopes, commands, loop.interaction, loop.cells, loop.rate_hz, subaperture_m=loop.subaperture_m
+        slopes,
+        commands,
+        loop.interaction,
+        loop.cells,
+        loop.rate_hz,
+        subaperture_m=loop.subaperture_m,
+        pixel_scale_arcsec=loop.unit_arcsec,
     )
 
 
 def compared(ready: Commissioned, log: Log) -> dict[str, Any]:
-    """Score the integrator, the package's own, pyRTC's predictors and the filter."""
+    """Score integrators, pyRTC's predictors and the filter; compare the report with the loop."""
     runs, loop, effort = ready.runs, ready.loop, ready.runs.effort
     scores: dict[str, list[float]] = {
         INTEGRATOR: [ready.plain(seed).score for seed in effort.seeds],
@@ -163,8 +172,16 @@ def compared(ready: Commissioned, log: Log) -> dict[str, Any]:
     filtered = [loop.run(ready.fresh(), seed, effort.frames) for seed in effort.seeds]
     scores[FILTER] = [run.score for run in filtered]
     log(f"{FILTER}: {scores[FILTER]}")
-    chosen = {INTEGRATOR: f"gain {ready.gain:g}", FILTER: ""}
-    for name, matrix in loop.own.items() if effort.with_others else ():
+    recording = recording_of(loop, ready.learning)
+    modal = reports.modal_matrix(recording)
+    scores[MODAL] = [
+        loop.run(Integrator(loop, modal, 1.0), seed, effort.frames).score for seed in effort.seeds
+    ]
+    log(f"{MODAL}: {scores[MODAL]}")
+    report = reports.reported(recording, dict(scores), loop.r0_m)
+    log(f"report: {report['advice']} r0 {report['r0']}")
+    chosen = {INTEGRATOR: f"gain {ready.gain:g}", MODAL: "", FILTER: ""}
+    for name, matrix in loop.own.items():
         gain, _ = runs.best_gain(name, matrix)
         own = [runs.integrator(name, matrix, gain, seed, effort.frames).score for seed in effort.seeds]
         scores[name], chosen[name] = own, f"gain {gain:g}"
@@ -179,6 +196,7 @@ def compared(ready: Commissioned, log: Log) -> dict[str, Any]:
         "chosen": chosen,
         "ahead": {name: _ahead(scores[FILTER], values) for name, values in scores.items() if name != FILTER},
         "predicting": [float(run.predicting.mean()) for run in filtered],
+        "report": report,
     }
 
 

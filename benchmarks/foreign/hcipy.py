@@ -11,24 +11,26 @@ from numpy.typing import NDArray
 import faintspot as fs
 from benchmarks.foreign.base import IMAGING_M, Floats, SteppedLoop
 from benchmarks.foreign.specula import example
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 
-_R0_M = 0.2
 _SHARES = 0.5, 0.3, 0.2
+_TILT_RAD = 1e-7
 
 
 class HcipyLoop(SteppedLoop):
     """Loop of HCIPy, 7 x 7 lenslets, slopes by `window`."""
 
-    name, rate_hz, delay_frames = "hcipy-40", 250.0, 2
+    rate_hz, delay_frames, r0_m = 250.0, 2, 0.2
     winds = [(6.0, 20.0), (12.0, 110.0), (20.0, 230.0)]  # noqa: RUF012
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, flux_e: float, folder: Path) -> None:
         from faintspot.adapters.hcipy import SlopeEstimator
 
         super().__init__(folder, "hcipy")
         self._example = system = example("hcipy_loop")
+        self.name, self._photons = f"hcipy-{flux_e:g}", system.photons * flux_e / system.FLUX_E
         self.subaperture_m = system.DIAMETER_M / 7
-        settings = fs.Settings("window", flux_e=system.FLUX_E, window_fwhm_px=4.0)
+        settings = fs.Settings("window", flux_e=flux_e, window_fwhm_px=4.0)
         camera = fs.Calibration(dark=0.0, read_noise_e=system.READ_NOISE_E)
         psf = fs.PSF.analytic("diffraction", size=1.0)
         self._estimator = SlopeEstimator(
@@ -43,9 +45,16 @@ class HcipyLoop(SteppedLoop):
         with self._estimator.calibrating():
             for poke_m in 3e-8 * np.vstack([np.eye(commands), -np.eye(commands)]):
                 system.mirror.actuators = poke_m
-                slopes.append(self._slopes(system.image(system.noiseless, 0 * system.pupil, system.photons)))
+                slopes.append(self._slopes(system.image(system.noiseless, 0 * system.pupil, self._photons)))
+            system.mirror.flatten()
+            tilts = [
+                self._slopes(system.image(system.noiseless, sign * _TILT_RAD * system.grid.x, self._photons))
+                for sign in (1, -1)
+            ]
         plus, minus = np.split(np.array(slopes), 2)
         self._flat = np.mean(slopes, axis=0)
+        of_tilt = (tilts[0] - tilts[1])[: len(self._flat) // 2].mean() / 2
+        self.unit_arcsec = abs(_TILT_RAD / of_tilt) / ARCSEC
         self.interaction = (plus - minus).T / 6e-8
         self.own = {"HCIPy's Tikhonov inverse": system.hcipy.inverse_tikhonov(self.interaction, rcond=0.03)}
         self.cells = self._cells()
@@ -64,7 +73,7 @@ class HcipyLoop(SteppedLoop):
     def simulated(self, seed: int, frames: int) -> NDArray[np.float32]:
         """See `SteppedLoop`."""
         system = self._example
-        strength = system.hcipy.Cn_squared_from_fried_parameter(_R0_M, 500e-9)
+        strength = system.hcipy.Cn_squared_from_fried_parameter(self.r0_m, 500e-9)
         layers = [
             system.hcipy.InfiniteAtmosphericLayer(
                 system.grid,
@@ -92,5 +101,5 @@ class HcipyLoop(SteppedLoop):
         system.mirror.actuators = command
         residual = path_m + system.mirror.opd
         field = np.average(np.exp(2j * np.pi / IMAGING_M * residual), weights=system.pupil)
-        slopes = self._slopes(system.image(system.noisy, path_m, system.photons)) - self._flat
+        slopes = self._slopes(system.image(system.noisy, path_m, self._photons)) - self._flat
         return slopes, float(np.abs(field) ** 2)

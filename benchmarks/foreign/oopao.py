@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 import faintspot as fs
 from benchmarks.foreign.base import IMAGING_M, Control, Floats, SteppedLoop
 from faintspot.loop.control.identification.vibrations import Vibration
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 
-_R0_M = 0.25
-"""Of the turbulence that is simulated; another r0 scales it."""
+_R0_M = 0.25  # of the turbulence that is simulated; another r0 scales it
 _POKE_M = 2e-8
 _TRUNCATED = 4
 """Singular values that OOPAO's reconstructor leaves out."""
@@ -56,6 +56,7 @@ class OopaoLoop(SteppedLoop):
         super().__init__(folder, f"oopao-{case.diameter_m:g}")
         self._case, self.name, self.rate_hz = case, f"oopao-{case.name}", case.rate_hz
         self.delay_frames, self.subaperture_m = case.delay_frames, case.diameter_m / case.lenslets
+        self.r0_m = case.r0_m
         points = case.lenslets * case.lenslet_px
         with _quiet():
             self._telescope = Telescope(
@@ -81,6 +82,7 @@ class OopaoLoop(SteppedLoop):
         self.cells = np.argwhere(self._wfs.valid_subapertures)
         pokes, self._tilt_of_signal = self._calibrate()
         self.interaction = pokes
+        self.unit_arcsec = points / case.diameter_m / self._tilt_of_signal / ARCSEC
         with _quiet():
             vault = CalibrationVault(pokes, nTrunc=_TRUNCATED)
         self.own = {"OOPAO's truncated inverse": np.asarray(vault.Mtrunc)}
@@ -115,7 +117,7 @@ class OopaoLoop(SteppedLoop):
 
     def _gradients(self) -> Floats:
         """Return mean gradients of the wavefront of the latest frame, x and y."""
-        path_m = self._star.phase * self._star.wavelength
+        path_m = self._star.phase * self._star.wavelength / (2 * np.pi)
         return np.concatenate([self._lenslets(np.gradient(path_m, axis=axis)) for axis in (1, 0)])
 
     def true_gain(self, control: Control, seed: int, frames: int) -> float:

@@ -16,8 +16,8 @@ from faintspot.loop.control.phase import residual_phase
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 GRIDS: dict[str, dict[str, tuple[Any, ...]]] = {
-    "least_squares": {"order": (4, 8, 16, 32), "regularization": (1e-3, 1e-2, 1e-1, 1.0)},
-    "ar_kalman": {"noise_band": (0.05, 0.1, 0.2, 0.4)},
+    "least_squares": {"order": (8, 16, 32, 64), "regularization": (1e-5, 1e-4, 1e-3, 1e-2, 1e-1)},
+    "ar_kalman": {"noise_band": (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)},
 }
 _GAINS = (0.3, 0.5, 0.7, 1.0)
 

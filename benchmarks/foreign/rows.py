@@ -1,17 +1,17 @@
-"""Rows of the table: loops of OOPAO, SPECULA and HCIPy."""
+"""Rows of the table: loops of OOPAO, SPECULA, HCIPy and soapy."""
 
 from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from benchmarks.foreign.base import ForeignLoop
 from benchmarks.foreign.oopao import OopaoCase, OopaoLoop
 
-_MODULES = {"oopao": "OOPAO", "specula": "specula", "hcipy": "hcipy"}
+_MODULES = {"oopao": "OOPAO", "specula": "specula", "hcipy": "hcipy", "soapy": "soapy"}
 TOOLS = tuple(_MODULES)
 
 
@@ -21,7 +21,8 @@ class Row:
 
     name: str
     title: str
-    make: Callable[[Path], ForeignLoop]
+    make: Callable[[Path, float], ForeignLoop]
+    """Takes the folder of the turbulence and a factor on the flux."""
     goal: float | None = None
     turned: bool = False
     """Whether the winds reverse after learning."""
@@ -32,42 +33,52 @@ class Row:
         return self.name.partition("-")[0]
 
 
-def _oopao(case: OopaoCase) -> Callable[[Path], ForeignLoop]:
-    return partial(OopaoLoop, case)
+def _oopao(case: OopaoCase, folder: Path, brightness: float) -> ForeignLoop:
+    brighter = replace(case, name=f"{case.name}x{brightness:g}", flux_e=case.flux_e * brightness)
+    return OopaoLoop(case if brightness == 1 else brighter, folder)
 
 
-def _specula(flux_e: float, own_slopes: bool, folder: Path) -> ForeignLoop:
+def _specula(flux_e: float, own_slopes: bool, folder: Path, brightness: float) -> ForeignLoop:
     from benchmarks.foreign.specula import SpeculaLoop
 
-    return SpeculaLoop(flux_e, own_slopes=own_slopes, folder=folder)
+    return SpeculaLoop(flux_e * brightness, own_slopes=own_slopes, folder=folder)
 
 
-def _hcipy(folder: Path) -> ForeignLoop:
+def _hcipy(folder: Path, brightness: float) -> ForeignLoop:
     from benchmarks.foreign.hcipy import HcipyLoop
 
-    return HcipyLoop(folder)
+    return HcipyLoop(40.0 * brightness, folder)
+
+
+def _soapy(folder: Path, brightness: float) -> ForeignLoop:
+    from benchmarks.foreign.soapy import SoapyLoop
+
+    return SoapyLoop(40.0 * brightness, folder)
 
 
 _FIRST = OopaoCase("first")
 _LARGE = OopaoCase("large", lenslets=16, lenslet_px=6, diameter_m=8.0, rate_hz=500.0)
 ROWS = (
-    Row("oopao-20", "r0 0.25 m, 20 e-, 3 e- read noise", _oopao(_FIRST), 0.73),
-    Row("oopao-60", "r0 0.15 m, 60 e-, 3 e-", _oopao(OopaoCase("60", 0.15, 60.0, 3.0, 4.0)), 0.60),
-    Row("oopao-200", "r0 0.25 m, 200 e-, 1 e-", _oopao(OopaoCase("200", 0.25, 200.0, 1.0)), 0.835),
+    Row("oopao-20", "r0 0.25 m, 20 e-, 3 e- read noise", partial(_oopao, _FIRST), 0.73),
+    Row("oopao-60", "r0 0.15 m, 60 e-, 3 e-", partial(_oopao, OopaoCase("60", 0.15, 60.0, 3.0, 4.0)), 0.60),
+    Row("oopao-200", "r0 0.25 m, 200 e-, 1 e-", partial(_oopao, OopaoCase("200", 0.25, 200.0, 1.0)), 0.835),
     Row(
         "oopao-vibration",
         "the first with a tip of 45 Hz, 120 nm rms",
-        _oopao(OopaoCase("vibration", vibration_nm=120.0)),
+        partial(_oopao, OopaoCase("vibration", vibration_nm=120.0)),
         0.71,
     ),
-    Row("oopao-delay3", "the first, delay of 3 frames", _oopao(OopaoCase("3", delay_frames=3)), 0.70),
-    Row("oopao-delay1", "the first, delay of 1 frame", _oopao(OopaoCase("1", delay_frames=1))),
-    Row("oopao-turned", "the first, winds reversed after learning", _oopao(_FIRST), turned=True),
+    Row(
+        "oopao-delay3", "the first, delay of 3 frames", partial(_oopao, OopaoCase("3", delay_frames=3)), 0.70
+    ),
+    Row("oopao-delay1", "the first, delay of 1 frame", partial(_oopao, OopaoCase("1", delay_frames=1))),
+    Row("oopao-turned", "the first, winds reversed after learning", partial(_oopao, _FIRST), turned=True),
     Row("specula-40", "27 Zernikes, three winds, 40 e-", partial(_specula, 40.0, False), 0.70),
     Row("specula-20", "27 Zernikes, three winds, 20 e-", partial(_specula, 20.0, False), 0.65),
     Row("specula-own", "40 e-, SPECULA's own slopes", partial(_specula, 40.0, True), 0.725),
     Row("hcipy-40", "three of its layers, 40 e-, 1 e-", _hcipy),
-    Row("oopao-large", "8 m, 16 x 16, 500 Hz, r0 0.25 m, 20 e-, 3 e-", _oopao(_LARGE)),
+    Row("soapy-40", "three of its infinite screens, 40 e-, 1 e-", _soapy),
+    Row("oopao-large", "8 m, 16 x 16, 500 Hz, r0 0.25 m, 20 e-, 3 e-", partial(_oopao, _LARGE)),
 )
 
 

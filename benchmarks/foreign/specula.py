@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.foreign.base import SETTLE_FRAMES, Control, ForeignLoop, Observed
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 _QUANTUM_EFFICIENCY = 0.01 / 40.0
 """For an electron a lenslet: the star's brightness is that of the example."""
+_SEEING_TO_R0 = 0.9759 * 500e-9
+"""m rad: SPECULA's own product of seeing and r0."""
 
 
 def example(name: str) -> Any:
@@ -55,9 +58,13 @@ class SpeculaLoop(ForeignLoop):
         matrix = np.asarray(found.objs["im_calibrator"].outputs["out_intmat"].get_value(), np.float64)
         modes = self._example.MODES
         self.interaction = matrix if matrix.shape[1] == modes else matrix.T
-        self.own = {"SPECULA's Modalrec and Integrator": np.asarray(np.linalg.pinv(self.interaction))}
+        self.own = {}  # its Modalrec is the inverse, its Integrator the one that is compared
         subapertures = found.objs["slopec"].subapdata
         pixels, side = np.asarray(subapertures.idxs), int(subapertures.np_sub)
+        main = self._example.SYSTEM["main"]
+        tilt = 4e-9 / (main["pixel_pupil"] * main["pixel_pitch"])  # Noll's first Zernike mode, 1 nm rms
+        self.unit_arcsec = abs(tilt / np.median(self.interaction[: len(pixels), 0])) / ARCSEC
+        self.r0_m = _SEEING_TO_R0 / (self._example.SEEING_ARCSEC * ARCSEC)
         self.cells = np.stack(np.divmod(pixels[:, 0], side * subapertures.nx), axis=1) // side
         speeds, directions = (list(values) for values in zip(*self.winds, strict=True))
         constant = self._example.constant
