@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived, write_atomically
+from faintspot.base.json_text import parse_json
 from faintspot.base.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
 from faintspot.experiments.closed_loop.magnitude import with_flux
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, NOISE_SCALE, MethodKind, method_kind
@@ -147,7 +147,7 @@ class LoopAnswer:
 
     def choice(self, name: str, flux: int) -> dict[str, Any]:
         """Return a candidate's tuned values at a measured flux."""
-        choice: dict[str, Any] = json.loads(str(self.measured.choices[self._index(name), flux]))
+        choice: dict[str, Any] = parse_json(str(self.measured.choices[self._index(name), flux]))
         return choice
 
     def _index(self, name: str) -> int:

@@ -32,7 +32,7 @@ class OpenLoop:
     run: NDArray[np.int64]
     """(frames,): numbers of runs without a gap."""
     variance_error: Floats
-    """(2 n,): relative standard error of the noise's variance."""
+    """(2 n,): relative standard error of the noise's variance; NaN where the noise is unknown."""
 
     @property
     def variance(self) -> Floats:
@@ -106,13 +106,15 @@ def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:
     residual, atmosphere = grid
     measured = np.isfinite(atmosphere)
     variance, count = _noise_variance(atmosphere)
+    if count.any():
+        variance = np.where(count > 0, variance, variance[count > 0].mean())
     variance = np.maximum(variance, _LEAST_SIGNAL * float(np.nanvar(atmosphere)))
     telemetry = OpenLoopTelemetry(
         np.where(measured, atmosphere, 0.0), np.where(measured, variance, np.inf), measured.astype(np.float64)
     )
     runs = np.repeat(runs_of(frame), np.diff(frame, append=frame[-1] + 1))
     # Products of Gaussian noise with its deviation from a parabola have this variance.
-    error = np.sqrt(2.5 / np.maximum(count, 1))
+    error = np.where(count > 0, np.sqrt(2.5 / np.maximum(count, 1)), np.nan)
     return OpenLoop(telemetry, np.where(measured, residual, 0.0), runs, error)
 
 
