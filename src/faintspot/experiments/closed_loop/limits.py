@@ -158,13 +158,14 @@ def limiting_magnitudes(
     part = (high - level) / np.where(high > low, high - low, 1.0)
     if not straight:
         slopes = at_both(PchipInterpolator(faint, curves, axis=-1).derivative()(faint))
-        part = _crossing(high, low, *((last - first) * slope for slope in slopes), level)
+        part = _crossing((high, low), ((last - first) * slopes[0], (last - first) * slopes[1]), level)
     bounded = np.where(curves[..., -1] >= level, np.inf, first + part * (last - first))
     return np.asarray(np.where(curves[..., 0] < level, -np.inf, bounded), np.float64)
 
 
-def _crossing(high: Floats, low: Floats, slope: Floats, next_slope: Floats, level: float) -> Floats:
+def _crossing(values: tuple[Floats, Floats], slopes: tuple[Floats, Floats], level: float) -> Floats:
     """Return where in [0, 1] falling cubics cross a level, from their values and slopes at both ends."""
+    (high, low), (slope, next_slope) = values, slopes
     start, end = np.zeros_like(high), np.ones_like(high)
     for _ in range(_HALVINGS):
         t = 0.5 * (start + end)

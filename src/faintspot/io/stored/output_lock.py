@@ -10,11 +10,6 @@ from pathlib import Path
 
 from faintspot.base.errors import InputError
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
 _OWNER_BYTES = 200
 _FAR = 1 << 30  # Windows locks bytes: one that nobody reads
 # File systems without locks: there only the mark in the output, read before every write, protects it.
@@ -97,10 +92,12 @@ def _lock(descriptor: int) -> None:
     OSError
         When the file system has no locks.
     """
-    if fcntl is not None:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return
-    import msvcrt
+    try:
+        import fcntl
+    except ImportError:
+        import msvcrt
 
-    os.lseek(descriptor, _FAR, os.SEEK_SET)
-    msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+        os.lseek(descriptor, _FAR, os.SEEK_SET)
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+    else:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

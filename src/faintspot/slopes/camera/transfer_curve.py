@@ -123,7 +123,7 @@ def fit_line(curve: Curve) -> Line | None:
     terms = np.stack([curve.share, curve.flux], axis=1)
     n = len(terms)
     varies = curve.variance > 0
-    if min(n, np.count_nonzero(varies)) < 2 * _GROUPS or np.ptp(curve.mean) == 0:
+    if min(n, int(np.count_nonzero(varies))) < 2 * _GROUPS or np.ptp(curve.mean) == 0:
         return None
     least = 0.1 * float(np.median(curve.variance[varies]))
     # Weights must not follow the noise of faint pixels: below the typical flux they are equal.

@@ -205,7 +205,7 @@ def _fitted(
     residual = measured - flux[:, None] * shapes
     weights = _weights(flux, shapes, variance, measured, mean.frames)
     chi_square = float((weights * residual**2).sum())
-    significance = _significance(weights, measured, chi_square, len(flux) + np.count_nonzero(density))
+    significance = _significance(weights, measured, chi_square, len(flux) + int(np.count_nonzero(density)))
     return SodiumFit(SodiumProfile(profile.altitudes_m, density), flux, chi_square, significance)
 
 
@@ -213,7 +213,7 @@ def _significance(weights: Floats, measured: Floats, chi_square: float, free: in
     """Return the F ratio of spots against constant images."""
     constant = (weights * measured).sum(axis=1) / weights.sum(axis=1)
     without = float((weights * (measured - constant[:, None]) ** 2).sum())
-    pixels = np.count_nonzero(weights > _NEGLIGIBLE * weights.max())
+    pixels = int(np.count_nonzero(weights > _NEGLIGIBLE * weights.max()))
     left = max(chi_square, _NEGLIGIBLE * without) / max(pixels - free, 1)
     return float((without - chi_square) / free / left) if left > 0 else 0.0
 
