@@ -32,7 +32,7 @@ def hide() -> None:
             return locks
         return original(name, variables, *arguments, **options)
 
-    builtins.__import__ = visible
+    builtins.__import__ = visible  # type: ignore[assignment]
     for name in FUNCTIONS:
         if hasattr(os, name):
             delattr(os, name)
