@@ -210,7 +210,7 @@ def _fitted(
 
 
 def _significance(weights: Floats, measured: Floats, chi_square: float, free: int) -> float:
-    """Return the F ratio of spots against constant images."""
+    """Return the F ratio of spots relative to constant images."""
     constant = (weights * measured).sum(axis=1) / weights.sum(axis=1)
     without = float((weights * (measured - constant[:, None]) ** 2).sum())
     pixels = int(np.count_nonzero(weights > _NEGLIGIBLE * weights.max()))
