@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,8 +12,10 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+from tests.beyond_posix import MODULES
 from tests.cli.cli_cases import CONFIGURATION, Commands, assert_equal, expected, simulated
 
+import faintspot as fs
 from faintspot import InputError
 from faintspot.base import extras
 from faintspot.cli.realtime.command import command as realtime
@@ -60,6 +63,54 @@ def test_everything_imports_and_what_is_not_real_time_works(tmp_path: Path) -> N
     assert_equal(tmp_path / "slopes.zarr", expected(frames))
     assert (tmp_path / "tuned.toml").exists()
     assert "400/400" in done.stderr  # realisations of the study, in two processes
+
+
+@pytest.mark.slow
+def test_the_whole_chain_works_without_modules_of_posix(tmp_path: Path) -> None:
+    """As on Windows, as far as it can be taken away: layout, slopes, wavefront, tune, study, telemetry."""
+    frames = simulated()
+    np.save(tmp_path / "frames.npy", frames)
+    (tmp_path / "faintspot.toml").write_text(CONFIGURATION)
+    (tmp_path / "study.toml").write_text(STUDY)
+    slopes = np.random.default_rng(1).standard_normal((300, 32))
+    np.savez(tmp_path / "loop.npz", slopes=slopes, slope_unit="px", frame_rate_hz=250.0, loop="open")
+    commands = (
+        "doctor",
+        "slopes frames.npy --config faintspot.toml -o slopes.zarr",
+        "wavefront slopes.zarr -o wavefront.json",
+        "tune --read-noise-e 3 --pixels 8 --fwhm-px 1.8 --flux-e 200 -o tuned.toml",
+        "study run study.toml --workers 2",
+        "telemetry loop.npz -o loop.html",
+        "layout frames.npy --grid 4x4 --pixels 8 -o new.toml",
+        "realtime run",
+    )
+    done = subprocess.run(
+        [sys.executable, SCRIPT.with_name("beyond_posix.py"), *commands],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+        capture_output=True,
+        text=True,
+        timeout=500,
+        stdin=subprocess.DEVNULL,
+    )
+    assert "Traceback" not in done.stderr
+    assert done.stderr.splitlines()[-1] == "faintspot: error: faintspot realtime needs Linux"
+    assert int(done.stdout.split()[0]) > 300  # modules
+    assert_equal(tmp_path / "slopes.zarr", expected(frames))
+    for name in ("wavefront.json", "tuned.toml", "loop.html", "new.toml"):
+        assert (tmp_path / name).exists(), name
+    assert "400/400" in done.stderr
+
+
+def test_modules_of_posix_are_imported_by_the_engine_only() -> None:
+    package = Path(fs.__file__).parent
+    imported = re.compile(rf"^(?:import|from) (?:{'|'.join(MODULES)})\b", re.MULTILINE)
+    users = {
+        file.relative_to(package).parts[0]
+        for file in package.rglob("*.py")
+        if imported.search(file.read_text())
+    }
+    assert users == {"engine"}
 
 
 def real_time_commands(group: click.Group) -> Iterator[tuple[str, click.Command]]:

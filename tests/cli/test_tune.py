@@ -105,6 +105,8 @@ def test_from_frames(run: Commands) -> None:
         (("tune", *KNOWN[:-2]), ("magnitude", "flux_e")),
         (("tune", *KNOWN, "--magnitude", 3), ("--magnitude", "both")),
         (("tune", *KNOWN, "--budget", "3furlongs"), ("budget", "0.05arcsec")),
+        (("tune", *KNOWN[:-2], "--flux-e", "nan"), ("--flux-e", "finite")),
+        (("tune", *KNOWN[:-2], "--flux-e", "-3"), ("--flux-e", "above 0")),
         (("tune", *KNOWN, "--grid", "7-7"), ("--grid", "7x7")),
         (("tune", *KNOWN, "--grid", "7x7", "--config", "a.toml"), ("--grid", "--config")),
         (("tune", *KNOWN, "--config", "nothere.toml"), ("nothere.toml",)),

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from astropy.io import fits
 from tests.cli.cli_cases import CONFIGURATION, Commands, simulated
 
 from faintspot import Layout
+from faintspot.base.json_text import parse_json
 from faintspot.io import read_slopes
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.wavefront import fit_wavefront
@@ -33,7 +33,8 @@ def test_table_picture_and_files(run: Commands, slopes: Path) -> None:
     assert f"picture: {slopes.parent / 'slopes_wavefront.png'}" in out
     layout = Layout.grid((4, 4), pixels=8, pixel_scale_arcsec=0.4, diameter_m=4.2)
     expected = fit_wavefront(Slopes.from_variables(read_slopes(slopes).variables), layout)
-    written = json.loads(Path("w.json").read_text())
+    written = parse_json(Path("w.json").read_text())
+    assert written["unknown"] == {}
     assert written["unit"] == "nm"
     assert [mode["noll"] for mode in written["mean"]["modes"]] == list(range(2, 11))
     np.testing.assert_allclose(written["frames"]["coefficients"], expected.coefficients)
@@ -50,6 +51,18 @@ def test_table_picture_and_files(run: Commands, slopes: Path) -> None:
         assert units[0].header["BUNIT"] == "nm"
         np.testing.assert_allclose(units["MODES"].data["MEAN"], expected.mean)
         np.testing.assert_allclose(units["STANDARD_ERRORS"].data, expected.standard_errors)
+
+
+def test_unknown_values_are_null_with_a_reason(run: Commands, folder: Path, no_picture: None) -> None:
+    frames = simulated(3)
+    frames[1] = 0
+    np.save("frames.npy", frames)
+    run.ok("slopes", "frames.npy", "-o", "slopes.npz")
+    run.ok("wavefront", "slopes.npz", "-o", "w.json")
+    written = parse_json(Path("w.json").read_text())
+    assert written["pupil_radius_m"] is None
+    assert written["frames"]["coefficients"][1] == [None] * 9
+    assert set(written["unknown"]) == {"pupil_radius_m", "frames"}
 
 
 def test_without_scales_it_says_its_unit(run: Commands, slopes: Path) -> None:

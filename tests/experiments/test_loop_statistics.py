@@ -10,12 +10,15 @@ from hypothesis.extra.numpy import arrays
 from tests.experiments.result_cases import made_up_magnitude
 
 from faintspot.base.statistics import mean_by_blocks
-from faintspot.experiments.closed_loop.results import (
-    differences_by_flux,
+from faintspot.experiments.closed_loop.limits import (
     falling,
-    gains_in_magnitude,
     limiting_magnitudes,
     magnitude_gain,
+    magnitude_limit,
+)
+from faintspot.experiments.closed_loop.results import (
+    differences_by_flux,
+    gains_in_magnitude,
 )
 
 MAGNITUDES = np.linspace(8.0, 13.0, 6)
@@ -57,15 +60,57 @@ def test_many_curves_at_once_are_as_one_by_one() -> None:
     np.testing.assert_allclose(together, [limiting_magnitudes(MAGNITUDES, one, 0.5) for one in many])
 
 
-def test_the_limiting_magnitude_lies_on_the_line_between_points() -> None:
-    assert limiting_magnitudes([8, 9, 10], [0.6, 0.5, 0.3], 0.4) == pytest.approx(9.5)
+def test_the_limiting_magnitude_lies_between_points() -> None:
+    assert limiting_magnitudes([8, 9, 10], [0.6, 0.5, 0.3], 0.4, straight=True) == pytest.approx(9.5)
+    assert limiting_magnitudes([8, 9, 10], [0.5, 0.4, 0.3], 0.35) == pytest.approx(9.5)
+    assert limiting_magnitudes([8, 9, 10], [0.6, 0.5, 0.3], 0.5) == pytest.approx(9.0)
     assert limiting_magnitudes([8, 9], [0.6, 0.5], 0.4) == math.inf
     assert limiting_magnitudes([8, 9], [0.3, 0.2], 0.4) == -math.inf
 
 
+@pytest.mark.parametrize("apart", [0.5, 1.0, 1.5])
+def test_limits_of_curves_that_bend_hold_within_their_errors(apart: float) -> None:
+    """A third of the error of straight lines, which is the error that is stated."""
+    wrong, stated, straight = [], [], []
+    for middle in np.linspace(10.0, 11.0, 9):
+        for level in (0.15, 0.3, 0.45):
+            faint = np.arange(7.0, 14.5, apart)
+            strehl = 0.6 / (1 + np.exp((faint - middle) / 0.7))
+            truth = middle + 0.7 * np.log(0.6 / level - 1)
+            limit = magnitude_limit(faint, np.tile(strehl[:, None], 6), level)
+            wrong.append(limit.magnitude.value - truth)
+            stated.append(limit.estimate.standard_error)
+            straight.append(float(limiting_magnitudes(faint, strehl, level, straight=True)) - truth)
+    rms, of_lines = (float(np.sqrt(np.square(errors).mean())) for errors in (wrong, straight))
+    assert rms < 0.6 * of_lines
+    assert rms < float(np.sqrt(np.square(stated).mean())) < 1.5 * of_lines
+
+
+def test_a_gain_between_curves_that_bend_differently_is_not_that_of_lines() -> None:
+    """Stars 1.5 magnitudes apart: lines are wrong by more than the error, which both results state."""
+    faint = np.arange(7.0, 14.5, 1.5)
+    one, other = (0.6 / (1 + np.exp((faint - middle) / 0.5)) for middle in (11.0, 10.25))
+    runs = [np.tile(curve[:, None], 6) for curve in (one, other)]
+    gain = magnitude_gain(faint, *runs, 0.15)
+    assert gain.interpolation_error > 0.02
+    assert abs(gain.magnitude.value - 0.75) < 2 * gain.interpolation_error
+    found = gain.estimate
+    assert found.low < 0.75 < found.high
+
+
+def test_two_stars_show_no_bend_and_the_interval_says_so() -> None:
+    faint = [9.0, 10.5]
+    one, other = (0.6 / (1 + np.exp((np.array(faint) - middle) / 0.5)) for middle in (10.4, 9.8))
+    runs = [np.tile(curve[:, None], 6) for curve in (one, other)]
+    found = magnitude_gain(faint, *runs, 0.35).estimate
+    assert found.standard_error == pytest.approx(1.5 * math.sqrt(2 / 12))
+    assert found.low < 0.6 < found.high
+    assert abs(found.value - 0.6) > 0.05
+
+
 def test_the_gain_is_the_shift_between_two_curves() -> None:
     # Straight lines moved by 0.3 mag; air that is common to both moves them together.
-    found = magnitude_gain(MAGNITUDES, curves(0.3), curves(0.0), 0.45)
+    found = magnitude_gain(MAGNITUDES, curves(0.3), curves(0.0), 0.45).estimate
     assert found.value == pytest.approx(0.3)
     assert found.low == pytest.approx(0.3)
     assert found.high == pytest.approx(0.3)
@@ -79,20 +124,19 @@ def test_the_order_of_magnitudes_does_not_matter() -> None:
 
 
 def test_a_gain_beyond_what_was_measured_is_not_made_up() -> None:
-    found = magnitude_gain(MAGNITUDES, curves(3.0), curves(0.0), 0.35)
-    assert found.value == math.inf
-    assert magnitude_gain(MAGNITUDES, curves(0.0), curves(3.0), 0.35).value == -math.inf
-    assert math.isnan(magnitude_gain(MAGNITUDES, curves(3.0), curves(3.0), 0.35).value)
+    assert magnitude_gain(MAGNITUDES, curves(3.0), curves(0.0), 0.35).magnitude.value == math.inf
+    assert magnitude_gain(MAGNITUDES, curves(0.0), curves(3.0), 0.35).magnitude.value == -math.inf
+    assert math.isnan(magnitude_gain(MAGNITUDES, curves(3.0), curves(3.0), 0.35).magnitude.value)
 
 
 def test_an_interval_that_leaves_the_magnitudes_is_open() -> None:
-    found = magnitude_gain(MAGNITUDES, curves(0.9, scatter=0.1), curves(0.0, scatter=0.0), 0.31)
+    found = magnitude_gain(MAGNITUDES, curves(0.9, scatter=0.1), curves(0.0, scatter=0.0), 0.31).estimate
     assert math.isfinite(found.value)
     assert found.high == math.inf
 
 
 def test_two_realisations_give_no_interval() -> None:
-    found = magnitude_gain(MAGNITUDES, curves(0.3, 2), curves(0.0, 2), 0.45)
+    found = magnitude_gain(MAGNITUDES, curves(0.3, 2), curves(0.0, 2), 0.45).estimate
     assert found.value == pytest.approx(0.3)
     assert math.isnan(found.low)
 
@@ -100,8 +144,9 @@ def test_two_realisations_give_no_interval() -> None:
 def test_what_is_not_measured_yet_is_left_out() -> None:
     missing = curves(0.3)
     missing[0, 2] = np.nan
-    assert magnitude_gain(MAGNITUDES, missing, curves(0.0), 0.45).value == pytest.approx(0.3)
-    assert math.isnan(magnitude_gain(MAGNITUDES, missing * np.nan, curves(0.0), 0.45).value)
+    found = magnitude_gain(MAGNITUDES, missing, curves(0.0), 0.45).magnitude
+    assert found.value == pytest.approx(0.3)
+    assert math.isnan(magnitude_gain(MAGNITUDES, missing * np.nan, curves(0.0), 0.45).magnitude.value)
 
 
 def test_block_intervals_hold_as_often_as_they_say() -> None:
@@ -118,8 +163,7 @@ def test_gains_in_magnitude_are_those_of_the_curves() -> None:
     result = made_up_magnitude(0.3)
     gains = gains_in_magnitude(result, 1, 0)
     assert list(gains)[:2] == [0.05, 0.1]
-    # Straight pieces between points 1 mag apart stand for a curve: a tenth of a magnitude.
-    assert gains[0.3].value == pytest.approx(0.3, abs=0.1)
+    assert gains[0.3].value == pytest.approx(0.3, abs=0.05)
     assert gains[0.3].decided == 1
 
 

@@ -38,7 +38,7 @@ from faintspot.slopes.estimators.algorithms.brightest import brightest_pixels
 from faintspot.slopes.kernels import parallel
 from faintspot.slopes.kernels.compilation.host import WIDTHS
 from faintspot.slopes.kernels.driver.groups import STAGE_ROWS, SlopeArrays, new_scratch
-from faintspot.slopes.pipeline.slope_pipeline import kernel_frames
+from faintspot.slopes.pipeline.slope_pipeline import _prior_slopes, kernel_frames
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.spots.psf import PSF
 
@@ -178,7 +178,8 @@ def _measured(
         variants = plan.variants(flux.mean(axis=1, dtype=np.float64))
     else:
         variants = np.zeros(n_frames, np.int64)
-    task = guard(plan.task(variants, None if prior is None else prior.reshape(1, 2, n)))
+    predicted = None if prior is None else _prior_slopes(prior, n_frames, pipeline.layout)
+    task = guard(plan.task(variants, predicted))
     results = guard(SlopeArrays(*(np.empty((n_frames, n), kind) for kind in RESULT_TYPES)))
     rows = STAGE_ROWS * int(rng.integers(2))
     stages = guard(np.empty((rows, n_frames, n, pipeline.layout.pixels), np.float32))

@@ -17,6 +17,7 @@ from faintspot.base.errors import InputError
 # Largest pixel values whose sums and squares the kernels form without overflow.
 LARGEST_FLOAT32 = 1e30
 LARGEST_FLOAT64 = 1e290
+_WHOLE = -(2.0**53), 2.0**53  # whole numbers that float64 holds
 
 
 def real_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray[Any]:
@@ -97,8 +98,10 @@ def numbers_between(
 ) -> NDArray[Any]:
     """Return `value` (scalar or array) as float64, or int64 when `integer`, within [low, high].
 
-    With `low_open`, `low` itself is not allowed.
+    With `low_open`, `low` itself is not allowed. True and False are no numbers.
     """
+    if _has_truth_values(value):
+        raise InputError(f"{name} = {value!r}: expected a number, got true or false")
     array = finite_array(name, value)
     wrong = (array <= low) if low_open else (array < low)
     wrong = wrong | (array > high)
@@ -113,6 +116,15 @@ def numbers_between(
     return numbers
 
 
+def _has_truth_values(value: Any) -> bool:
+    """Return whether a value, or an item of a sequence, is True or False."""
+    if isinstance(value, np.ndarray):
+        return bool(value.dtype == np.bool_)
+    if isinstance(value, list | tuple):
+        return any(map(_has_truth_values, value))
+    return isinstance(value, bool | np.bool_)
+
+
 def number_between(
     name: str, value: Any, low: float = -np.inf, high: float = np.inf, **kind: Unpack[NumberKind]
 ) -> float:
@@ -121,6 +133,15 @@ def number_between(
     if array.ndim:
         raise InputError(f"{name}: expected one number, got an array of shape {array.shape}")
     return float(array)
+
+
+def increasing(name: str, value: Any, count: int, *, integer: bool = False) -> NDArray[Any]:
+    """Return `count` increasing numbers, (count,), such as times or frame numbers; a column is one, too."""
+    array = numbers_between(name, value, *(_WHOLE if integer else ()), integer=integer)
+    is_column = array.size == count == max(array.shape, default=0)
+    if not is_column or (np.diff(array.ravel()) <= 0).any():
+        raise InputError(f"{name}: expected {count} increasing numbers, got shape {array.shape}")
+    return array.ravel()
 
 
 def one_of(name: str, value: Any, choices: Sequence[str]) -> str:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import json
 import os
 import secrets
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from faintspot.base.errors import InputError
 
@@ -148,17 +147,3 @@ def sync_folder(path: Path) -> None:
     except OSError as error:
         if error.errno not in _CANNOT_SYNC:
             raise
-
-
-def parse_json(text: str | bytes) -> Any:
-    """Return the content of a JSON text.
-
-    Raises
-    ------
-    ValueError
-        If it is not JSON, or is nested too deeply for Python.
-    """
-    try:
-        return json.loads(text)
-    except RecursionError:
-        raise ValueError("nested too deeply") from None

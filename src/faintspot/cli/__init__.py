@@ -40,6 +40,7 @@ _MODULES = {
     "realtime": "realtime.command",
 }
 """Modules of commands that are not named after them."""
+_OF_POSIX = ("fcntl", "resource")
 
 
 def module_of(name: str) -> str:
@@ -62,7 +63,12 @@ class _LazyGroup(Group):
         """Import one command."""
         if name not in _COMMANDS:
             return None
-        command: click.Command = import_module(module_of(name)).command
+        try:
+            command: click.Command = import_module(module_of(name)).command
+        except ModuleNotFoundError as error:
+            if error.name not in _OF_POSIX:
+                raise
+            raise InputError(f"faintspot {name} needs Linux") from None
         command.name = name  # in the modules all are called "command"
         return command
 

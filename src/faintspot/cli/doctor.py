@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 from dataclasses import asdict, dataclass
@@ -12,6 +11,7 @@ from pathlib import Path
 import click
 
 from faintspot.base.extras import EXTRAS, present
+from faintspot.base.json_text import to_json
 from faintspot.base.version import __version__
 from faintspot.cli.shared.commands import option
 
@@ -46,7 +46,7 @@ def command(as_json: bool) -> None:
     """
     findings = examine()
     if as_json:
-        click.echo(json.dumps([asdict(finding) for finding in findings], indent=1))
+        click.echo(to_json([asdict(finding) for finding in findings], indent=1))
         return
     for finding in findings:
         click.echo(f"{finding.name:14s} {finding.value}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,6 +11,7 @@ import click
 from faintspot.base.errors import InputError
 from faintspot.base.extras import require, require_linux
 from faintspot.base.files import derived, write_atomically
+from faintspot.base.json_text import to_json
 from faintspot.cli.realtime.record import record_engine, summary
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import needs
@@ -90,7 +90,7 @@ def command(
         raise InputError("--controller: expected the recording of a closed loop, got an open one")
     report = report_of_loop(loop, lambda step: click.echo(f"{step} ...", err=True))
     numbers = derived(page, ".json")
-    write_atomically(numbers, json.dumps(report.as_values(), indent=1))
+    write_atomically(numbers, to_json(report.as_values(), indent=1))
     write_atomically(page, page_of_loop(report))
     for remark in report.loop.remarks:
         click.echo(remark)

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.base.files import output_errors, parse_json
+from faintspot.base.files import output_errors
+from faintspot.base.json_text import parse_json
 from faintspot.base.version import __version__
 from faintspot.io.locations import one_line
 

@@ -346,9 +346,9 @@ def test_dark_level_and_hot_pixels_of_the_frame(run: Commands, folder: Path) -> 
     assert calibration.bad_pixels.tolist() == [[5, 70], [80, 3]]
     # The median of some hundred background pixels with 3 e- of noise and faint wings of the spots.
     assert calibration.dark == pytest.approx(OFFSET_ADU, abs=1.5)
-    assert not calibration.vouches_for_dark
+    assert not calibration.dark_is_known
     assert run("layout", "frames.npy", "-o", "new.toml", "--dark", "70", "--overwrite").code == 0
-    assert Calibration.load(folder / "new.toml").vouches_for_dark
+    assert Calibration.load(folder / "new.toml").dark_is_known
 
 
 @pytest.mark.usefixtures("no_picture")

@@ -51,10 +51,12 @@ def outdated(model: ControlModel) -> ControlModel:
 class Run:
     """A loop on known open-loop slopes, whose records go into telemetry."""
 
-    def __init__(self, name: str, model: ControlModel, centroid_gain: float = 1.0) -> None:
+    def __init__(
+        self, name: str, model: ControlModel, centroid_gain: float = 1.0, records: int | None = None
+    ) -> None:
         self._gain = centroid_gain
         self.loop = ControlLoop(Control(INTERACTION, None, OPTIONS, model), LAYOUT)
-        self.ring = TelemetryRing.create(name, LAYOUT, commands=INTERACTION.shape[1])
+        self.ring = TelemetryRing.create(name, LAYOUT, commands=INTERACTION.shape[1], records=records)
         self._sent, self._number = [np.zeros(INTERACTION.shape[1])] * 2, 0
         self.loop.close()
 
@@ -180,3 +182,30 @@ def test_a_process_that_dies_is_one_line(name: str, tmp_path: Path) -> None:
         wait_for(lambda: bool(lines))
     assert len(lines) == 1
     assert "none.toml" in engine.learning["fault"]
+
+
+def test_it_never_learns_across_records_that_were_lost(
+    name: str, model: ControlModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames before and after a gap are no time series: what waits is forgotten, and it begins anew."""
+    monkeypatch.setattr("faintspot.engine.background.learning.FEWEST_FRAMES", 90)
+    path = tmp_path / "faintspot.toml"
+    configuration_file.save(path, LAYOUT)
+    np.save(tmp_path / "m.npy", INTERACTION)
+    model.save(tmp_path / "model.npz")
+    save_control(path, interaction_matrix="m.npy", controller=KALMAN, model="model.npz")
+    run = Run(name, model, records=150)
+    learning = BackgroundLearning(name, path, 180 * FRAME_S)
+    run.frames(120)
+    assert not learning.take()
+    run.frames(200)  # more than the ring holds
+    assert not learning.take()
+    run.frames(140)
+    assert not learning.take()  # with the frames before the gap it would be enough
+    run.frames(60)
+    assert learning.take()
+    frames = np.concatenate([records["frame"] for records in learning._records])
+    assert (frames[0], len(frames)) == (320, 200)
+    assert (np.diff(frames) == 1).all()
+    learning.close()
+    run.ring.close()

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tests.engine.page.cases import unpacked
 
-from faintspot.engine.page.messages import packed, plain
+from faintspot.engine.page.messages import packed
 
 
 def test_message_holds_values_and_arrays_as_they_were() -> None:
@@ -21,8 +21,3 @@ def test_message_holds_values_and_arrays_as_they_were() -> None:
     for name, array in arrays.items():
         assert found[name].dtype == array.dtype
         np.testing.assert_array_equal(found[name], array)
-
-
-def test_plain_values_are_what_json_can_hold() -> None:
-    given = {"a": np.float64("inf"), 3: (np.int64(2), [float("-inf")]), "array": np.array([1.5, np.nan])}
-    assert plain(given) == {"a": None, "3": [2, [None]], "array": [1.5, None]}

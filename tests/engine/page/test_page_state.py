@@ -5,11 +5,11 @@ import pytest
 
 pytest.importorskip("zarr")
 
-from tests.engine.page.cases import records
+from tests.engine.page.cases import N, records
 
 from faintspot.base.flags import SubapertureFlag
 from faintspot.engine.page import page_state as page_state_module
-from faintspot.engine.page.batch import Batch
+from faintspot.engine.page.batch import Batch, Picture
 from faintspot.engine.page.page_state import PageState, flag_names
 
 
@@ -33,6 +33,24 @@ def test_newest_frame_and_strip_charts() -> None:
     np.testing.assert_allclose(strip["strehl"], [np.nan, 0.5])
     # x is +-0.5 px about its mean, y is 0: along one axis 0.5 / sqrt 2.
     np.testing.assert_allclose(strip["rms_px"], 0.5 / np.sqrt(2), rtol=1e-6)
+
+
+def test_flux_is_that_of_the_star_whatever_methods_keep() -> None:
+    """35 electrons of a spot over a background of 2; the method keeps 100 and 60 of what it sees."""
+    page_state = PageState(["none", "tv"])
+    image = np.full((N, 8, 8), 2.0, np.float32)
+    image[:, 3:5, 3:5] += np.array([10.0, 5.0, 10.0, 10.0]).reshape(2, 2)
+    for turn in range(10):
+        made = records(10 * turn, 10, method=turn % 2)
+        made["flux"] = [100.0, 60.0][turn % 2]
+        noise = np.random.default_rng(turn).normal(0, 0.3, image.shape).astype(np.float32)
+        page_state.add(Batch(made, picture=Picture(10 * turn, np.zeros((24, 24), np.float32), image + noise)))
+    values, arrays = page_state.now()
+    assert values["flux_of"] == "of the star"
+    np.testing.assert_allclose(arrays["flux"], 35.0, atol=6.0)  # 64 pixels of .1, twice for the background
+    strip = arrays["strip"][:, values["strip"].index("flux_e")]
+    np.testing.assert_allclose(strip, 35.0, atol=6.0)
+    assert page_state.methods_compared()[0]["figures"]["flux kept (e-)"]["mean"] == pytest.approx(100.0)
 
 
 def test_truth_that_comes_before_its_frame_counts_for_it() -> None:
@@ -79,7 +97,7 @@ def test_methods_in_turn_are_compared_with_the_first() -> None:
         page_state.add(Batch(made))
     none, tv = page_state.methods_compared()
     assert (none["method"], tv["method"], none["frames"]) == ("none", "tv", 1000)
-    flux = tv["figures"]["flux (e-)"]
+    flux = tv["figures"]["flux kept (e-)"]
     assert flux["mean"] == pytest.approx(110.0)
     assert flux["difference"] == pytest.approx(10.0)
     assert flux["decided"] == 1

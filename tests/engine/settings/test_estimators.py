@@ -207,3 +207,21 @@ def test_the_commands(camera: Camera, tmp_path: Path, monkeypatch: pytest.Monkey
         run("unload", "mine")
         with pytest.raises(fs.InputError, match="No such file"):
             run("load", "none.py")
+
+
+@pytest.mark.parametrize("then", ["", "raise ValueError('late')"])
+def test_a_file_that_changes_the_folder_leaves_the_engine_where_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, then: str
+) -> None:
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path)
+    path, before = write(tmp_path, top=f"os.chdir('other')\n{then}"), estimators()
+    try:
+        if then:
+            with pytest.raises(fs.InputError, match="late"):
+                load_estimators(path)
+        else:
+            assert list(load_estimators(path).kinds) == ["mine"]
+        assert Path.cwd() == tmp_path
+    finally:
+        restore(before)

@@ -12,7 +12,7 @@ from tests.cli.cli_cases import Commands
 from tests.loop.telemetry.loop_cases import CELLS, recorded
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.control.identification.recording import NUMBERS, Recording, prepared
 from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
 
 WORDS = """
@@ -134,7 +134,7 @@ def test_aot_file(tmp_path: Path) -> None:
         ({"interaction_matrix": np.ones((50, 35))}, r"interaction_matrix: expected shape \(50, 36\)"),
         ({"slopes": np.zeros((9, 51))}, r"slopes: expected shape \(frames, 2 n\)"),
         ({"cells": np.zeros((4, 2))}, r"cells: expected shape \(25, 2\)"),
-        ({"time_s": np.zeros(2550)}, "time_s: expected 2550 increasing times"),
+        ({"time_s": np.zeros(2550)}, "time_s: expected 2550 increasing numbers"),
         ({"flags": np.zeros((2550, 24), int)}, r"flags: expected integers of shape \(2550, 25\)"),
         ({"slope": 1.0}, "did you mean slopes"),
     ],
@@ -159,3 +159,86 @@ def test_command(tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch)
     assert "Other choices of control" in Path("night.html").read_text()
     assert Path("night.json").stat().st_size > 1000
     run.refused("telemetry", "absent.npz", naming=("no such file",))
+
+
+def small() -> dict[str, Any]:
+    """Arrays and numbers of a recording of four sub-apertures."""
+    slopes = np.random.default_rng(1).standard_normal((20, 8))
+    return {"slopes": slopes, "slope_unit": "px", "frame_rate_hz": 250.0}
+
+
+COLUMN = np.arange(20)[:, None]
+WRONG: list[tuple[str, Any, str]] = [
+    ("time_s", 3.0, "expected 20 increasing numbers"),
+    ("frame", 3, "expected 20 increasing numbers"),
+    ("frame", COLUMN.astype(str), "real numbers"),
+    ("frame", COLUMN + 0.5, "whole number"),
+    ("frame", COLUMN * 1j, "real numbers"),
+    ("slopes", 3.0, "dimensions"),
+    ("slopes", np.full((20, 8), "1.5"), "real numbers"),
+    ("slopes", np.full((20, 8), 1j), "real numbers"),
+    ("commands", 3.0, "dimensions"),
+    ("control_matrix", 3.0, "dimensions"),
+    ("cells", 3, "expected shape"),
+    ("cells", np.zeros((4, 2)), "one twice"),
+    ("cells", [[0, 0], [0, 1], [10**6, 0], [1, 1]], "at most 1000"),
+    ("cells", np.full((4, 2), 1e300), "expected a number"),
+    ("cells", [[0, 0], [0, 1], [1, 0], [1, 0.5]], "whole number"),
+    *((name, True, "got true or false") for name in NUMBERS),
+    *((name, 1e300, "expected a number from") for name in NUMBERS),
+    *((name, 1e-300, "expected a") for name in NUMBERS),
+    *((name, [1.0, 2.0], "one number|expected a number") for name in NUMBERS),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "expected"), WRONG)
+def test_values_that_are_wrong(tmp_path: Path, name: str, value: Any, expected: str) -> None:
+    np.savez(tmp_path / "night.npz", **{**small(), name: value})
+    with pytest.raises(InputError, match=rf"{name}.*({expected})"):
+        read_recorded_loop(tmp_path / "night.npz")
+
+
+@pytest.mark.parametrize("value", ["3", "[[1, 2], [3]]", '[["a", "b"]]', "true", "[]", "{a = 1}"])
+def test_arrays_of_toml_that_are_wrong(tmp_path: Path, value: str) -> None:
+    (tmp_path / "night.toml").write_text(f'slopes = {value}\nslope_unit = "px"\nframe_rate_hz = 250')
+    with pytest.raises(InputError, match="slopes: expected"):
+        read_recorded_loop(tmp_path / "night.toml")
+
+
+def test_columns_are_times_and_frame_numbers(tmp_path: Path) -> None:
+    """As a CSV of one column is read."""
+    np.savez(tmp_path / "night.npz", **small(), time_s=COLUMN / 125, frame=2 * COLUMN)
+    loop = read_recorded_loop(tmp_path / "night.npz")
+    assert np.array_equal(loop.frame, 2 * np.arange(20))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "the file is empty"),
+        ("a,b\n", "the file is empty"),
+        ("1,2\n1\n", "number of columns"),
+        ("a,b\nc,d\n", "string 'c'"),
+        ("1,2\nx,3\n", "string 'x'"),
+        ("a,2\n3,4\n", "string 'a'"),
+    ],
+)
+def test_tables_that_are_wrong(tmp_path: Path, text: str, expected: str) -> None:
+    (tmp_path / "night.csv").write_text(text)
+    with pytest.raises(InputError, match=f"rows of numbers.*{expected}"):
+        read_recorded_loop(tmp_path / "night.csv")
+
+
+def test_a_first_row_that_is_not_measured_is_no_line_of_names(tmp_path: Path) -> None:
+    (tmp_path / "night.csv").write_text("x,y\n,nan\n1,2\n3,4\n")
+    (tmp_path / "system.toml").write_text('slope_unit = "px"\nframe_rate_hz = 9\ncells = [[0, 0]]')
+    loop = read_recorded_loop(tmp_path / "night.csv", tmp_path / "system.toml")
+    np.testing.assert_array_equal(loop.slopes, [[np.nan] * 2, [1, 2], [3, 4]])
+
+
+def test_slopes_of_very_different_size_are_broken() -> None:
+    slopes = small()["slopes"]
+    slopes[:, 7] *= 1e10
+    loop = Recording(slopes, None, None, np.ones((2, 2)), 250.0)
+    with pytest.raises(InputError, match="columns 7 over 1e"):
+        prepared(loop)

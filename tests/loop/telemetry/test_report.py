@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,6 +13,7 @@ from tests.loop.control.driven import driven, oscillator
 from tests.loop.telemetry.loop_cases import AIR, LOOP_GAIN, NOISE_PX, RATE_HZ, recorded
 
 from faintspot.base.errors import InputError
+from faintspot.base.json_text import parse_json, to_json
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.measured import Measured
 from faintspot.loop.control.identification.open_loop import open_loop_of
@@ -98,11 +98,37 @@ def numbers(values: Any) -> Iterator[dict[str, Any]]:
 
 
 def test_every_number_has_an_interval(report: LoopReport) -> None:
-    plain = json.loads(json.dumps(report.as_values(), allow_nan=False))
+    plain = parse_json(to_json(report.as_values(), exact=True))
     found = list(numbers(plain))
     assert len(found) > 40
     for each in found:
         assert each["value"] is None or each["low"] <= each["value"] <= each["high"]
+
+
+@pytest.mark.slow
+def test_dead_and_rarely_measured_sub_apertures() -> None:
+    """They have no noise, for a reason that is given, and what the others show stays."""
+    loop = recorded()
+    slopes = loop.slopes.copy()
+    slopes[:, [3, 28]] = np.nan
+    slopes[np.arange(len(slopes)) % 50 > 0, 7] = np.nan
+    found = report_of_loop(replace(loop, slopes=slopes))
+    assert found.noise_px is not None
+    assert np.flatnonzero(np.isnan(found.noise_px)).tolist() == [3, 7, 28]
+    assert value(found, "noise", "noise of a slope").value == pytest.approx(NOISE_PX, rel=0.05)
+    assert {choice.name for choice in found.choices} >= {AS_RUN, BEST, MODES, FILTER}
+    plain = parse_json(to_json(found.as_values()))
+    assert [k for k, noise in enumerate(plain["noise"]["of_slopes"]) if noise is None] == [3, 7, 28]
+    assert "five consecutive frames" in plain["noise"]["of_slopes_unknown"]
+    assert all(math.isfinite(each["value"]) for each in numbers(plain["choices"]))
+    assert "5 % intervals" in page_of_loop(found)
+
+
+def test_what_is_unknown_has_a_reason() -> None:
+    found = report_of_loop(replace(recorded().part(slice(0, 250)), pixel_scale_arcsec=None))
+    unknown = [each for each in numbers(parse_json(to_json(found.as_values()))) if None in each.values()]
+    assert {each["name"] for each in unknown} >= {"r0 at 500 nm", "delay"}
+    assert all(each["remark"] for each in unknown)
 
 
 def test_limits_of_actuators() -> None:

@@ -70,10 +70,10 @@ def test_is_immutable_and_private() -> None:
 
 def test_who_vouches_for_the_dark() -> None:
     """A dark that is left out counts as 0, but nobody says that it is."""
-    assert not fs.Calibration().vouches_for_dark
-    assert fs.Calibration(dark=0.0).vouches_for_dark
-    assert fs.Calibration(dark=np.zeros((3, 4))).vouches_for_dark
-    assert not fs.Calibration(dark=70.0, estimated=("dark",)).vouches_for_dark
+    assert not fs.Calibration().dark_is_known
+    assert fs.Calibration(dark=0.0).dark_is_known
+    assert fs.Calibration(dark=np.zeros((3, 4))).dark_is_known
+    assert not fs.Calibration(dark=70.0, estimated=("dark",)).dark_is_known
     assert fs.Calibration(dark=0.0) != fs.Calibration()
 
 

@@ -175,3 +175,9 @@ def test_a_real_camera() -> None:
 def test_wrong_values_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         measure_detector(**arguments)
+
+
+def test_a_camera_that_is_stuck_has_no_gain() -> None:
+    """One frame again and again."""
+    frame = np.random.default_rng(4).poisson(50.0, (40, 40))
+    assert measure_detector(np.tile(frame, (20, 1, 1))).gain_e_per_adu is None

@@ -84,6 +84,28 @@ def test_dark_subapertures_are_left_out(recording: Path, tmp_path: Path) -> None
     np.testing.assert_allclose(found.lattice_of(wrong).centres, LAYOUT.centres, atol=0.15)
 
 
+def test_command_reads_as_many_frames_as_stated(recording: Path, run: Commands, tmp_path: Path) -> None:
+    """The frames after them are saturated, and would hide the spots."""
+    frames = np.full((30, *LAYOUT.frame_shape), 6e4, np.float32)
+    frames[:4] = np.load(recording / "frames.npy", mmap_mode="r")[:4]
+    np.save(tmp_path / "frames.npy", frames)
+    path = tmp_path / "faintspot.toml"
+    for item in (LAYOUT, calibration(), fs.Settings("ml", search_range_px=2.0)):
+        item.save(path)
+    line = ("sodium", tmp_path / "frames.npy", "--config", path, "--launch-m", "-5", "0")
+    refused = run(*line)
+    assert refused.code == 2
+    assert "expected images of spots" in refused.err
+    assert not (tmp_path / "faintspot.sodium.npz").exists()
+    done = run(*line, "--frames", "4")
+    assert done.code == 0, done.err
+    with open_frames([tmp_path / "frames.npy"]) as source:
+        laser = LaserSpots([-5.0, 0.0], 1.0)
+        expected = sodium_of_frames(source, LAYOUT, calibration(), laser, most_frames=4)
+    learnt = fs.SodiumProfile.load(tmp_path / "faintspot.sodium.npz")
+    np.testing.assert_allclose(learnt.density, expected.sodium.fit.profile.density, rtol=1e-3)
+
+
 @pytest.mark.slow
 def test_command_and_report(recording: Path, run: Commands) -> None:
     """What the command has learnt is what a pipeline of the configuration then knows."""
@@ -121,10 +143,31 @@ def test_profiles_of_a_recorded_engine() -> None:
     assert sodium_sections_of_changes([{"changes": {"sodium": "too long"}}]) == []
 
 
-def test_frames_without_spots_and_a_layout_without_angles_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("level", [0.0, 7.0, 65535.0])
+@pytest.mark.parametrize("noise", [0.0, 0.43, 3.0])
+def test_frames_without_spots_are_refused(tmp_path: Path, level: float, noise: float) -> None:
+    rng = np.random.default_rng(3)
+    np.save(tmp_path / "none.npy", level + noise * rng.standard_normal((20, *LAYOUT.frame_shape)))
+    known = fs.Calibration(read_noise_e=0.43)
+    with (
+        open_frames([tmp_path / "none.npy"]) as source,
+        pytest.raises(InputError, match=r"images_e: expected (images of spots|flux)|dark"),
+    ):
+        sodium_of_frames(source, LAYOUT, known, LASER)
+
+
+def test_faint_spots_are_taken(recording: Path) -> None:
+    """Four frames of 200 e- are enough: the profile is near the one of all frames."""
+    with open_frames([recording / "frames.npy"]) as source:
+        known = sodium_of_frames(source, LAYOUT, calibration(), LASER, most_frames=4).sodium
+    assert known.fit.significance > 30
+    assert known.fit.profile.mean_m == pytest.approx(TRUE.mean_m, abs=1500)
+
+
+def test_a_layout_without_angles_is_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "none.npy", np.zeros((3, *LAYOUT.frame_shape)))
-    with open_frames([tmp_path / "none.npy"]) as source:
-        with pytest.raises(InputError):
-            sodium_of_frames(source, LAYOUT, fs.Calibration(), LASER)
-        with pytest.raises(InputError, match="pixel_scale_arcsec"):
-            sodium_of_frames(source, replace(LAYOUT, pixel_scale_arcsec=None), fs.Calibration(), LASER)
+    with (
+        open_frames([tmp_path / "none.npy"]) as source,
+        pytest.raises(InputError, match="pixel_scale_arcsec"),
+    ):
+        sodium_of_frames(source, replace(LAYOUT, pixel_scale_arcsec=None), fs.Calibration(), LASER)

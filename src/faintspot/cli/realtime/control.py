@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import click
 
+from faintspot.base.json_text import to_json
 from faintspot.cli.realtime.camera import stop_on_signal
 from faintspot.cli.shared.commands import Group, option
 from faintspot.cli.shared.engine_requests import (
-    as_text,
     asked,
     asked_at_length,
     loop_in_words,
@@ -34,7 +33,7 @@ _LOOP_ACTIONS = {
 def status(name: str, as_json: bool) -> None:
     """Show counters, latencies and the loop of a running engine."""
     reply = asked(name, "status")
-    click.echo(as_text(reply) if as_json else summary(reply))
+    click.echo(to_json(reply, indent=1) if as_json else summary(reply))
 
 
 @click.command("get")
@@ -46,7 +45,7 @@ def get(name: str, settings: tuple[str, ...]) -> None:
     Defaults are filled in; null is what is not used, or found from the PSF or each frame.
     """
     for key, value in asked(name, "get", names=list(settings) or None)["settings"].items():
-        click.echo(f"{key} = {json.dumps(value)}")
+        click.echo(f"{key} = {to_json(value)}")
 
 
 @click.command("set", short_help="Change settings of a running engine, between two frames.")
@@ -157,7 +156,7 @@ def control() -> None:
 def loop_status(name: str, as_json: bool) -> None:
     """Show whether the loop is closed, and if not, why."""
     loop = asked(name, "loop", action="status")["loop"]
-    click.echo(as_text(loop) if as_json else loop_in_words(loop))
+    click.echo(to_json(loop, indent=1) if as_json else loop_in_words(loop))
 
 
 @control.command("gain")

@@ -7,9 +7,9 @@ from typing import Any
 
 import click
 
+from faintspot.base.json_text import to_json
 from faintspot.cli.realtime.camera import published, stop_on_signal
 from faintspot.cli.shared.commands import Group, option
-from faintspot.cli.shared.engine_requests import as_text
 from faintspot.cli.shared.options import AS_JSON, FRAMES, READOUT_FRACTION, SLOTS, name_option
 from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
 from faintspot.engine.requests.requests import request, since
@@ -138,7 +138,7 @@ def telescope_status(name: str, as_json: bool) -> None:
     """Show what the telescope sees, and whether it keeps its pace."""
     reply = request(socket_path(name, TELESCOPE), "status")
     if as_json:
-        click.echo(as_text(reply))
+        click.echo(to_json(reply, indent=1))
         return
     commands, truth = reply["commands"], reply["truth"]
     click.echo(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from typing import Any
@@ -31,11 +30,6 @@ def asked_at_length(name: str, command: str, **fields: Any) -> dict[str, Any]:
         return asked(name, command, timeout_s=LENGTHY_TIMEOUT_S, **fields)
     finally:
         timer.cancel()
-
-
-def as_text(values: dict[str, Any]) -> str:
-    """Return an answer as JSON for people and programs."""
-    return json.dumps(values, indent=1)
 
 
 def loop_in_words(loop: dict[str, Any]) -> str:

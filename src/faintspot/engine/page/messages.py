@@ -7,14 +7,13 @@ each padded to eight bytes; offsets count from the first one.
 
 from __future__ import annotations
 
-import json
-import math
 import struct
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
+
+from faintspot.base.json_text import to_json
 
 _ALIGN = 8
 
@@ -29,20 +28,7 @@ def packed(kind: str, values: Mapping[str, Any], arrays: Mapping[str, NDArray[An
         described[name] = [array.dtype.name, list(array.shape), offset]
         blocks += [data, bytes(-len(data) % _ALIGN)]
         offset += len(data) + len(blocks[-1])
-    head = {"kind": kind, "values": plain(values), "arrays": described}
-    text = json.dumps(head, allow_nan=False).encode()
+    head = {"kind": kind, "values": values, "arrays": described}
+    text = to_json(head).encode()
     text += b" " * (-(len(text) + 4) % _ALIGN)
     return b"".join([struct.pack("<I", len(text)), text, *blocks])
-
-
-def plain(value: Any) -> Any:
-    """Return a value as JSON allows it: null for numbers that are not finite, lists for arrays."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

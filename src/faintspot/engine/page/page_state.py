@@ -28,10 +28,11 @@ _STRIP = ("time_s", "latency_us", "longest_us", "rms_px", "flux_e", "lost", "str
 """Row of the strip charts: result of one read of the telemetry."""
 _FRAME = ("time_s", "method", "latency_us", "rms_px", "flux_e", "valid", "strehl")
 """Row of the last frames."""
+_MEAN_PICTURES = 20  # time constant of the mean images from which the star's flux is taken
 _BIN_EDGES_US = 2.0 ** (np.arange(0, 20 * 4 + 1) / 4)  # 1 us to 1 s, four bins in a factor of 2
 _COMPARED = {
     "rms of slopes (px)": ("rms_px", 1.0),
-    "flux (e-)": ("flux_e", 1.0),
+    "flux kept (e-)": ("flux_e", 1.0),
     "valid (%)": ("valid", 100.0),
     "latency (µs)": ("latency_us", 1.0),
     "Strehl ratio": ("strehl", 1.0),
@@ -55,6 +56,8 @@ class PageState:
         self.seen = self.lost = self.missed = 0
         """Numbers of frames, of missing frame numbers, and of records for which the page was too slow."""
         self.commands: Floats | None = None
+        self._images: Floats | None = None  # mean of the sub-apertures' images, electrons
+        self._pictures = 0
         self._strip: deque[tuple[float, ...]] = deque()
         self._frames: deque[Floats] = deque()
         self._first_method = 0  # number of the first method of the present interleaving
@@ -73,6 +76,8 @@ class PageState:
             self.commands = batch.commands
         if batch.truth is not None:
             self._truths.append(batch.truth)
+        if batch.picture is not None:
+            self._take_images(batch.picture.denoised)
         records = batch.records
         if not len(records):
             return
@@ -85,6 +90,29 @@ class PageState:
         self._frames.append(rows)
         self._strip.append(self._strip_row(rows, lost, batch))
         self._forget(rows[-1, 0])
+
+    @property
+    def star_flux_e(self) -> Floats | None:
+        """Flux of the star in each sub-aperture, (n,); None without images.
+
+        The sum of the mean image above the median of its edge, which no estimator changes: denoising keeps
+        the sum.
+        """
+        if self._images is None:
+            return None
+        edge = np.ones(self._images.shape[1:], np.bool_)
+        edge[1:-1, 1:-1] = False
+        background = np.median(self._images[:, edge], axis=1)
+        return np.asarray(self._images.sum(axis=(1, 2)) - edge.size * background, np.float64)
+
+    def _take_images(self, images: NDArray[np.float32]) -> None:
+        """Add images to their running mean."""
+        new = np.nan_to_num(images, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float64)
+        self._pictures += 1
+        if self._images is None or self._images.shape != new.shape:
+            self._images, self._pictures = new, 1
+            return
+        self._images += (new - self._images) / min(self._pictures, _MEAN_PICTURES)
 
     def record_of(self, frame: int) -> NDArray[Any] | None:
         """Return the record of a frame from the last read; None if it is older."""
@@ -101,7 +129,9 @@ class PageState:
         strip = np.array(self._strip, np.float64).reshape(-1, len(_STRIP))
         if len(strip):
             strip[:, 0] -= strip[-1, 0]
+        star = self.star_flux_e
         values: dict[str, Any] = {
+            "flux_of": "kept by the method" if star is None else "of the star",
             "strip": _STRIP,
             "strip_s": STRIP_S,
             "seen": self.seen,
@@ -112,6 +142,8 @@ class PageState:
         if newest is not None:
             values |= {"frame": int(newest["frame"]), "method": self._method_name(int(newest["method"]))}
             arrays |= {name: newest[name] for name in ("x", "y", "flux", "flags")}
+            if star is not None:
+                arrays["flux"] = star.astype(np.float32)
         if self.commands is not None:
             arrays["commands"] = self.commands.astype(np.float32)
         return values, arrays
@@ -207,7 +239,10 @@ class PageState:
         return int(np.maximum(all_left_out(frames), 0).sum())
 
     def _strip_row(self, rows: Floats, lost: int, batch: Batch) -> tuple[float, ...]:
-        latency, rms, flux = (rows[:, _FRAME.index(name)] for name in ("latency_us", "rms_px", "flux_e"))
+        latency, rms, kept = (rows[:, _FRAME.index(name)] for name in ("latency_us", "rms_px", "flux_e"))
+        star = self.star_flux_e
+        valid = are_valid(batch.records["flags"][-1])
+        flux = kept if star is None else star[valid]
         return (
             rows[-1, 0],
             float(np.median(latency)),

@@ -15,12 +15,12 @@ from importlib.resources import files
 from typing import Any
 
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.base.files import parse_json
+from faintspot.base.json_text import parse_json, to_json
 from faintspot.engine.page.access import Access
 from faintspot.engine.page.batch import Source
 from faintspot.engine.page.client_requests import ClientRequests, answered
 from faintspot.engine.page.latest_messages import LatestMessages
-from faintspot.engine.page.messages import packed, plain
+from faintspot.engine.page.messages import packed
 from faintspot.engine.page.page import UPDATE_S, Page
 from faintspot.engine.pixels.camera import StopEvent
 from faintspot.engine.requests.requests import in_thread
@@ -262,7 +262,7 @@ class Client(_Guarded, WebSocketHandler):
             # In a thread, because the engine may take long to answer.
             reply = await in_thread(partial(answered, self.server.client_requests, request))
         with contextlib.suppress(WebSocketClosedError):
-            await self.write_message(json.dumps({"id": number, **plain(reply)}, allow_nan=False))
+            await self.write_message(to_json({"id": number, **reply}))
         if self._feeding is None:
             self.close(_NOT_ALLOWED)
         await asyncio.sleep(_PAUSE_S)
@@ -301,7 +301,7 @@ def _parsed(message: str | bytes) -> dict[str, Any]:
     """Return a request: a JSON object with "do", whose values can be sent back as JSON."""
     try:
         request = parse_json(message) if isinstance(message, str) else None
-        json.dumps(request, allow_nan=False, ensure_ascii=False).encode()  # NaN, infinity, lone surrogates
+        json.dumps(request, ensure_ascii=False).encode()  # lone surrogates
     except (ValueError, RecursionError):
         request = None
     if not isinstance(request, dict) or not isinstance(request.get("do"), str):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import os
 import socket
 import threading
@@ -18,11 +17,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
-from faintspot.base.files import parse_json
+from faintspot.base.json_text import parse_json, to_json
 from faintspot.engine.requests.private_socket import (
     ENGINE,
     bound_listener,
@@ -69,7 +66,7 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
     kind, name = server_of(Path(path))
     starts = "run" if kind == ENGINE else f"{kind} run"
     try:
-        line = _encoded({"command": command, **fields})
+        line = _encoded({"command": command, **fields}, exact=True)
     except (TypeError, ValueError) as error:
         raise InputError(f"request: expected what JSON can hold ({error})") from None
     if len(line) > LARGEST_REQUEST:
@@ -287,17 +284,8 @@ def _answer(handler: Handler, fields: dict[str, Any]) -> bytes:
         return _encoded(_refusal(f"{type(error).__name__}: {error}"))
 
 
-def _encoded(message: Mapping[str, Any]) -> bytes:
-    return json.dumps(message, allow_nan=False, default=_jsonable).encode() + b"\n"
-
-
-def _jsonable(value: Any) -> Any:
-    """Convert values that JSON lacks: NumPy's numbers and arrays, paths."""
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"{type(value).__name__} cannot be sent")
+def _encoded(message: Mapping[str, Any], *, exact: bool = False) -> bytes:
+    return to_json(message, exact=exact).encode() + b"\n"
 
 
 def _refusal(text: str) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import sys
 import types
@@ -53,7 +54,8 @@ def load_estimators(path: Path) -> EstimatorFile:
     before, kinds_before = sys.modules.get(module.__name__), registry.estimators()
     sys.modules[module.__name__] = module  # dataclasses and pickle look modules up there
     try:
-        call_within(LOAD_LIMIT_S, str(path), _run, code, module, path)
+        with contextlib.chdir("."):  # the file may change the folder, the engine stays in its own
+            call_within(LOAD_LIMIT_S, str(path), _run, code, module, path)
         now = registry.estimators().items()
         kinds = {name: kind for name, kind in now if kinds_before.get(name) is not kind}
         if not kinds:

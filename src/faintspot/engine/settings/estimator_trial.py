@@ -6,7 +6,6 @@ answers with one line of JSON. It ends at the time limit, even if the parent has
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
 import resource
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import parse_json
+from faintspot.base.json_text import parse_json, to_json
 from faintspot.engine.path.python_path import tried
 from faintspot.engine.settings.estimator_file import load_estimators
 from faintspot.slopes.estimators.faults import one_line
@@ -118,5 +117,5 @@ def main() -> None:
     except BaseException as error:
         refused = isinstance(error, InputError)
         reply = {"error": str(error) if refused else f"{trial.path}: {one_line(error)}"}
-    os.write(answer, json.dumps(reply).encode())
+    os.write(answer, to_json(reply).encode())
     os._exit(0)  # do not wait for threads that never return

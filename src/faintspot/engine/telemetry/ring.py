@@ -17,7 +17,6 @@ oldest, so a reader already counts the oldest as lost.
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
 import struct
@@ -32,6 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
+from faintspot.base.json_text import parse_json, to_json
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.pixel_segment import Header, create_segment, segment_path
 from faintspot.engine.pixels.processes import process_start
@@ -43,7 +43,6 @@ from faintspot.engine.telemetry.segment import (
     image_type,
     kinds_of,
     layout_values,
-    plain,
     record_type,
     up_to_pages,
 )
@@ -235,11 +234,11 @@ class TelemetryRing(Closing):
         """
         head = {"frame": int(frame), "number": int(number)}
         entry = {**head, "changes": dict(changes), "where": where}
-        text = json.dumps(entry, default=plain).encode()
+        text = to_json(entry).encode()
         if len(text) > CHANGE_BYTES - 8:
             names = dict.fromkeys(list(changes)[:20], "too long")
             short = {**head, "changes": names, "where": "too long", "too_long_bytes": len(text)}
-            text = json.dumps(short).encode()
+            text = to_json(short).encode()
         ring = self._rings.changes
         written = ring.written
         item = ring.items[written % len(ring.items)]
@@ -294,7 +293,7 @@ class TelemetryReader:
         text = memory[_START.size : _START.size + length].tobytes()
         if magic != _MAGIC or zlib.crc32(text) != checksum:
             raise InputError(f"{path}: expected telemetry of this version of faintspot")
-        return cls(name, ring, up_to_pages(_START.size + length), json.loads(text))
+        return cls(name, ring, up_to_pages(_START.size + length), parse_json(text))
 
     @property
     def stale(self) -> bool:
@@ -310,7 +309,7 @@ class TelemetryReader:
         Each has frame, number, changes (values by name) and where (sub-apertures, None for all).
         """
         items, cursor, dropped = self._changes.since(cursor)
-        changes = [json.loads(item["text"][: item["length"]].tobytes()) for item in items]
+        changes = [parse_json(item["text"][: item["length"]].tobytes()) for item in items]
         return changes, cursor, dropped
 
     def close(self) -> None:
@@ -320,7 +319,7 @@ class TelemetryReader:
 
 def _segment(name: str, description: Mapping[str, Any]) -> tuple[PixelRing, int]:
     """Create the segment, with its description and empty rings; return it and the offset of the rings."""
-    text = json.dumps(description).encode()
+    text = to_json(description).encode()
     begin = up_to_pages(_START.size + len(text))
     rings = sum(up_to_pages(kind.itemsize * slots) for kind, slots in kinds_of(description))
     pid, segment = os.getpid(), f"{name}_telemetry"

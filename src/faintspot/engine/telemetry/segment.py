@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.json_text import plain_values
 from faintspot.slopes.kernels.compilation.ordered import fence, load, store
 from faintspot.slopes.sensor.layout import Layout
 
@@ -133,14 +134,8 @@ def kinds_of(description: Mapping[str, Any]) -> list[tuple[np.dtype[np.void], in
 
 def layout_values(layout: Layout) -> dict[str, Any]:
     """Return a layout as plain values, from which `Layout` can be rebuilt."""
-    return {
-        name: plain(value) if isinstance(value, np.ndarray) else value for name, value in vars(layout).items()
-    }
-
-
-def plain(value: Any) -> Any:
-    """Convert NumPy's numbers and arrays to plain values, and other objects to text."""
-    return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
+    values: dict[str, Any] = plain_values(vars(layout))
+    return values
 
 
 def up_to_pages(size: int) -> int:

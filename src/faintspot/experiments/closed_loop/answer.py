@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +14,9 @@ from numpy.typing import NDArray
 from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived, write_atomically
-from faintspot.base.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
+from faintspot.base.json_text import parse_json
+from faintspot.base.statistics import Estimate, paired_mean
+from faintspot.experiments.closed_loop.limits import Limit, falling, magnitude_gain, magnitude_limit
 from faintspot.experiments.closed_loop.magnitude import with_flux
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, NOISE_SCALE, MethodKind, method_kind
 from faintspot.experiments.closed_loop.question import (
@@ -26,14 +27,8 @@ from faintspot.experiments.closed_loop.question import (
     known_magnitudes,
     sky_coverage,
 )
-from faintspot.experiments.closed_loop.results import (
-    MagnitudeResult,
-    falling,
-    limiting_magnitudes,
-    magnitude_gain,
-)
+from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.methods import Knowledge
-from faintspot.experiments.words import with_error
 from faintspot.loop.control.identification.learning import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import Method
@@ -43,30 +38,6 @@ from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.spots.psf import PSF
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Limit:
-    """Magnitude at which a Strehl curve falls below a level, or the distance of two curves there."""
-
-    magnitude: Estimate
-    """Infinite: above the level with every star that was measured; minus infinite: below it."""
-    interpolation_error: float
-    """Bound on the error of linear interpolation, from the curve's bend."""
-
-    @property
-    def is_known(self) -> bool:
-        """Whether it is within what was measured."""
-        return math.isfinite(self.magnitude.value)
-
-    @property
-    def error(self) -> float:
-        """Standard error, both kinds together; NaN with too few realisations."""
-        return math.hypot(self.magnitude.standard_error, self.interpolation_error)
-
-    def in_words(self, *, sign: bool = False) -> str:
-        """Return it with its error, at least 0.01 mag."""
-        return with_error(Estimate(self.magnitude.value, self.error), 2, sign=sign, smallest=0.01)
 
 
 @dataclass(frozen=True)
@@ -147,7 +118,7 @@ class LoopAnswer:
 
     def choice(self, name: str, flux: int) -> dict[str, Any]:
         """Return a candidate's tuned values at a measured flux."""
-        choice: dict[str, Any] = json.loads(str(self.measured.choices[self._index(name), flux]))
+        choice: dict[str, Any] = parse_json(str(self.measured.choices[self._index(name), flux]))
         return choice
 
     def _index(self, name: str) -> int:
@@ -198,29 +169,11 @@ class LoopAnswer:
 
     def limit(self, name: str) -> Limit:
         """Return a method's limiting magnitude."""
-        faint, strehl = self._from_bright(name)
-        value = float(limiting_magnitudes(faint, strehl.mean(axis=1), self.level))
-        if not math.isfinite(value):
-            return Limit(Estimate(value), 0.0)
-        between = abs(_interpolation_error(faint, strehl.mean(axis=1), value))
-        realisations = strehl.shape[1]
-        if realisations < FEWEST_PIECES:
-            return Limit(Estimate(value), between)
-        draws = np.random.default_rng(SEED).integers(0, realisations, (DRAWS, realisations))
-        drawn = limiting_magnitudes(faint, strehl[:, draws].mean(axis=2).T, self.level)
-        return Limit(of_draws(value, drawn, realisations), between)
+        return magnitude_limit(*self._from_bright(name), self.level)
 
     def gain(self, name: str, reference: str) -> Limit:
         """Return the gain in limiting magnitude over another method; NaN where one of them has no limit."""
-        faint, strehl = self._from_bright(name)
-        gain = magnitude_gain(faint, strehl, self._from_bright(reference)[1], self.level)
-        if not math.isfinite(gain.value):
-            return Limit(gain, 0.0)
-        curves = [self._from_bright(method)[1].mean(axis=1) for method in (name, reference)]
-        values = [float(limiting_magnitudes(faint, curve, self.level)) for curve in curves]
-        # Curves that bend alike are wrong alike.
-        errors = [_interpolation_error(faint, *pair) for pair in zip(curves, values, strict=True)]
-        return Limit(gain, abs(errors[0] - errors[1]))
+        return magnitude_gain(*self._from_bright(name), self._from_bright(reference)[1], self.level)
 
     def coverage(self, name: str, place: str) -> Coverage | None:
         """Return what part of a place of `PLACES` a method can use; None: no radius."""
@@ -312,20 +265,6 @@ class LoopAnswer:
     def _from_bright(self, name: str) -> tuple[Floats, Floats]:
         """Return rising magnitudes (F,), and the Strehl ratios (F, R) there."""
         return self.magnitudes[::-1], self.runs(name)[::-1]
-
-
-def _interpolation_error(faint: Floats, strehl: Floats, value: float) -> float:
-    """Return by how much a crossing that was read off a straight line is too large as the curve bends, about.
-
-    That is the second divided difference, the mean of those at both ends of the line, times the distances
-    from the ends, over the slope. Of curves of several shapes it is 0.5 to 1 times the actual error (rms).
-    """
-    curve = falling(strehl)
-    end = int(np.clip(np.searchsorted(faint, value), 1, len(faint) - 1))
-    slopes = np.diff(curve) / np.diff(faint)
-    bends = np.diff(slopes) / (faint[2:] - faint[:-2])  # of the knots but the first and the last
-    bend = bends[max(0, end - 2) : end].mean()
-    return float(bend * (value - faint[end - 1]) * (faint[end] - value) / abs(slopes[end - 1]))
 
 
 def _simplicity(kind: MethodKind) -> tuple[Any, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import numbers_between
 from faintspot.base.errors import InputError
+from faintspot.base.json_text import to_json
 from faintspot.experiments.closed_loop.methods import Choice, MethodKind, default_methods, method_kind
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.closed_loop.search import (
@@ -113,7 +113,7 @@ def run_magnitude(
         array_of("strehl"),
         array_of("centroid_gain"),
         array_of("settings")[:, :, 0],
-        np.array([[json.dumps(choices[kind.name, flux]) for flux in fluxes] for kind in kinds]),
+        np.array([[to_json(choices[kind.name, flux]) for flux in fluxes] for kind in kinds]),
         configuration.to_text(),
     )
     result.save(experiment.folder / MAGNITUDE_FILE)

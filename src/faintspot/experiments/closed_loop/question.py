@@ -161,7 +161,7 @@ _LEAST_PHOTONS = 0.5
 
 @dataclass(frozen=True, eq=False)
 class LoopQuestion:
-    """A closed loop, and the stars that it shall be told for.
+    """A closed loop, and the stars to answer for.
 
     Parameters
     ----------

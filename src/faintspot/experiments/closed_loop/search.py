@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import theilslopes
 
 from faintspot.base.checks import number_between
+from faintspot.base.json_text import parse_json, to_json
 from faintspot.base.statistics import slope_statistics
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Choice, MethodKind, Tunable
 from faintspot.experiments.running import Advance
@@ -248,7 +248,7 @@ def tuning_unit(
     """Return what `tune` found, as arrays that can be stored."""
     tuned = tune(kind, configuration, search, advance, slopes=slopes)
     return {
-        "choice": np.asarray(json.dumps(dict(tuned.choice))),
+        "choice": np.asarray(to_json(tuned.choice)),
         "strehl": np.asarray(tuned.strehl),
         "tried": np.asarray(tuned.tried),
     }
@@ -282,7 +282,7 @@ def smoothed(
 
 def stored(result: Mapping[str, NDArray[Any]]) -> Tuned:
     """Return what `tuning_unit` stored."""
-    return Tuned(json.loads(str(result["choice"])), float(result["strehl"]), int(result["tried"]))
+    return Tuned(parse_json(str(result["choice"])), float(result["strehl"]), int(result["tried"]))
 
 
 def tuning_frames(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.json_text import parse_json
 from faintspot.base.report.page import Table
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import paired_mean
@@ -111,7 +111,7 @@ def _settings_words(choice: str, text: str) -> str:
     """Return tuned values as one line."""
     if not text:
         return "not tuned yet"
-    parts = [f"gain {json.loads(choice)[LOOP_GAIN]:.2g}"]
+    parts = [f"gain {parse_json(choice)[LOOP_GAIN]:.2g}"]
     for options in tomllib.loads(text).values():
         parts += [_value_words(name, value) for name, value in options.items() if name != "name"]
     return ", ".join(parts)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -12,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import parse_json, read_bytes, replace_file
+from faintspot.base.files import read_bytes, replace_file
+from faintspot.base.json_text import parse_json, to_json
 from faintspot.base.sizes import MOST_TEXT_BYTES, check_bytes
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES
 from faintspot.io.locations import one_line
@@ -80,7 +80,7 @@ def replace_attributes(path: Path, changed: Mapping[str, Any]) -> None:
     """Replace attributes of a group in one step, which the store's own setter does not guarantee."""
     metadata = parse_json((path / "zarr.json").read_text(encoding="utf-8"))
     metadata["attributes"].update(changed)
-    replace_file(path / "zarr.json", json.dumps(metadata, indent=2))
+    replace_file(path / "zarr.json", to_json(metadata, indent=2))
 
 
 def checked_codecs() -> tuple[Any, ...]:

@@ -7,7 +7,6 @@ integers without a value, which become NaN.
 from __future__ import annotations
 
 import gzip
-import json
 import warnings
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import parse_json
+from faintspot.base.json_text import parse_json, to_json
 from faintspot.base.sizes import check_bytes
 from faintspot.io.arrays.fits_units import AOT_VERSION, Unit, units_of
 from faintspot.io.arrays.stored_array import StoredArray
@@ -89,7 +88,7 @@ class Fits(FileFormat):
             _write_image(stream, name, values[:], unit_of(name, slopes.attributes), VARIABLES[name].long_name)
         for name, values in slopes.coordinates.items():
             _write_image(stream, name, values, COORDINATE_UNITS.get(name, "1"), "of each sub-aperture")
-        text = np.frombuffer(json.dumps(dict(slopes.attributes)).encode(), np.uint8)
+        text = np.frombuffer(to_json(slopes.attributes).encode(), np.uint8)
         _write_image(stream, "attributes", text, "1", "JSON text, UTF-8")
 
     def read(self, path: Path) -> StoredSlopes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import zipfile
 from collections.abc import Iterator
@@ -14,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import check_regular, parse_json
+from faintspot.base.files import check_regular
+from faintspot.base.json_text import parse_json, to_json
 from faintspot.base.npz import unpacked
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
 from faintspot.io.arrays.streams import StreamedArray, check_present
@@ -112,7 +112,7 @@ class Npz(FileFormat):
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
         """Write each variable and coordinate, and the attributes as a JSON text named `attributes`."""
         arrays = {**slopes.variables, **slopes.coordinates}
-        arrays["attributes"] = np.array(json.dumps(dict(slopes.attributes)))
+        arrays["attributes"] = np.array(to_json(slopes.attributes))
         with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, array in arrays.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:

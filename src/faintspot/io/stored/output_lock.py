@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
 import socket
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 from faintspot.base.errors import InputError
 
 _OWNER_BYTES = 200
+_FAR = 1 << 30  # Windows locks bytes: one that nobody reads
 # File systems without locks: there only the mark in the output, read before every write, protects it.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS)
 
@@ -37,16 +37,18 @@ class OutputLock:
         self._descriptor = -1
         while not self._is_held():
             self.release(keep_file=True)  # close the file if its holder removed it meanwhile
-            self._descriptor = os.open(self._file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            self._descriptor = os.open(self._file, os.O_RDWR | os.O_CREAT, 0o666)
             self._take(path)
         os.ftruncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
+        os.lseek(self._descriptor, 0, os.SEEK_SET)
+        os.write(self._descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
 
     def release(self, *, keep_file: bool = False) -> None:
         """Release the lock; repeated calls do nothing."""
         if self._descriptor >= 0:
             if not keep_file:
-                self._file.unlink(missing_ok=True)
+                with contextlib.suppress(PermissionError):  # Windows keeps open files
+                    self._file.unlink(missing_ok=True)
             os.close(self._descriptor)
             self._descriptor = -1
 
@@ -56,9 +58,10 @@ class OutputLock:
 
     def _take(self, path: Path) -> None:
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            owner = os.pread(self._descriptor, _OWNER_BYTES, 0).decode(errors="replace").strip()
+            _lock(self._descriptor)
+        except (BlockingIOError, PermissionError):
+            os.lseek(self._descriptor, 0, os.SEEK_SET)
+            owner = os.read(self._descriptor, _OWNER_BYTES).decode(errors="replace").strip()
             self.release(keep_file=True)
             raise InputError(
                 f"{path}: is being written by {owner or 'another program'}; "
@@ -77,3 +80,24 @@ class OutputLock:
             return os.path.samestat(os.fstat(self._descriptor), self._file.stat())
         except FileNotFoundError:
             return False
+
+
+def _lock(descriptor: int) -> None:
+    """Lock a file without waiting.
+
+    Raises
+    ------
+    BlockingIOError, PermissionError
+        When another program holds the lock; the second one on Windows.
+    OSError
+        When the file system has no locks.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        import msvcrt
+
+        os.lseek(descriptor, _FAR, os.SEEK_SET)
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+    else:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

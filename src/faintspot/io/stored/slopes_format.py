@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.base.json_text import plain_values
 from faintspot.base.sizes import check_bytes, memory_bytes
 
 
@@ -231,16 +231,8 @@ def with_absent(variables: Mapping[str, Any]) -> dict[str, Any]:
 
 def json_values(name: str, value: Mapping[str, Any]) -> dict[str, Any]:
     """Return a mapping as plain JSON values: NumPy numbers, arrays and paths are converted."""
-
-    def plain(item: Any) -> Any:
-        if isinstance(item, np.generic | np.ndarray):
-            return item.tolist()
-        if isinstance(item, Path):
-            return str(item)
-        raise TypeError(f"{type(item).__name__} cannot be stored")
-
     try:
-        values: dict[str, Any] = json.loads(json.dumps(dict(value), default=plain, allow_nan=False))
+        values: dict[str, Any] = plain_values(value, exact=True)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: expected numbers, texts and lists of them ({error})") from None
     return values

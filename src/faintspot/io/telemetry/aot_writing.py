@@ -7,7 +7,6 @@ for flags, iterations, the interleaved configurations and denoised images: these
 
 from __future__ import annotations
 
-import json
 import warnings
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import write_atomically
+from faintspot.base.json_text import to_json
 from faintspot.base.toml_files import parse_text
 from faintspot.io.telemetry.aot_reading import FLAGS_COLUMN, NOISE, NOISE_COLUMNS
 from faintspot.io.telemetry.recording import Telemetry
@@ -92,7 +92,7 @@ def _system(telemetry: Telemetry, ao_mode: str) -> Any:
         name=str(attributes["name"]),
         date_beginning=datetime.fromtimestamp(unix[0], UTC),
         date_end=datetime.fromtimestamp(unix[-1], UTC),
-        config=json.dumps(tables),
+        config=to_json(tables),
         main_telescope=aotpy.MainTelescope("TELESCOPE"),
         sources=[source],
         wavefront_sensors=[_sensor(telemetry, source, tables.get("estimator", {}).get("name"))],
@@ -122,7 +122,7 @@ def _metadata(telemetry: Telemetry) -> list[Any]:
         Metadatum("ORIGIN", "faintspot"),
         Metadatum("DROPPED", dropped, "frames measured, lost by the recorder"),
         Metadatum("METHODS", ", ".join(telemetry.attributes["methods"]), "interleaved settings"),
-        *(Metadatum(f"CHG{i}", json.dumps(change)) for i, change in enumerate(telemetry.changes, 1)),
+        *(Metadatum(f"CHG{i}", to_json(change)) for i, change in enumerate(telemetry.changes, 1)),
     ]
 
 
@@ -145,9 +145,9 @@ def _sensor(telemetry: Telemetry, source: Any, estimator: str | None) -> Any:
     if taken_off is not None:
         reference = reference + np.reshape(taken_off, reference.shape)
     exact = [
-        aotpy.Metadatum("LAYOUT", json.dumps(layout), "as faintspot has it"),
-        aotpy.Metadatum("PARTS", json.dumps(attributes.get("parts")), "calibration, PSF, score"),
-        aotpy.Metadatum("SUBTRACT", json.dumps(taken_off), "slopes that were subtracted, px"),
+        aotpy.Metadatum("LAYOUT", to_json(layout), "as faintspot has it"),
+        aotpy.Metadatum("PARTS", to_json(attributes.get("parts")), "calibration, PSF, score"),
+        aotpy.Metadatum("SUBTRACT", to_json(taken_off), "slopes that were subtracted, px"),
     ]
     sensor = aotpy.ShackHartmann(
         uid="SENSOR",

@@ -74,11 +74,11 @@ class Choice:
     def as_values(self) -> dict[str, Any]:
         """Return plain values."""
         names = ("residual", "less", "total", "strehl")
-        gain = self.gain if math.isfinite(self.gain) else None
+        gain = {"gain": self.gain} if math.isfinite(self.gain) else {}
         of_modes = {} if self.modal_gains is None else {"modal_gains": list(self.modal_gains)}
         return {
             "name": self.name,
-            "gain": gain,
+            **gain,
             **of_modes,
             **{name: getattr(self, name).as_values() for name in names},
         }
@@ -111,7 +111,7 @@ def compared_choices(
     phase = residual_phase(reconstructor.clean, loop.interaction_matrix, loop.cells)
     gain_error = float(np.nan_to_num(delay.gain_error)) / delay.gain
     views = [_View.of(slopes, phase) for slopes in (open_loop, open_loop.scaled(1 + gain_error))]
-    relative = float(open_loop.variance_error.mean()) / math.sqrt(len(reconstructor.modes.T))
+    relative = float(np.nanmean(open_loop.variance_error)) / math.sqrt(len(reconstructor.modes.T))
     scale = _Scale.of(loop, r0, delay, relative)
 
     def learnt_left(model: ControlModel) -> list[Floats]:
@@ -179,7 +179,10 @@ class _View:
         share = replayed.trust.mean(axis=1)
         least = np.quantile(share[SETTLE_FRAMES:], 1 - _LEAST_COMPARED)
         scored = SETTLE_FRAMES + np.flatnonzero(share[SETTLE_FRAMES:] >= max(float(least), 1e-9))
-        noise = float(open_loop.variance @ np.square(phase).sum(axis=0))
+        # Slopes never measured count as the mean of the others, as in `compared`.
+        known = np.isfinite(open_loop.variance)
+        variance = np.where(known, open_loop.variance, open_loop.variance[known].mean())
+        noise = float(variance @ np.square(phase).sum(axis=0))
         view = cls(replayed, scored, share[scored], np.zeros(0), noise)
         ran = np.square(open_loop.residual[half - SETTLE_FRAMES :] @ phase.T).sum(axis=1)
         return replace(view, ran=view.compared(ran))

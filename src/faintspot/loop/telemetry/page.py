@@ -99,7 +99,7 @@ def _noise_figure(report: LoopReport) -> FigureWithData | None:
     for panel, values, name in zip(axes, halves, "xy", strict=True):
         grid = np.full(cells.max(axis=0) + 1, np.nan)
         grid[tuple(cells.T)] = values
-        shown = panel.imshow(grid, vmin=halves.min(), vmax=halves.max())
+        shown = panel.imshow(grid, vmin=np.nanmin(halves), vmax=np.nanmax(halves))
         panel.set(title=f"noise of {name}", xlabel="column", ylabel="row")
     colour_bar(axes, shown, report.loop.slope_unit)
     rows = [(*cell, *pair) for cell, pair in zip(report.loop.cells, halves.T, strict=True)]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import finite_array, number_between, one_of
+from faintspot.base.checks import finite_array, increasing, one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays
 from faintspot.base.toml_files import check_keys, parse_file
@@ -19,7 +19,7 @@ from faintspot.io.frames import read_array
 from faintspot.io.telemetry.pyrtc_session import holds_session, read_session
 from faintspot.io.telemetry.recording import read_telemetry
 from faintspot.loop.control.configuration import load_control
-from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.control.identification.recording import NUMBERS, Recording
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.sensor.pupil import side_m
@@ -30,17 +30,7 @@ UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
 """Units of slopes, in arcsec."""
 _OF_AOT = {"pix": "px", "pixel": "px", "px": "px", "arcsec": "arcsec", "rad": "rad"}
 _ARRAYS = ("slopes", "commands", "interaction_matrix", "control_matrix", "cells", "time_s", "frame", "flags")
-_NUMBERS = (
-    "frame_rate_hz",
-    "pixel_scale_arcsec",
-    "subaperture_m",
-    "diameter_m",
-    "delay_frames",
-    "largest_command",
-    "outer_scale_m",
-    "science_wavelength_m",
-)
-_WORDS = ("sent_after_frames", "slope_unit", "slope_order", "loop")
+_WORDS = ("slope_unit", "slope_order", "loop")
 _PAIRS, _AXES = "pairs", "axes"
 _TABLES = (".npz", ".npy", ".csv", ".txt")
 
@@ -89,7 +79,7 @@ def read_recorded_loop(
 def _of_toml(path: Path) -> dict[str, Any]:
     """Return the values of a TOML file, with the arrays that it names."""
     values = parse_file(path)
-    check_keys(f"{path}: ", values, [*_ARRAYS, *_NUMBERS, *_WORDS])
+    check_keys(f"{path}: ", values, [*_ARRAYS, *NUMBERS, *_WORDS])
     for name in _ARRAYS:
         if name in values and isinstance(values[name], str):
             values[name] = _array(str(path.parent / values[name]))
@@ -100,17 +90,35 @@ def _array(location: str) -> NDArray[Any]:
     if not location.endswith((".csv", ".txt")):
         return read_array(location)
     try:
-        table = np.genfromtxt(location, delimiter=",", ndmin=2)
+        with Path(location).open(encoding="utf-8") as stream:
+            lines = [line for line in stream if line.split("#")[0].strip()]
+        if lines and not any(map(_is_number, lines[0].split(","))):
+            del lines[0]  # a line of names
+        if not lines:
+            raise ValueError("the file is empty")
+        return np.loadtxt(lines, delimiter=",", ndmin=2, converters=_number)
     except (OSError, ValueError) as error:
-        raise InputError(f"{location}: expected rows of numbers with commas ({error})") from None
-    return table[1:] if np.isnan(table[0]).all() else table  # a line of names
+        reason = " ".join(str(error).split())
+        raise InputError(f"{location}: expected rows of numbers with commas ({reason})") from None
+
+
+def _number(field: str) -> float:
+    return float(field.strip() or "nan")
+
+
+def _is_number(field: str) -> bool:
+    try:
+        _number(field)
+    except ValueError:
+        return False
+    return True
 
 
 def _of_table(path: Path) -> dict[str, Any]:
     if path.suffix != ".npz":
         return {"slopes": _array(str(path))}
     stored = read_arrays(path, "slopes of a loop")
-    check_keys(f"{path}: ", stored, [*_ARRAYS, *_NUMBERS, *_WORDS])
+    check_keys(f"{path}: ", stored, [*_ARRAYS, *NUMBERS, *_WORDS])
     return {name: array.item() if array.ndim == 0 else array for name, array in stored.items()}
 
 
@@ -175,11 +183,11 @@ def _loop(name: str, values: dict[str, Any]) -> Recording:
     """Return the loop of values from files, checked."""
     if "slopes" not in values:
         raise InputError("slopes: expected an array, found none")
-    slopes, remarks = np.asarray(values["slopes"], np.float64), []
+    slopes, remarks = real_array("slopes", values["slopes"], minimum_dimensions=1).astype(np.float64), []
     in_pairs = one_of("slope_order", values.get("slope_order", _AXES), (_AXES, _PAIRS)) == _PAIRS
     if in_pairs and slopes.ndim == 2:
         slopes = np.hstack([slopes[:, ::2], slopes[:, 1::2]])
-    numbers = {key: number_between(key, values[key], 0, low_open=True) for key in _NUMBERS if key in values}
+    numbers = {key: option.checked(key, values[key]) for key, option in NUMBERS.items() if key in values}
     if "slope_unit" not in values:
         raise InputError(f"slope_unit: unknown; give it in a TOML file with --system ({', '.join(UNITS)})")
     unit = one_of("slope_unit", values["slope_unit"], list(UNITS))
@@ -187,7 +195,8 @@ def _loop(name: str, values: dict[str, Any]) -> Recording:
     frame, rate = _timing(values, len(slopes), numbers.get("frame_rate_hz"))
     interaction = values.get("interaction_matrix")
     if interaction is None and values.get("control_matrix") is not None:
-        control = finite_array("control_matrix", values["control_matrix"]).astype(np.float64)
+        control = finite_array("control_matrix", values["control_matrix"], minimum_dimensions=2)
+        control = control.astype(np.float64)
         interaction = np.linalg.pinv(control.reshape(len(control), -1), rcond=0.03)
         remarks.append("interaction matrix: pseudo-inverse of the control matrix")
     diameter_m = numbers.pop("diameter_m", None)
@@ -199,7 +208,6 @@ def _loop(name: str, values: dict[str, Any]) -> Recording:
         interaction,
         values.get("cells"),
         **known,
-        sent_after_frames=values.get("sent_after_frames"),
         frame=frame,
         is_closed=one_of("loop", values.get("loop", "closed"), ("closed", "open")) == "closed",
         slope_unit=unit,
@@ -225,16 +233,11 @@ def _timing(values: dict[str, Any], frames: int, rate: float | None) -> tuple[ND
     """Return frame numbers and the frame rate."""
     time = values.get("time_s")
     if time is not None:
-        time = finite_array("time_s", time).astype(np.float64)
-        if len(time) != frames or (np.diff(time) <= 0).any():
-            raise InputError(f"time_s: expected {frames} increasing times, got {len(time)}")
+        time = increasing("time_s", time, frames)
         rate = rate or float(1 / np.median(np.diff(time))) if frames > 1 else rate
     if rate is None:
         raise InputError("frame_rate_hz: unknown; give it in a TOML file with --system")
     frame = values.get("frame")
     if frame is None:
         frame = np.arange(frames) if time is None else np.rint((time - time[0]) * rate)
-    frame = np.asarray(frame).astype(np.int64)
-    if len(frame) != frames or (np.diff(frame) <= 0).any():
-        raise InputError(f"frame: expected {frames} increasing numbers, got {len(frame)}")
-    return frame, rate
+    return increasing("frame", frame, frames, integer=True), rate

@@ -61,8 +61,8 @@ def recorded_loop(
     in_turn = any(str(method).endswith(f"+{KALMAN}") for method in recording.attributes.get("methods", []))
     if (predicted and unknown) or (prior_std_px is not None and in_turn):
         raise InputError(
-            "recording: expected a loop closed with an integrator, as what another controller or program has "
-            "told the estimator to expect was not recorded"
+            "recording: expected a loop closed with an integrator, as the prior that another controller or "
+            "program sent to the estimator was not recorded"
         )
     rows, frame = np.asarray(recording.loop) == CLOSED, np.asarray(recording.frame)
     if np.count_nonzero(rows) < FEWEST_FRAMES + options.delay_frames:

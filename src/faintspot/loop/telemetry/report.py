@@ -82,8 +82,10 @@ class LoopReport:
             for name, part in self.parts.items()
         }
         if self.noise_px is not None and self.noise_error_px is not None:
-            values["noise"]["of_slopes"] = _plain(self.noise_px)
-            values["noise"]["of_slopes_error"] = _plain(self.noise_error_px)
+            values["noise"]["of_slopes"] = _rounded(self.noise_px)
+            values["noise"]["of_slopes_error"] = _rounded(self.noise_error_px)
+            if not np.isfinite(self.noise_px).all():
+                values["noise"]["of_slopes_unknown"] = "null: not measured in five consecutive frames"
         values["choices"]["compared"] = [choice.as_values() for choice in self.choices]
         return {
             "recording": self.loop.name,
@@ -211,10 +213,16 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
         for name in ("noise", "turbulence", "vibrations", "spectra", "choices"):
             report.parts[name].missing = report.parts[name].missing or f"{error}."
         return None
-    report.noise_px = loop.unit * delay.gains(len(loop.cells)) * np.sqrt(open_loop.variance)
+    known = np.isfinite(open_loop.variance_error)
+    if not known.any():
+        part.missing = "No slope was measured in five consecutive frames."
+        return open_loop
+    report.noise_px = np.where(
+        known, loop.unit * delay.gains(len(loop.cells)) * np.sqrt(open_loop.variance), np.nan
+    )
     report.noise_error_px = 0.5 * report.noise_px * open_loop.variance_error
-    rms = float(np.sqrt(np.square(report.noise_px).mean()))
-    spread = 0.5 * rms * float(open_loop.variance_error.mean()) / math.sqrt(len(open_loop.variance))
+    rms = float(np.sqrt(np.square(report.noise_px[known]).mean()))
+    spread = 0.5 * rms * float(open_loop.variance_error[known].mean()) / math.sqrt(known.sum())
     spread = math.hypot(spread, _PARABOLA_ERROR * rms)
     remark = "rms over the sub-apertures"
     part.values.append(Measured("noise of a slope", loop.slope_unit, rms, spread, remark))
@@ -323,5 +331,5 @@ def _choices(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> None:
         part.missing = str(error)
 
 
-def _plain(values: Floats) -> list[float]:
+def _rounded(values: Floats) -> list[float]:
     return [float(f"{value:.4g}") for value in values]

@@ -138,7 +138,7 @@ class Calibration:
         return 2.0 if self.em_gain > 1 else 1.0
 
     @property
-    def vouches_for_dark(self) -> bool:
+    def dark_is_known(self) -> bool:
         """Whether the dark level is known accurately; otherwise estimators may fit it."""
         return self.dark is not None and "dark" not in self.estimated
 

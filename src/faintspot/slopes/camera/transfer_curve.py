@@ -122,8 +122,10 @@ def fit_line(curve: Curve) -> Line | None:
     """Fit variance = intercept * share + slope * flux; standard errors by jackknife over groups of pixels."""
     terms = np.stack([curve.share, curve.flux], axis=1)
     n = len(terms)
-    if n < 2 * _GROUPS or np.ptp(curve.mean) == 0:
+    varies = curve.variance > 0
+    if min(n, int(np.count_nonzero(varies))) < 2 * _GROUPS or np.ptp(curve.mean) == 0:
         return None
+    least = 0.1 * float(np.median(curve.variance[varies]))
     # Weights must not follow the noise of faint pixels: below the typical flux they are equal.
     bright = max(float(np.sum(np.square(curve.mean)) / max(np.sum(np.abs(curve.mean)), 1e-300)), 0.0)
     typical = np.maximum(curve.mean, bright)
@@ -133,9 +135,8 @@ def fit_line(curve: Curve) -> Line | None:
         good = (curve.variance > 0) & (curve.variance < _LARGEST_EXCESS * model)
         weight = good / np.square(scale)
         solution = _solve(terms * weight[:, None], terms, curve.variance)
-        smallest = 0.1 * float(np.median(curve.variance)) + 1e-300
-        model = np.maximum(terms @ solution, smallest)
-        scale = np.maximum(solution[0] + solution[1] * typical, smallest)
+        model = np.maximum(terms @ solution, least)
+        scale = np.maximum(solution[0] + solution[1] * typical, least)
     weighted = terms * weight[:, None]
     group = np.arange(n) * _GROUPS // n
     subsets = [group != left_out for left_out in range(_GROUPS)]

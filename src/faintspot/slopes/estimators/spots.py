@@ -56,7 +56,7 @@ class SpotPlan(EstimatorPlan):
     def fits_background(self) -> bool:
         """Whether a constant background is fitted along with the spot."""
         choice = getattr(self.estimator, "local_background", "off")
-        return choice == "on" or (choice == "auto" and not self.sensor.calibration.vouches_for_dark)
+        return choice == "on" or (choice == "auto" and not self.sensor.calibration.dark_is_known)
 
     @property
     def model_tables(self) -> spot_fits.ModelTables:

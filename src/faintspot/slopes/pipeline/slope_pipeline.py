@@ -268,7 +268,7 @@ class SlopePipeline:
         text = (
             f"{self.layout.window} {self.layout.bin} {calibration.saturation_adu} "
             f"{calibration.read_noise_photoelectrons} {calibration.background_e} {calibration.em_gain} "
-            f"{calibration.vouches_for_dark} {configuration.to_text(self.settings)}"
+            f"{calibration.dark_is_known} {configuration.to_text(self.settings)}"
         )
         return (
             b"".join(np.ascontiguousarray(part).tobytes() for part in parts) + self._identity + text.encode()

@@ -18,9 +18,11 @@ Floats = NDArray[np.float64]
 _ROUNDS = 3  # fluxes and weights follow the profile
 _RIDGE = 1e-9  # relative to the mean information on an altitude
 _CENTRED = 1e4  # information that the spots are centred, relative to that of the images
+_NEGLIGIBLE = 1e-6  # relative weight of a pixel, or relative chi-square
 _LEAST_VARIANCE = 1e-6  # relative to the mean of the images
 _SMOOTHNESS = 0.1
 _LARGEST_BLUR_FWHM = 2.0
+_SIGNIFICANT = 3.0  # ratio of mean squares (F test) by which spots must fit better than constant images
 
 
 class SodiumFit(NamedTuple):
@@ -31,6 +33,10 @@ class SodiumFit(NamedTuple):
     """Flux of the whole spots [electrons], (n,)."""
     chi_square: float
     """Sum of the squared deviations of the mean images, in units of their variance."""
+    significance: float
+    """Decrease of chi-square by the spots for each free value, relative to what is left for each pixel.
+
+    Relative to constant images; about 1 for images of noise alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +145,7 @@ def fit_sodium_profile(
     Raises
     ------
     InputError
-        If shapes differ, a value is out of range, or the images have no flux.
+        If shapes differ, a value is out of range, or the images show no spots.
 
     Examples
     --------
@@ -154,6 +160,20 @@ def fit_sodium_profile(
     >>> print(f"{true.std_m / 1e3:.1f} km, {found.profile.std_m / 1e3:.1f} km")
     3.5 km, 3.5 km
     """
+    return _constrained(
+        _fitted(mean, star, profile, dark_variance_e2=dark_variance_e2, smoothness=smoothness)
+    )
+
+
+def _fitted(
+    mean: MeanImages,
+    star: LaserGuideStar,
+    profile: SodiumProfile,
+    *,
+    dark_variance_e2: ArrayLike,
+    smoothness: float,
+) -> SodiumFit:
+    """Return the profile, also where nothing constrains it."""
     dark = numbers_between("dark_variance_e2", dark_variance_e2, 0.0)
     expected = number_between("smoothness", smoothness, 0.0, low_open=True)
     data, shape = mean.images_e, mean.images_e.shape
@@ -183,8 +203,29 @@ def fit_sodium_profile(
         density = SodiumProfile(profile.altitudes_m, density).density
     shapes = flat @ density
     residual = measured - flux[:, None] * shapes
-    chi_square = float((_weights(flux, shapes, variance, measured, mean.frames) * residual**2).sum())
-    return SodiumFit(SodiumProfile(profile.altitudes_m, density), flux, chi_square)
+    weights = _weights(flux, shapes, variance, measured, mean.frames)
+    chi_square = float((weights * residual**2).sum())
+    significance = _significance(weights, measured, chi_square, len(flux) + int(np.count_nonzero(density)))
+    return SodiumFit(SodiumProfile(profile.altitudes_m, density), flux, chi_square, significance)
+
+
+def _significance(weights: Floats, measured: Floats, chi_square: float, free: int) -> float:
+    """Return the F ratio of spots relative to constant images."""
+    constant = (weights * measured).sum(axis=1) / weights.sum(axis=1)
+    without = float((weights * (measured - constant[:, None]) ** 2).sum())
+    pixels = int(np.count_nonzero(weights > _NEGLIGIBLE * weights.max()))
+    left = max(chi_square, _NEGLIGIBLE * without) / max(pixels - free, 1)
+    return float((without - chi_square) / free / left) if left > 0 else 0.0
+
+
+def _constrained(fit: SodiumFit) -> SodiumFit:
+    """Return a fit; refuse one that the images do not constrain."""
+    if not fit.significance > _SIGNIFICANT:
+        raise InputError(
+            "images_e: expected images of spots, got ones that constant images fit as well "
+            f"(F ratio {fit.significance:.2g}, expected above {_SIGNIFICANT:g})"
+        )
+    return fit
 
 
 def fit_spot(
@@ -226,13 +267,13 @@ def fit_spot(
 
     def fitted(blur_px: float) -> SodiumFit:
         options: dict[str, Any] = {"dark_variance_e2": dark_variance_e2, "smoothness": smoothness}
-        return fit_sodium_profile(mean, blurred(blur_px), profile, **options)
+        return _fitted(mean, blurred(blur_px), profile, **options)
 
     widest = _LARGEST_BLUR_FWHM * float(star.spot.fwhm_px.mean())
     best = minimize_scalar(
         lambda blur: fitted(blur).chi_square, bounds=(0.0, widest), method="bounded", options={"xatol": 0.01}
     )
-    return blurred(float(best.x)), fitted(float(best.x))
+    return blurred(float(best.x)), _constrained(fitted(float(best.x)))
 
 
 def _weights(flux: Floats, shapes: Floats, dark: Floats, measured: Floats, frames: float | None) -> Floats:

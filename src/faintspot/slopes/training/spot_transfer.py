@@ -123,7 +123,7 @@ def _fitted_psf(
     gain = excess / noise.slope
     calibration = Calibration(gain_e_per_adu=gain, em_gain=em_gain, read_noise_e=noise.dark**0.5 * gain)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of few sub-pixel positions: whoever keeps the PSF is told
+        warnings.simplefilter("ignore")  # about few sub-pixel positions: repeated where the PSF is kept
         learnt = learn_psf_from_images(images, calibration=calibration, rng=rng)
     adu = em_gain / gain
     return learnt.psf, learnt.positions, learnt.flux_e * adu, float(learnt.background_e[0]) * adu

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
+from faintspot.base.json_text import to_json
 from faintspot.base.report.figure_data import csv_text
 from faintspot.io.optional_packages import load_fits
 from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
@@ -82,8 +82,8 @@ def _json(wavefront: Wavefront) -> str:
         for j, (n, m), mean, error in zip(
             wavefront.modes,
             (noll_to_nm(int(j)) for j in wavefront.modes),
-            _plain(wavefront.mean),
-            _plain(wavefront.mean_standard_error),
+            wavefront.mean,
+            wavefront.mean_standard_error,
             strict=True,
         )
     ]
@@ -100,21 +100,26 @@ def _json(wavefront: Wavefront) -> str:
             "modes": modes,
         },
         "frames": {
-            "rms": _plain(wavefront.rms()),
-            "rms_without_tilt": _plain(wavefront.rms(tilt=False)),
-            "residual_px": _plain(wavefront.residual_px),
-            "coefficients": _plain(wavefront.coefficients),
-            "standard_errors": _plain(wavefront.standard_errors),
+            "rms": wavefront.rms(),
+            "rms_without_tilt": wavefront.rms(tilt=False),
+            "residual_px": wavefront.residual_px,
+            "coefficients": wavefront.coefficients,
+            "standard_errors": wavefront.standard_errors,
         },
     }
-    return json.dumps(values, indent=1, allow_nan=False)
+    return to_json({**values, "unknown": _unknown(wavefront)}, indent=1)
 
 
-def _plain(values: Floats) -> Any:
-    """Return an array as lists with None for unknown values."""
-    plain = values.astype(object)
-    plain[~np.isfinite(values)] = None
-    return plain.tolist()
+def _unknown(wavefront: Wavefront) -> dict[str, str]:
+    """Return why values are unknown (null), by name."""
+    reasons = {}
+    if wavefront.pupil.radius_m is None:
+        reasons["pupil_radius_m"] = "the layout has neither subaperture_m nor diameter_m"
+    if not wavefront.fitted.all():
+        reasons["frames"] = "too few valid sub-apertures to separate the modes"
+    elif not np.isfinite(wavefront.standard_errors).all():
+        reasons["standard_errors"] = "no standard errors of the slopes, and no residuals to replace them"
+    return reasons
 
 
 def _fits(wavefront: Wavefront) -> bytes:

@@ -164,7 +164,7 @@ function showSlopes(values, arrays, where) {
   const low = Math.min(0, ...lit), high = Math.max(...lit, 1);
   flux = [flux[0] + 0.2 * (low - flux[0]), high > flux[1] ? high : flux[1] + 0.05 * (high - flux[1])];
   drawMap(byId("flux"), where, light, ...flux);
-  say("flux-caption", `mean ${inWords(mean(light))} e⁻`);
+  say("flux-caption", `${values.flux_of}, mean ${inWords(mean(light))} e⁻`);
   colourBar("flux-scale", flux, "e⁻");
 
   drawValidity(byId("valid"), where, flags, invalid);
@@ -237,7 +237,7 @@ function showStrips({ strip: names, strip_s: seconds }, { data, shape }) {
   drawStrip(byId("rms"), times, seconds, [{ values: rms, colour: "first" }], { from: 0 });
   say("rms-caption", `about the mean slopes: ${inWords(last(rms))} px`);
   drawStrip(byId("mean-flux"), times, seconds, [{ values: light, colour: "first" }], { from: 0 });
-  say("mean-flux-caption", `per sub-aperture: ${inWords(last(light))} e⁻`);
+  say("mean-flux-caption", `${values.flux_of}, per sub-aperture: ${inWords(last(light))} e⁻`);
   const strehl = column("strehl"), some = strehl.some(Number.isFinite);
   byId("strehl-figure").hidden = !some;
   if (some) {

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.slope_records import SlopeRecords
 from faintspot.loop.control.identification.slope_spectra import SlopeSpectra
 from faintspot.loop.control.identification.vibrations import MODES, Vibration, mode_shapes
@@ -181,6 +182,8 @@ class LayerLikelihood:
         winds = _grid()
         spectra = np.array([self._spectra.of_wind(wind, self._tables) for wind in winds])
         strength, noise = self.strengths(spectra, self._start())
+        if not strength.sum() > 0:
+            raise InputError("slopes: no turbulence that a wind carries was found")
         remaining, peaks = strength.copy(), []
         near = np.hypot(*(winds[:, None] - winds).transpose(2, 0, 1)) < _near(winds)[:, None]
         for _ in range(_MOST_LAYERS):

@@ -42,11 +42,10 @@ class Measured:
         return self.value / factor, self.value * factor
 
     def as_values(self) -> dict[str, Any]:
-        """Return plain values, for JSON; None if unknown."""
+        """Return plain values; the remark says why one is NaN."""
         low, high = self.interval
         numbers = {"value": self.value, "error": self.error, "low": low, "high": high}
-        plain = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-        return {"name": self.name, "unit": self.unit, **plain, "remark": self.remark}
+        return {"name": self.name, "unit": self.unit, **numbers, "remark": self.remark}
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ class OpenLoop:
     variance: Floats
     """(2 n,): variance of the noise; of known standard errors the median."""
     variance_error: Floats
-    """(2 n,): relative standard error of the measured variance."""
+    """(2 n,): relative standard error of the measured variance; NaN where it is unknown."""
 
     def scaled(self, gain: float) -> OpenLoop:
         """Return the same with residual slopes multiplied by a gain."""
@@ -158,6 +158,8 @@ def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:
     residual, atmosphere = grid
     measured = np.isfinite(atmosphere)
     variance, count = _noise_variance(atmosphere)
+    if count.any():
+        variance = np.where(count > 0, variance, variance[count > 0].mean())
     least = _LEAST_SIGNAL * float(np.nanvar(atmosphere))
     of_frames = usual = np.maximum(variance, least)
     if loop.standard_errors is not None:
@@ -177,7 +179,7 @@ def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:
     telemetry = OpenLoopTelemetry(np.where(measured, atmosphere, 0.0), of_frames, trust, covariance)
     runs = np.repeat(runs_of(frame), np.diff(frame, append=frame[-1] + 1))
     # Products of Gaussian noise with its deviation from a parabola have this variance.
-    error = np.sqrt(2.5 / np.maximum(count, 1))
+    error = np.where(count > 0, np.sqrt(2.5 / np.maximum(count, 1)), np.nan)
     return OpenLoop(telemetry, np.where(measured, residual, 0.0), runs, usual, error)
 
 

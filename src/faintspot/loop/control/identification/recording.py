@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import finite_array, number_between, real_array
+from faintspot.base.checks import finite_array, increasing, numbers_between, real_array
+from faintspot.base.config.options import Option
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.cell_order import order_remark
 from faintspot.loop.control.reconstructor import make_reconstructor
@@ -21,15 +22,34 @@ _CLEAR = 0.5  # correlation of an integrator's steps with its slopes, above whic
 _UNRELATED = 0.1  # correlation below which commands are not those of the loop
 _STEPS_FOR_TEST = 200  # fewest of them
 _PER_FRAME = ("slopes", "commands", "frame", "standard_errors", "covariance_xy")
-_OPTIONAL = (
-    "subaperture_m",
-    "pixel_scale_arcsec",
-    "delay_frames",
-    "largest_command",
-    "outer_scale_m",
-    "frame_rate_hz",
-    "science_wavelength_m",
-)
+_MOST_CELLS = 1000  # rows or columns of the lenslet array
+_BROKEN = 1e6  # rms of a slope relative to the median one
+
+
+def _positive(meaning: str, unit: str, low: float, high: float) -> Option:
+    return Option(meaning, unit, low, high, per_subaperture=False, optional=True)
+
+
+NUMBERS = {
+    "frame_rate_hz": _positive("Frame rate.", "Hz", 1e-3, 1e6),
+    "subaperture_m": _positive("Side of a sub-aperture.", "m", 1e-5, 100.0),
+    "diameter_m": _positive("Diameter of the pupil.", "m", 1e-4, 1000.0),
+    "pixel_scale_arcsec": _positive("Angle of one unit of the slopes.", "arcsec", 1e-9, 1e9),
+    "delay_frames": _positive("Delay of the loop.", "frames", 1e-3, 100.0),
+    "largest_command": _positive("Limit of a command.", "", 1e-30, 1e30),
+    "outer_scale_m": _positive("Outer scale of the turbulence.", "m", 1e-2, 1e6),
+    "science_wavelength_m": _positive("Wavelength of the Strehl ratio.", "m", 1e-8, 1e-3),
+    "sent_after_frames": Option(
+        "Frames from a command's slopes to its row.",
+        "",
+        0,
+        100,
+        whole=True,
+        per_subaperture=False,
+        optional=True,
+    ),
+}
+"""Numbers that describe a recording, by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,16 +109,13 @@ class Recording:
         if slopes.ndim != 2 or slopes.shape[1] % 2:
             raise InputError(f"slopes: expected shape (frames, 2 n), got {slopes.shape}")
         cells = cells_of(self.cells, slopes.shape[1] // 2)
-        frame = np.arange(len(slopes)) if self.frame is None else np.asarray(self.frame).astype(np.int64)
-        if len(frame) != len(slopes) or (np.diff(frame) <= 0).any():
-            raise InputError(f"frame: expected {len(slopes)} increasing numbers, got {len(frame)}")
+        frame = np.arange(len(slopes))
+        if self.frame is not None:
+            frame = increasing("frame", self.frame, len(slopes), integer=True)
         values: dict[str, Any] = {"slopes": slopes, "cells": cells, "frame": frame}
-        for name in _OPTIONAL:
-            if getattr(self, name) is not None:
-                values[name] = number_between(name, getattr(self, name), 0, low_open=True)
-        if self.sent_after_frames is not None:
-            sent = number_between("sent_after_frames", self.sent_after_frames, 0, 100, integer=True)
-            values["sent_after_frames"] = int(sent)
+        for name, declared in NUMBERS.items():
+            if hasattr(self, name):
+                values[name] = declared.checked(name, getattr(self, name))
         for name in ("commands", "interaction_matrix"):
             if getattr(self, name) is not None:
                 array = finite_array(name, getattr(self, name), minimum_dimensions=2).astype(np.float64)
@@ -175,10 +192,26 @@ def prepared(recording: Recording) -> Prepared:
     spread = float(slopes.std())
     if not spread > 1e-12 * float(np.abs(slopes).max(initial=0.0)):
         raise InputError(f"{recording.name}: expected slopes that vary, got constant ones")
+    _check_alike(recording)
     scaled = recording.scaled(spread)
     if recording.commands is None or recording.interaction_matrix is None or not recording.is_closed:
         return Prepared(scaled, 1.0, 0, math.inf)
     return _with_convention(scaled)
+
+
+def _check_alike(recording: Recording) -> None:
+    """Refuse a recording in which some slopes are so much larger than the others that they are broken."""
+    measured = np.isfinite(recording.slopes)
+    slopes = np.where(measured, recording.slopes, 0.0)
+    largest = np.abs(slopes).max(axis=0)
+    usual = float(np.median(largest[largest > 0]))
+    (broken,) = np.nonzero(largest > _BROKEN * usual)
+    if len(broken):
+        columns = ", ".join(map(str, broken[:5]))
+        raise InputError(
+            f"{recording.name}: expected slopes of similar size, got columns {columns} over {_BROKEN:g} "
+            "times the median; flag them, or write NaN there"
+        )
 
 
 def _with_convention(loop: Recording) -> Prepared:
@@ -255,10 +288,15 @@ def cells_of(stated: Any, n: int) -> NDArray[np.int64]:
             )
         return np.argwhere(np.ones((side, side)))
     cells = finite_array("cells", stated)
-    if cells.shape == (n, 2) and len(np.unique(cells, axis=0)) < n:
-        raise InputError(f"cells: expected {n} sub-apertures in different places, got some twice")
     if cells.shape == (n, 2):
-        return cells.astype(np.int64)
-    if cells.ndim == 2 and np.count_nonzero(cells > 0) == n:  # a mask
+        whole = numbers_between("cells", cells, -(2**31), 2**31, integer=True)
+        if len(np.unique(whole, axis=0)) < n:
+            raise InputError("cells: expected another row or column for each sub-aperture, got one twice")
+        if np.ptp(whole, axis=0).max() >= _MOST_CELLS:
+            raise InputError(
+                f"cells: expected at most {_MOST_CELLS} rows and columns, got {np.ptp(whole, axis=0) + 1}"
+            )
+        return whole
+    if cells.ndim == 2 and max(cells.shape) <= _MOST_CELLS and np.count_nonzero(cells > 0) == n:  # a mask
         return np.argwhere(cells > 0)
     raise InputError(f"cells: expected shape ({n}, 2), or a mask with {n} sub-apertures, got {cells.shape}")

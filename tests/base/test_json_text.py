@@ -1,0 +1,65 @@
+"""One writer of JSON, whose text every strict reader accepts."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import faintspot
+from faintspot.base.json_text import parse_json, plain_values, to_json
+
+# The page's server looks for lone surrogates, which text may hold in memory and not in a message.
+OTHERS = {"base/json_text.py", "engine/page/server.py"}
+
+
+def test_values_that_json_lacks_are_written_as_it_has_them() -> None:
+    given = {
+        "inf": np.float64("inf"),
+        3: (np.int64(2), [float("-inf")]),
+        "array": np.array([[1.5, np.nan]], np.float32),
+        "path": Path("a"),
+        "flags": [np.True_, None],
+        "other": 1j,
+    }
+    expected = {
+        "inf": None,
+        "3": [2, [None]],
+        "array": [[1.5, None]],
+        "path": "a",
+        "flags": [True, None],
+        "other": "1j",
+    }
+    assert plain_values(given) == expected
+    assert json.loads(to_json(given)) == expected
+    assert to_json({"a": 1}, indent=1) == '{\n "a": 1\n}'
+
+
+@pytest.mark.parametrize(
+    ("value", "error"), [(math.nan, ValueError), ([math.inf], ValueError), (1j, TypeError)]
+)
+def test_exact_text_holds_values_as_they_are(value: Any, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        to_json({"a": value}, exact=True)
+    assert to_json({"a": Path("b"), "c": np.arange(2)}, exact=True) == '{"a": "b", "c": [0, 1]}'
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, b"\xff", "{", "NaN", '{"a": [-Infinity]}'])
+def test_text_that_is_not_json_is_refused(text: str | bytes) -> None:
+    assert parse_json('{"a": [1]}') == {"a": [1]}
+    with pytest.raises(ValueError):  # noqa: PT011
+        parse_json(text)
+
+
+def test_all_json_is_written_and_read_here() -> None:
+    package = Path(faintspot.__file__).parent
+    files = sorted(package.rglob("*.py"))
+    assert len(files) > 400
+    imported = re.compile(r"^\s*(?:import|from) json\b", re.MULTILINE)
+    users = {file for file in files if imported.search(file.read_text(encoding="utf-8"))}
+    assert {file.relative_to(package).as_posix() for file in users} == OTHERS
