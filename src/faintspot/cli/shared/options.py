@@ -55,12 +55,24 @@ READOUT_FRACTION = option(
 PORT = option(
     "--port", type=click.IntRange(0, 65535), default=8642, help="Port of the page; 0: any that is free."
 )
-WORKERS = option(
-    "--workers",
-    type=click.IntRange(0),
-    help="Processes on this machine; 0: this process alone.",
-    show_default="all processors",
-)
+
+
+def where_work_is_done(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --workers and --scheduler."""
+    workers = option(
+        "--workers",
+        type=click.IntRange(0),
+        help="Processes on this machine; 0 or 1: this process alone.",
+        show_default="all processors",
+    )
+    scheduler = option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Dask scheduler whose workers do the work instead, such as tls://host:8786.",
+    )
+    return workers(scheduler(command))
+
+
 PIXEL_SCALE = option(
     "--pixel-scale-arcsec",
     type=float,
