@@ -148,7 +148,7 @@ class _TelemetryMethod:
         return cls(plain, tuple(values.items()))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=4)  # a search scales the noise of one model by three factors
 def _learnt(
     configuration: LoopConfiguration,
     method: _TelemetryMethod,
@@ -169,7 +169,7 @@ def _learnt(
     return learn_controller(kind, plant, telemetry, site, control.frame_rate_hz, control.winds, noise_scale)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=1)  # for several controls; 170 MB with 40 x 40 sub-apertures
 def _telemetry(
     configuration: LoopConfiguration, method: _TelemetryMethod, seed: int, simulate: Simulate
 ) -> OpenLoopTelemetry:
