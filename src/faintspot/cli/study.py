@@ -11,7 +11,7 @@ import click
 from faintspot.base.files import derived
 from faintspot.cli.shared.commands import Group, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import where_work_is_done
+from faintspot.cli.shared.options import SCHEDULER, WORKERS
 from faintspot.cli.shared.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -24,7 +24,8 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that say where and how a study runs."""
     for each in (
         option("--overwrite", is_flag=True, help="Replace the store of another study."),
-        where_work_is_done,
+        SCHEDULER,
+        WORKERS,
     ):
         command = each(command)
     return command

@@ -156,9 +156,8 @@ class _Count:
     """Amount of finished work, in finished and unfinished units."""
 
     def __init__(self, missing: list[Unit], total: int, progress: Progress | None) -> None:
-        self._sizes, self._total = np.array([unit.size for unit in missing]), total
+        self._sizes, self._total, self._progress = np.array([u.size for u in missing]), total, progress
         self.done, self._lock = np.zeros_like(self._sizes), threading.Lock()
-        self._progress = progress
         self.at(slice(None), 0)
 
     def at(self, unit: int | slice, done: ArrayLike) -> None:
@@ -208,10 +207,9 @@ def _by_joblib(
             with parallel_config("loky", inner_max_num_threads=1, initializer=_begin_worker):
                 parallel = Parallel(processes, **how)
         own = [kind for kind in estimators().values() if not kind.__module__.startswith("faintspot.")]
-        job = delayed(_in_worker)
         # In tuples: other large arguments would stay with one worker, and be lost with it.
         results = parallel(
-            job((function, unit.arguments), (number, told), (own, __version__))
+            delayed(_in_worker)((function, unit.arguments), (number, told), (own, __version__))
             for number, unit in list(units.items())
         )
         try:
@@ -222,11 +220,7 @@ def _by_joblib(
                 results.close()
 
 
-def _in_worker(
-    work: tuple[Callable[..., Arrays], tuple[Any, ...]],
-    place: tuple[int, Path | None],
-    package: tuple[list[Any], str],
-) -> tuple[int, Arrays]:
+def _in_worker(work: tuple[Any, ...], place: tuple[int, Path | None], package: tuple[Any, ...]) -> Any:
     """Run a unit with the estimators that are registered where the experiment was started."""
     (function, arguments), (number, told), (own, version) = work, place, package
     if version != __version__:
@@ -302,6 +296,3 @@ def _cluster(scheduler: str, say: Callable[[str], None]) -> Iterator[Any]:
         say(f"Dask scheduler {scheduler}, when its first worker is there")
         client.wait_for_workers(1)
         yield Backend(client=client)
-
-
-__all__ = ["Advance", "Progress", "Results", "Unit", "WorkerPool", "run_units"]

@@ -12,7 +12,7 @@ import click
 from faintspot.cli.loop.tune import tune
 from faintspot.cli.shared.commands import Group, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import where_work_is_done
+from faintspot.cli.shared.options import SCHEDULER, WORKERS
 from faintspot.cli.shared.progress import progress_bar
 
 _needs_loop = needs("loop", "hcipy", "joblib", "zarr", "matplotlib", "jinja2")
@@ -22,7 +22,8 @@ def _experiment_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of every experiment."""
     for each in (
         option("--overwrite", is_flag=True, help="Replace another experiment in the folder."),
-        where_work_is_done,
+        SCHEDULER,
+        WORKERS,
         option("--quick", is_flag=True, help="Fewer and shorter runs: a few minutes."),
         option(
             "--output", "-o", metavar="FOLDER", help="Where results go.", show_default="NAME, or NAME-quick"

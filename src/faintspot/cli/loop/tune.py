@@ -12,7 +12,7 @@ from rich.console import Console
 from faintspot.base.errors import InputError
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import where_work_is_done
+from faintspot.cli.shared.options import SCHEDULER, WORKERS
 from faintspot.cli.shared.output import check_target, picture_file, results_table, wrapped, write_picture
 from faintspot.cli.shared.progress import progress_bar
 
@@ -60,7 +60,8 @@ if TYPE_CHECKING:
     show_default="the isoplanatic angle",
 )
 @option("--seed", type=click.IntRange(0), help="Seed of turbulence and noise.", show_default="CONFIG")
-@where_work_is_done
+@WORKERS
+@SCHEDULER
 @option(
     "--results", metavar="FOLDER", help="Folder of finished work, to continue from.", show_default="NAME-tune"
 )

@@ -55,24 +55,13 @@ READOUT_FRACTION = option(
 PORT = option(
     "--port", type=click.IntRange(0, 65535), default=8642, help="Port of the page; 0: any that is free."
 )
-
-
-def where_work_is_done(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add --workers and --scheduler."""
-    workers = option(
-        "--workers",
-        type=click.IntRange(0),
-        help="Processes on this machine; 0 or 1: this process alone.",
-        show_default="all processors",
-    )
-    scheduler = option(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="Dask scheduler whose workers do the work instead, such as tls://host:8786.",
-    )
-    return workers(scheduler(command))
-
-
+WORKERS = option(
+    "--workers",
+    type=click.IntRange(0),
+    help="Processes on this machine; 0 or 1: this process alone.",
+    show_default="all processors",
+)
+SCHEDULER = option("--scheduler", metavar="ADDRESS", help="Dask scheduler to use instead: tls://host:8786.")
 PIXEL_SCALE = option(
     "--pixel-scale-arcsec",
     type=float,
