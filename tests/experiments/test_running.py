@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -161,7 +162,7 @@ def test_interruption_does_not_wait_for_units() -> None:
     units = [Unit("short", (0,), 2), Unit("long", (1,), 1), Unit("longer", (2,), 1)]
 
     def stop(done: int, total: int) -> None:
-        if store.done("short"):
+        if store.done("short") and threading.current_thread() is threading.main_thread():
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -221,3 +222,9 @@ def test_own_estimators_reach_the_workers(tmp_path: Path) -> None:
 def test_number_of_workers_is_checked() -> None:
     with pytest.raises(InputError, match="workers"):
         WorkerPool(workers=-1)
+
+
+def test_a_scheduler_needs_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingExtraError, match=r"faintspot\[cluster\]"):
+        WorkerPool(scheduler="tcp://127.0.0.1:8786")
