@@ -204,7 +204,8 @@ def _by_joblib(
         else:
             pool.say(f"{processes} processes on this machine")
             told = stack.enter_context(_followed(count))
-            with parallel_config("loky", inner_max_num_threads=1, initializer=_begin_worker):
+            begin = {"initializer": _begin_worker, "initargs": (os.getpid(),)}
+            with parallel_config("loky", inner_max_num_threads=1, **begin):
                 parallel = Parallel(processes, **how)
         own = [kind for kind in estimators().values() if not kind.__module__.startswith("faintspot.")]
         # In tuples: other large arguments would stay with one worker, and be lost with it.
@@ -234,10 +235,9 @@ def _in_worker(work: tuple[Any, ...], place: tuple[int, Path | None], package: t
         raise InputError(" ".join(str(error).split())) from None
 
 
-def _begin_worker() -> None:
+def _begin_worker(parent: int) -> None:
     """Leave interruptions to the parent, and end with it: joblib would go on with what is queued."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = os.getppid()
 
     def end_with_parent() -> None:
         while os.getppid() == parent:
