@@ -72,7 +72,7 @@ $(VENV)/installed-demo: pyproject.toml constraints.txt
 # Tests run these tools, and pyRTC and soapy (which brings 0.7 GB of a graphical toolkit) where they are there.
 $(VENV)/installed: $(VENV)/installed-demo
 	@echo "installing what develops and tests it ..."
-	$(PIP) --editable '.[all,oopao,specula]' --group develop
+	$(PIP) --editable '.[all,cluster,oopao,specula]' --group develop
 	@touch $@
 
 $(VENV)/installed-docs: $(VENV)/installed

@@ -45,6 +45,7 @@ NOT_RUN = {
     "open_study(": "needs a study's results",
     "PixelRing.create": "needs a camera",
     "pyshmem.open": "needs a running engine",
+    "dask_jobqueue": "needs a batch system",
 }
 """What marks a block that is not run here, and why."""
 

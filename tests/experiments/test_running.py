@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +23,7 @@ from faintspot.experiments.store import MemoryStore, ZarrStore
 
 pytestmark = pytest.mark.machine_time("starts other processes")
 
+ROOT = Path(__file__).parents[2]
 UNITS = [Unit(f"unit {number}", (number,), 10) for number in range(4)]
 
 
@@ -54,10 +58,42 @@ def die(number: int, advance: Callable[[int], None]) -> dict[str, NDArray[Any]]:
     raise AssertionError
 
 
+def half(number: int, advance: Callable[[int], None]) -> dict[str, NDArray[Any]]:
+    advance(5)
+    time.sleep(3)
+    return {}
+
+
+def note_and_sleep(folder: str, number: int, advance: Callable[[int], None]) -> dict[str, NDArray[Any]]:
+    (Path(folder) / str(os.getpid())).touch()
+    time.sleep(1000)
+    return {}
+
+
 def sleep(number: int, advance: Callable[[int], None]) -> dict[str, NDArray[Any]]:
     if number:
         time.sleep(1000)
     return {"process": np.asarray(os.getpid())}
+
+
+def gone(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def environment() -> dict[str, str]:
+    """Environment of programs that import this package and its tests."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
 
 
 def values(results: Any) -> list[int]:
@@ -99,31 +135,96 @@ def test_processes_give_the_same() -> None:
     assert said == ["2 processes on this machine"]
     for function, message in ((impossible, "refused"), (without_package, "pip install")):
         with pytest.raises(InputError, match=message):
-            run_units(function, UNITS[:1], MemoryStore(), WorkerPool(1))
+            run_units(function, UNITS, MemoryStore(), WorkerPool(2))
 
 
 def test_a_process_dies(tmp_path: Path) -> None:
     units = [Unit(unit.key, (str(tmp_path), *unit.arguments)) for unit in UNITS]
-    assert values(run_units(die_once, units, MemoryStore(), WorkerPool(1))) == [0, 2, 4, 6]
-    with refused("died repeatedly"):
-        run_units(die, UNITS[:1], MemoryStore(), WorkerPool(1))
+    assert values(run_units(die_once, units, MemoryStore(), WorkerPool(2))) == [0, 2, 4, 6]
+    with refused("lost repeatedly", "kept"):
+        run_units(die, UNITS, MemoryStore(), WorkerPool(2))
+
+
+def test_the_bar_moves_within_units() -> None:
+    counts: list[int] = []
+
+    def progress(done: int, total: int) -> None:
+        counts.append(done)
+
+    run_units(half, UNITS[:2], MemoryStore(), WorkerPool(2, progress))
+    assert 5 in counts or 10 in counts[:-2]
+    assert counts == sorted(counts)
+    assert counts[-1] == 20
 
 
 def test_interruption_does_not_wait_for_units() -> None:
     store = MemoryStore()
-    units = [Unit("short", (0,), 2), Unit("long", (1,), 1)]
+    units = [Unit("short", (0,), 2), Unit("long", (1,), 1), Unit("longer", (2,), 1)]
 
     def stop(done: int, total: int) -> None:
-        if done == 2:
+        if store.done("short") and threading.current_thread() is threading.main_thread():
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_units(sleep, units, store, WorkerPool(1, progress=stop))
-    assert store.done("short")
-    process = int(store.read("short")["process"])
-    assert not Path(f"/proc/{process}").exists() or not Path("/proc").exists()
+        run_units(sleep, units, store, WorkerPool(2, progress=stop))
+    assert gone(int(store.read("short")["process"]))
+
+
+CHILD = """
+from faintspot.experiments.running import Unit, WorkerPool, run_units
+from faintspot.experiments.store import MemoryStore
+from tests.experiments.test_running import note_and_sleep
+units = [Unit(str(number), ({folder!r}, number)) for number in range(4)]
+run_units(note_and_sleep, units, MemoryStore(), WorkerPool(2))
+"""
+
+
+def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
+    program = subprocess.Popen([sys.executable, "-c", CHILD.format(folder=str(tmp_path))], env=environment())
+    try:
+        wait_until(lambda: len(list(tmp_path.iterdir())) == 2)
+    finally:
+        program.kill()
+        program.wait()
+    for note in tmp_path.iterdir():
+        wait_until(lambda note=note: gone(int(note.name)))  # type: ignore[misc]
+
+
+OWN = """
+from dataclasses import dataclass
+from faintspot.experiments import StudySpecification, Sweep, run
+from faintspot.slopes.estimators import Estimator, register
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Middle(Estimator):
+    name = "middle"
+    label = "the middle of the window"
+    def locate(self, images, sensor, prior):
+        return sensor.zero
+
+sweep = Sweep("flux", flux_e=[30, 100, 300], pixels=8)
+study = StudySpecification("own", [sweep], realisations=20, estimators=["middle"], fixed_k=[])
+print(float(run(study, workers=2)["error"].mean()))
+"""
+
+
+def test_own_estimators_reach_the_workers(tmp_path: Path) -> None:
+    for package in ("xarray", "zarr"):
+        pytest.importorskip(package)
+    script = tmp_path / "own.py"
+    script.write_text(OWN)
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, env=environment())
+    assert ended.returncode == 0, ended.stderr
+    assert 0.3 < float(ended.stdout) < 0.7  # as positions are within a pixel of the middle
 
 
 def test_number_of_workers_is_checked() -> None:
     with pytest.raises(InputError, match="workers"):
         WorkerPool(workers=-1)
+
+
+def test_a_scheduler_needs_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingExtraError, match=r"faintspot\[cluster\]"):
+        WorkerPool(scheduler="tcp://127.0.0.1:8786")

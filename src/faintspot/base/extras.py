@@ -11,7 +11,8 @@ from faintspot.base.errors import InputError, MissingExtraError
 EXTRAS = {
     "io": ("astropy", "h5py", "PIL", "tifffile", "zarr"),
     "report": ("matplotlib", "jinja2"),
-    "loop": ("hcipy", "xarray"),
+    "loop": ("hcipy", "joblib", "xarray"),
+    "cluster": ("distributed",),
     "realtime": ("pyshmem", "aotpy", "tornado"),
     "oopao": ("OOPAO",),
     "specula": ("specula",),

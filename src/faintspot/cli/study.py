@@ -11,7 +11,7 @@ import click
 from faintspot.base.files import derived
 from faintspot.cli.shared.commands import Group, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import WORKERS
+from faintspot.cli.shared.options import SCHEDULER, WORKERS
 from faintspot.cli.shared.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that say where and how a study runs."""
     for each in (
         option("--overwrite", is_flag=True, help="Replace the store of another study."),
+        SCHEDULER,
         WORKERS,
     ):
         command = each(command)
@@ -46,7 +47,7 @@ def command() -> None:
     """
 
 
-@needs("loop", "xarray", "zarr")
+@needs("loop", "joblib", "xarray", "zarr")
 @command.command(short_help="Run a study of your own.")
 @click.argument("specification", metavar="TOML")
 @option(
@@ -74,7 +75,7 @@ def run(specification: str, output: str | None, **where: Any) -> None:
     click.echo(f"Next: faintspot report {shlex.quote(target)}")
 
 
-@needs("loop", "xarray", "zarr", "matplotlib", "jinja2")
+@needs("loop", "joblib", "xarray", "zarr", "matplotlib", "jinja2")
 @command.command(short_help="Repeat the study of Basden et al. 2015.")
 @option("--quick", is_flag=True, help="Fewer cells and realisations: about a minute.")
 @option(
@@ -106,7 +107,7 @@ def paper(quick: bool, figures: tuple[str, ...], output: str | None, **where: An
     _measure_and_report(paper_study(quick, figures or None), target, where)
 
 
-@needs("loop", "xarray", "zarr", "matplotlib", "jinja2")
+@needs("loop", "joblib", "xarray", "zarr", "matplotlib", "jinja2")
 @command.command(short_help="Compare all estimators with each other and with the limit.")
 @option("--quick", is_flag=True, help="A few cells of fewer realisations: less than a minute.")
 @option(

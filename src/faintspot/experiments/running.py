@@ -1,42 +1,41 @@
-"""Running units of work over processes of this machine.
+"""Running units of work with joblib: in processes of this machine, or on a running Dask cluster.
 
-No port is opened: processes talk through pipes that nobody else can reach.
+Work on this machine opens no network port.
 """
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
+import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
+from faintspot.base.extras import require
+from faintspot.base.version import __version__
 from faintspot.experiments.store import Arrays, UnitStore
+from faintspot.slopes.estimators.registry import estimators, register
 from faintspot.slopes.kernels.parallel import available_cpus
 
 Progress = Callable[[int, int], None]
 Advance = Callable[[int], None]
 """Told how much of a unit is done, in the measure of its `size`."""
 
-_TELLING_S = 0.5  # between what workers tell of their progress
-_ALLOWED_DEATHS = 3  # of processes on this machine
-_WORKER_ENVIRONMENT = {
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    # Workers keep freed memory for the next block, up to these sizes in bytes; else the system clears it anew
-    # for every array, which takes a quarter of the time.
-    "MALLOC_TRIM_THRESHOLD_": str(1 << 28),
-    "MALLOC_MMAP_THRESHOLD_": str(1 << 25),
-}
+_LOOK_S = 0.5  # between looks at how far workers are
+_ATTEMPTS = 3  # where workers die or a connection is lost
+_CONNECT_S = 10
 
 
 @dataclass(frozen=True)
@@ -52,31 +51,39 @@ class Unit:
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """Processes that run the units.
+    """Processes or cluster that run the units.
 
     Parameters
     ----------
     workers : int, optional
-        Processes on this machine; as many as there are processors by default. 0: this process.
+        Processes on this machine; as many as there are processors by default. 0 or 1: this process.
     progress : callable, optional
-        Called with how much is done and how much there is in all.
+        Called with how much is done and how much there is in all, also from another thread.
     announce : callable, optional
         Called with a line of text that says what is done.
+    scheduler : str, optional
+        Address of a running Dask scheduler instead, such as "tls://host:8786". Anyone who can reach it can
+        run code as the user of its workers: see docs/cluster.md.
 
     Raises
     ------
     InputError
         For a number of workers that is no whole number from 0.
+    MissingExtraError
+        For a scheduler where Dask is not installed.
     """
 
     workers: int | None = None
     progress: Progress | None = None
     announce: Callable[[str], None] | None = None
+    scheduler: str | None = None
 
     def __post_init__(self) -> None:
         if self.workers is not None:
             workers = int(number_between("workers", self.workers, 0, 10_000, integer=True))
             object.__setattr__(self, "workers", workers)
+        if self.scheduler is not None:
+            require("cluster", "distributed", purpose="A Dask scheduler")
 
     def say(self, text: str) -> None:
         """Announce a line of text."""
@@ -106,7 +113,7 @@ def in_stages(pool: WorkerPool, sizes: Sequence[int]) -> list[WorkerPool]:
 
 def run_units(
     function: Callable[..., Arrays], units: list[Unit], store: UnitStore, pool: WorkerPool
-) -> Mapping[str, Arrays]:
+) -> Results:
     """Run the units whose results are not stored yet, store each as it finishes; return all results, by key.
 
     Results do not depend on where units run, in which order, or on interruptions.
@@ -114,8 +121,8 @@ def run_units(
     Parameters
     ----------
     function : callable
-        Of a module, so that workers can import it. Called with a unit's arguments and, after them, a function
-        that it tells from time to time how much it has done; returns what the store keeps.
+        Called with a unit's arguments and, after them, a function that it tells from time to time how much
+        it has done; returns what the store keeps.
     units : list of Unit
         Larger ones are begun first, so that no worker is left with one.
     store : UnitStore
@@ -124,165 +131,168 @@ def run_units(
     Raises
     ------
     InputError
-        When workers die repeatedly, or results cannot be written.
+        When workers die repeatedly, the scheduler cannot be reached, or results cannot be written.
     """
     missing = sorted((unit for unit in units if not store.done(unit.key)), key=lambda unit: -unit.size)
     if missing:
-        count = _Count(units, missing, pool.progress)
-        for unit, result in _finished(function, missing, pool, count):
-            store.write(unit.key, result)
-            count.at(unit.key, unit.size)
-    return _Stored(store, [unit.key for unit in units])
+        count = _Count(missing, sum(unit.size for unit in units), pool.progress)
+        for number, result in _finished(function, dict(enumerate(missing)), pool, count):
+            store.write(missing[number].key, result)
+            count.at(number, missing[number].size)
+    return Results(store)
 
 
-class _Stored(Mapping[str, Arrays]):
+@dataclass(frozen=True)
+class Results:
     """Results of units by key, read when they are asked for."""
 
-    def __init__(self, store: UnitStore, keys: list[str]) -> None:
-        self._store, self._keys = store, keys
+    store: UnitStore
 
     def __getitem__(self, key: str) -> Arrays:
-        return self._store.read(key)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._keys)
-
-    def __len__(self) -> int:
-        return len(self._keys)
-
-
-Finished = Iterator[tuple[Unit, Arrays]]
+        return self.store.read(key)
 
 
 class _Count:
     """Amount of finished work, in finished and unfinished units."""
 
-    def __init__(self, units: list[Unit], missing: list[Unit], progress: Progress | None) -> None:
-        self._whole = {unit.key: unit.size for unit in units}
-        self._done = {**self._whole, **{unit.key: 0 for unit in missing}}
-        self._progress = progress
-        self._show()
+    def __init__(self, missing: list[Unit], total: int, progress: Progress | None) -> None:
+        self._sizes, self._total, self._progress = np.array([u.size for u in missing]), total, progress
+        self.done, self._lock = np.zeros_like(self._sizes), threading.Lock()
+        self.at(slice(None), 0)
 
-    def at(self, key: str, done: int) -> None:
-        """Note how far a unit is; what it does beyond what was expected does not count."""
-        self._done[key] = max(self._done[key], min(done, self._whole[key]))
-        self._show()
-
-    def _show(self) -> None:
-        if self._progress is not None:
-            self._progress(sum(self._done.values()), sum(self._whole.values()))
+    def at(self, unit: int | slice, done: ArrayLike) -> None:
+        """Note how far a unit is, or all; what it does beyond what was expected does not count."""
+        with self._lock:
+            self.done[unit] = np.clip(done, self.done[unit], self._sizes[unit])
+            if self._progress is not None:
+                self._progress(self._total - int((self._sizes - self.done).sum()), self._total)
 
 
 def _finished(
-    function: Callable[..., Arrays], units: list[Unit], pool: WorkerPool, count: _Count
-) -> Finished:
-    """Yield every unit and its result as it finishes."""
-    if pool.workers == 0:
-        return _here(function, units, count)
+    function: Callable[..., Arrays], units: dict[int, Unit], pool: WorkerPool, count: _Count
+) -> Iterator[tuple[int, Arrays]]:
+    """Yield the number of every unit and its result as it finishes; go on where workers are lost."""
     processes = min(available_cpus() if pool.workers is None else pool.workers, len(units))
-    pool.say(f"{processes} {'process' if processes == 1 else 'processes'} on this machine")
-    return _by_processes(function, units, processes, count)
-
-
-def _here(function: Callable[..., Arrays], units: list[Unit], count: _Count) -> Finished:
-    for unit in units:
-        yield unit, function(*unit.arguments, lambda done, key=unit.key: count.at(key, done))
-
-
-def _by_processes(
-    function: Callable[..., Arrays], units: list[Unit], processes: int, count: _Count
-) -> Finished:
-    """Let processes do the units; where one of them dies, new ones go on with what is left."""
-    remaining = {unit.key: unit for unit in units}
-    for deaths in range(1, _ALLOWED_DEATHS + 1):
+    if pool.scheduler is None and processes < 2:
+        for number, unit in units.items():
+            yield number, function(*unit.arguments, lambda done, number=number: count.at(number, done))
+        return
+    for _ in range(_ATTEMPTS):
         try:
-            for key, result in _by_one_pool(function, list(remaining.values()), processes, count):
-                yield remaining.pop(key), result
-        except BrokenProcessPool:
-            if deaths == _ALLOWED_DEATHS:
-                raise InputError(
-                    "processes died repeatedly, perhaps for lack of memory: what is finished is kept, try "
-                    "fewer workers; a script must do this under if __name__ == '__main__':"
-                ) from None
-        else:
+            for number, result in _by_joblib(function, units, processes, pool, count):
+                del units[number]
+                yield number, result
             return
+        except BrokenProcessPool as error:
+            reason = str(error)
+    raise InputError(
+        f"workers were lost repeatedly, perhaps for lack of memory: what is finished is kept ({reason})"
+    )
 
 
-def _by_one_pool(
-    function: Callable[..., Arrays], units: list[Unit], processes: int, count: _Count
-) -> Iterator[tuple[str, Arrays]]:
-    # A process that was forked could not go on with the threads of this one.
-    context = multiprocessing.get_context("spawn")
-    news = context.SimpleQueue()
-    earlier = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(processes, context, _begin_worker, (news,))
-    pending: dict[Future[Arrays], str] = {}
+def _by_joblib(
+    function: Callable[..., Arrays], units: dict[int, Unit], processes: int, pool: WorkerPool, count: _Count
+) -> Iterator[tuple[int, Arrays]]:
+    require("loop", "joblib", purpose="Work in several processes")
+    from joblib import Parallel, delayed, parallel_config
+
+    how = {"return_as": "generator_unordered", "batch_size": 1}
+    with ExitStack() as stack:
+        if pool.scheduler is not None:
+            backend, told = stack.enter_context(_cluster(pool.scheduler, pool.say)), None
+            parallel = Parallel(backend=backend, pre_dispatch="all", **how)
+        else:
+            pool.say(f"{processes} processes on this machine")
+            told = stack.enter_context(_followed(count))
+            begin = {"initializer": _begin_worker, "initargs": (os.getpid(),)}
+            with parallel_config("loky", inner_max_num_threads=1, **begin):
+                parallel = Parallel(processes, **how)
+        own = [kind for kind in estimators().values() if not kind.__module__.startswith("faintspot.")]
+        # In tuples: other large arguments would stay with one worker, and be lost with it.
+        results = parallel(
+            delayed(_in_worker)((function, unit.arguments), (number, told), (own, __version__))
+            for number, unit in list(units.items())
+        )
+        try:
+            for result in results:  # noqa: UP028 - `yield from` would close them before what follows
+                yield result
+        finally:
+            with warnings.catch_warnings(action="ignore"):  # about results that nobody takes
+                results.close()
+
+
+def _in_worker(work: tuple[Any, ...], place: tuple[int, Path | None], package: tuple[Any, ...]) -> Any:
+    """Run a unit with the estimators that are registered where the experiment was started."""
+    (function, arguments), (number, told), (own, version) = work, place, package
+    if version != __version__:
+        raise InputError("a worker has another version of faintspot: install the same one everywhere")
+    for kind in own:
+        register(kind)
+    done = np.zeros(number + 1) if told is None else np.load(told, mmap_mode="r+")
     try:
-        with _worker_environment():
-            for unit in units:
-                pending[pool.submit(_in_process, function, unit.key, unit.arguments)] = unit.key
-            while pending:
-                finished = wait(pending, _TELLING_S, FIRST_COMPLETED).done
-                while not news.empty():
-                    count.at(*news.get())
-                for future in finished:
-                    yield pending.pop(future), future.result()
-    finally:
-        if pending:  # an error, or the user has interrupted: nobody waits for these
-            for child in set(multiprocessing.active_children()) - earlier:
-                child.terminate()
-        pool.shutdown(cancel_futures=True)
+        return number, function(*arguments, lambda amount: done.__setitem__(number, amount))
+    except ImportError as error:  # whose own kind cannot be sent to another process
+        raise InputError(" ".join(str(error).split())) from None
 
 
-@contextmanager
-def _worker_environment() -> Iterator[None]:
-    """Set what processes that are started meanwhile find in their environment, unless the user has."""
-    added = {name: value for name, value in _WORKER_ENVIRONMENT.items() if name not in os.environ}
-    os.environ.update(added)
-    try:
-        yield
-    finally:
-        for name in added:
-            os.environ.pop(name, None)
-
-
-_news: Any = None
-"""In a worker process: where it tells how far it is."""
-
-
-def _begin_worker(news: Any) -> None:
-    """Leave interruptions to the parent, and end with it."""
-    global _news
-    _news = news
+def _begin_worker(parent: int) -> None:
+    """Leave interruptions to the parent, and end with it: joblib would go on with what is queued."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
 
     def end_with_parent() -> None:
-        parent.join()
+        while os.getppid() == parent:
+            time.sleep(_LOOK_S)
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-def _in_process(function: Callable[..., Arrays], key: str, arguments: tuple[Any, ...]) -> Arrays:
-    try:
-        return function(*arguments, _seldom(lambda done: _news.put((key, done))))
-    except ImportError as error:  # whose own kind cannot be sent to another process
-        raise InputError(" ".join(str(error).split())) from None
+@contextmanager
+def _followed(count: _Count) -> Iterator[Path]:
+    """Follow how far workers on this machine are, which they write into the file that this yields."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        path, ended = Path(folder) / "done.npy", threading.Event()
+        np.save(path, count.done)
+        done = np.load(path, mmap_mode="r")
+
+        def follow() -> None:
+            while not ended.wait(_LOOK_S):
+                count.at(slice(None), done)
+
+        thread = threading.Thread(target=follow, daemon=True)
+        thread.start()
+        try:
+            yield path
+        finally:
+            ended.set()
+            thread.join()
 
 
-def _seldom(tell: Advance) -> Advance:
-    """Return a function that forwards progress at most a few times a second."""
-    last = time.monotonic()
+@contextmanager
+def _cluster(scheduler: str, say: Callable[[str], None]) -> Iterator[Any]:
+    """Connect to a running scheduler; yield joblib's backend, which alone waits forever for lost workers."""
+    import distributed
+    from joblib._dask import DaskDistributedBackend
 
-    def advance(done: int) -> None:
-        nonlocal last
-        if time.monotonic() - last >= _TELLING_S:
-            last = time.monotonic()
-            tell(done)
+    class Backend(DaskDistributedBackend):  # type: ignore[misc]
+        def submit(self, func: Any, callback: Any = None) -> Any:
+            future = super().submit(func, callback)
+            future.add_done_callback(lambda done: done.exception() and callback(done.exception()))
+            return future
 
-    return advance
+        def retrieve_result_callback(self, out: Any) -> Any:
+            if isinstance(out, BaseException):  # Dask's own, not a unit's
+                raise BrokenProcessPool(str(out))
+            return super().retrieve_result_callback(out)
 
-
-__all__ = ["Advance", "Progress", "Unit", "WorkerPool", "run_units"]
+    try:  # never as Dask's default, which what else the process does would use
+        client = distributed.Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, RuntimeError, TypeError) as error:
+        raise InputError(
+            f"scheduler = {scheduler!r}: cannot be reached, expected an address such as tcp://host:8786, or "
+            f"tls:// with certificates in Dask's configuration ({error})"
+        ) from None
+    with client:
+        say(f"Dask scheduler {scheduler}, when its first worker is there")
+        client.wait_for_workers(1)
+        yield Backend(client=client)

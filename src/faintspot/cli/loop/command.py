@@ -12,16 +12,17 @@ import click
 from faintspot.cli.loop.tune import tune
 from faintspot.cli.shared.commands import Group, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import WORKERS
+from faintspot.cli.shared.options import SCHEDULER, WORKERS
 from faintspot.cli.shared.progress import progress_bar
 
-_needs_loop = needs("loop", "hcipy", "zarr", "matplotlib", "jinja2")
+_needs_loop = needs("loop", "hcipy", "joblib", "zarr", "matplotlib", "jinja2")
 
 
 def _experiment_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of every experiment."""
     for each in (
         option("--overwrite", is_flag=True, help="Replace another experiment in the folder."),
+        SCHEDULER,
         WORKERS,
         option("--quick", is_flag=True, help="Fewer and shorter runs: a few minutes."),
         option(
@@ -171,6 +172,7 @@ def _measure(
     quick: bool,
     overwrite: bool,
     workers: int | None,
+    scheduler: str | None,
 ) -> None:
     """Run an experiment with a progress bar, print the summary of its result and write its page."""
     from faintspot.experiments.closed_loop.page import write_loop_report
@@ -181,7 +183,7 @@ def _measure(
     loop = load_loop(configuration)
     folder = output or (f"{loop.name}-quick" if quick else loop.name)
     with progress_bar("loop") as advance:
-        pool = WorkerPool(workers, advance, lambda text: click.echo(text, err=True))
+        pool = WorkerPool(workers, advance, lambda text: click.echo(text, err=True), scheduler)
         result = run(loop, folder, *what, quick=quick, pool=pool, overwrite=overwrite)
     click.echo(loop_summary(LoopResults(**{name: result})))
     page = Path(folder) / "report.html"

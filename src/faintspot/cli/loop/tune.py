@@ -12,7 +12,7 @@ from rich.console import Console
 from faintspot.base.errors import InputError
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import WORKERS
+from faintspot.cli.shared.options import SCHEDULER, WORKERS
 from faintspot.cli.shared.output import check_target, picture_file, results_table, wrapped, write_picture
 from faintspot.cli.shared.progress import progress_bar
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from faintspot.experiments.closed_loop.question import LoopQuestion
 
 
-@needs("loop", "hcipy", "zarr", "matplotlib", "jinja2")
+@needs("loop", "hcipy", "joblib", "zarr", "matplotlib", "jinja2")
 @click.command("tune", short_help="Recommend an estimator and a control for a closed loop.")
 @click.argument("configuration", metavar="CONFIG")
 @option("--magnitude", type=float, metavar="MAG", help="Magnitude of the guide star.", show_default="CONFIG")
@@ -61,6 +61,7 @@ if TYPE_CHECKING:
 )
 @option("--seed", type=click.IntRange(0), help="Seed of turbulence and noise.", show_default="CONFIG")
 @WORKERS
+@SCHEDULER
 @option(
     "--results", metavar="FOLDER", help="Folder of finished work, to continue from.", show_default="NAME-tune"
 )
@@ -91,7 +92,7 @@ def tune(
 
     folder = results or f"{question.configuration.name}-tune"
     with progress_bar("loop") as advance:
-        place = WorkerPool(options["workers"], progress=advance)
+        place = WorkerPool(options["workers"], advance, scheduler=options["scheduler"])
         answer = tune_loop(question, folder, pool=place, overwrite=overwrite)
     show(answer)
     loop = answer.save(target)

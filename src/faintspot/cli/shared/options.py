@@ -58,9 +58,10 @@ PORT = option(
 WORKERS = option(
     "--workers",
     type=click.IntRange(0),
-    help="Processes on this machine; 0: this process alone.",
+    help="Processes on this machine; 0 or 1: this process alone.",
     show_default="all processors",
 )
+SCHEDULER = option("--scheduler", metavar="ADDRESS", help="Dask scheduler to use instead: tls://host:8786.")
 PIXEL_SCALE = option(
     "--pixel-scale-arcsec",
     type=float,

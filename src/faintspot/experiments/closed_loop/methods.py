@@ -25,7 +25,7 @@ from faintspot.slopes.estimators.built_in.maximum_a_posteriori import MaximumAPo
 from faintspot.slopes.estimators.built_in.window import Window
 from faintspot.slopes.estimators.registry import estimator_named, estimators
 from faintspot.slopes.pipeline.settings import Settings
-from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.psf import PSF, spot_psf
 from faintspot.slopes.spots.score import TrainedScore
 
 Choice = Mapping[str, Any]
@@ -288,12 +288,7 @@ def _spread(values: Sequence[Any], count: int) -> Tunable:
 
 def _flat_psf(configuration: LoopConfiguration) -> PSF:
     sensor = configuration.sensor
-    return _psf(configuration.spot_width_px / 2, sensor.spot_elongation, float(sensor.pixels))
-
-
-@functools.lru_cache(maxsize=4)
-def _psf(size: float, elongation: float, radius_px: float) -> PSF:
-    return PSF.analytic(size=size, elongation=elongation, radius_px=radius_px)
+    return spot_psf(configuration.spot_width_px / 2, sensor.spot_elongation, radius_px=sensor.pixels)
 
 
 def _without_runs(configuration: LoopConfiguration) -> LoopConfiguration:

@@ -23,7 +23,7 @@ from faintspot.slopes.pipeline.images import measure_images
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.simulate import Detector
-from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.psf import PSF, spot_psf
 from faintspot.slopes.spots.score import TrainedScore
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
 
@@ -180,7 +180,7 @@ class CellMethods:
         """The PSF without turbulence, as far out as a window sees it."""
         cell = self.cell
         radius = math.ceil(cell.pixels / 2 + self._within_px) + 2
-        return _psf_of(cell.profile, cell.size, cell.elongation, radius)
+        return spot_psf(cell.size, cell.elongation, cell.profile, radius)
 
     @functools.cached_property
     def _spot_fwhm_px(self) -> tuple[float, float]:
@@ -196,11 +196,6 @@ class CellMethods:
         rng = np.random.default_rng(np.random.SeedSequence(entropy))
         scene = replace(self.scene, position_range_px=cell.position_range_px)
         return score_for_scene(scene, detector_of(cell), rng, search_range_px=self._within_px)
-
-
-@functools.lru_cache(maxsize=16)
-def _psf_of(profile: str, size: float, elongation: float, radius_px: float) -> PSF:
-    return PSF.analytic(profile, size=size, elongation=elongation, radius_px=radius_px)
 
 
 def position_table(

@@ -156,6 +156,7 @@ def run(
     progress: Callable[[int, int], None] | None = None,
     *,
     workers: int | None = None,
+    scheduler: str | None = None,
     overwrite: bool = False,
     announce: Callable[[str], None] | None = None,
 ) -> xarray.Dataset:
@@ -173,8 +174,9 @@ def run(
     progress : callable, optional
         Called with the number of finished cells and of all, if any are missing.
     workers : int, optional
-        Processes on this machine; as many as there are processors by default. A script must then call this
-        function under ``if __name__ == "__main__":``. 0 works in this process.
+        Processes on this machine; as many as there are processors by default. 0 or 1 works in this process.
+    scheduler : str, optional
+        Address of a running Dask scheduler instead; see docs/cluster.md for who may reach it.
     overwrite : bool
         Replace the store, if it is one of a study.
     announce : callable, optional
@@ -188,7 +190,7 @@ def run(
     Raises
     ------
     InputError
-        When the store belongs to another study or cannot be written.
+        When the store belongs to another study or cannot be written, or the scheduler cannot be reached.
 
     Examples
     --------
@@ -201,7 +203,7 @@ def run(
     """
     if not isinstance(specification, StudySpecification):
         raise InputError(f"specification: expected a StudySpecification, got {type(specification).__name__}")
-    pool = WorkerPool(workers, progress, announce)
+    pool = WorkerPool(workers, progress, announce, scheduler)
     units = [Unit(str(index), (cell, specification)) for index, cell in enumerate(specification.cells())]
     if store is None:
         memory = MemoryStore()

@@ -151,7 +151,7 @@ class _TelemetryMethod:
         return cls(plain, tuple(values.items()))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=4)  # a search scales the noise of one model by three factors
 def _learnt(
     configuration: LoopConfiguration,
     method: _TelemetryMethod,
@@ -174,7 +174,7 @@ def _learnt(
     return replace(learnt, model=replace(learnt.model, centroid_gain=gain))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=1)  # for several controls; 170 MB with 40 x 40 sub-apertures
 def _telemetry(
     configuration: LoopConfiguration, method: _TelemetryMethod, seed: int, simulate: Simulate
 ) -> tuple[OpenLoopTelemetry, float]:

@@ -17,13 +17,13 @@ from faintspot.loop.simulation.configuration.configuration import LoopConfigurat
 from faintspot.loop.simulation.control import learnt_control
 from faintspot.loop.simulation.methods import PRIOR, Method
 from faintspot.loop.simulation.simulation import measure_gains, simulate_loop
-from faintspot.loop.simulation.telescope.calibration import flat_psf, make_pipeline, reference_slopes
+from faintspot.loop.simulation.telescope.calibration import make_pipeline, reference_slopes
 from faintspot.loop.simulation.telescope.camera import camera_calibration
 from faintspot.loop.simulation.telescope.model import prepare
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.pipeline.settings import Settings
-from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.psf import PSF, spot_psf
 from faintspot.slopes.spots.score import Score
 
 CONFIGURATION = "faintspot.toml"
@@ -73,7 +73,7 @@ def write_engine_files(
         folder.mkdir(parents=True, exist_ok=True)
     optics = prepare(configuration)
     path = folder / CONFIGURATION
-    psf = flat_psf(configuration.spot_width_px, configuration.sensor.spot_elongation)
+    psf = spot_psf(configuration.spot_width_px / 2, configuration.sensor.spot_elongation)
     sizes: dict[str, Any] = {
         "subaperture_m": configuration.subaperture_m,
         "pixel_scale_arcsec": configuration.pixel_scale_rad / ARCSEC,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +31,6 @@ _MAPS = ("dark", "flat", "bad_pixels", "read_noise_e")
 # Limit of values that the kernels square in float32, with a wide margin; no camera reaches it.
 _GAINS = 1e-9, 1e9
 _LARGEST_READ_NOISE_E, _LARGEST_BACKGROUND_E, _LARGEST_ADU = 1e6, 1e9, 1e30
-
-
-@cache  # asked in every frame
-def _largest(dtype: np.dtype[Any]) -> float:
-    return float(np.iinfo(dtype).max)
 
 
 @dataclass(frozen=True)
@@ -243,7 +237,7 @@ class Calibration:
         if self.saturation_adu is not None:
             return self.saturation_adu
         # Not infinity, which an infinite pixel would reach.
-        return _largest(dtype) if dtype.kind in "iu" else math.nan
+        return float(np.iinfo(dtype).max) if dtype.kind in "iu" else math.nan
 
     def _check_shapes(self, frame_shape: tuple[int, int]) -> None:
         """Raise an error if a map does not have the frame's shape."""

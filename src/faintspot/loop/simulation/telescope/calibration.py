@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from faintspot.slopes.pipeline.mean_flux import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.psf import PSF, spot_psf
 
 _BRIGHT_E = 1e6
 _POKE_NM = 20.0
@@ -95,13 +94,7 @@ def reference_slopes(
 def _psf(configuration: LoopConfiguration, method: Method) -> PSF:
     if method.psf is not None:
         return method.psf
-    return flat_psf(configuration.spot_width_px, configuration.sensor.spot_elongation)
-
-
-@lru_cache(maxsize=4)
-def flat_psf(width_px: float, elongation: float) -> PSF:
-    """Return the PSF of a lenslet without turbulence."""
-    return PSF.analytic(size=width_px / 2, elongation=elongation)
+    return spot_psf(configuration.spot_width_px / 2, configuration.sensor.spot_elongation)
 
 
 def interaction_matrix(sensor: ShackHartmann, mirror: DeformableMirror) -> Floats:

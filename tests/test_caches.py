@@ -1,0 +1,70 @@
+"""Every cache of the package has a name here and a bound."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+
+import faintspot
+
+SOURCE = Path(faintspot.__file__).parent
+
+OF_THE_PROGRAM = {
+    "engine/streams/semaphores.py _libc",
+    "engine/streams/shared_streams.py _keeps_order",
+    "adapters/checks.py check_version",
+    "adapters/pyrtc.py camera",
+    "adapters/pyrtc.py slopes_process",
+    "slopes/camera/dark_frames.py _one_level_limit",
+    "slopes/estimators/registry.py _load",
+    "slopes/kernels/compilation/cached.py _tell_once",
+    "slopes/kernels/compilation/cached.py _warn_once",
+    "slopes/kernels/compilation/compiling.py _kernels_stamp",
+    "slopes/kernels/compilation/host.py _lanes",
+    "slopes/kernels/compilation/target.py compile_target",
+    "slopes/kernels/driver/groups.py driver_of",
+    "slopes/kernels/driver/streaming.py streamed",
+    "slopes/kernels/parallel.py _pool",
+    "slopes/kernels/total_variation/flat_start.py flat_start_table",
+    "slopes/pipeline/slope_pipeline.py _checks",
+}
+"""Without a bound: of nothing, types, kernels, or sizes, of which a program has few; a few kB each."""
+
+OF_DATA = {
+    "experiments/closed_loop/methods.py _trained_score": 4,
+    "loop/control/identification/slope_spectra.py _table": 44,
+    "loop/simulation/control.py _learnt": 4,
+    "loop/simulation/control.py _telemetry": 1,
+    "loop/simulation/simulation.py _learnt_sodium": 4,
+    "loop/simulation/simulation.py _typical_spots": 2,
+    "loop/simulation/telescope/model.py _laser_source": 2,
+    "loop/simulation/telescope/model.py _prepared": 2,
+    "loop/simulation/telescope/model.py atmosphere_of": 2,
+    "loop/turbulence/slope_covariance.py _structure": 4,
+    "slopes/estimators/built_in/correlation.py _references": 2,
+    "slopes/spots/pixel_information.py _information_table": 64,
+    "slopes/spots/psf.py spot_psf": 16,
+    "slopes/spots/speckled.py _phase_modes": 8,
+}
+"""Largest number of results that are remembered."""
+
+
+def caches() -> Iterator[tuple[str, int | None]]:
+    """Every function that remembers results, and how many at most."""
+    for path in sorted(SOURCE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            for decorator in getattr(node, "decorator_list", []):
+                name = ast.unparse(decorator).partition("(")[0].rpartition(".")[2]
+                if name in ("cache", "lru_cache"):
+                    name = node.name  # type: ignore[attr-defined]
+                    file = path.relative_to(SOURCE)
+                    module = import_module(".".join(["faintspot", *file.with_suffix("").parts]))
+                    yield f"{file.as_posix()} {name}", getattr(module, name).cache_parameters()["maxsize"]
+
+
+def test_every_cache_has_a_name_and_a_bound() -> None:
+    bounds = dict(caches())
+    assert {name for name, most in bounds.items() if most is None} == OF_THE_PROGRAM
+    assert {name: most for name, most in bounds.items() if most is not None} == OF_DATA
