@@ -32,6 +32,8 @@ class Night:
 
     labels: tuple[str, ...]
     """(M,): names of the methods."""
+    settings: tuple[str, ...]
+    """(M,): settings of each method in words, loop gain included."""
     reference: int
     """Number of the method that the others are compared with."""
     set_names: tuple[str, ...]
@@ -168,7 +170,7 @@ def load_night(path: str | Path) -> Night:
     }:
         raise InputError(f"{path}: expected a night of format {_FORMAT}, got something else")
     values: dict[str, Any] = {**attributes, **columns}
-    for name in ("labels", "set_names"):
+    for name in ("labels", "settings", "set_names"):
         values[name] = tuple(values[name])
     return Night(**values)
 
