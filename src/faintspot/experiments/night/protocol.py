@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -188,19 +188,6 @@ def label_of(name: str, strength_e: float) -> str:
     if name == NONE:
         return "no TV"
     return f"TV {strength_e:.3g} e-" if name == TV else kind_of(name).label
-
-
-def plan_in_words(plan: NightPlan, tuned: bool) -> str:
-    """Return window, number of pixels and loop gain in words."""
-    if tuned:
-        return "number of pixels and loop gain of each method tuned in other turbulence"
-    return f"{plan.keep_brightest} brightest pixels, loop gain of the configuration"
-
-
-def plan_with(plan: NightPlan, **changes: Sequence[Any] | None) -> NightPlan:
-    """Return the plan with the changes that are not None."""
-    known = {item.name for item in fields(plan)}
-    return replace(plan, **{n: tuple(v) for n, v in changes.items() if v is not None and n in known})
 
 
 QUICK_PLAN = NightPlan(block_frames=260, settle_in_block=60, strengths=(4, 6, 4, 6), repeats=(2, 1, 2, 1))
