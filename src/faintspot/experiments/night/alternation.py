@@ -119,10 +119,21 @@ def jackknife(value: float, without: Sequence[float]) -> Estimate:
     return Estimate(value, error, value - half, value + half, pieces)
 
 
-def drifting_part(design: Floats, values: Floats, time_s: Floats) -> Floats:
-    """Return the drift itself at each observation, without the regression and without noise, (n,)."""
-    drift = likeliest_drift(design, values, time_s)
-    correlation = drift.correlation(time_s)
-    residual = values - design @ coefficients(design, values, correlation)
-    smooth = correlation - (1 - drift.share) * np.eye(len(values))
-    return np.asarray(smooth @ cho_solve(cho_factor(correlation, lower=True), residual))
+def predicted_by_others(values: Floats, time_s: Floats, group: NDArray[np.int64]) -> Floats:
+    """Return a drifting value at each observation as those of all other groups predict it, (n,).
+
+    Parameters
+    ----------
+    values, time_s : (n,) array
+    group : (n,) array of int
+        Observations that do not take part in each other's prediction.
+    """
+    mean = np.ones((len(values), 1))
+    inverse = np.linalg.inv(likeliest_drift(mean, values, time_s).correlation(time_s))
+    weighted = inverse @ mean
+    residual = inverse @ (values - weighted[:, 0] @ values / weighted.sum())
+    predicted = values.copy()
+    for number in np.unique(group):
+        rows = np.flatnonzero(group == number)
+        predicted[rows] -= np.linalg.solve(inverse[np.ix_(rows, rows)], residual[rows])
+    return predicted

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.statistics import Estimate
-from faintspot.experiments.night.alternation import coefficient, drifting_part, jackknife
+from faintspot.experiments.night.alternation import coefficient, jackknife, predicted_by_others
 from faintspot.experiments.night.blocks import Night
 from faintspot.experiments.night.protocol import BEST_STRENGTHS_E
 
@@ -23,6 +23,7 @@ STRENGTH_RANGES_E = ((0.0, 0.3), (0.3, 0.6), BEST_STRENGTHS_E, (1.1, 1.6), (1.6,
 ALL_STRENGTHS = "TV, all strengths"
 BEST = f"TV, {BEST_STRENGTHS_E[0]:g} to {BEST_STRENGTHS_E[1]:g} e⁻"
 _FEWEST_ROWS = 3
+_FEWEST_SEEN = 10  # blocks with a measured r0
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,16 +149,14 @@ def contrast(night: Night, chosen: Rows, others: Rows, seeing: Floats | None) ->
 def drift_of_r0(night: Night) -> Floats | None:
     """Return the logarithm of r0 as it drifts, (B,), from the measured r0 of all blocks; None without.
 
-    Each method may measure r0 with an error of its own, which would otherwise pass for a difference between
-    methods; noise of single blocks is taken out.
+    Each method may measure r0 with an error of its own, which would pass for a difference between methods.
+    Therefore the r0 of a block is what the blocks of the other methods before and after it predict.
     """
     known = np.isfinite(night.r0_m) & (night.r0_m > 0)
-    if known.sum() < max(2 * len(night.labels), 10):
+    if known.sum() < _FEWEST_SEEN or len(np.unique(night.method[known])) < 2:
         return None
-    methods = np.unique(night.method[known])
-    design = (night.method[known][:, None] == methods).astype(np.float64)
     time_s = night.middle_s
-    part = drifting_part(design, np.log(night.r0_m[known]), time_s[known])
+    part = predicted_by_others(np.log(night.r0_m[known]), time_s[known], night.method[known])
     return np.interp(time_s, time_s[known], part)
 
 

@@ -273,9 +273,7 @@ class _Loop:
     def step(self, frame: int) -> None:
         """Simulate one frame."""
         number, commands = int(self.schedule[frame]), self.line.acting
-        time = self.disabled_errors.time_s(
-            self.first_frame + frame, self.configuration.control.frame_rate_hz
-        )
+        time = self.disabled_errors.time_s(self.first_frame + frame, self.configuration.control.frame_rate_hz)
         after, wavefront = self.telescope_model.wavefronts(time, commands)
         self._observe(frame, time, after)
         slopes = self._measure(frame, self.telescope_model.by_rows(time, wavefront, self.line.around))
