@@ -116,21 +116,34 @@ def night_summary_text(night: Night) -> str:
     return "\n".join([*found, *_conclusions(night)])
 
 
+def night_sections(night: Night) -> list[Section]:
+    """Return the sections of a night, for a page of its own or another one."""
+    return [
+        _verdicts_section(night),
+        Section("night-panels", _TEXT["panels.title"], figures=[panels_figure(night)]),
+        Section("night-means", _TEXT["table1.title"], tables=[_means_table(night)]),
+        _differences_section(night),
+        _seeing_section(night),
+        Section("night-settings", _TEXT["settings.title"], tables=[_settings_table(night)]),
+    ]
+
+
 def night_page(night: Night) -> Page:
     """Return the page of a night."""
     configuration = _configuration(night)
     name = "" if configuration is None else f": “{configuration.name}”"
-    sections = [
-        _verdicts_section(night),
-        Section("panels", _TEXT["panels.title"], figures=[panels_figure(night)]),
-        Section("means", _TEXT["table1.title"], tables=[_means_table(night)]),
-        _differences_section(night),
-        _seeing_section(night),
-        Section("settings", _TEXT["settings.title"], tables=[_settings_table(night)]),
-    ]
+    sections = night_sections(night)
     if night.configuration:
         sections.append(configuration_section(night.configuration))
     return Page(_TEXT("page.title", name=name), _facts(night), sections)
+
+
+def verdict_in_words(verdict: NightVerdict) -> str:
+    """Return the measured effect, the one in the same turbulence and the hours for 3 sigma."""
+    paired = ""
+    if verdict.paired_outcome:
+        paired = f"; in the same turbulence {with_interval(verdict.paired)}"
+    return f"{_effect(verdict)}{paired}; 3 σ take {in_hours(verdict.hours_needed)} of alternating"
 
 
 def in_hours(hours: float) -> str:
@@ -177,19 +190,18 @@ def _verdicts_section(night: Night) -> Section:
     found = verdicts(night)
     title = _TEXT["verdicts.title"]
     if not found:
-        return Section("verdicts", title, missing=_TEXT["verdicts.missing"])
+        return Section("night-verdicts", title, missing=_TEXT["verdicts.missing"])
     rows: list[list[str | Cell]] = [
         [
             each.statement,
-            Cell(badge=Badge(each.outcome, _COLOURS[each.outcome])),
-            _effect(each),
-            Cell(with_interval(each.paired), small=each.paired_outcome) if each.paired_outcome else NOTHING,
+            Cell(badge=Badge(each.outcome, _COLOURS[each.outcome]), small=_effect(each)),
+            Cell(each.paired_outcome, small=with_interval(each.paired)) if each.paired_outcome else NOTHING,
             in_hours(each.hours_needed),
         ]
         for each in found
     ]
     table = _TEXT.table("verdicts", rows)
-    return Section("verdicts", title, tables=[table], points=_conclusions(night))
+    return Section("night-verdicts", title, tables=[table], points=_conclusions(night))
 
 
 def _means_table(night: Night) -> Table:
@@ -243,13 +255,13 @@ def _differences_section(night: Night) -> Section:
     ]
     if ranges:
         tables.append(_TEXT.table("strengths", ranges, reference=reference))
-    return Section("differences", _TEXT("differences.title", reference=reference), tables=tables)
+    return Section("night-differences", _TEXT("differences.title", reference=reference), tables=tables)
 
 
 def _seeing_section(night: Night) -> Section:
     fits = lines(night)
     if not fits:
-        return Section("r0", _TEXT["seeing.title"], missing=_TEXT["seeing.missing"])
+        return Section("night-r0", _TEXT["seeing.title"], missing=_TEXT["seeing.missing"])
     text = [_TEXT["seeing.text"]]
     ratio = (night.r0_m / night.true_r0_m)[np.isfinite(night.r0_m / night.true_r0_m)]
     if len(ratio):
@@ -264,7 +276,7 @@ def _seeing_section(night: Night) -> Section:
         ]
         for line in fits
     ]
-    return Section("r0", _TEXT["seeing.title"], text, [_TEXT.table("seeing", rows)])
+    return Section("night-r0", _TEXT["seeing.title"], text, [_TEXT.table("seeing", rows)])
 
 
 def _settings_table(night: Night) -> Table:
