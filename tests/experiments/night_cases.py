@@ -39,7 +39,7 @@ def night_with(
     labels = tuple(dict.fromkeys(label_of(name, strength) for _, name, strength in entries))
     strength = np.array([strength for _, _, strength in entries])
     count = len(entries)
-    start_s = BLOCK_S * np.arange(count)
+    start_s = np.linspace(0.0, BLOCK_S * (count - 1), count, dtype=np.float64)
     drift = drifting(rng, start_s)
     seen = 0.4 + 0.12 * drift - 0.01 * drift**2 + 0.015 * rng.standard_normal(count)
     change = np.where(strength > 0, effect, 0.0) + np.where((strength >= 0.6) & (strength <= 1.1), best, 0.0)

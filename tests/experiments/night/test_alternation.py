@@ -13,7 +13,7 @@ from faintspot.experiments.night.alternation import (
     predicted_by_others,
 )
 
-TIME_S = 2.4 * np.arange(150)
+TIME_S = np.linspace(0.0, 2.4 * 149, 150, dtype=np.float64)
 ONE = np.ones((150, 1))
 
 

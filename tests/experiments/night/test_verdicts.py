@@ -22,10 +22,10 @@ def test_a_night_that_contradicts_it() -> None:
 
 
 def test_a_small_effect_is_not_decided_by_alternation_but_by_the_same_turbulence() -> None:
-    (every, *_) = verdicts(night_with(2, effect=-0.02))
+    (every, *_) = verdicts(night_with(0, effect=-0.02))
     assert (every.outcome, every.paired_outcome) == (OPEN, FAILS)
     assert abs(every.significance) < 3
-    assert every.hours_needed > 2 * night_with(2).hours
+    assert every.hours_needed > 2 * night_with(0).hours
 
 
 def test_without_paired_runs_there_is_no_paired_verdict() -> None:

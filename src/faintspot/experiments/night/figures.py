@@ -26,7 +26,7 @@ _TV_STYLES: dict[str, dict[str, Any]] = {
     BEST: {"color": METHOD_COLOURS[0], "marker": "s"},
 }
 _MARKERS = "Dv<>P"
-_POINT = {"ls": "", "ms": 5, "elinewidth": 0.7, "alpha": 0.85}
+_POINT: dict[str, Any] = {"ls": "", "ms": 5, "elinewidth": 0.7, "alpha": 0.85}
 
 
 @styled
@@ -34,9 +34,9 @@ def panels_figure(night: Night) -> FigureWithData:
     """Draw Strehl ratio against time, measured r0 and strength, with errors."""
     shown = _shown(night)
     has_r0, has_strength = bool(np.isfinite(night.r0_m).any()), bool((night.strength_e > 0).any())
-    names = [["time"], *([["r0"]] if has_r0 else []), *([["strength"]] if has_strength else [])]
+    names = ["time", *(["r0"] if has_r0 else []), *(["strength"] if has_strength else [])]
     figure = new_figure(0.72 * WIDTH, 4.1 * len(names))
-    panels = figure.subplot_mosaic(names)
+    panels = dict(zip(names, figure.subplots(len(names), squeeze=False)[:, 0], strict=True))
     label = strehl_axis(night.wavelength_m)
     _against(panels["time"], night, night.middle_s / 60, None, shown)
     for number in np.unique(night.set_number)[1:]:

@@ -87,7 +87,8 @@ def verdicts(night: Night) -> list[NightVerdict]:
     fits = lines(night)
     if fits:
         slope = fits[0].slope_per_m
-        to_cm = Estimate(slope.value / 100, slope.standard_error / 100, count=slope.count)
+        ends = slope.low / 100, slope.high / 100
+        to_cm = Estimate(slope.value / 100, slope.standard_error / 100, *ends, slope.count)
         needed = hours_needed(to_cm.value, to_cm.standard_error, night.hours)
         verdict.append(NightVerdict(_TEXT["statements.r0"], to_cm, _NO_ESTIMATE, "per cm", needed))
     return verdict
