@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -200,7 +201,7 @@ def _verdicts_section(night: Night) -> Section:
         ]
         for each in found
     ]
-    table = _TEXT.table("verdicts", rows)
+    table = replace(_TEXT.table("verdicts", rows), prose=True)
     return Section("night-verdicts", title, tables=[table], points=_conclusions(night))
 
 
@@ -281,8 +282,7 @@ def _seeing_section(night: Night) -> Section:
 
 def _settings_table(night: Night) -> Table:
     rows = [[label, text] for label, text in zip(night.labels, night.settings, strict=True)]
-    table = _TEXT.table("settings", rows)
-    return Table(table.header, rows, words=True, folded=f"{len(rows)} methods")
+    return replace(_TEXT.table("settings", rows), prose=True, folded=f"{len(rows)} methods")
 
 
 def _configuration(night: Night) -> LoopConfiguration | None:

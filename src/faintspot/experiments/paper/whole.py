@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from faintspot.base.report.page import Badge, Cell, Section
@@ -32,7 +32,7 @@ class PaperRow:
     statement: str
     verdict: str
     condition: str
-    """Where it holds; "" where nothing is to be added."""
+    """Cases in which it holds; "" where nothing is to be added."""
     number: str
 
 
@@ -72,7 +72,7 @@ def paper_section(rows: Sequence[PaperRow]) -> Section:
         for row in rows
     ]
     missing = "" if rows else _TEXT["whole.missing"]
-    tables = [_TEXT.table("whole.table", cells)] if rows else []
+    tables = [replace(_TEXT.table("whole.table", cells), prose=True)] if rows else []
     return Section("paper", _TEXT["whole.title"], tables=tables, missing=missing)
 
 
@@ -81,7 +81,7 @@ def paper_markdown(rows: Sequence[PaperRow]) -> str:
     header = ["figure or table", "statement", "verdict", "number"]
     table = [header, ["---"] * len(header)]
     for row in rows:
-        condition = f": {row.condition}" if row.condition else ""
+        condition = f"<br>{row.condition}" if row.condition else ""
         table.append([row.part, row.statement, f"**{row.verdict}**{condition}", row.number])
     return "".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |\n" for line in table)
 
@@ -93,10 +93,8 @@ def _row(part: str, verdict: Verdict, fixed: str) -> PaperRow:
     condition = ""
     if outcomes == {Outcome.HOLDS}:
         word = HOLDS
-    elif outcomes == {Outcome.FAILS}:
-        word = FAILS
     else:
-        word = HOLDS_IF
+        word = HOLDS_IF if Outcome.HOLDS in outcomes else FAILS
         shares = [(verdict.best, _TEXT["whole.best"]), (verdict.fixed, _TEXT("whole.fixed", k=fixed))]
         condition = "; ".join(_share(finding, where) for finding, where in shares if finding.cases)
     numbers = [
@@ -111,7 +109,7 @@ def _share(finding: Finding, where: str) -> str:
     """Return in how many cases a claim holds."""
     counts = [sum(case.outcome is outcome for case in finding.cases) for outcome in Outcome]
     holds, in_part = counts[0], counts[1]
-    part = f" ({in_part} more in part)" if in_part else ""
+    part = f" ({in_part} in part)" if in_part else ""
     return f"{where}: {holds} of {len(finding.cases)} cases{part}"
 
 
