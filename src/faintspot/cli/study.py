@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from faintspot.base.files import derived
+from faintspot.base.files import derived, write_atomically
 from faintspot.cli.shared.commands import Group, option
 from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.options import SCHEDULER, WORKERS
@@ -17,6 +18,7 @@ from faintspot.cli.shared.progress import progress_bar
 if TYPE_CHECKING:
     import xarray
 
+    from faintspot.experiments.night.blocks import Night
     from faintspot.experiments.study.specification import StudySpecification
 
 
@@ -75,11 +77,15 @@ def run(specification: str, output: str | None, **where: Any) -> None:
     click.echo(f"Next: faintspot report {shlex.quote(target)}")
 
 
-@needs("loop", "joblib", "xarray", "zarr", "matplotlib", "jinja2")
+@needs("loop", "joblib", "xarray", "zarr", "matplotlib", "jinja2", "hcipy")
 @command.command(short_help="Repeat the study of Basden et al. 2015.")
 @option("--quick", is_flag=True, help="Fewer cells and realisations: about a minute.")
 @option(
-    "--figure", "figures", multiple=True, metavar="NAME", help="Only what this figure needs: fig2 to fig7."
+    "--figure",
+    "figures",
+    multiple=True,
+    metavar="NAME",
+    help="Only what this figure needs: fig2 to fig7, or night (Table 1 and its figure).",
 )
 @option(
     "--output",
@@ -92,19 +98,50 @@ def run(specification: str, output: str | None, **where: Any) -> None:
 def paper(quick: bool, figures: tuple[str, ...], output: str | None, **where: Any) -> None:
     """Repeat the study of Basden et al. 2015 (arXiv:1503.06043).
 
-    Every figure of the paper and a verdict on every claim, with error bars, in one report page beside the
-    store of results. Interrupted or killed and started again, the command goes on where it stopped.
+    Every figure and table of the paper and a verdict on every claim, with error bars, in one report page and
+    one Markdown table beside the store of results: the Monte-Carlo figures, then the observations, as
+    `faintspot loop night` simulates them. Interrupted or killed and started again, the command goes on where
+    it stopped.
 
     \b
     Examples:
       faintspot study paper --quick
       faintspot study paper -o paper.zarr
-      faintspot study paper --figure fig4 --figure fig6
+      faintspot study paper --figure fig4 --figure night
     """
-    from faintspot.experiments.study.built_in import paper_study
+    from faintspot.experiments.paper.whole import paper_markdown, paper_rows
+    from faintspot.experiments.report.page import night_folder, write_study_report
+    from faintspot.experiments.study.built_in import FIGURES, NIGHT, paper_study
 
     target = output or "-".join(["paper", *(["quick"] if quick else []), *figures]) + ".zarr"
-    _measure_and_report(paper_study(quick, figures or None), target, where)
+    of_study = tuple(name for name in figures or FIGURES if name != NIGHT)
+    described = paper_study(quick, of_study) if of_study else None
+    dataset = None if described is None else _measure(described, target, **where)
+    night = _night(night_folder(target), quick, **where) if NIGHT in figures or not figures else None
+    if dataset is not None:
+        page = derived(target, ".html")
+        write_study_report(dataset, page, night)
+        click.echo(f"{page}: open it in a browser")
+    table = derived(target, ".md")
+    write_atomically(table, paper_markdown(paper_rows(dataset, night)))
+    click.echo(f"{table}: the paper, figure by figure")
+
+
+def _night(
+    folder: Path, quick: bool, overwrite: bool, workers: int | None, scheduler: str | None
+) -> Night:
+    """Simulate the paper's observations with a progress bar and write their page."""
+    from faintspot.experiments.night.page import PAGE_FILE, write_night
+    from faintspot.experiments.night.simulated import run_night
+    from faintspot.experiments.running import WorkerPool
+    from faintspot.loop.simulation.configuration.configuration import load_loop
+
+    with progress_bar("night") as advance:
+        pool = WorkerPool(workers, advance, lambda text: click.echo(text, err=True), scheduler)
+        night = run_night(load_loop("canary"), folder, quick=quick, pool=pool, overwrite=overwrite)
+    write_night(night, folder)
+    click.echo(f"{folder / PAGE_FILE}: open it in a browser")
+    return night
 
 
 @needs("loop", "joblib", "xarray", "zarr", "matplotlib", "jinja2")

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,9 @@ from tests.experiments.experiment_cases import SEARCH, small
 
 import faintspot.cli
 from faintspot.experiments.closed_loop import budget, magnitude
+from faintspot.experiments.night import protocol
+from faintspot.experiments.night.blocks import load_night
+from faintspot.experiments.night.protocol import NightPlan
 from faintspot.loop.control.configuration import load_control
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop, shipped_loops
 from faintspot.slopes.pipeline import configuration
@@ -47,6 +51,30 @@ def test_magnitude(run: Commands) -> None:
     again = run("report", "here", "-o", "page.html")
     assert again.out == "page.html: open it in a browser\n"
     assert Path("page.html").is_file()
+
+
+@pytest.mark.slow
+def test_night(run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+    short = NightPlan(30, 10, (2, 2), (1.0, 0.75), (2, 2), keep_brightest=12)
+    monkeypatch.setattr(protocol, "QUICK_PLAN", short)
+    arguments = "loop", "night", "small.toml", "--quick", "--workers", 0
+    result = run(*arguments, "--methods", "none,tv,smoothed", "--strengths", "0.7,1.5")
+    assert result.code == 0, result.err
+    lines = result.out.splitlines()
+    assert lines[0].startswith("TV raises the mean Strehl ratio")
+    assert lines[-1] == "small-night-quick/night.html: open it in a browser"
+    assert any(line.startswith("Gaussian smoothing") for line in lines)
+    assert load_night("small-night-quick/night.zarr").labels[1:3] == ("TV 0.7 e-", "TV 1.5 e-")
+    assert json.loads(Path("small-night-quick/night.json").read_text(encoding="utf-8"))["verdicts"]
+    again = run(*arguments, "--methods", "none,tv,smoothed", "--strengths", "0.7,1.5")
+    assert again.out == result.out  # nothing was done again
+    other = run(*arguments, "--strengths", "0.7")
+    assert other.code != 0
+    assert "--overwrite" in other.err
+    for option, words in (("--strengths", "expected numbers"), ("--methods", "two or more")):
+        refused = run(*arguments, option, "x")
+        assert refused.code != 0
+        assert words in refused.err
 
 
 def test_budget(run: Commands) -> None:

@@ -33,8 +33,8 @@ class TestPage:
     def test_is_complete_and_in_order(self) -> None:
         html = study_report(of(paper_study(quick=True)))
         sections = re.findall(r'<section id="([^"]+)"', html)
-        assert sections[:4] == ["verdicts", "guidance", "baselines", "gains"]
-        assert sections[4:11] == ["fig1", "fig2", "fig3", "fig4", "fig5", "fig6", "fig7"]
+        assert sections[:5] == ["paper", "verdicts", "guidance", "baselines", "gains"]
+        assert sections[5:12] == ["fig1", "fig2", "fig3", "fig4", "fig5", "fig6", "fig7"]
         assert sections[-2:] == ["cases", "specification"]
         assert html.count('<tr><th scope="row">') >= 8
         assert "not finished" not in html

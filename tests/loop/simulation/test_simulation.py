@@ -58,6 +58,17 @@ def test_methods_see_the_same_atmosphere_and_photons(record: LoopRecord) -> None
     assert mixed.labels == ("plain", "tv")
 
 
+def test_a_run_goes_on_where_another_ended() -> None:
+    loop = faint().replace("control", mode="open")
+    whole, end = (loop.replace("run", frames=frames, settle_frames=1) for frames in (12, 5))
+    record = simulate_loop(whole, [plain()])
+    later = simulate_loop(end, [plain()], first_frame=7)
+    np.testing.assert_array_equal(later.slopes_px, record.slopes_px[7:])
+    np.testing.assert_array_equal(later.r0_m, record.r0_m[7:])
+    with pytest.raises(InputError, match="first_frame"):
+        simulate_loop(end, [plain()], first_frame=-1)
+
+
 def test_realisations_differ(record: LoopRecord) -> None:
     other = simulate_loop(faint().replace("run", frames=5, settle_frames=1), [plain()], realisation=1)
     assert not np.array_equal(other.strehl[:5], record.strehl[:5])

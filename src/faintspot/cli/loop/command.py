@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from faintspot.cli.loop.night import night
 from faintspot.cli.loop.tune import tune
 from faintspot.cli.shared.commands import Group, option
 from faintspot.cli.shared.needs import needs
@@ -51,6 +52,7 @@ def command() -> None:
 
 
 command.add_command(tune)
+command.add_command(night)
 
 
 @command.command(name="list", short_help="List the shipped configurations.")

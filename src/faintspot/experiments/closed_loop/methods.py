@@ -163,8 +163,10 @@ class MethodKind:
             tuned[name] = _spread(values, _FIRST_VALUES[min(number, len(_FIRST_VALUES) - 1)])
         return tuned
 
-    def method(self, configuration: LoopConfiguration, choice: Choice) -> Method:
+    def method(self, configuration: LoopConfiguration, choice: Choice | None = None) -> Method:
         """Return the method with tuned values, for the configuration's own flux.
+
+        Without a choice, options are automatic and the loop gain is the configuration's.
 
         The PSF of those that need one is that of a flat wavefront; the score is trained on simulated spots
         of the same strength of turbulence, flux and camera.
@@ -174,9 +176,10 @@ class MethodKind:
         InputError
             When a value is missing.
         """
-        for name in self.tuned(configuration):
-            if name not in choice:
-                raise InputError(f"choice: expected a value for {name!r} of the method {self.name!r}")
+        missing = [] if choice is None else [n for n in self.tuned(configuration) if n not in choice]
+        if missing:
+            raise InputError(f"choice: expected a value for {missing[0]!r} of the method {self.name!r}")
+        choice = choice or {}
         loop_options = (LOOP_GAIN, NOISE_SCALE)
         options = {name: value for name, value in choice.items() if name not in loop_options}
         estimator = self._untuned(configuration).replaced(options)
@@ -189,7 +192,7 @@ class MethodKind:
             Settings(
                 estimator, search_range_px=configuration.position_range_px() if laser and needs_psf else None
             ),
-            float(choice[LOOP_GAIN]),
+            choice.get(LOOP_GAIN),
             control=self.control,
             noise_scale=float(choice.get(NOISE_SCALE, 1.0)),
             psf=_flat_psf(configuration) if needs_psf and not laser else None,

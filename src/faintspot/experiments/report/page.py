@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from faintspot.base.errors import InputError
+from faintspot.base.files import derived
 from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import Page, Section, configuration_section, html_of, write_page
 from faintspot.base.report.texts import Texts
+from faintspot.experiments.night.blocks import NIGHT_STORE, Night, load_night
+from faintspot.experiments.night.page import night_sections
 from faintspot.experiments.paper.claims import fixed_mode, guidance, verdicts
 from faintspot.experiments.paper.figures import (
     baselines_figure,
@@ -24,6 +27,7 @@ from faintspot.experiments.paper.tables import (
     mode_in_words,
     verdicts_section,
 )
+from faintspot.experiments.paper.whole import paper_rows, paper_section
 from faintspot.experiments.report.efficiency import compares_estimators, findings, result_sections
 from faintspot.experiments.report.estimator_figures import estimator_figures
 from faintspot.experiments.study.specification import StudySpecification
@@ -50,16 +54,24 @@ def report_of_study(path: str | Path) -> str:
     """
     from faintspot.experiments.study.run import open_study
 
-    return study_report(open_study(path))
+    store = night_folder(path) / NIGHT_STORE
+    return study_report(open_study(path), load_night(store) if store.exists() else None)
 
 
-def study_report(dataset: xarray.Dataset) -> str:
+def night_folder(path: str | Path) -> Path:
+    """Return where the night that belongs to the paper's study is, beside the study."""
+    return derived(path, "-night")
+
+
+def study_report(dataset: xarray.Dataset, night: Night | None = None) -> str:
     """Return the report page of a study as HTML: self-contained, without scripts.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         What a run of a study returned; it may be unfinished, which the page says.
+    night : Night, optional
+        The paper's observations.
 
     Raises
     ------
@@ -68,12 +80,12 @@ def study_report(dataset: xarray.Dataset) -> str:
     MissingExtraError
         When matplotlib or jinja2 is not installed.
     """
-    return html_of(_page(_checked(dataset)))
+    return html_of(_page(_checked(dataset), night))
 
 
-def write_study_report(dataset: xarray.Dataset, path: str | Path) -> list[Path]:
+def write_study_report(dataset: xarray.Dataset, path: str | Path, night: Night | None = None) -> list[Path]:
     """Write the page of a study, checked as by `study_report`, as `write_page` does."""
-    return write_page(_page(_checked(dataset)), path)
+    return write_page(_page(_checked(dataset), night), path)
 
 
 def study_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
@@ -137,7 +149,7 @@ def _widths_in_words(specification: StudySpecification) -> str:
     return text
 
 
-def _page(dataset: xarray.Dataset) -> Page:
+def _page(dataset: xarray.Dataset, night: Night | None) -> Page:
     attributes = dataset.attrs
     done, total = int(dataset["done"].sum()), dataset.sizes["cell"]
     specification = StudySpecification.from_text(str(attributes["specification"]))
@@ -155,7 +167,7 @@ def _page(dataset: xarray.Dataset) -> Page:
         title=f"{subject}: study “{specification.name}”",
         facts={name: _TEXT(f"study.facts.{name}", **values) for name in _TEXT["study.facts"]},
         sections=[
-            *(_of_estimators(dataset) if of_estimators else _of_claims(dataset)),
+            *(_of_estimators(dataset) if of_estimators else _of_claims(dataset, night)),
             configuration_section(str(attributes["specification"]), "Specification"),
         ],
         warnings=[_TEXT("study.unfinished", missing=total - done)] if done < total else [],
@@ -175,14 +187,16 @@ def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
     ]
 
 
-def _of_claims(dataset: xarray.Dataset) -> list[Section]:
+def _of_claims(dataset: xarray.Dataset, night: Night | None) -> list[Section]:
     judged = verdicts(dataset)
     return [
+        paper_section(paper_rows(dataset, night)),
         verdicts_section(judged, mode_in_words(fixed_mode(dataset))),
         Section("guidance", "When to use TV", text=guidance(dataset)),
         baselines_section(dataset),
         gains_section(dataset),
         *_figure_sections(dataset),
+        *([] if night is None else night_sections(night)),
         cases_section(judged),
     ]
 

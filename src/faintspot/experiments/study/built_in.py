@@ -11,6 +11,8 @@ from faintspot.base.errors import InputError
 from faintspot.experiments.study.specification import StudySpecification
 
 FIGURES = ("fig2", "fig3", "fig4", "fig5", "fig6", "fig7")
+NIGHT = "night"
+"""Name of the paper's observations beside those of its figures."""
 
 
 def paper_study(quick: bool = False, figures: Sequence[str] | None = None) -> StudySpecification:

@@ -95,6 +95,7 @@ def simulate_loop(
     *,
     seed: int | None = None,
     realisation: int = 0,
+    first_frame: int = 0,
     progress: Callable[[int, int], None] | None = None,
     disabled_errors: DisabledErrors | None = None,
 ) -> LoopRecord:
@@ -114,6 +115,8 @@ def simulate_loop(
         Default: the configuration's.
     realisation : int
         Other realisations have other air and other noise.
+    first_frame : int
+        Number of the first frame: a run that begins where another ended sees the turbulence go on.
     progress : callable, optional
         Called with the number of frames done and that of all, after every frame.
     disabled_errors : DisabledErrors, optional
@@ -142,12 +145,13 @@ def simulate_loop(
     numbers = _checked_schedule(configuration, methods, schedule)
     start = configuration.run.seed if seed is None else int(number_between("seed", seed, 0, integer=True))
     number = int(number_between("realisation", realisation, 0, integer=True))
+    first = int(number_between("first_frame", first_frame, 0, integer=True))
     switches = DisabledErrors() if disabled_errors is None else disabled_errors
     ready = [
         learnt_control(switches.configuration(configuration), method, start, simulate_loop)
         for method in map(switches.method, methods)
     ]
-    arguments = configuration, ready, numbers, start, number, switches
+    arguments = configuration, ready, numbers, start, number, first, switches
     gains = None
     if switches.exact_gain:
         gains = _Loop(*arguments).run(None).gains_in_run()
@@ -183,6 +187,7 @@ class _Loop:
         schedule: NDArray[np.int64],
         seed: int,
         realisation: int,
+        first_frame: int,
         disabled_errors: DisabledErrors,
         gains: NDArray[np.float64] | None = None,
     ) -> None:
@@ -191,7 +196,7 @@ class _Loop:
         self.methods = methods = tuple(self._with_spots(method) for method, _ in ready)
         self.learnt = [learnt for _, learnt in ready]
         self.schedule, self.disabled_errors = schedule, disabled_errors
-        self.seed, self.realisation = seed, realisation
+        self.seed, self.realisation, self.first_frame = seed, realisation, first_frame
         self.telescope_model = TelescopeModel(
             configuration,
             seed,
@@ -273,7 +278,7 @@ class _Loop:
     def step(self, frame: int) -> None:
         """Simulate one frame."""
         number, commands = int(self.schedule[frame]), self.line.acting
-        time = self.disabled_errors.time_s(frame, self.configuration.control.frame_rate_hz)
+        time = self.disabled_errors.time_s(self.first_frame + frame, self.configuration.control.frame_rate_hz)
         after, wavefront = self.telescope_model.wavefronts(time, commands)
         self._observe(frame, time, after)
         slopes = self._measure(frame, self.telescope_model.by_rows(time, wavefront, self.line.around))
@@ -282,7 +287,7 @@ class _Loop:
         vector, covariance = (values.astype(np.float64) for values in (slopes.vector, slopes.covariance_xy))
         vector *= per_px
         if self.low_orders is not None:
-            vector = self.low_orders.merged(frame, wavefront, vector, slopes.flags)
+            vector = self.low_orders.merged(self.first_frame + frame, wavefront, vector, slopes.flags)
         self.controllers[number].update(vector, error.astype(np.float64) * per_px, covariance * per_px**2)
         self.slopes[frame], self.errors[frame] = slopes.vector, error
         self.covariances[frame] = slopes.covariance_xy
@@ -302,7 +307,7 @@ class _Loop:
         prior = None
         if self.methods[number].predict_prior:
             prior = self.controllers[number].expected().mean_px
-        pixels = self.telescope_model.frame(frame, wavefront)
+        pixels = self.telescope_model.frame(self.first_frame + frame, wavefront)
         slopes = self.pipelines[number](pixels, prior)
         self._follow_profile(number, pixels, slopes)
         flux = self.fluxes[number]

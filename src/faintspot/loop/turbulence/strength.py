@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +77,8 @@ def turbulence_strength(
     atmosphere, residual = (
         slopes[:, columns] - slopes[:, columns].mean(axis=0) for slopes in (atmosphere_px, residual_px)
     )
-    degrees = [degree for degree in _degrees(site) if degree.shape[1]]
+    geometry = site.subaperture_m, site.pixel_scale_rad, site.averaged
+    degrees, expected = _theory(tuple(map(tuple, site.positions_m.tolist())), *geometry)
     measured = [(basis, _signal(atmosphere @ basis, run)) for basis in degrees]
     usable = [(number, basis, signal) for number, (basis, signal) in enumerate(measured, 1) if signal > 0]
     if not usable:
@@ -87,7 +89,7 @@ def turbulence_strength(
     of_degree = _ERROR_OF_DEGREE / _TO_R0 * np.array(number)
     covariance = np.diag(sampling + np.square(gain_spread * np.array(change)) + np.square(of_degree))
     covariance += gain_error**2 * np.outer(change, change)
-    theory = np.array([_theory(site, scale_m, list(modes)) for scale_m in _SCALES_M])
+    theory = expected[:, np.array(number) - 1]
     return _fitted(np.log(signal), theory, covariance, outer_scale_m)
 
 
@@ -136,9 +138,25 @@ def _degrees(site: SlopeTurbulence) -> list[Floats]:
     return degrees[1:]
 
 
-def _theory(site: SlopeTurbulence, outer_scale_m: float, degrees: list[Floats]) -> list[float]:
-    covariance = replace(site, outer_scale_m=outer_scale_m).covariance_px2()
-    return [math.log(float(np.einsum("ik,ij,jk->", modes, covariance, modes))) for modes in degrees]
+@lru_cache(maxsize=4)
+def _theory(
+    positions_m: tuple[tuple[float, float], ...],
+    subaperture_m: float,
+    pixel_scale_rad: float,
+    averaged: float,
+) -> tuple[list[Floats], Floats]:
+    """Return the degrees and the logarithms of their variances for r0 = 1 m, (scales, degrees); cached."""
+    winds = np.ones(1), np.zeros((1, 2))
+    site = SlopeTurbulence(
+        np.array(positions_m), subaperture_m, pixel_scale_rad, 1.0, OUTER_SCALE_M, *winds, averaged
+    )
+    degrees = [degree for degree in _degrees(site) if degree.shape[1]]
+    covariances = [replace(site, outer_scale_m=scale_m).covariance_px2() for scale_m in _SCALES_M]
+    variances = [
+        [float(np.einsum("ik,ij,jk->", modes, covariance, modes)) for modes in degrees]
+        for covariance in covariances
+    ]
+    return degrees, np.log(variances)
 
 
 def _lagged(modes: Floats, run: NDArray[np.int64], lag: int) -> float:

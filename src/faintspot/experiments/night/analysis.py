@@ -1,0 +1,228 @@
+"""Differences between methods that alternated, with errors, and the hours that would show them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.statistics import Estimate
+from faintspot.experiments.night.alternation import coefficient, jackknife, predicted_by_others
+from faintspot.experiments.night.blocks import Night
+from faintspot.experiments.night.protocol import BEST_STRENGTHS_E
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.bool_]
+
+SIGMA = 3.0
+"""Standard errors from which a difference counts as seen."""
+STRENGTH_RANGES_E = ((0.0, 0.3), (0.3, 0.6), BEST_STRENGTHS_E, (1.1, 1.6), (1.6, math.inf))
+"""Strengths taken together; one on an edge belongs to the paper's range, else to the lower range."""
+ALL_STRENGTHS = "TV, all strengths"
+BEST = f"TV, {BEST_STRENGTHS_E[0]:g} to {BEST_STRENGTHS_E[1]:g} e⁻"
+_FEWEST_ROWS = 3
+_FEWEST_SEEN = 10  # blocks with a measured r0
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Blocks that are compared with the reference."""
+
+    name: str
+    rows: Rows
+    """(B,)"""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Strehl ratio of a group minus that of the reference."""
+
+    name: str
+    blocks: int
+    measured: Estimate
+    """At equal r0, where it was measured."""
+    without_r0: Estimate
+    """Without r0 as a covariate."""
+    paired: Estimate | None
+    """Against the reference in the same turbulence at the same time; None where that is not known."""
+    hours: float
+    """Duration of the blocks of group and reference, settling included."""
+
+    @property
+    def hours_needed(self) -> float:
+        """Hours of alternating until the effect is `SIGMA` standard errors; of the paired effect if known."""
+        effect = self.measured if self.paired is None else self.paired
+        return hours_needed(effect.value, self.measured.standard_error, self.hours)
+
+    @property
+    def is_long_enough(self) -> bool:
+        """Whether the night shows the effect with `SIGMA` standard errors."""
+        return self.hours_needed <= self.hours
+
+
+@dataclass(frozen=True)
+class Line:
+    """Least-squares line of Strehl ratio against measured r0."""
+
+    name: str
+    slope_per_m: Estimate
+    intercept: float
+    correlation: float
+    blocks: int
+
+
+def groups(night: Night) -> list[Group]:
+    """Return what is compared with the reference: all strengths, those of the paper's column, other methods.
+
+    A strength of 0 changes nothing and belongs to no group.
+    """
+    strength, found = night.strength_e, []
+    if (strength > 0).any():
+        found.append(Group(ALL_STRENGTHS, strength > 0))
+        low, high = BEST_STRENGTHS_E
+        best = (strength >= low) & (strength <= high)
+        if best.any():
+            found.append(Group(BEST, best))
+    for number, label in enumerate(night.labels):
+        rows = (night.method == number) & np.isnan(strength)
+        if number != night.reference and rows.any():
+            found.append(Group(label, rows))
+    return found
+
+
+def differences(night: Night) -> list[Difference]:
+    """Return the difference of each group from the reference."""
+    seeing = drift_of_r0(night)
+    return [difference(night, group, seeing) for group in groups(night)]
+
+
+def difference(night: Night, group: Group, seeing: Floats | None) -> Difference:
+    """Return the difference of a group from the reference.
+
+    Parameters
+    ----------
+    night : Night
+    group : Group
+    seeing : (B,) array, optional
+        See `drift_of_r0`.
+    """
+    reference = night.method == night.reference
+    rows = (reference | group.rows) & np.isfinite(night.strehl)
+    paired = None
+    known = group.rows & np.isfinite(night.paired_strehl - night.strehl)
+    if known.any():
+        change = (night.strehl - night.paired_strehl)[known]
+        one = np.ones((len(change), 1))
+        paired = coefficient(one, change, night.middle_s[known], night.cycle[known], 0)
+    seconds = night.duration_s[rows] + night.overhead_s
+    return Difference(
+        group.name,
+        int(group.rows.sum()),
+        contrast(night, group.rows, reference, seeing),
+        contrast(night, group.rows, reference, None),
+        paired,
+        float(seconds.sum()) / 3600,
+    )
+
+
+def contrast(night: Night, chosen: Rows, others: Rows, seeing: Floats | None) -> Estimate:
+    """Return the Strehl ratio of some blocks minus that of others.
+
+    Sets have means of their own; with `seeing` the Strehl ratio is a parabola of it.
+    """
+    rows = (chosen | others) & np.isfinite(night.strehl)
+    if min((chosen & rows).sum(), (others & rows).sum()) < _FEWEST_ROWS:
+        return Estimate(math.nan)
+    columns = [chosen[rows].astype(np.float64)]
+    columns += [
+        (night.set_number[rows] == number).astype(np.float64) for number in range(len(night.set_names))
+    ]
+    if seeing is not None:
+        away = seeing[rows] - seeing[rows].mean()
+        columns += [away, away**2 - np.mean(away**2)]
+    design = np.column_stack(columns)
+    return coefficient(design, night.strehl[rows], night.middle_s[rows], night.cycle[rows], 0)
+
+
+def drift_of_r0(night: Night) -> Floats | None:
+    """Return the logarithm of r0 as it drifts, (B,), from the measured r0 of all blocks; None without.
+
+    Each method may measure r0 with an error of its own, which would pass for a difference between methods.
+    Therefore the r0 of a block is what the blocks of the other methods before and after it predict.
+    """
+    known = np.isfinite(night.r0_m) & (night.r0_m > 0)
+    if known.sum() < _FEWEST_SEEN or len(np.unique(night.method[known])) < 2:
+        return None
+    time_s = night.middle_s
+    part = predicted_by_others(np.log(night.r0_m[known]), time_s[known], night.method[known])
+    return np.interp(time_s, time_s[known], part)
+
+
+def by_strength(night: Night) -> list[tuple[float, Difference]]:
+    """Return the mean strength and the difference from the reference of each range of strengths."""
+    seeing, strength, found = drift_of_r0(night), night.strength_e, []
+    low_best, high_best = BEST_STRENGTHS_E
+    best = (strength >= low_best) & (strength <= high_best)
+    for low, high in STRENGTH_RANGES_E:
+        rows = best if low == low_best else (strength > low) & (strength <= high) & ~best
+        if rows.sum() >= _FEWEST_ROWS:
+            name = f"{low:g} to {high:g} e⁻" if math.isfinite(high) else f"above {low:g} e⁻"
+            found.append((float(strength[rows].mean()), difference(night, Group(name, rows), seeing)))
+    return found
+
+
+def lines(night: Night) -> list[Line]:
+    """Return Strehl ratio against measured r0 as a line, for the reference and each group."""
+    every = [Group(night.labels[night.reference], night.method == night.reference), *groups(night)]
+    return [line for group in every if (line := _line(night, group)) is not None]
+
+
+def _line(night: Night, group: Group) -> Line | None:
+    rows = group.rows & np.isfinite(night.r0_m + night.strehl)
+    if rows.sum() < _FEWEST_ROWS or np.ptp(night.r0_m[rows]) == 0:
+        return None
+    r0, strehl = night.r0_m[rows], night.strehl[rows]
+    slope, intercept = np.polyfit(r0, strehl, 1)
+    cycle = night.cycle[rows]
+    without = [
+        float(np.polyfit(r0[cycle != number], strehl[cycle != number], 1)[0])
+        for number in np.unique(cycle)
+        if np.unique(r0[cycle != number]).size > 1
+    ]
+    correlation = float(np.corrcoef(r0, strehl)[0, 1])
+    return Line(group.name, jackknife(float(slope), without), float(intercept), correlation, len(r0))
+
+
+def hours_needed(effect: float, error: float, hours: float, sigma: float = SIGMA) -> float:
+    """Return the hours after which an effect is `sigma` standard errors, whose square falls with time.
+
+    Parameters
+    ----------
+    effect : float
+    error : float
+        Its standard error after `hours`.
+    hours : float
+    sigma : float
+    """
+    if not (math.isfinite(effect) and math.isfinite(error)):
+        return math.nan
+    return hours * (sigma * error / abs(effect)) ** 2 if effect else math.inf
+
+
+def significance(estimate: Estimate) -> float:
+    """Return a value in units of its standard error; NaN where it has none."""
+    error = estimate.standard_error
+    return estimate.value / error if math.isfinite(error) and error > 0 else math.nan
+
+
+def group_means(night: Night, rows: Rows) -> list[tuple[float, float, int]]:
+    """Return mean, standard deviation and number of some blocks in each set, and in all of them."""
+    found = []
+    for number in [*range(len(night.set_names)), None]:
+        part = rows & (np.ones_like(rows) if number is None else night.set_number == number)
+        values = night.strehl[part & np.isfinite(night.strehl)]
+        scatter = float(values.std(ddof=1)) if len(values) > 1 else math.nan
+        found.append((float(values.mean()) if len(values) else math.nan, scatter, len(values)))
+    return found

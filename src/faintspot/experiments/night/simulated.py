@@ -1,0 +1,247 @@
+"""The night in a simulated loop: alternating methods, and the reference alone in the same turbulence."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.experiments.closed_loop.methods import Choice
+from faintspot.experiments.closed_loop.search import QUICK, Search, stored, tuning_frames, tuning_unit
+from faintspot.experiments.night.blocks import NIGHT_STORE, Night
+from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan, kind_of
+from faintspot.experiments.night.seeing import r0_of_slopes
+from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
+from faintspot.experiments.store import ZarrStore, fingerprint_of
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.control import slope_turbulence
+from faintspot.loop.simulation.files import make_folder
+from faintspot.loop.simulation.methods import Method
+from faintspot.loop.simulation.record import LoopRecord
+from faintspot.loop.simulation.simulation import simulate_loop
+
+Floats = NDArray[np.float64]
+
+KIND = "night"
+_PIECES = 10  # of a block, from whose scatter the error of its mean follows
+_LEAST_VALID = 0.9  # of the slopes of a block; large ones are missed most, so that r0 comes out too large
+_VALUES = (
+    "strehl", "strehl_error", "phase_rad2", "phase_error_rad2", "r0_m", "r0_error_m", "true_r0_m"
+)  # fmt: skip
+
+
+def run_night(
+    configuration: LoopConfiguration,
+    folder: str | Path,
+    *,
+    plan: NightPlan | None = None,
+    quick: bool = False,
+    tuned: bool = False,
+    paired: bool = True,
+    pool: WorkerPool | None = None,
+    overwrite: bool = False,
+) -> Night:
+    """Observe a night in simulation, or what is left of it; the result is also written to the folder.
+
+    The sets follow one another in one continuous atmosphere, in which r0 drifts as configured. Each unit of
+    work is a set; where it is finished, it is not done again.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+    folder : path
+        Where finished units and the night are kept; made where it is not there.
+    plan : NightPlan, optional
+        Default: the paper's, or with `quick` a short one.
+    quick : bool
+        Short blocks, few strengths and a coarse search.
+    tuned : bool
+        Whether number of pixels, loop gain and options are tuned for each method in other turbulence.
+    paired : bool
+        Whether the reference also runs alone in the same turbulence.
+    pool : WorkerPool, optional
+        Where the work is done. Default: processes on this machine.
+    overwrite : bool
+        Whether another experiment in the folder is replaced.
+
+    Raises
+    ------
+    InputError
+        When the folder holds another experiment, or methods and configuration do not fit together.
+    MissingExtraError
+        When HCIPy or zarr is not installed.
+
+    Examples
+    --------
+    >>> from faintspot.experiments.night.simulated import run_night
+    >>> from faintspot.loop.simulation import load_loop
+    >>> night = run_night(load_loop("canary"), "night", quick=True)  # doctest: +SKIP
+    """
+    plan = plan or (QUICK_PLAN if quick else NightPlan())
+    pool, folder = pool or WorkerPool(), make_folder(folder)
+    identity = fingerprint_of(configuration.to_text(), str(asdict(plan)), f"tuned: {tuned}, quick: {quick}")
+
+    def results_of(name: str, function: Any, units: list[Unit], stage: WorkerPool) -> Any:
+        path = make_folder(folder / "units") / f"{name}.zarr"
+        keys, attributes = [unit.key for unit in units], {"name": configuration.name}
+        store = ZarrStore(path, KIND, identity, keys, attributes=attributes, overwrite=overwrite)
+        return run_units(function, units, store, stage)
+
+    plan.made(plan.configuration(configuration, 0), 0, {})  # refuses what does not fit before any work
+    trials = _trials(configuration, plan, QUICK if quick else Search()) if tuned else []
+    units = _units(configuration, plan, {}, paired)
+    stages = in_stages(pool, [sum(unit.size for unit in each) for each in (trials, units)])
+    choices: dict[str, Choice] = {}
+    if trials:
+        pool.say("tuning")
+        found = results_of("tuning", tuning_unit, trials, stages[0])
+        choices = {unit.key: stored(found[unit.key]).choice for unit in trials}
+    pool.say("observing")
+    units = _units(configuration, plan, choices, paired)
+    results = dict(results_of("night", observe, units, stages[1]))
+    night = _night(configuration, plan, choices, results)
+    night.save(folder / NIGHT_STORE)
+    return night
+
+
+def _trials(configuration: LoopConfiguration, plan: NightPlan, search: Search) -> list[Unit]:
+    """Return the units that tune the methods of a plan."""
+    kinds = {name: kind_of(name) for name in plan.methods}
+    return [
+        Unit(name, (kind, configuration, search, None), tuning_frames(kind, configuration, search))
+        for name, kind in kinds.items()
+    ]
+
+
+def _units(
+    configuration: LoopConfiguration, plan: NightPlan, choices: dict[str, Choice], paired: bool
+) -> list[Unit]:
+    """Return the sets with alternating methods, and those of the reference alone."""
+    return [
+        Unit(_key(number, alone), (configuration, plan, number, choices, alone), plan.frames(number))
+        for alone in ([False, True] if paired else [False])
+        for number in range(plan.sets)
+    ]
+
+
+def _key(number: int, alone: bool) -> str:
+    return f"{number + 1}-reference" if alone else f"{number + 1}"
+
+
+def observe(
+    configuration: LoopConfiguration,
+    plan: NightPlan,
+    number: int,
+    choices: dict[str, Choice],
+    alone: bool,
+    advance: Advance,
+) -> dict[str, NDArray[Any]]:
+    """Observe one set; return the values of its blocks, NaN up to the number of blocks of the longest set.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+    plan : NightPlan
+    number : int
+        Set, counted from 0.
+    choices : dict
+        Tuned values by the method's name.
+    alone : bool
+        Whether the reference measures all blocks.
+    advance : callable
+        Called with the number of frames done.
+    """
+    whole = plan.configuration(configuration, number)
+    schedule = plan.schedule(number)
+    methods = plan.made(whole, number, choices)
+    record = simulate_loop(
+        whole,
+        methods[:1] if alone else methods,
+        np.zeros_like(schedule) if alone else schedule,
+        first_frame=plan.first_frame(number),
+        progress=lambda done, total: advance(done),
+    )
+    most = max(plan.blocks(each) for each in range(plan.sets))
+    values = np.full((len(_VALUES), most), np.nan)
+    for block in range(plan.blocks(number)):
+        first = block * plan.block_frames
+        values[:, block] = _of_block(
+            record, whole, slice(first + plan.settle_in_block, first + plan.block_frames), seeing=not alone
+        )
+    return dict(zip(_VALUES, values, strict=True))
+
+
+def _of_block(record: LoopRecord, configuration: LoopConfiguration, rows: slice, seeing: bool) -> list[float]:
+    """Return the values of a block, in the order of `_VALUES`."""
+    to_phase = (2e-9 * math.pi / configuration.science.wavelength_m) ** 2
+    phase = to_phase * np.square(record.residual_nm[rows])
+    r0 = (math.nan, math.nan)
+    if seeing and record.valid[rows].mean() >= _LEAST_VALID:
+        gain = record.centroid_gain[record.method[rows]][:, None]
+        residual = record.slopes_px[rows] / gain
+        mirror = record.commands[rows].astype(np.float64) @ record.interaction_matrix.T
+        open_loop = residual - mirror if record.closed else residual
+        site = slope_turbulence(configuration, record.cells)
+        r0 = r0_of_slopes(open_loop, residual, site, configuration.atmosphere.outer_scale_m)
+    true = float(np.mean(record.r0_m[rows] ** (-5 / 3)) ** (-3 / 5))
+    return [*_mean(record.strehl[rows]), *_mean(phase), *r0, true]
+
+
+def _mean(values: Floats) -> tuple[float, float]:
+    """Return the mean of a block and its standard error, from consecutive pieces."""
+    pieces = [float(piece.mean()) for piece in np.array_split(values, _PIECES)]
+    return float(values.mean()), float(np.std(pieces, ddof=1)) / math.sqrt(_PIECES)
+
+
+def _night(
+    configuration: LoopConfiguration, plan: NightPlan, choices: dict[str, Choice], results: dict[str, Any]
+) -> Night:
+    """Put the sets together."""
+    rate = configuration.control.frame_rate_hz
+    columns: dict[str, list[Any]] = {
+        name: [] for name in ("set_number", "method", "strength_e", "start_s", *_VALUES, "paired_strehl")
+    }
+    methods: dict[str, Method] = {}
+    for number in range(plan.sets):
+        entries, count = plan.entries(number), plan.blocks(number)
+        for method in plan.made(plan.configuration(configuration, number), number, choices):
+            methods.setdefault(method.label, method)
+        made = [method.label for method in plan.made(configuration, number, choices)]
+        order = np.arange(count) % len(entries)
+        first = plan.first_frame(number) + plan.settle_in_block + plan.block_frames * np.arange(count)
+        alone = results.get(_key(number, True), {}).get("strehl", np.full(count, np.nan))
+        columns["set_number"].append(np.full(count, number))
+        columns["method"].append(np.array([list(methods).index(made[entry]) for entry in order]))
+        columns["strength_e"].append(np.array([entries[entry][1] for entry in order]))
+        columns["start_s"].append(first / rate)
+        columns["paired_strehl"].append(alone[:count])
+        for name in _VALUES:
+            columns[name].append(results[_key(number, False)][name][:count])
+    values: dict[str, Any] = {name: np.concatenate(parts) for name, parts in columns.items()}
+    scored = plan.block_frames - plan.settle_in_block
+    return Night(
+        labels=tuple(methods),
+        settings=tuple(
+            _in_words(configuration, method, max(1, len(plan.strength_factors)))
+            for method in methods.values()
+        ),
+        reference=0,
+        set_names=tuple(plan.set_name(number) for number in range(plan.sets)),
+        duration_s=np.full(len(values["start_s"]), scored / rate),
+        overhead_s=plan.settle_in_block / rate,
+        wavelength_m=configuration.science.wavelength_m,
+        source="simulated",
+        configuration=configuration.to_text(),
+        **values,
+    )
+
+
+def _in_words(configuration: LoopConfiguration, method: Method, subapertures: int) -> str:
+    """Return settings and loop gain of a method in words."""
+    gain = configuration.control.gain if method.gain is None else method.gain
+    words = method.estimator.in_words(subapertures, configuration.sensor.pixels**2)
+    return f"{words}; loop gain {gain:.3g}"

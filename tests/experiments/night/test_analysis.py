@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.experiments.night_cases import night_with, without_r0
+
+from faintspot.experiments.night.analysis import (
+    ALL_STRENGTHS,
+    BEST,
+    by_strength,
+    differences,
+    drift_of_r0,
+    group_means,
+    groups,
+    hours_needed,
+    lines,
+)
+
+
+def test_groups_leave_a_strength_of_zero_out() -> None:
+    night = night_with()
+    found = {group.name: group.rows for group in groups(night)}
+    assert list(found) == [ALL_STRENGTHS, BEST]
+    assert (night.strength_e[found[ALL_STRENGTHS]] > 0).all()
+    assert night.strength_e[found[BEST]].min() >= 0.6
+    assert night.strength_e[found[BEST]].max() <= 1.1
+    counted = found[ALL_STRENGTHS] | np.isnan(night.strength_e) | (night.strength_e == 0)
+    assert counted.all()
+
+
+def test_a_method_without_strength_is_a_group_of_its_own() -> None:
+    night = night_with()
+    labels = (*night.labels, "fixed window")
+    method = np.where(night.strength_e == 0, len(labels) - 1, night.method)
+    strength = np.where(night.strength_e == 0, np.nan, night.strength_e)
+    settings = (*night.settings, "")
+    changed = replace(night, labels=labels, settings=settings, method=method, strength_e=strength)
+    assert [group.name for group in groups(changed)] == [ALL_STRENGTHS, BEST, "fixed window"]
+
+
+@pytest.mark.parametrize("effect", [0.12, -0.12])
+def test_a_known_effect_is_found_within_its_error(effect: float) -> None:
+    every, best = differences(night_with(1, effect=effect, best=-2 * effect))
+    for found, true in ((every, None), (best, -effect)):
+        assert found.paired is not None
+        if true is not None:
+            assert abs(found.measured.value - true) < 3 * found.measured.standard_error
+            assert abs(found.paired.value - true) < 3 * found.paired.standard_error
+        assert found.paired.standard_error < found.measured.standard_error
+        assert 0.003 < found.measured.standard_error < 0.05
+    assert best.measured.decided == -np.sign(effect)
+
+
+@pytest.mark.slow
+def test_errors_are_those_of_repeated_nights() -> None:
+    found = [differences(night_with(seed))[0].measured for seed in range(10)]
+    scatter = np.std([each.value for each in found], ddof=1)
+    stated = np.mean([each.standard_error for each in found])
+    assert 0.5 < scatter / stated < 1.8  # 10 nights: the scatter is known to 24 %
+    assert sum(each.decided != 0 for each in found) <= 3  # 0.5 are expected
+
+
+def test_r0_that_one_method_measures_too_large_hardly_matters() -> None:
+    shifts = [
+        differences(night_with(seed, bias_of_r0=0.1))[0].measured.value
+        - differences(night_with(seed))[0].measured.value
+        for seed in range(2)
+    ]
+    assert abs(np.mean(shifts)) < 0.016  # r0 as measured would shift it by -0.04
+
+
+def test_the_drift_follows_r0() -> None:
+    night = night_with(3)
+    drift = drift_of_r0(night)
+    assert drift is not None
+    assert np.corrcoef(drift, np.log(night.true_r0_m))[0, 1] > 0.8
+    assert drift_of_r0(without_r0(night)) is None
+
+
+def test_a_night_without_r0_is_compared_all_the_same() -> None:
+    night = night_with(4, effect=0.1)
+    found = differences(without_r0(night))[0]
+    assert found.measured == found.without_r0
+    assert abs(found.measured.value - 0.1) < 3.5 * found.measured.standard_error
+    assert lines(without_r0(night)) == []
+
+
+def test_unknown_strehl_ratios_are_left_out() -> None:
+    night = night_with(5)
+    strehl = night.strehl.copy()
+    strehl[[0, 20]] = np.nan
+    found = differences(replace(night, strehl=strehl))[0]
+    assert math.isfinite(found.measured.value)
+    assert found.paired is not None
+    assert math.isfinite(found.paired.value)
+
+
+def test_hours_are_those_of_three_standard_errors() -> None:
+    assert hours_needed(0.03, 0.01, 2.0) == pytest.approx(2.0)
+    assert hours_needed(-0.01, 0.01, 2.0) == pytest.approx(18.0)
+    assert hours_needed(0.0, 0.01, 2.0) == math.inf
+    assert math.isnan(hours_needed(math.nan, 0.01, 2.0))
+    seen, unseen = (differences(night_with(6, effect=effect))[0] for effect in (0.3, 0.005))
+    assert seen.is_long_enough
+    assert not unseen.is_long_enough
+
+
+def test_without_paired_runs_hours_are_those_of_the_measured_effect() -> None:
+    found = differences(night_with(7, effect=0.1, paired=False))[0]
+    assert found.paired is None
+    measured = found.measured
+    assert found.hours_needed == pytest.approx(
+        hours_needed(measured.value, measured.standard_error, found.hours)
+    )
+
+
+def test_ranges_of_strengths_hold_every_strength_once() -> None:
+    night = night_with(8, best=0.2)
+    ranges = by_strength(night)
+    assert sum(each.blocks for _, each in ranges) == (night.strength_e > 0).sum()
+    assert max((each.measured.value, each.name) for _, each in ranges)[1] == "0.6 to 1.1 e⁻"
+    assert [strength for strength, _ in ranges] == sorted(strength for strength, _ in ranges)
+
+
+def test_the_line_against_r0_is_least_squares() -> None:
+    night = night_with(9)
+    line = lines(night)[0]
+    rows = night.method == night.reference
+    slope, intercept = np.polyfit(night.r0_m[rows], night.strehl[rows], 1)
+    assert (line.slope_per_m.value, line.intercept) == pytest.approx((slope, intercept))
+    assert line.correlation == pytest.approx(np.corrcoef(night.r0_m[rows], night.strehl[rows])[0, 1])
+    assert line.slope_per_m.decided == 1
+
+
+def test_means_of_sets_and_of_all() -> None:
+    night = night_with()
+    rows = night.method == night.reference
+    *of_sets, of_all = group_means(night, rows)
+    assert [count for _, _, count in of_sets] == [4, 2, 4, 2]
+    assert of_all[0] == pytest.approx(night.strehl[rows].mean())
+    assert of_sets[1][0] == pytest.approx(night.strehl[rows & (night.set_number == 1)].mean())

@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.experiments.night_cases import night_with, without_r0
+
+from faintspot.experiments.night.analysis import differences
+from faintspot.experiments.night.blocks import load_night
+from faintspot.experiments.night.page import in_hours, night_summary, night_summary_text, write_night
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("zarr")
+pytestmark = pytest.mark.usefixtures("undrawn_pictures")
+
+
+def test_store_summary_and_page(tmp_path: Path) -> None:
+    night = night_with(1, effect=0.2)
+    written = write_night(night, tmp_path)
+    assert [path.name for path in written[:3]] == ["night.zarr", "night.json", "night.html"]
+    np.testing.assert_array_equal(load_night(tmp_path / "night.zarr").strehl, night.strehl)
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(constant)
+
+    summary = json.loads((tmp_path / "night.json").read_text(encoding="utf-8"), parse_constant=refuse)
+    found = differences(night)[0]
+    of_all = summary["differences"][0]
+    assert of_all["at_equal_r0"]["value"] == pytest.approx(found.measured.value, rel=1e-5)
+    assert of_all["in_the_same_turbulence"]["value"] == pytest.approx(0.2, abs=0.05)
+    assert summary["verdicts"][0]["outcome"] == "holds"
+    html = (tmp_path / "night.html").read_text(encoding="utf-8")
+    sections = re.findall(r'<section id="([^"]+)"', html)
+    assert sections == [
+        "night-verdicts", "night-panels", "night-means", "night-differences", "night-r0", "night-settings"
+    ]  # fmt: skip
+    assert html.count("paper –") == 12  # four sets, three columns, none of them known
+    assert "not available" in html
+
+
+def test_what_is_not_known_is_null() -> None:
+    night = without_r0(night_with(2, paired=False))
+    night = replace(night, true_r0_m=night.r0_m)
+    summary = night_summary(night)
+    json.dumps(summary, allow_nan=False)
+    assert summary["against_r0"] == []
+    assert summary["differences"][0]["in_the_same_turbulence"] is None
+
+
+def test_the_text_has_a_line_for_each_verdict_and_difference() -> None:
+    lines = night_summary_text(night_with(3)).splitlines()
+    assert len(lines) == 4 + 2
+    assert all(" σ" in line for line in lines)
+    assert all("alternating" in line for line in lines[4:])
+
+
+@pytest.mark.parametrize(
+    ("hours", "words"),
+    [(0.05, "3 min"), (0.5, "30 min"), (2.25, "2.2 h"), (48.0, "48 h"), (12345.0, "12 345 h"), (np.inf, "–")],
+)
+def test_durations(hours: float, words: str) -> None:
+    assert in_hours(hours).replace("\u202f", " ") == words

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.experiments.experiment_cases import HERE, StopsAfter, assert_same_units, small
+
+from faintspot.base.errors import InputError
+from faintspot.experiments.night.blocks import load_night
+from faintspot.experiments.night.protocol import NightPlan
+from faintspot.experiments.night.simulated import run_night
+from faintspot.experiments.running import WorkerPool
+from faintspot.loop.simulation import simulate_loop
+
+pytest.importorskip("hcipy")
+pytest.importorskip("zarr")
+
+PLAN = NightPlan(
+    block_frames=60,
+    settle_in_block=20,
+    strengths=(2, 3),
+    em_fractions=(1.0, 0.75),
+    repeats=(2, 1),
+    strongest_e=1.0,
+    keep_brightest=12,
+)
+LOOP = small().replace("atmosphere", r0_m=(0.1, 0.2), drift_time_s=2.0).replace("camera", em_gain=100.0)
+
+
+def test_a_night_is_what_the_loop_does(tmp_path: Path) -> None:
+    night = run_night(LOOP, tmp_path, plan=PLAN, pool=HERE)
+    assert len(night.strehl) == 2 * 3 + 4
+    assert night.labels == ("no TV", "TV 0 e-", "TV 1 e-", "TV 0.5 e-")
+    np.testing.assert_array_equal(night.method, [0, 1, 2, 0, 1, 2, 0, 1, 3, 2])
+    np.testing.assert_array_equal(night.set_number, [0] * 6 + [1] * 4)
+    rate = LOOP.control.frame_rate_hz
+    np.testing.assert_allclose(night.start_s, (60 * np.arange(10) + 20) / rate)
+    # The first block of the reference has seen nothing else, so that it is the reference's own run.
+    assert night.paired_strehl[0] == night.strehl[0]
+    first = PLAN.configuration(LOOP, 0).replace("run", frames=60)
+    alone = simulate_loop(first, PLAN.made(first, 0, {})[:1])
+    assert night.strehl[0] == pytest.approx(alone.strehl[20:].mean())
+    assert night.true_r0_m[0] == pytest.approx(np.mean(alone.r0_m[20:] ** (-5 / 3)) ** (-3 / 5))
+    phase = (2e-9 * np.pi / night.wavelength_m) ** 2 * np.square(alone.residual_nm[20:])
+    assert night.phase_rad2[0] == pytest.approx(phase.mean())
+    # The second set goes on where the first ended.
+    second = PLAN.configuration(LOOP, 1).replace("run", frames=60)
+    later = simulate_loop(second, PLAN.made(second, 1, {})[:1], first_frame=360)
+    assert night.strehl[6] == pytest.approx(later.strehl[20:].mean())
+    assert np.isfinite(night.r0_m).sum() >= 8
+    assert ((night.r0_m > 0.3 * night.true_r0_m) & (night.r0_m < 3 * night.true_r0_m))[
+        np.isfinite(night.r0_m)
+    ].all()
+    np.testing.assert_array_equal(load_night(tmp_path / "night.zarr").strehl, night.strehl)
+
+
+@pytest.mark.slow
+def test_an_interrupted_night_goes_on(tmp_path: Path) -> None:
+    whole, interrupted = tmp_path / "whole", tmp_path / "interrupted"
+    run_night(LOOP, whole, plan=PLAN, pool=HERE)
+    with pytest.raises(KeyboardInterrupt):
+        run_night(LOOP, interrupted, plan=PLAN, pool=WorkerPool(0, StopsAfter(500)))
+    assert not (interrupted / "night.zarr").exists()
+    run_night(LOOP, interrupted, plan=PLAN, pool=HERE)
+    assert_same_units(whole, interrupted)
+    with pytest.raises(InputError, match="--overwrite"):
+        run_night(LOOP, interrupted, plan=replace(PLAN, keep_brightest=9), pool=HERE)
+
+
+def test_without_paired_runs_and_in_open_loop(tmp_path: Path) -> None:
+    loop = LOOP.replace("control", mode="open")
+    night = run_night(loop, tmp_path, plan=replace(PLAN, repeats=(1, 1)), pool=HERE, paired=False)
+    assert not night.is_paired
+    assert np.isfinite(night.strehl).all()
+
+
+@pytest.mark.slow
+def test_tuned(tmp_path: Path) -> None:
+    plan = replace(PLAN, methods=("none", "tv", "window"), repeats=(1, 1))
+    night = run_night(LOOP, tmp_path, plan=plan, pool=HERE, quick=True, tuned=True)
+    assert "fixed window" in night.labels
+    assert len(night.settings) == len(night.labels)
+    assert (tmp_path / "units" / "tuning.zarr").is_dir()
