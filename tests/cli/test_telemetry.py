@@ -16,11 +16,14 @@ pytest.importorskip("zarr")
 
 from tests.engine import telemetry_cases
 from tests.engine.telemetry_cases import FIELDS, LAYOUT, SETTINGS, Engine, N
+from tests.experiments.night.recorded_cases import write_recording
+from tests.loop.telemetry.alternation_cases import MATRIX, PIXEL_ARCSEC, SIDE, SUBAPERTURE_M, alternating
 
 from faintspot.engine.pixels.pixel_segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
+from faintspot.slopes.sensor.layout import Layout
 
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
 
@@ -63,3 +66,21 @@ def test_what_does_not_fit_together(folder: Path, run: Commands) -> None:
     run.refused("telemetry", naming=("expected FILE or --engine",))
     run.refused("telemetry", "night.zarr", "--seconds", "3", naming=("expected --engine",))
     run.refused("telemetry", "--engine", "nobody", naming=("start the engine first",))
+
+
+@pytest.mark.slow
+def test_methods_that_alternated_are_compared(folder: Path, run: Commands) -> None:
+    known = alternating(2000)
+    loop = known.loop
+    layout = Layout.grid((SIDE, SIDE), pixels=8, pixel_scale_arcsec=PIXEL_ARCSEC, subaperture_m=SUBAPERTURE_M)
+    write_recording(
+        folder / "night.zarr", layout, loop.slopes_px, loop.commands, loop.method, ("none", "tv:0.6"), MATRIX
+    )
+    told = run.ok("telemetry", "night.zarr")
+    assert "estimated from slopes" in told.out
+    numbers = json.loads(Path("night.json").read_text())
+    assert numbers["reference"] == "none"
+    assert numbers["turns"] == 40
+    assert "How the blocks were made" in Path("night.html").read_text()
+    run.refused("telemetry", "night.zarr", "--strehl", "absent.csv", naming=("absent.csv",))
+    run.refused("telemetry", "night.zarr", "--one-loop", "--settle", "5", naming=("--settle", "alternated"))
