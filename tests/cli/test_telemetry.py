@@ -16,12 +16,15 @@ pytest.importorskip("zarr")
 
 from tests.engine import telemetry_cases
 from tests.engine.telemetry_cases import FIELDS, LAYOUT, SETTINGS, Engine, N
+from tests.experiments.night.recorded_cases import write_recording
+from tests.loop.telemetry.alternation_cases import MATRIX, PIXEL_ARCSEC, SIDE, SUBAPERTURE_M, alternating
 from tests.loop.telemetry.loop_cases import recorded
 
 from faintspot.engine.pixels.pixel_segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
+from faintspot.slopes.sensor.layout import Layout
 
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
 
@@ -81,3 +84,21 @@ def test_controllers_that_cannot_be_learnt(folder: Path, run: Commands) -> None:
     assert not Path("controller.npz").exists()
     np.savez("loop.npz", **values, **known, loop="open")
     run.refused("telemetry", "loop.npz", "--controller", "controller.npz", naming=("closed loop",))
+
+
+@pytest.mark.slow
+def test_methods_that_alternated_are_compared(folder: Path, run: Commands) -> None:
+    known = alternating(2000)
+    loop = known.loop
+    layout = Layout.grid((SIDE, SIDE), pixels=8, pixel_scale_arcsec=PIXEL_ARCSEC, subaperture_m=SUBAPERTURE_M)
+    write_recording(
+        folder / "night.zarr", layout, loop.slopes_px, loop.commands, loop.method, ("none", "tv:0.6"), MATRIX
+    )
+    told = run.ok("telemetry", "night.zarr")
+    assert "estimated from slopes" in told.out
+    numbers = json.loads(Path("night.json").read_text())
+    assert numbers["reference"] == "none"
+    assert numbers["turns"] == 40
+    assert "How the blocks were made" in Path("night.html").read_text()
+    run.refused("telemetry", "night.zarr", "--strehl", "absent.csv", naming=("absent.csv",))
+    run.refused("telemetry", "night.zarr", "--one-loop", "--settle", "5", naming=("--settle", "alternated"))

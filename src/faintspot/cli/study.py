@@ -127,9 +127,7 @@ def paper(quick: bool, figures: tuple[str, ...], output: str | None, **where: An
     click.echo(f"{table}: the paper, figure by figure")
 
 
-def _night(
-    folder: Path, quick: bool, overwrite: bool, workers: int | None, scheduler: str | None
-) -> Night:
+def _night(folder: Path, quick: bool, overwrite: bool, workers: int | None, scheduler: str | None) -> Night:
     """Simulate the paper's observations with a progress bar and write their page."""
     from faintspot.experiments.night.page import PAGE_FILE, write_night
     from faintspot.experiments.night.simulated import run_night

@@ -35,8 +35,22 @@ _SECONDS = 20.0
     "--config",
     metavar="TOML",
     help="Configuration with [control], for recordings of the engine.",
-    show_default="with --engine: faintspot.toml",
+    show_default="as recorded; with --engine: faintspot.toml",
 )
+@option(
+    "--strehl",
+    metavar="CSV",
+    help="Measured Strehl ratios for methods that alternated: Unix time of the middle, Strehl ratio and "
+    "perhaps duration [s] of each exposure.",
+)
+@option(
+    "--settle",
+    metavar="FRAMES",
+    type=click.IntRange(1),
+    help="Frames at the beginning of each turn of a method that do not count.",
+    show_default="delay and 3 / loop gain; 100 for filters",
+)
+@option("--one-loop", is_flag=True, help="Report the loop as a whole, although methods alternated.")
 @option("--controller", metavar="NPZ", help="Learn a predictive controller as well, and write it to a file.")
 @option("--output", "-o", metavar="HTML", help="Page to write.", show_default="FILE's or NAME's, with .html")
 def command(
@@ -45,6 +59,9 @@ def command(
     seconds: float | None,
     system: str | None,
     config: str | None,
+    strehl: str | None,
+    settle: int | None,
+    one_loop: bool,
     controller: str | None,
     output: str | None,
 ) -> None:
@@ -55,10 +72,14 @@ def command(
     as JSON. Every value has a 95 % interval. It replays other gains and a predictive filter on the recorded
     turbulence. Takes a minute.
 
+    Where methods alternated in a closed loop (realtime run --interleave), it compares them instead: Strehl
+    ratio and residual phase, with hours of observing that would decide.
+
     \b
     Examples:
       faintspot telemetry --engine faintspot --seconds 20
-      faintspot telemetry night.zarr --config faintspot.toml
+      faintspot telemetry night.zarr
+      faintspot telemetry night.zarr --strehl times.csv
       faintspot telemetry night_aot.fits --system rate_and_unit.toml
       faintspot telemetry loop.toml -o loop.html
       faintspot telemetry loop.npz --controller controller.npz
@@ -85,6 +106,14 @@ def command(
             load_control(config)  # faults of the file are found before the recording
             _record(engine, recording, _SECONDS if seconds is None else seconds)
         assert recording is not None
+        alternated = not one_loop and controller is None and _alternates(recording)
+        if alternated:
+            _report_night(recording, page, config, system, strehl, settle)
+            return
+        if strehl is not None or settle is not None:
+            raise InputError(
+                f"{recording}: --strehl and --settle: expected methods that alternated in a closed loop"
+            )
         loop = read_recorded_loop(recording, system, config)
     if controller is not None and not loop.is_closed:
         raise InputError("--controller: expected the recording of a closed loop, got an open one")
@@ -105,6 +134,46 @@ def command(
             raise InputError(f"{controller}: not written, keep the integrator: {error}") from None
         control.save(controller)
         click.echo(f"{controller}: {control.summary()}")
+
+
+def _alternates(recording: Path) -> bool:
+    """Return whether a recording is of methods that alternated in a closed loop."""
+    from faintspot.io.arrays.zarr_store import holds_telemetry
+
+    if not (recording.is_dir() and holds_telemetry(recording)):
+        return False
+    from faintspot.experiments.night.recorded import alternates
+
+    return alternates(recording)
+
+
+def _report_night(
+    recording: Path,
+    page: Path,
+    config: str | None,
+    system: str | None,
+    strehl: str | None,
+    settle: int | None,
+) -> None:
+    """Write the page and the numbers of methods that alternated."""
+    from faintspot.base.report.page import write_page
+    from faintspot.experiments.night.measured_strehl import read_strehl
+    from faintspot.experiments.night.recorded import recorded_night
+    from faintspot.experiments.night.recorded_page import (
+        page_of_recording,
+        summary_of_recording,
+        text_of_recording,
+    )
+
+    measured = None if strehl is None else read_strehl(strehl)
+    night = recorded_night(
+        recording, configuration=config, system=system, strehl=measured, settle_frames=settle
+    )
+    numbers = derived(page, ".json")
+    write_atomically(numbers, to_json(summary_of_recording(night), indent=1))
+    write_page(page_of_recording(night), page)
+    click.echo(text_of_recording(night))
+    click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
 
 
 def _record(engine: str, store: Path, seconds: float) -> None:

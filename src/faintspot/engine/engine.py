@@ -28,6 +28,7 @@ from faintspot.engine.streams.slope_streams import SlopeStreams
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io.frame_numbers import left_out
 from faintspot.loop.control.configuration import NONE, STREAM, Control
+from faintspot.loop.control.recorded import packed_control
 from faintspot.slopes.pipeline.configuration import packed, to_text
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
@@ -166,6 +167,7 @@ class Engine:
                 commands=commands,
                 reference=None if control is None else control.reference,
                 parts=packed(first.calibration, *first.spot),
+                control=packed_control(control),
             )
         except InputError:
             self._streams.close()

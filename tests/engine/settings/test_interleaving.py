@@ -29,6 +29,28 @@ def test_texts() -> None:
     assert found.labels == ["none", "tv", "ml", "noise_std=2+keep_brightest=20", "set"]
 
 
+def test_strengths() -> None:
+    found = Interleaving.parse("tv:0.6,smoothed:0.9+keep_brightest=7,tv:2+polc")
+    assert [method.changes for method in found.methods] == [
+        {"estimator": "tv", "noise_std": 0.6},
+        {"estimator": "smoothed", "smoothing_px": 0.9, "keep_brightest": 7},
+        {"estimator": "tv", "noise_std": 2},
+    ]
+    assert found.labels[0] == "tv:0.6"
+    assert found.methods[0].of(fs.Settings("tv", noise_std=2.0, keep_brightest=9)) == fs.Settings(
+        "tv", noise_std=0.6, keep_brightest=9
+    )
+    with refused("interleave: 'ml:2'", "no strength"):
+        Interleaving.parse("ml:2")
+
+
+def test_controllers_alone() -> None:
+    found = Interleaving.parse("integrator,kalman,none+search_range_px=3+modal")
+    assert [method.control for method in found.methods] == ["integrator", "kalman", "modal"]
+    assert [method.changes for method in found.methods] == [{}, {}, {"search_range_px": 3}]
+    assert [method.denoises for method in found.methods] == [True, True, False]
+
+
 def test_controllers() -> None:
     found = Interleaving.parse("window+integrator,set+kalman,none,noise_std=2+keep_brightest=20+modal")
     assert [method.control for method in found.methods] == ["integrator", "kalman", None, "modal"]
@@ -61,7 +83,8 @@ def test_turns() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "tvv", "none,,tv", "strength=2", "noise_std=", "kalman", "tv+", "tv+kalman+polc", "tv+none"]
+    "text",
+    ["", "tvv", "none,,tv", "strength=2", "noise_std=", "tv:", "kalmann", "tv+", "tv+kalman+polc", "tv+none"],
 )
 def test_anything_else_is_refused(text: str) -> None:
     with pytest.raises(fs.InputError):

@@ -42,7 +42,8 @@ from faintspot.engine.requests.private_socket import socket_path
 @option(
     "--interleave",
     metavar="METHODS",
-    help="Alternate between settings, and controllers, such as none,tv or ml+integrator,map+kalman.",
+    help="Alternate between settings, strengths or controllers, such as none,tv:0.6,tv:0.8 or "
+    "integrator,kalman.",
 )
 @option("--every", type=click.IntRange(1), default=50, help="Frames for each in turn.")
 @option(
@@ -94,8 +95,8 @@ def run(
 
     \b
     On sky, with and without, 50 frames each (NAME_marks says which):
-      faintspot realtime run --interleave none,tv --every 50
-      faintspot realtime run --close-loop --interleave window+integrator,map+kalman --every 250
+      faintspot realtime run --close-loop --interleave none,tv:0.6,tv:0.8 --every 50
+      faintspot realtime run --close-loop --interleave integrator,kalman --every 250
     """
     from faintspot.base.config.written_changes import parse_subapertures
     from faintspot.base.errors import InputError

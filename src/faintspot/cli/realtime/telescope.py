@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import time
+from contextlib import ExitStack
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import click
 
+from faintspot.base.files import output_errors
 from faintspot.base.json_text import to_json
 from faintspot.cli.realtime.camera import published, stop_on_signal
 from faintspot.cli.shared.commands import Group, option
@@ -60,6 +63,11 @@ def telescope() -> None:
     default=0,
     help="Number of the realisation; each has other turbulence and noise.",
 )
+@option(
+    "--strehl",
+    metavar="CSV",
+    help="Write the true Strehl ratio of every frame, for faintspot telemetry --strehl.",
+)
 def run(
     configuration: str,
     name: str,
@@ -67,6 +75,7 @@ def run(
     write_config: str | None,
     control: str,
     frames: int | None,
+    strehl: str | None,
     **options: Any,
 ) -> None:
     """Simulate a telescope: turbulence, mirror, Shack-Hartmann sensor and camera, at a camera's pace.
@@ -94,7 +103,12 @@ def run(
     if write_config is not None:
         click.echo(f"{name}: {write_engine_files(observed, write_config, control)} written")
     say = partial(click.echo, err=True)
-    with SimulatedTelescope(observed, name, say=lambda line: say(f"{name}: {line}"), **options) as simulated:
+    options["say"] = lambda line: say(f"{name}: {line}")
+    with ExitStack() as files:
+        if strehl is not None:
+            exposure_s = 1 / observed.control.frame_rate_hz
+            options["keep_truth"] = files.enter_context(_StrehlFile(strehl, exposure_s)).write
+        simulated = files.enter_context(SimulatedTelescope(observed, name, **options))
         optics = simulated.telescope_model.optics
         rows, columns = optics.sensor.layout.frame_shape
         server = ControlServer(socket_path(name, TELESCOPE), commands_of(simulated), lengthy=LENGTHY)
@@ -106,6 +120,35 @@ def run(
             )
             report = simulated.run(frames, stop)
     click.echo(f"{name}: {published(report)}")
+
+
+class _StrehlFile:
+    """CSV file with Unix time of the middle, true Strehl ratio and duration of each exposure.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+
+    def __init__(self, path: str, exposure_s: float) -> None:
+        self._path, self._exposure_s = path, exposure_s
+        with output_errors(path):
+            self._stream = open(path, "w", encoding="utf-8")  # noqa: SIM115
+            self._stream.write("time_s,strehl,exposure_s\n")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.close()
+
+    def write(self, truth: tuple[float, ...]) -> None:
+        """Write one exposure."""
+        _, strehl, *_, begun_s, _, _ = truth
+        time_s = begun_s + self._exposure_s / 2 + time.time() - time.monotonic()
+        with output_errors(self._path):
+            self._stream.write(f"{time_s:.4f},{strehl:.5f},{self._exposure_s:.6g}\n")
 
 
 @telescope.command("set", short_help="Change the star or the turbulence.")

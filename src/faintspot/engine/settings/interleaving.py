@@ -76,11 +76,11 @@ class Interleaving:
 
     @classmethod
     def parse(cls, text: str, every: int = 1, first: int = 0) -> Interleaving:
-        """Parse a text such as "none,tv" or "noise_std=1,noise_std=2+keep_brightest=20,ml".
+        """Parse a text such as "none,tv:0.6,tv:0.8" or "integrator,map+kalman".
 
         Each configuration is "set" (the present settings), "none" (the same without denoising), the name of
-        an estimator, or new values of settings, NAME=VALUE, joined with "+". A controller may follow after
-        another "+", as in "map+kalman".
+        an estimator, perhaps with its strength ("tv:0.6"), or new values of settings, NAME=VALUE; more
+        values may follow after "+", and a controller. A controller alone has the present settings.
 
         Raises
         ------
@@ -115,6 +115,9 @@ def methods_after(
 
 
 def _parsed_method(text: str) -> InterleavedMethod:
+    """Return a method: settings, a controller, or both joined with "+"."""
+    if text in CONTROLS:
+        return InterleavedMethod(text, {}, control=text)
     measured, _, control = text.rpartition("+")
     if measured and control in CONTROLS:
         return replace(_parsed_settings(measured), label=text, control=control)
@@ -122,16 +125,33 @@ def _parsed_method(text: str) -> InterleavedMethod:
 
 
 def _parsed_settings(text: str) -> InterleavedMethod:
-    if text in (_SET, _NONE):
-        return InterleavedMethod(text, {}, denoises=text == _SET)
-    if text in estimators():
-        return InterleavedMethod(text, {"estimator": text})
-    if "=" in text:
-        changes = parse_changes(text.split("+"))
+    first, *others = text.split("+")
+    name, colon, strength = first.partition(":")
+    changes: dict[str, Any] = {}
+    if first not in (_SET, _NONE):
+        if name in estimators():
+            changes["estimator"] = name
+        elif colon or "=" not in first:
+            names = ", ".join([_SET, _NONE, *estimators()])
+            raise InputError(
+                f"interleave: {text!r}: expected {names}, ESTIMATOR:STRENGTH, NAME=VALUE or one of "
+                f"{', '.join(CONTROLS)}; several joined with +, the controller last"
+            )
+        else:
+            others = [first, *others]
+    if colon:
+        others = [f"{_strength_option(text, name)}={strength}", *others]
+    if others:
+        changes |= parse_changes(others)
         check_names(list(changes))
-        return InterleavedMethod(text, changes)
-    names = ", ".join([_SET, _NONE, *estimators()])
-    raise InputError(
-        f"interleave: {text!r}: expected {names}, or NAME=VALUE with + between several, perhaps "
-        f"followed by + and one of {', '.join(CONTROLS)}"
-    )
+    return InterleavedMethod(text, changes, denoises=first != _NONE)
+
+
+def _strength_option(text: str, name: str) -> str:
+    """Return the option of an estimator that ESTIMATOR:STRENGTH sets."""
+    option = estimators()[name].strength_option
+    if option is None:
+        raise InputError(
+            f"interleave: {text!r}: expected {name} alone or with +NAME=VALUE; it has no strength"
+        )
+    return option

@@ -134,6 +134,7 @@ class Recorder:
             "settings": reader.settings,
             "reference": reader.description.get("reference"),
             "parts": reader.description.get("parts"),
+            "control": reader.description.get("control"),
             **self._waiting.attributes(reader),
         }
         self._store = TelemetryStore(path, reader.records.kind, reader.images.kind, attributes)

@@ -97,6 +97,7 @@ class TelemetryRing(Closing):
         commands: int = 0,
         reference: ArrayLike | None = None,
         parts: Mapping[str, str] | None = None,
+        control: Mapping[str, Any] | None = None,
         records: int | None = None,
         image_slots: int | None = None,
     ) -> TelemetryRing:
@@ -117,6 +118,8 @@ class TelemetryRing(Closing):
             Reference slopes that were subtracted, px, for readers.
         parts : mapping, optional
             Calibration, PSF and score, for readers (`faintspot.slopes.pipeline.configuration.packed`).
+        control : mapping, optional
+            Interaction matrix and options, for readers (`faintspot.loop.control.recorded.packed_control`).
         records : int, optional
             Number of records, about 60 + 29 n bytes each: a reader may lag by one frame less. Default: as
             many as fit into 32 MiB, up to 4096.
@@ -142,6 +145,7 @@ class TelemetryRing(Closing):
             "commands": commands,
             "reference": None if reference is None else np.asarray(reference).tolist(),
             "parts": parts,
+            "control": control,
             "records": int(number_between("records", records, 2, 1 << 24, integer=True)),
             "image_slots": int(number_between("image_slots", image_slots, 2, 1 << 16, integer=True)),
             "change_slots": CHANGE_SLOTS,

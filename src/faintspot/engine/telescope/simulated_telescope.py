@@ -83,6 +83,8 @@ class SimulatedTelescope(Readout, Closing):
         Frames in the ring.
     say : function, optional
         Called with a one-line message about the commands, and when the pace cannot be kept.
+    keep_truth : function, optional
+        Called with the values of `TRUTH` after each frame.
 
     Attributes
     ----------
@@ -108,10 +110,12 @@ class SimulatedTelescope(Readout, Closing):
         rows_per_block: int | None = None,
         slots: int = 4,
         say: Callable[[str], None] | None = None,
+        keep_truth: Callable[[tuple[float, ...]], None] | None = None,
     ) -> None:
         if configuration.camera.rolling_shutter:
             raise InputError("camera.rolling_shutter: expected 0, as this telescope knows no later commands")
         self.configuration, self.name, self._say = configuration, name, say or (lambda _: None)
+        self._keep_truth = keep_truth
         self._conditions = Conditions.of(configuration)
         start = configuration.run.seed if seed is None else seed
         self.telescope_model = telescope_model = TelescopeModel(configuration, start, realisation)
@@ -215,6 +219,8 @@ class SimulatedTelescope(Readout, Closing):
         super()._publish(moment, frame)
         self._truth.write_locked(np.array(exposure.truth), frame_id=number)
         self._frames.write_locked(frame, frame_id=number)
+        if self._keep_truth is not None:
+            self._keep_truth(exposure.truth)
         self._complain()
 
     def _begin(self, number: int) -> Future[Exposure]:

@@ -2,5 +2,6 @@
 
 `blocks` (`Night`: one row for each block of frames), `protocol` and `simulated` (the night of Basden et al.
 2015 in a simulated loop), `analysis` (`differences(night)`: with errors, and hours for 3 sigma), `verdicts`
-(`verdicts(night)`), `figures` and `page` (`write_night(night, folder)`: Zarr, JSON and page).
+(`verdicts(night)`), `figures` and `page` (`write_night(night, folder)`: Zarr, JSON and page). `recorded`
+makes a night of the engine's telemetry, with the page of `recorded_page`.
 """

@@ -24,6 +24,7 @@ ALL_STRENGTHS = "TV, all strengths"
 BEST = f"TV, {BEST_STRENGTHS_E[0]:g} to {BEST_STRENGTHS_E[1]:g} e⁻"
 _FEWEST_ROWS = 3
 _FEWEST_SEEN = 10  # blocks with a measured r0
+_NORMAL = 1.96  # standard errors on each side of a 95 % interval
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +50,16 @@ class Difference:
     """Against the reference in the same turbulence at the same time; None where that is not known."""
     hours: float
     """Duration of the blocks of group and reference, settling included."""
+    shared_error: float = 0.0
+    """Part of the measured error that does not fall with time."""
 
     @property
     def hours_needed(self) -> float:
         """Hours of alternating until the effect is `SIGMA` standard errors; of the paired effect if known."""
         effect = self.measured if self.paired is None else self.paired
-        return hours_needed(effect.value, self.measured.standard_error, self.hours)
+        return hours_needed(
+            effect.value, self.measured.standard_error, self.hours, shared_error=self.shared_error
+        )
 
     @property
     def is_long_enough(self) -> bool:
@@ -124,6 +129,7 @@ def difference(night: Night, group: Group, seeing: Floats | None) -> Difference:
         contrast(night, group.rows, reference, None),
         paired,
         float(seconds.sum()) / 3600,
+        _shared_error(night, group.rows & rows, reference & rows),
     )
 
 
@@ -143,7 +149,27 @@ def contrast(night: Night, chosen: Rows, others: Rows, seeing: Floats | None) ->
         away = seeing[rows] - seeing[rows].mean()
         columns += [away, away**2 - np.mean(away**2)]
     design = np.column_stack(columns)
-    return coefficient(design, night.strehl[rows], night.middle_s[rows], night.cycle[rows], 0)
+    found = coefficient(design, night.strehl[rows], night.middle_s[rows], night.cycle[rows], 0)
+    return _with_shared(found, _shared_error(night, chosen & rows, others & rows))
+
+
+def _shared_error(night: Night, chosen: Rows, others: Rows) -> float:
+    """Return the error of a difference that its blocks have in common."""
+    if night.shared_error is None or not (chosen.any() and others.any()):
+        return 0.0
+    return abs(float(night.shared_error[chosen].mean() - night.shared_error[others].mean()))
+
+
+def _with_shared(estimate: Estimate, error: float) -> Estimate:
+    """Return an estimate with one more error, which does not show in the scatter of the blocks."""
+    if not math.isfinite(estimate.standard_error):
+        return estimate
+    low, high = (
+        estimate.value + sign * math.hypot(limit - estimate.value, _NORMAL * error)
+        for sign, limit in ((-1, estimate.low), (1, estimate.high))
+    )
+    total = math.hypot(estimate.standard_error, error)
+    return Estimate(estimate.value, total, low, high, estimate.count)
 
 
 def drift_of_r0(night: Night) -> Floats | None:
@@ -195,8 +221,12 @@ def _line(night: Night, group: Group) -> Line | None:
     return Line(group.name, jackknife(float(slope), without), float(intercept), correlation, len(r0))
 
 
-def hours_needed(effect: float, error: float, hours: float, sigma: float = SIGMA) -> float:
+def hours_needed(
+    effect: float, error: float, hours: float, sigma: float = SIGMA, *, shared_error: float = 0.0
+) -> float:
     """Return the hours after which an effect is `sigma` standard errors, whose square falls with time.
+
+    Infinite where no time is long enough.
 
     Parameters
     ----------
@@ -205,10 +235,13 @@ def hours_needed(effect: float, error: float, hours: float, sigma: float = SIGMA
         Its standard error after `hours`.
     hours : float
     sigma : float
+    shared_error : float
+        Part of the error that does not fall with time.
     """
     if not (math.isfinite(effect) and math.isfinite(error)):
         return math.nan
-    return hours * (sigma * error / abs(effect)) ** 2 if effect else math.inf
+    left = (effect / sigma) ** 2 - shared_error**2
+    return hours * max(error**2 - shared_error**2, 0.0) / left if left > 0 else math.inf
 
 
 def significance(estimate: Estimate) -> float:

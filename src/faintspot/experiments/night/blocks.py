@@ -71,6 +71,8 @@ class Night:
     """Where the blocks come from, in words: "simulated" or a file."""
     configuration: str
     """TOML text of the simulated configuration, or ""."""
+    shared_error: Floats | None = None
+    """Standard error of `strehl`, against that of the reference, that blocks of a method have in common."""
 
     def __post_init__(self) -> None:
         count = len(self.start_s)

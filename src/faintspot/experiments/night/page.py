@@ -171,6 +171,8 @@ def _conclusions(night: Night) -> list[str]:
 
 
 def _length(difference: Difference) -> str:
+    if math.isinf(difference.hours_needed) and difference.shared_error > 0:
+        return str(_TEXT["page.never"])
     if not math.isfinite(difference.hours_needed):
         return str(_TEXT["page.unknown"])
     values = {"hours": in_hours(difference.hours), "needed": in_hours(difference.hours_needed)}

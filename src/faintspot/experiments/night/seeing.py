@@ -22,8 +22,9 @@ def r0_of_slopes(
     outer_scale_m: float | None = None,
     *,
     gain_error: float = 0.0,
+    run: NDArray[np.int64] | None = None,
 ) -> tuple[float, float]:
-    """Return r0 at 500 nm of consecutive frames and its standard error, m; NaN where it is not measured.
+    """Return r0 at 500 nm of frames and its standard error, m; NaN where it is not measured.
 
     Parameters
     ----------
@@ -35,10 +36,12 @@ def r0_of_slopes(
         Outer scale, where it is known.
     gain_error : float
         Relative standard error of the centroid gain.
+    run : (frames,) array of int, optional
+        Frames with the same number are consecutive. Default: all are.
     """
     if len(open_loop_px) < FEWEST_FRAMES:
         return math.nan, math.nan
-    run = np.zeros(len(open_loop_px), np.int64)
+    run = np.zeros(len(open_loop_px), np.int64) if run is None else run
     slopes = np.asarray(open_loop_px, np.float64), np.asarray(residual_px, np.float64)
     strength = turbulence_strength(*slopes, run, site, gain_error=gain_error, outer_scale_m=outer_scale_m)
     return strength.r0_m, strength.r0_error_m

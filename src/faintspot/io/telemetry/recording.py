@@ -114,8 +114,9 @@ class Telemetry:
     """Changes of settings: frame (the first with it), number, changes (values by name), where (None: all)."""
     attributes: dict[str, Any]
     """Plain values: layout (``Layout(**attributes["layout"])``), initial settings (TOML), methods (names of
-    the interleaved configurations), reference (slopes that were subtracted, or None), dropped_records,
-    dropped_images, dropped_changes, complete, ended_because."""
+    the interleaved configurations), reference (slopes that were subtracted, or None), control (interaction
+    matrix and options, see `faintspot.loop.control.recorded`, or None), dropped_records, dropped_images,
+    dropped_changes, complete, ended_because."""
 
     def __repr__(self) -> str:
         """Return the numbers of frames, sub-apertures, images and changes."""
@@ -149,7 +150,9 @@ class Telemetry:
         return (self.last_row_time_ns + offset) / 1e9
 
 
-_PARTS = "parts"
+_PARTS, _CONTROL = "parts", "control"
+_WRITTEN_ONCE = _PARTS, _CONTROL
+"""Large attributes, in a group of their own: the others are replaced with every block of frames."""
 _ARRAYS = tuple(field.name for field in fields(Telemetry) if field.name not in ("changes", "attributes"))
 
 
@@ -287,7 +290,8 @@ def attributes_of(store: Path) -> dict[str, Any]:
         attributes = stored_attributes(store)
         is_telemetry = attributes["format"] == FORMAT and attributes["version"] == 1
         if (store / _PARTS).is_dir():
-            attributes[_PARTS] = stored_attributes(store / _PARTS)[_PARTS]
+            stored = stored_attributes(store / _PARTS)
+            attributes |= {_PARTS: stored[_PARTS], _CONTROL: stored.get(_CONTROL)}
     except (OSError, ValueError, KeyError, TypeError):
         is_telemetry = False
     if not (is_telemetry and is_store(store)):
@@ -305,10 +309,9 @@ def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mappin
     hidden = path.with_name(f".{path.name}.new")
     shutil.rmtree(hidden, ignore_errors=True)
     hidden.mkdir()
-    rest = {name: value for name, value in attributes.items() if name != _PARTS}
+    rest = {name: value for name, value in attributes.items() if name not in _WRITTEN_ONCE}
     group = zarr.create_group(str(hidden), zarr_format=3, attributes=rest)
-    # Large and written once; the store's other attributes are replaced with every block of frames.
-    group.create_group(_PARTS, attributes={_PARTS: attributes.get(_PARTS)})
+    group.create_group(_PARTS, attributes={name: attributes.get(name) for name in _WRITTEN_ONCE})
     for kind in kinds:
         for name, values in _columns(np.empty(0, kind)):
             row = values.shape[1:]

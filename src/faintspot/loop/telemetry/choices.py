@@ -213,11 +213,17 @@ class _Scale:
             unit = f"{loop.slope_unit or 'slope unit'} x sub-aperture"
             return cls(unit, loop.unit, math.nan, math.nan, math.nan, gain_error, noise_error)
         factor = loop.pixel_scale_arcsec * ARCSEC * loop.subaperture_m * 1e9
-        square = (loop.subaperture_m / r0.value) ** (5 / 3) * (_R0_WAVELENGTH_NM / (2 * math.pi)) ** 2
-        unseen = _FITTING + _ALIASING
-        error = square * math.hypot(_FITTING_ERROR, unseen * 5 / 3 * r0.error / r0.value)
+        unseen = 1e18 * unseen_m2(loop.subaperture_m, r0.value)
+        of_fitting = _FITTING_ERROR / (_FITTING + _ALIASING)
+        error = unseen * math.hypot(of_fitting, 5 / 3 * r0.error / r0.value)
         wavelength_nm = loop.science_wavelength_m * 1e9
-        return cls("nm", factor, unseen * square, error, wavelength_nm, gain_error, noise_error)
+        return cls("nm", factor, unseen, error, wavelength_nm, gain_error, noise_error)
+
+
+def unseen_m2(subaperture_m: float, r0_m: float) -> float:
+    """Return the variance of the wavefront that slopes do not show: fitting and aliasing, m^2."""
+    radians = (_FITTING + _ALIASING) * math.pow(subaperture_m / r0_m, 5 / 3)
+    return radians * (1e-9 * _R0_WAVELENGTH_NM / (2 * math.pi)) ** 2
 
 
 def _choice(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from faintspot.io.telemetry.pyrtc_session import holds_session, read_session
 from faintspot.io.telemetry.recording import read_telemetry
 from faintspot.loop.control.configuration import load_control
 from faintspot.loop.control.identification.recording import NUMBERS, Recording
+from faintspot.loop.control.recorded import RecordedControl, unpacked_control
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.sensor.pupil import side_m
@@ -48,7 +50,7 @@ def read_recorded_loop(
     system : path, optional
         TOML with values that the recording lacks, or that replace its own.
     configuration : path, optional
-        faintspot.toml with [control], for a store of `faintspot realtime record`.
+        faintspot.toml with [control], for a store of `faintspot realtime record`. Default: as recorded.
 
     Raises
     ------
@@ -59,7 +61,7 @@ def read_recorded_loop(
     if not path.exists():
         raise InputError(f"{path}: no such file or directory")
     if path.suffix == ".toml":
-        values = _of_toml(path)
+        values = _system_values(path)
     elif path.suffix in _TABLES:
         values = _of_table(path)
     elif holds_session(path):
@@ -69,21 +71,42 @@ def read_recorded_loop(
     else:
         values = _of_aot(path)
     if system is not None:
-        values |= _of_toml(Path(system))
+        values |= _system_values(Path(system))
     try:
         return _loop(path.name, values)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def _of_toml(path: Path) -> dict[str, Any]:
-    """Return the values of a TOML file, with the arrays that it names."""
+def _system_values(path: Path) -> dict[str, Any]:
+    """Return the values of a TOML file, with the arrays that it names.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, or names something unknown.
+    """
     values = parse_file(path)
     check_keys(f"{path}: ", values, [*_ARRAYS, *NUMBERS, *_WORDS])
     for name in _ARRAYS:
         if name in values and isinstance(values[name], str):
             values[name] = _array(str(path.parent / values[name]))
     return values
+
+
+def system_numbers(path: Path) -> dict[str, float]:
+    """Return the numbers of a TOML file with values of a system, checked.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, names something unknown, or a number is out of range.
+    """
+    return _numbers(_system_values(path))
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    return {key: option.checked(key, values[key]) for key, option in NUMBERS.items() if key in values}
 
 
 def _array(location: str) -> NDArray[Any]:
@@ -140,7 +163,7 @@ def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
     for name in ("pixel_scale_arcsec", "subaperture_m", "diameter_m"):
         if layout.get(name) is not None:
             values[name] = layout[name]
-    control = None if configuration is None else load_control(configuration)
+    control = control_of(recording.attributes, configuration)
     if recording.commands.shape[1]:
         values["commands"] = recording.commands[rows]
     if control is not None:
@@ -149,6 +172,22 @@ def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
         if control.options.largest_command is not None:
             values["largest_command"] = control.options.largest_command
     return values
+
+
+def control_of(
+    attributes: Mapping[str, Any], configuration: str | Path | None = None
+) -> RecordedControl | None:
+    """Return the control of an engine's recording, from a configuration file or as recorded.
+
+    Raises
+    ------
+    InputError
+        When either cannot be understood.
+    """
+    if configuration is None:
+        return unpacked_control(attributes)
+    control = load_control(configuration)
+    return None if control is None else RecordedControl(control.interaction, control.options)
 
 
 def _of_aot(path: Path) -> dict[str, Any]:
@@ -187,7 +226,7 @@ def _loop(name: str, values: dict[str, Any]) -> Recording:
     in_pairs = one_of("slope_order", values.get("slope_order", _AXES), (_AXES, _PAIRS)) == _PAIRS
     if in_pairs and slopes.ndim == 2:
         slopes = np.hstack([slopes[:, ::2], slopes[:, 1::2]])
-    numbers = {key: option.checked(key, values[key]) for key, option in NUMBERS.items() if key in values}
+    numbers = _numbers(values)
     if "slope_unit" not in values:
         raise InputError(f"slope_unit: unknown; give it in a TOML file with --system ({', '.join(UNITS)})")
     unit = one_of("slope_unit", values["slope_unit"], list(UNITS))

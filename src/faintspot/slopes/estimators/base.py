@@ -117,6 +117,8 @@ class Estimator(Options):
     """Steps shown in figures, in order."""
     takes_prior: ClassVar[bool] = False
     """Whether slopes predicted by a control loop improve the estimate."""
+    strength_option: ClassVar[str | None] = None
+    """Option that is the strength of the denoising, as in the method `tv:0.6`."""
 
     # Description ---------------------------------------------------------------------------------------
 

@@ -157,7 +157,7 @@ def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:
         grid -= np.nansum(grid, axis=1, keepdims=True) / np.isfinite(grid).sum(axis=1, keepdims=True)
     residual, atmosphere = grid
     measured = np.isfinite(atmosphere)
-    variance, count = _noise_variance(atmosphere)
+    variance, count = noise_variance(atmosphere)
     if count.any():
         variance = np.where(count > 0, variance, variance[count > 0].mean())
     least = _LEAST_SIGNAL * float(np.nanvar(atmosphere))
@@ -198,7 +198,7 @@ def _held(loop: Recording, delay: LoopDelay) -> tuple[Floats, NDArray[np.bool_]]
     return mirror, is_known
 
 
-def _noise_variance(slopes: Floats) -> tuple[Floats, Floats]:
+def noise_variance(slopes: Floats) -> tuple[Floats, Floats]:
     """Return the variance of each slope's noise, and the number of frames that it is from.
 
     From the slopes without each frame's mean along x and y, which fast vibrations change.

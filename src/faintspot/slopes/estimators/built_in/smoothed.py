@@ -46,6 +46,7 @@ class Smoothed(KeepingBrightest):
     style = Style("#E69F00", "-", "D")
     steps_shown = (RAW, CALIBRATED, Step("smoothed", "denoised"), BACKGROUND)
     automatic_method = "smoothed"
+    strength_option = "smoothing_px"
 
     @property
     def denoises(self) -> bool:

@@ -71,6 +71,7 @@ class TotalVariation(KeepingBrightest):
     style = Style("#D55E00", "-", "s")
     steps_shown = (RAW, CALIBRATED, Step("denoised", "denoised"), BACKGROUND)
     automatic_method = "tv"
+    strength_option = "noise_std"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,0 +1,159 @@
+"""Methods and conditions of a recording in which methods alternated, from its attributes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.toml_files import parse_text
+from faintspot.io.telemetry.recording import Telemetry
+from faintspot.loop.control.configuration import ControlOptions
+from faintspot.loop.control.identification.model import CONTROLS, INTEGRATOR, KALMAN, MODAL
+from faintspot.loop.control.recorded import RecordedControl
+from faintspot.loop.telemetry.recording import CLOSED
+from faintspot.slopes.estimators.registry import estimators
+from faintspot.slopes.pipeline.settings import option_names
+
+_NONE, _SET = "none", "set"
+_TV, _STRENGTH = "tv", "noise_std"
+_FLUX, _GAIN = "flux_e", "gain"
+_TIMES = 3.0  # time constants of an integrator, after which 5 % of the method before are left
+_FILTER_FRAMES = 100  # in which a filter that begins anew converges
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedMethods:
+    """Methods that measured frames in a closed loop; names that occur twice are one method."""
+
+    labels: tuple[str, ...]
+    settings: tuple[str, ...]
+    """In words."""
+    strength_e: tuple[float, ...]
+    """Strength of TV [e-]; NaN for methods without one."""
+    groups: tuple[int, ...]
+    """Number that methods share which differ in the controller only."""
+    leaning: tuple[str, ...]
+    """Methods whose slopes lean on the prediction of a filter."""
+    number: NDArray[np.int64]
+    """Index into labels for each number in telemetry; -1: not in a closed loop."""
+    reference: int
+    controllers: tuple[str, ...]
+    options: ControlOptions
+    least_gain: float
+    """Smallest loop gain of the recording."""
+
+    @classmethod
+    def of(cls, telemetry: Telemetry, control: RecordedControl) -> RecordedMethods:
+        """Return the methods of a recording."""
+        names = [str(name) for name in telemetry.attributes.get("methods") or [_SET]]
+        seen = np.unique(telemetry.method[telemetry.loop == CLOSED])
+        names += [f"method {number}" for number in range(len(names), int(seen.max(initial=-1)) + 1)]
+        labels = tuple(dict.fromkeys(names[number] for number in seen))
+        number = np.full(len(names), -1)
+        number[seen] = [labels.index(names[each]) for each in seen]
+        parts = [_parts(label, control.options.controller) for label in labels]
+        measured = list(dict.fromkeys(part for part, _ in parts))
+        usual = _estimator(str(telemetry.attributes.get("settings", "")))
+        predicted = [
+            label
+            for label, (part, kind) in zip(labels, parts, strict=True)
+            if kind == KALMAN and _takes_prior(part, usual)
+        ]
+        gains = [
+            change["changes"][_GAIN]
+            for change in telemetry.changes
+            if isinstance(change.get("changes", {}).get(_GAIN), int | float)
+        ]
+        return cls(
+            labels,
+            tuple(f"{_in_words(part)}; {CONTROLS[kind]}" for part, kind in parts),
+            tuple(_strength(part) for part, _ in parts),
+            tuple(measured.index(part) for part, _ in parts),
+            tuple(predicted),
+            number,
+            labels.index(_NONE) if _NONE in labels else 0,
+            tuple(kind for _, kind in parts),
+            control.options,
+            max(min([control.options.gain, *gains]), 1e-3),
+        )
+
+    @property
+    def centroid_gain(self) -> float:
+        """Centroid gain that [control] states."""
+        return float(self.options.centroid_gain)
+
+    def settle_frames(self, method: int) -> int:
+        """Return the frames at the beginning of a turn in which the method before still counts.
+
+        For integrators: the delay, and three times one over the smallest loop gain of the recording. For
+        filters, which begin anew with each turn: 100.
+        """
+        if self.controllers[method] not in (INTEGRATOR, MODAL):
+            return _FILTER_FRAMES
+        return int(self.options.delay_frames) + math.ceil(_TIMES / self.least_gain)
+
+
+def conditions_of(telemetry: Telemetry) -> tuple[NDArray[np.int64], list[str]]:
+    """Return the number of the conditions of each frame, (frames,), and their names.
+
+    They change with settings that all methods share and with the loop gain, not with the flux or the methods.
+    """
+    names, frames, gain = ["as begun"], [], None
+    known = {*option_names(), "estimator"} - {_FLUX}
+    for change in telemetry.changes:
+        values = change.get("changes", {})
+        new = {name: value for name, value in values.items() if name in known}
+        if _GAIN in values:
+            if gain is not None and values[_GAIN] != gain:
+                new[_GAIN] = values[_GAIN]
+            gain = values[_GAIN]
+        if new:
+            frames.append(int(change["frame"]))
+            names.append("; ".join(f"{name} = {str(value)[:40]}" for name, value in new.items()))
+    order = np.argsort(frames, kind="stable")
+    number = np.searchsorted(np.array(frames, np.int64)[order], telemetry.frame, side="right")
+    return number.astype(np.int64), [names[0], *(names[1 + place] for place in order)]
+
+
+def _parts(label: str, usual: str) -> tuple[str, str]:
+    """Return what measures the slopes, and the controller."""
+    if label in CONTROLS:
+        return _SET, label
+    measured, _, control = label.rpartition("+")
+    return (measured, control) if measured and control in CONTROLS else (label, usual)
+
+
+def _estimator(settings: str) -> str:
+    """Return the estimator of settings in TOML."""
+    table = parse_text(settings, "settings").get("estimator", {}) if settings else {}
+    return str(table.get("name", "")) if isinstance(table, dict) else ""
+
+
+def _takes_prior(measured: str, usual: str) -> bool:
+    """Return whether an estimator uses predicted slopes as its prior."""
+    name = measured.partition("+")[0].partition(":")[0]
+    kind = estimators().get(name if name in estimators() else usual)
+    return kind is not None and kind.takes_prior
+
+
+def _strength(measured: str) -> float:
+    """Return the strength of TV that a method's name states."""
+    first, *others = measured.split("+")
+    name, _, value = first.partition(":")
+    options = dict(part.split("=", 1) for part in [first, *others] if "=" in part)
+    text = value if name == _TV else options.get(_STRENGTH, "")
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _in_words(measured: str) -> str:
+    if measured == _SET:
+        return "settings of the engine"
+    if measured == _NONE:
+        return "settings of the engine, without denoising"
+    return measured.replace("+", ", ")

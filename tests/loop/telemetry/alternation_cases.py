@@ -1,0 +1,90 @@
+"""Closed loops of methods that alternate, whose residual phase and centroid gains are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.loop.control.phase import residual_phase
+from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.telemetry.alternation import AlternatingLoop
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
+
+Floats = NDArray[np.float64]
+
+SIDE, DELAY, LOOP_GAIN = 5, 2, 0.4
+CELLS = np.argwhere(np.ones((SIDE, SIDE)))
+SUBAPERTURE_M, PIXEL_ARCSEC, RATE_HZ = 0.6, 0.1, 250.0
+
+
+def corner_matrix() -> Floats:
+    """Return slopes (2 n, commands) of a mirror with an actuator at each corner of the sub-apertures."""
+    corners = (SIDE + 1) ** 2
+    matrix = np.zeros((2, len(CELLS), corners))
+    for number, (row, column) in enumerate(CELLS):
+        for down in (0, 1):
+            for right in (0, 1):
+                corner = (row + down) * (SIDE + 1) + column + right
+                matrix[0, number, corner] = right - 0.5
+                matrix[1, number, corner] = down - 0.5
+    return matrix.reshape(-1, corners)
+
+
+MATRIX = corner_matrix()
+
+
+@dataclass(frozen=True, eq=False)
+class KnownLoop:
+    """A loop, and what is true of it."""
+
+    loop: AlternatingLoop
+    phase_m2: Floats
+    """(frames,): residual phase variance within the mirror's reach."""
+
+
+def alternating(
+    frames: int = 6000,
+    every: int = 50,
+    *,
+    noise_px: Sequence[float] = (0.1, 0.05),
+    gains: Sequence[float] = (1.0, 1.0),
+    seed: int = 1,
+) -> KnownLoop:
+    """Simulate an integrator in turbulence that the mirror can correct, whose strength drifts."""
+    rng = np.random.default_rng(seed)
+    reconstructor = make_reconstructor(MATRIX)
+    method = np.arange(frames) // every % len(gains)
+    strength = np.exp(0.3 * np.sin(2 * np.pi * np.arange(frames) / 2500 + seed))
+    turbulence, speed = np.zeros((2, MATRIX.shape[1]))  # smooth: what is white is noise
+    commands = np.zeros((frames + DELAY, MATRIX.shape[1]))
+    slopes, true = np.zeros((frames, len(MATRIX))), np.zeros((frames, len(MATRIX)))
+    driving = 0.004 * rng.standard_normal((frames, MATRIX.shape[1]))
+    noise = rng.standard_normal(slopes.shape)
+    for frame in range(frames):
+        speed = 0.94 * speed + driving[frame]
+        turbulence = 0.99 * turbulence + speed
+        true[frame] = MATRIX @ (strength[frame] * turbulence + commands[frame])
+        gain = gains[method[frame]]
+        slopes[frame] = gain * true[frame] + noise_px[method[frame]] * noise[frame]
+        # commands[k + DELAY] is computed from frame k.
+        latest = commands[frame + DELAY - 1]
+        commands[frame + DELAY] = 0.99 * latest - LOOP_GAIN * reconstructor.matrix @ slopes[frame]
+    loop = AlternatingLoop(
+        slopes.astype(np.float32),
+        commands[DELAY:].astype(np.float32),
+        np.arange(frames),
+        np.arange(frames) / RATE_HZ,
+        method,
+        np.zeros(frames, np.int64),
+        MATRIX,
+        DELAY,
+        CELLS,
+        SUBAPERTURE_M,
+        PIXEL_ARCSEC,
+    )
+    per_px = PIXEL_ARCSEC * ARCSEC * SUBAPERTURE_M
+    phase = true @ (per_px * residual_phase(reconstructor.clean, MATRIX, CELLS)).T
+    return KnownLoop(loop, np.square(phase).sum(axis=1))

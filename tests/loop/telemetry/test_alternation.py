@@ -1,0 +1,66 @@
+"""Turns of methods, and their residual phase."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.loop.telemetry.alternation_cases import alternating
+
+from faintspot.loop.telemetry.alternation import phase_of_turn, turns_of
+
+SETTLE = [12, 12]
+
+
+def test_turns() -> None:
+    loop = alternating(1020).loop
+    loop.method[400:440] = -1  # open
+    loop.conditions[700:] = 1
+    loop = replace(loop, frame=loop.frame + 5 * (np.arange(1020) >= 155))
+    turns = turns_of(loop, [10, 20])
+    assert [(turn.method, turn.begin, turn.scored, turn.end) for turn in turns[:4]] == [
+        (0, 0, 10, 50),
+        (1, 50, 70, 100),
+        (0, 100, 110, 150),
+        (1, 150, 165, 200),  # 5 of the settling frames were lost
+    ]
+    spans = [(turn.begin, turn.end) for turn in turns]
+    assert (400, 450) not in spans
+    assert (440, 450) not in spans  # no frame is left after settling
+    assert {turn.conditions for turn in turns if turn.begin >= 700} == {1}
+    assert turns[-1].end == 1000  # the last turn is cut short
+    assert len(turns_of(loop, [60, 20])) == len([turn for turn in turns if turn.method == 1])
+
+
+@pytest.mark.parametrize("gains", [(1.0, 1.0), (0.7, 0.95)])
+def test_residual_phase_is_the_true_one(gains: tuple[float, float]) -> None:
+    known = alternating(gains=gains)
+    for method in (0, 1):
+        turns = [turn for turn in turns_of(known.loop, SETTLE) if turn.method == method]
+        found = [phase_of_turn(known.loop, turn, gains[method]) for turn in turns]
+        measured, error = np.array([(each.variance_m2, each.error_m2) for each in found if each]).T
+        true = np.array([known.phase_m2[turn.scored : turn.end].mean() for turn in turns])
+        assert len(measured) == len(turns) == 60
+        deviation = measured - true
+        # 60 turns: the mean within 4 standard errors, the standard error itself known to 9 %.
+        assert abs(deviation.mean()) < 4 * error.mean() / np.sqrt(60)
+        assert deviation.std() == pytest.approx(np.sqrt(np.square(error).mean()), rel=0.35)
+        # The noise, which was subtracted, is more than that in method 0.
+        assert true.mean() > 5 * error.mean() / np.sqrt(60)
+
+
+def test_a_turn_of_which_too_little_was_measured_has_no_phase() -> None:
+    loop = alternating(400).loop
+    turn = turns_of(loop, SETTLE)[2]
+    loop.slopes_px[turn.scored : turn.end, :26] = np.nan
+    assert phase_of_turn(loop, turn, 1.0) is None
+
+
+def test_slopes_that_were_not_measured_do_not_count() -> None:
+    known = alternating(1000)
+    turns = turns_of(known.loop, SETTLE)
+    before = np.mean([each.variance_m2 for turn in turns if (each := phase_of_turn(known.loop, turn, 1.0))])
+    known.loop.slopes_px[np.random.default_rng(2).random(known.loop.slopes_px.shape) < 0.02] = np.nan
+    after = np.mean([each.variance_m2 for turn in turns if (each := phase_of_turn(known.loop, turn, 1.0))])
+    assert after == pytest.approx(before, rel=0.1)
