@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,11 +18,13 @@ from faintspot.base.toml_files import check_keys, parse_file
 from faintspot.base.validity import leave_out
 from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.frames import read_array
+from faintspot.io.references import holds_slopes
 from faintspot.io.telemetry.recording import read_telemetry
 from faintspot.loop.control.configuration import load_control
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.slopes.recorded.stored_run import open_run
 from faintspot.slopes.sensor.pupil import side_m
 
 Floats = NDArray[np.float64]
@@ -39,25 +43,32 @@ _NUMBERS = (
     "outer_scale_m",
     "science_wavelength_m",
 )
+_SCALES = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
+"""What a layout knows of the telescope."""
 _WORDS = ("sent_after_frames", "slope_unit", "slope_order", "loop")
 _PAIRS, _AXES = "pairs", "axes"
 _TABLES = (".npz", ".npy", ".csv", ".txt")
 
 
 def read_recorded_loop(
-    path: str | Path, system: str | Path | None = None, configuration: str | Path | None = None
+    path: str | Path,
+    system: str | Path | None = None,
+    configuration: str | Path | None = None,
+    stated: Mapping[str, float] | None = None,
 ) -> Recording:
     """Read a recording of a loop.
 
     Parameters
     ----------
     path : path
-        A store of `faintspot realtime record`, an AOT file, a TOML file that names arrays, or a NumPy or CSV
-        file with slopes.
+        A store of `faintspot realtime record`, slopes of `faintspot slopes` without a loop, an AOT file, a
+        TOML file that names arrays, or a NumPy or CSV file with slopes.
     system : path, optional
         TOML with values that the recording lacks, or that replace its own.
     configuration : path, optional
         faintspot.toml with [control], for a store of `faintspot realtime record`.
+    stated : dict of str to float, optional
+        Values that replace those of files, such as frame_rate_hz.
 
     Raises
     ------
@@ -69,14 +80,17 @@ def read_recorded_loop(
         raise InputError(f"{path}: no such file or directory")
     if path.suffix == ".toml":
         values = _of_toml(path)
-    elif path.suffix in _TABLES:
-        values = _of_table(path)
     elif path.is_dir() and holds_telemetry(path):
         values = _of_store(path, configuration)
+    elif path.suffix != ".csv" and holds_slopes(path):
+        values = _of_slopes(path)
+    elif path.suffix in _TABLES:
+        values = _of_table(path)
     else:
         values = _of_aot(path)
     if system is not None:
         values |= _of_toml(Path(system))
+    values |= stated or {}
     try:
         return _loop(path.name, values)
     except InputError as error:
@@ -126,9 +140,7 @@ def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
         "cells": np.asarray(layout["cells"]),
         "loop": "closed" if closed.any() else "open",
     }
-    for name in ("pixel_scale_arcsec", "subaperture_m", "diameter_m"):
-        if layout.get(name) is not None:
-            values[name] = layout[name]
+    values |= {name: layout[name] for name in _SCALES if layout.get(name) is not None}
     control = None if configuration is None else load_control(configuration)
     if recording.commands.shape[1]:
         values["commands"] = recording.commands[rows]
@@ -138,6 +150,27 @@ def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
         if control.options.largest_command is not None:
             values["largest_command"] = control.options.largest_command
     return values
+
+
+def _of_slopes(path: Path) -> dict[str, Any]:
+    """Return the values of slopes that `faintspot slopes` wrote, taken as those of an open loop."""
+    run = open_run(path)
+    layout = run.layout
+    if layout is None:
+        raise InputError(f"{path}: expected slopes with their layout ({' '.join(run.notes)})")
+    if layout.geometry != "square":
+        raise InputError(f"{path}: expected a square array of lenslets, got a {layout.geometry} one")
+    x, y = (run.stored.variables[axis].astype(np.float64) for axis in "xy")
+    angle = math.radians(layout.angle_deg)
+    along, across = math.cos(angle) * x + math.sin(angle) * y, math.cos(angle) * y - math.sin(angle) * x
+    values: dict[str, Any] = {
+        "slopes": np.hstack([along, across]),
+        "flags": run.stored.variables["flags"] & ~np.uint8(run.keep),
+        "slope_unit": "px",
+        "cells": layout.cells,
+        "loop": "open",
+    }
+    return values | {name: scale for name in _SCALES if (scale := getattr(layout, name)) is not None}
 
 
 def _of_aot(path: Path) -> dict[str, Any]:
@@ -227,7 +260,7 @@ def _timing(values: dict[str, Any], frames: int, rate: float | None) -> tuple[ND
             raise InputError(f"time_s: expected {frames} increasing times, got {len(time)}")
         rate = rate or float(1 / np.median(np.diff(time))) if frames > 1 else rate
     if rate is None:
-        raise InputError("frame_rate_hz: unknown; give it in a TOML file with --system")
+        raise InputError("frame_rate_hz: unknown; give it with --frame-rate-hz")
     frame = values.get("frame")
     if frame is None:
         frame = np.arange(frames) if time is None else np.rint((time - time[0]) * rate)
