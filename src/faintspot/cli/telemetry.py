@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -15,6 +16,12 @@ from faintspot.base.json_text import to_json
 from faintspot.cli.realtime.record import record_engine, summary
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import needs
+from faintspot.cli.shared.options import DIAMETER, PIXEL_SCALE, SUBAPERTURE
+from faintspot.cli.shared.progress import progress_bar
+
+if TYPE_CHECKING:
+    from faintspot.loop.control.identification.recording import Recording
+    from faintspot.loop.telemetry.over_time import Piece
 
 _SECONDS = 20.0
 
@@ -51,6 +58,11 @@ _SECONDS = 20.0
     show_default="delay and 3 / loop gain; 100 for filters",
 )
 @option("--one-loop", is_flag=True, help="Report the loop as a whole, although methods alternated.")
+@option("--every", type=float, metavar="SECONDS", help="Turbulence against time as well, in such pieces.")
+@option("--frame-rate-hz", type=float, metavar="HZ", help="Frame rate, of slopes from frames.")
+@PIXEL_SCALE
+@SUBAPERTURE
+@DIAMETER
 @option("--controller", metavar="NPZ", help="Learn a predictive controller as well, and write it to a file.")
 @option("--output", "-o", metavar="HTML", help="Page to write.", show_default="FILE's or NAME's, with .html")
 def command(
@@ -62,15 +74,17 @@ def command(
     strehl: str | None,
     settle: int | None,
     one_loop: bool,
+    every: float | None,
     controller: str | None,
     output: str | None,
+    **stated: float | None,
 ) -> None:
     """Report noise, turbulence, vibrations and control of a recorded loop, of any system.
 
-    FILE is a store of `faintspot realtime record`, an AOT file (FITS), a telemetry session of pyRTC, a TOML
-    file that names arrays, or a NumPy or CSV file with slopes. Writes a page and, beside it, the same numbers
-    as JSON. Every value has a 95 % interval. It replays other gains and a predictive filter on the recorded
-    turbulence. Takes a minute.
+    FILE is a store of `faintspot realtime record`, slopes of `faintspot slopes` (without a loop), an AOT
+    file (FITS), a telemetry session of pyRTC, a TOML file that names arrays, or a NumPy or CSV file with
+    slopes. Writes a page and, beside it, the same numbers as JSON. Every value has a 95 % interval. Of a
+    loop it replays other gains and the predictive filter on the recorded turbulence. Takes a minute.
 
     Where methods alternated in a closed loop (realtime run --interleave), it compares them instead: Strehl
     ratio and residual phase, with hours of observing that would decide.
@@ -80,12 +94,14 @@ def command(
       faintspot telemetry --engine faintspot --seconds 20
       faintspot telemetry night.zarr
       faintspot telemetry night.zarr --strehl times.csv
+      faintspot telemetry slopes.zarr --frame-rate-hz 250 --every 60
       faintspot telemetry night_aot.fits --system rate_and_unit.toml
       faintspot telemetry loop.toml -o loop.html
       faintspot telemetry loop.npz --controller controller.npz
     """
     from faintspot.loop.control.configuration import load_control
     from faintspot.loop.control.identification.predictive_control import learn, learn_observed
+    from faintspot.loop.telemetry.over_time import table_of_pieces
     from faintspot.loop.telemetry.page import page_of_loop
     from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
     from faintspot.loop.telemetry.report import report_of_loop
@@ -114,13 +130,20 @@ def command(
             raise InputError(
                 f"{recording}: --strehl and --settle: expected methods that alternated in a closed loop"
             )
-        loop = read_recorded_loop(recording, system, config)
+        given = {name: value for name, value in stated.items() if value is not None}
+        loop = read_recorded_loop(recording, system, config, given)
     if controller is not None and not loop.is_closed:
         raise InputError("--controller: expected the recording of a closed loop, got an open one")
+    pieces = [] if every is None else _over_time(loop, every)
     report = report_of_loop(loop, lambda step: click.echo(f"{step} ...", err=True))
     numbers = derived(page, ".json")
-    write_atomically(numbers, to_json(report.as_values(), indent=1))
-    write_atomically(page, page_of_loop(report))
+    values = report.as_values() | {"over_time": [piece.as_values() for piece in pieces]}
+    write_atomically(numbers, to_json(values, indent=1))
+    write_atomically(page, page_of_loop(report, pieces))
+    if pieces:
+        table = derived(page, "-over-time.csv")
+        write_atomically(table, table_of_pieces(pieces))
+        click.echo(table)
     for remark in report.loop.remarks:
         click.echo(remark)
     if report.advice:
@@ -174,6 +197,14 @@ def _report_night(
     write_page(page_of_recording(night), page)
     click.echo(text_of_recording(night))
     click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
+
+
+def _over_time(loop: Recording, every_s: float) -> list[Piece]:
+    """Measure the turbulence of pieces of a recording, with a progress bar."""
+    from faintspot.loop.telemetry.over_time import turbulence_over_time
+
+    with progress_bar("pieces", "pieces") as advance:
+        return turbulence_over_time(loop, every_s, advance)
 
 
 def _record(engine: str, store: Path, seconds: float) -> None:

@@ -39,12 +39,24 @@ def read_reference(location: str | Path) -> NDArray[Any]:
         When the package that reads the format is not installed.
     """
     path, key = split_location(location)
-    if key is None and path.name.lower().endswith(tuple(slope_endings())):
-        form = slope_format(path)
-        form.require()
-        if form.has_slopes(path):
-            return _mean_positions(path, read_slopes(path))
+    if key is None and holds_slopes(path):
+        return _mean_positions(path, read_slopes(path))
     return read_array(location)
+
+
+def holds_slopes(path: Path) -> bool:
+    """Return whether a path is a file of slopes written by faintspot, as far as its names say.
+
+    Raises
+    ------
+    MissingExtraError
+        When the package that reads the format is not installed.
+    """
+    if not path.name.lower().endswith(tuple(slope_endings())):
+        return False
+    form = slope_format(path)
+    form.require()
+    return form.has_slopes(path)
 
 
 def _mean_positions(path: Path, slopes: StoredSlopes) -> NDArray[np.float64]:

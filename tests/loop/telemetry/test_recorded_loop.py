@@ -11,7 +11,10 @@ import pytest
 from tests.cli.cli_cases import Commands
 from tests.loop.telemetry.loop_cases import CELLS, recorded
 
+import faintspot as fs
 from faintspot.base.errors import InputError
+from faintspot.base.flags import SubapertureFlag
+from faintspot.io import create_writer
 from faintspot.loop.control.identification.recording import NUMBERS, Recording, prepared
 from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
 
@@ -242,3 +245,33 @@ def test_slopes_of_very_different_size_are_broken() -> None:
     loop = Recording(slopes, None, None, np.ones((2, 2)), 250.0)
     with pytest.raises(InputError, match="columns 7 over 1e"):
         prepared(loop)
+
+
+def test_slopes_of_frames_are_those_of_an_open_loop(tmp_path: Path) -> None:
+    """Slopes in the axes of a turned array; what is flagged is left out, unless the run keeps it."""
+    pytest.importorskip("zarr")
+    layout = replace(fs.Layout.grid((3, 3), pixels=8), angle_deg=90.0, pixel_scale_arcsec=0.2, diameter_m=1.8)
+    layout.save(tmp_path / "faintspot.toml")
+    fs.Settings("centroid").save(tmp_path / "faintspot.toml")
+    rng = np.random.default_rng(1)
+    shape = {"n_frames": 20, "n_subapertures": 9}
+    values = {name: np.zeros((20, 9)) for name in ("flux", "valid", "flags", "iterations", "bad_pixels")}
+    x, y = rng.normal(0, 1, (2, 20, 9))
+    values["flags"][3, 4], values["flags"][5, 6] = SubapertureFlag.NO_FLUX, SubapertureFlag.AT_SEARCH_LIMIT
+    attributes = {
+        "fingerprint": "one",
+        "configuration": (tmp_path / "faintspot.toml").read_text(),
+        "keep": ["limited"],
+    }
+    for name in ("slopes.zarr", "slopes.npz"):
+        with create_writer(tmp_path / name, attributes=attributes, coordinates={}, **shape) as writer:
+            writer.append(0, {"x": x, "y": y, **values})
+        with pytest.raises(InputError, match="frame_rate_hz: unknown; give it with --frame-rate-hz"):
+            read_recorded_loop(tmp_path / name)
+        loop = read_recorded_loop(tmp_path / name, stated={"frame_rate_hz": 100.0})
+        assert not loop.is_closed
+        assert (loop.commands, loop.subaperture_m, loop.pixel_scale_arcsec) == (None, 0.6, 0.2)
+        assert np.array_equal(loop.cells, layout.cells)
+        expected = np.hstack([y, -x])
+        expected[3, [4, 13]] = np.nan
+        assert np.allclose(loop.slopes, expected, atol=1e-6, equal_nan=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,6 +12,7 @@ import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
+from faintspot.base.json_text import to_json
 from faintspot.base.report.page import Badge, Cell, Page, Section, Table, configuration_section, write_page
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import Estimate
@@ -51,7 +51,7 @@ def write_night(night: Night, folder: str | Path) -> list[Path]:
     """
     folder = Path(folder)
     night.save(folder / NIGHT_STORE)
-    text = json.dumps(night_summary(night), indent=2, allow_nan=False, ensure_ascii=False)
+    text = to_json(night_summary(night), indent=2)
     write_atomically(folder / SUMMARY_FILE, text + "\n")
     pages = write_page(night_page(night), folder / PAGE_FILE)
     return [folder / NIGHT_STORE, folder / SUMMARY_FILE, *pages]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -10,17 +11,26 @@ from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, colour_ba
 from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import Page, Section, Table, html_of
 from faintspot.base.report.texts import Texts
-from faintspot.loop.control.identification.measured import Measured, wind_errors
+from faintspot.loop.control.identification.measured import R0, Measured, wind_errors
 from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER
+from faintspot.loop.telemetry.over_time import Piece
 from faintspot.loop.telemetry.report import LoopReport, Part
 
 _TEXT = Texts("faintspot.loop.telemetry")
 _STREHL = "Strehl ratio"
+_AGAINST_TIME = (
+    R0,
+    "r0 at 500 nm from differential image motion",
+    "coherence time at 500 nm",
+    "wind speed, mean for the coherence time",
+    "noise of a slope",
+)
+"""Quantities of pieces that are drawn."""
 _MOST_DECIMALS = 6
 
 
-def page_of_loop(report: LoopReport) -> str:
-    """Return the page (HTML) of a report.
+def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> str:
+    """Return the page (HTML) of a report, and of pieces of its recording.
 
     Raises
     ------
@@ -43,10 +53,16 @@ def page_of_loop(report: LoopReport) -> str:
         sections.append(
             Section(name, part.title, text, tables, [] if drawn is None else [drawn], missing=part.missing)
         )
+    if pieces:
+        missing = "; ".join(f"{piece.start_s:g} s: {piece.missing}" for piece in pieces if piece.missing)
+        sections.insert(
+            0, Section("time", _TEXT["time.title"], figures=[_time_figure(pieces)], missing=missing)
+        )
     loop = report.loop
     facts = {"Sub-apertures": str(len(loop.cells)), "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"}
     todo = [report.advice] if report.advice else []
-    title, remark = f"Loop of {loop.name}", _TEXT["remark"]
+    title = f"{'Loop' if loop.is_closed else 'Turbulence'} of {loop.name}"
+    remark = _TEXT["remark"]
     return html_of(Page(title, facts, sections, todo, warnings_title="What to do", remark=remark))
 
 
@@ -86,6 +102,30 @@ def _choices_table(report: LoopReport) -> Table:
         rows.append([choice.name, choice.gain_text or "–", *map(_with_interval, values)])
     texts = ["choices.table", *(["choices.strehl"] if _STREHL in shown else [])]
     return Table(["control", "gain", *shown], rows, " ".join(_TEXT[name] for name in texts))
+
+
+@styled
+def _time_figure(pieces: Sequence[Piece]) -> FigureWithData:
+    """Draw r0, coherence time, wind and noise of each piece."""
+    panels: dict[str, list[Measured]] = {}
+    for piece in pieces:
+        for name in _AGAINST_TIME:
+            panels.setdefault(name, []).append(piece.values.get(name, Measured(name, "")))
+    known = {name: values for name, values in panels.items() if any(math.isfinite(v.value) for v in values)}
+    figure = new_figure(WIDTH, max(2.0, 2.4 * len(known)))
+    middle = np.array([piece.start_s + piece.duration_s / 2 for piece in pieces])
+    rows: list[tuple[object, ...]] = []
+    for axes, (name, values) in zip(
+        figure.subplots(max(1, len(known)), 1, sharex=True, squeeze=False)[:, 0], known.items(), strict=False
+    ):
+        numbers = np.array([(value.value, *value.interval) for value in values]).T
+        spread = np.abs(numbers[1:] - numbers[0])
+        axes.errorbar(middle, numbers[0], spread, fmt="o-", color=METHOD_COLOURS[1], capsize=3)
+        unit = next(value.unit for value in values if math.isfinite(value.value))
+        axes.set(title=name, ylabel=unit, ylim=(0, None))
+        rows += [(name, time, *number) for time, number in zip(middle, numbers.T, strict=True)]
+    figure.axes[-1].set_xlabel("time since the first frame (s)")
+    return _TEXT.figure("time", figure, rows, ("quantity", "time", "value", "low", "high"))
 
 
 @styled

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from faintspot.base.toml_files import check_keys, parse_file
 from faintspot.base.validity import leave_out
 from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.frames import read_array
+from faintspot.io.references import holds_slopes
 from faintspot.io.telemetry.pyrtc_session import holds_session, read_session
 from faintspot.io.telemetry.recording import read_telemetry
 from faintspot.loop.control.configuration import load_control
@@ -24,6 +26,7 @@ from faintspot.loop.control.identification.recording import NUMBERS, Recording
 from faintspot.loop.control.recorded import RecordedControl, unpacked_control
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.slopes.recorded.stored_run import open_run
 from faintspot.slopes.sensor.pupil import side_m
 
 Floats = NDArray[np.float64]
@@ -32,25 +35,32 @@ UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
 """Units of slopes, in arcsec."""
 _OF_AOT = {"pix": "px", "pixel": "px", "px": "px", "arcsec": "arcsec", "rad": "rad"}
 _ARRAYS = ("slopes", "commands", "interaction_matrix", "control_matrix", "cells", "time_s", "frame", "flags")
+_SCALES = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
+"""What a layout knows of the telescope."""
 _WORDS = ("slope_unit", "slope_order", "loop")
 _PAIRS, _AXES = "pairs", "axes"
 _TABLES = (".npz", ".npy", ".csv", ".txt")
 
 
 def read_recorded_loop(
-    path: str | Path, system: str | Path | None = None, configuration: str | Path | None = None
+    path: str | Path,
+    system: str | Path | None = None,
+    configuration: str | Path | None = None,
+    stated: Mapping[str, float] | None = None,
 ) -> Recording:
     """Read a recording of a loop.
 
     Parameters
     ----------
     path : path
-        A store of `faintspot realtime record`, an AOT file, a telemetry session of pyRTC, a TOML file that
-        names arrays, or a NumPy or CSV file with slopes.
+        A store of `faintspot realtime record`, slopes of `faintspot slopes` without a loop, an AOT file, a
+        telemetry session of pyRTC, a TOML file that names arrays, or a NumPy or CSV file with slopes.
     system : path, optional
         TOML with values that the recording lacks, or that replace its own.
     configuration : path, optional
         faintspot.toml with [control], for a store of `faintspot realtime record`. Default: as recorded.
+    stated : dict of str to float, optional
+        Values that replace those of files, such as frame_rate_hz.
 
     Raises
     ------
@@ -62,16 +72,19 @@ def read_recorded_loop(
         raise InputError(f"{path}: no such file or directory")
     if path.suffix == ".toml":
         values = _system_values(path)
-    elif path.suffix in _TABLES:
-        values = _of_table(path)
     elif holds_session(path):
         values = read_session(path)
     elif path.is_dir() and holds_telemetry(path):
         values = _of_store(path, configuration)
+    elif path.suffix != ".csv" and holds_slopes(path):
+        values = _of_slopes(path)
+    elif path.suffix in _TABLES:
+        values = _of_table(path)
     else:
         values = _of_aot(path)
     if system is not None:
         values |= _system_values(Path(system))
+    values |= stated or {}
     try:
         return _loop(path.name, values)
     except InputError as error:
@@ -160,9 +173,7 @@ def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
         "cells": np.asarray(layout["cells"]),
         "loop": "closed" if closed.any() else "open",
     }
-    for name in ("pixel_scale_arcsec", "subaperture_m", "diameter_m"):
-        if layout.get(name) is not None:
-            values[name] = layout[name]
+    values |= {name: layout[name] for name in _SCALES if layout.get(name) is not None}
     control = control_of(recording.attributes, configuration)
     if recording.commands.shape[1]:
         values["commands"] = recording.commands[rows]
@@ -188,6 +199,27 @@ def control_of(
         return unpacked_control(attributes)
     control = load_control(configuration)
     return None if control is None else RecordedControl(control.interaction, control.options)
+
+
+def _of_slopes(path: Path) -> dict[str, Any]:
+    """Return the values of slopes that `faintspot slopes` wrote, taken as those of an open loop."""
+    run = open_run(path)
+    layout = run.layout
+    if layout is None:
+        raise InputError(f"{path}: expected slopes with their layout ({' '.join(run.notes)})")
+    if layout.geometry != "square":
+        raise InputError(f"{path}: expected a square array of lenslets, got a {layout.geometry} one")
+    x, y = (run.stored.variables[axis].astype(np.float64) for axis in "xy")
+    angle = math.radians(layout.angle_deg)
+    along, across = math.cos(angle) * x + math.sin(angle) * y, math.cos(angle) * y - math.sin(angle) * x
+    values: dict[str, Any] = {
+        "slopes": np.hstack([along, across]),
+        "flags": run.stored.variables["flags"] & ~np.uint8(run.keep),
+        "slope_unit": "px",
+        "cells": layout.cells,
+        "loop": "open",
+    }
+    return values | {name: scale for name in _SCALES if (scale := getattr(layout, name)) is not None}
 
 
 def _of_aot(path: Path) -> dict[str, Any]:
@@ -275,7 +307,7 @@ def _timing(values: dict[str, Any], frames: int, rate: float | None) -> tuple[ND
         time = increasing("time_s", time, frames)
         rate = rate or float(1 / np.median(np.diff(time))) if frames > 1 else rate
     if rate is None:
-        raise InputError("frame_rate_hz: unknown; give it in a TOML file with --system")
+        raise InputError("frame_rate_hz: unknown; give it with --frame-rate-hz")
     frame = values.get("frame")
     if frame is None:
         frame = np.arange(frames) if time is None else np.rint((time - time[0]) * rate)

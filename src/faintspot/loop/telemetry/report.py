@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
-from faintspot.loop.control.identification.measured import Measured, outer_scale_and_r0, wind_errors, winds_of
+from faintspot.loop.control.identification.measured import (
+    R0,
+    Measured,
+    outer_scale_and_r0,
+    wind_errors,
+    winds_of,
+)
 from faintspot.loop.control.identification.open_loop import (
     OpenLoop,
     known_delay,
@@ -26,9 +32,11 @@ from faintspot.loop.control.identification.recording import Recording, prepared
 from faintspot.loop.telemetry.choices import Choice, advice, compared_choices
 from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
 from faintspot.loop.telemetry.spectra import ModalSpectra, modal_spectra
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.loop.turbulence.image_motion import differential_image_motion
+from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.turbulence.strength import turbulence_strength
 from faintspot.slopes.sensor.pupil import subapertures_across
+from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 
 Floats = NDArray[np.float64]
 
@@ -36,6 +44,8 @@ _TIMES_AT_LIMIT = 3  # that a largest value occurs, to be taken for a limit
 _DRAWS = 1000
 _GAIN_SPREAD = 0.5  # of the deviation of the centroid gain from 1: it differs between spatial scales
 _MOST_UNMEASURED = 0.2  # of the slopes; large ones are missed most, so that the others vary too little
+_FEWEST_FOR_MOTION = 200  # frames with all slopes
+_MOSTLY = 0.8  # of the frames
 _PARABOLA_ERROR = 0.03  # of the noise: turbulence and speckles within two frames are no parabola
 
 
@@ -95,7 +105,9 @@ class LoopReport:
         }
 
 
-def report_of_loop(loop: Recording, progress: Callable[[str], None] = lambda _: None) -> LoopReport:
+def report_of_loop(
+    loop: Recording, progress: Callable[[str], None] = lambda _: None, *, compare: bool = True
+) -> LoopReport:
     """Analyse a recorded loop.
 
     Parameters
@@ -103,6 +115,8 @@ def report_of_loop(loop: Recording, progress: Callable[[str], None] = lambda _: 
     loop : Recording
     progress : callable
         Called with the name of each step.
+    compare : bool
+        Whether other choices of control are replayed.
 
     Raises
     ------
@@ -130,8 +144,9 @@ def report_of_loop(loop: Recording, progress: Callable[[str], None] = lambda _: 
         identification = _turbulence(report, open_loop, delay)
         if report.delay is not None and identification is not None:
             report.observed = ObservedLoop(ready, report.delay, open_loop, identification)
-        progress("other choices")
-        _choices(report, open_loop, delay)
+        if compare:
+            progress("other choices")
+            _choices(report, open_loop, delay)
     return report
 
 
@@ -260,25 +275,48 @@ def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> Id
     if loop.subaperture_m is None:
         part.missing = "Without subaperture_m (or diameter_m) neither r0 nor winds are known."
         return identification
-    r0 = Measured("r0 at 500 nm", "m", remark="pixel_scale_arcsec is unknown")
-    if loop.pixel_scale_arcsec is not None:
-        rows = open_loop.telemetry.trust.any(axis=1)
-        slopes = open_loop.telemetry.open_loop_px[rows], open_loop.residual[rows], open_loop.run[rows]
-        # A matrix of mean gradients makes of what the mirror corrects mean gradients, too.
-        averaged = 0.5 * (1 + identified.turbulence.averaged)
-        strength = turbulence_strength(
-            *slopes,
-            replace(site, averaged=averaged),
-            gain_error=delay.gain_error / delay.gain,
-            gain_spread=_GAIN_SPREAD * abs(1 - delay.gain),
-            outer_scale_m=loop.outer_scale_m,
-        )
-        part.values += outer_scale_and_r0(strength, loop.outer_scale_m)
-        r0 = part.values[-1]
-    else:
-        part.values.append(r0)
-    part.values += _winds(identified, r0)
+    strength = _strength(loop, open_loop, delay, replace(site, averaged=identified.turbulence.averaged))
+    part.values += strength
+    part.values += _winds(identified, next(value for value in strength if value.name == R0))
     return identification
+
+
+def _strength(
+    loop: Recording, open_loop: OpenLoop, delay: LoopDelay, site: SlopeTurbulence
+) -> list[Measured]:
+    """Return outer scale, r0, r0 as of a seeing monitor, and the seeing."""
+    if loop.pixel_scale_arcsec is None:
+        return [Measured(R0, "m", remark="pixel_scale_arcsec is unknown")]
+    if loop.is_closed:  # a matrix of mean gradients makes of what the mirror corrects mean gradients, too
+        site = replace(site, averaged=0.5 * (1 + site.averaged))
+    rows = open_loop.telemetry.trust.any(axis=1)
+    strength = turbulence_strength(
+        open_loop.telemetry.open_loop_px[rows],
+        open_loop.residual[rows],
+        open_loop.run[rows],
+        site,
+        gain_error=delay.gain_error / delay.gain,
+        gain_spread=_GAIN_SPREAD * abs(1 - delay.gain),
+        outer_scale_m=loop.outer_scale_m,
+    )
+    values = [*outer_scale_and_r0(strength, loop.outer_scale_m), *_image_motion(open_loop, site)]
+    seeing = 0.98 * R0_WAVELENGTH_M / strength.r0_m / ARCSEC
+    relative = strength.r0_error_m / strength.r0_m
+    return [*values, Measured("seeing at 500 nm", "arcsec", seeing, seeing * relative, "0.98 λ / r0", True)]
+
+
+def _image_motion(open_loop: OpenLoop, site: SlopeTurbulence) -> list[Measured]:
+    """Return r0 as a seeing monitor measures it, from the sub-apertures that were measured in most frames."""
+    measured = open_loop.telemetry.trust > 0
+    kept = measured.mean(axis=0).reshape(2, -1).min(axis=0) > _MOSTLY
+    columns = np.tile(kept, 2)
+    slopes = open_loop.telemetry.open_loop_px[measured[:, columns].all(axis=1)][:, columns]
+    if len(slopes) < _FEWEST_FOR_MOTION:
+        return []
+    site = replace(site, positions_m=site.positions_m[kept])
+    motion = differential_image_motion(slopes, open_loop.variance[columns], site)
+    remark = "as of a seeing monitor, for an infinite outer scale"
+    return [Measured("r0 at 500 nm from differential image motion", "m", *motion, remark, True)]
 
 
 def _winds(identified: Identified, r0: Measured) -> list[Measured]:
@@ -324,7 +362,7 @@ def _choices(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> None:
         part.missing = "The recording has no interaction or control matrix: no mirror can be replayed."
         return
     turbulence = report.parts["turbulence"].values
-    r0 = next((value for value in turbulence if value.name.startswith("r0")), Measured("r0", "m"))
+    r0 = next((value for value in turbulence if value.name == R0), Measured(R0, "m"))
     try:
         report.choices = compared_choices(loop, open_loop, delay, site_of_loop(loop), r0, report.turbulence)
     except InputError as error:

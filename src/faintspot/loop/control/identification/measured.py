@@ -15,6 +15,7 @@ from faintspot.loop.turbulence.strength import OUTER_SCALE_M, Strength
 
 Floats = NDArray[np.float64]
 
+R0 = "r0 at 500 nm"
 _WIND_ERROR = 0.35  # sub-apertures per second: measured slopes are not quite mean gradients in squares
 
 
@@ -96,7 +97,7 @@ def wind_errors(identified: Identified) -> Floats:
 def outer_scale_and_r0(strength: Strength, known_scale_m: float | None = None) -> list[Measured]:
     """Return the outer scale, where it is known with this value, and r0."""
     remark = f"{OUTER_SCALE_M:g} m within a factor of two was expected" if known_scale_m is None else "given"
-    name, unit = "r0 at 500 nm", "m"
+    name, unit = R0, "m"
     if not math.isfinite(strength.r0_m):
         outer = Measured("outer scale", "m", remark="unknown without r0")
         return [outer, Measured(name, unit, remark="the slopes vary no more than their noise")]

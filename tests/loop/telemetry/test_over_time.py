@@ -1,0 +1,61 @@
+"""Turbulence against time."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.loop.telemetry.loop_cases import AIR, RATE_HZ, recorded
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.telemetry.over_time import table_of_pieces, turbulence_over_time
+from faintspot.loop.telemetry.page import page_of_loop
+from faintspot.loop.telemetry.report import report_of_loop
+
+
+def opened(frames: int) -> Recording:
+    """Slopes of the turbulence without a loop; frames 400 to 800 were lost."""
+    loop = recorded()
+    assert loop.commands is not None
+    assert loop.interaction_matrix is not None
+    mirror = np.zeros_like(loop.slopes)
+    mirror[2:] = (loop.commands @ loop.interaction_matrix.T)[:-2]
+    seen = (loop.slopes - mirror)[:frames]
+    kept = np.r_[0:400, 800:frames]
+    return replace(
+        loop, slopes=seen[kept], frame=kept, commands=None, interaction_matrix=None, is_closed=False
+    )
+
+
+@pytest.mark.slow
+def test_pieces_of_an_open_loop() -> None:
+    """r0 of each piece within three errors, also of one that lost half of its frames."""
+    loop = opened(2400)
+    progress: list[tuple[int, int]] = []
+    pieces = turbulence_over_time(loop, 400 * 1.99 / RATE_HZ, lambda *counts: progress.append(counts))
+    assert progress == [(1, 3), (2, 3), (3, 3)]
+    assert [piece.start_s for piece in pieces] == pytest.approx([0.0, 796 / RATE_HZ, 1592 / RATE_HZ])
+    for piece in pieces:
+        r0 = piece.values["r0 at 500 nm"]
+        assert abs(r0.value - AIR.r0_m) < 3 * r0.error < 0.15
+        assert not piece.missing
+    rows = list(csv.DictReader(table_of_pieces(pieces).splitlines()))
+    assert [float(row["start_s"]) for row in rows] == pytest.approx(
+        [piece.start_s for piece in pieces], rel=1e-4
+    )
+    assert float(rows[2]["r0 at 500 nm (m)"]) == pytest.approx(
+        pieces[2].values["r0 at 500 nm"].value, rel=1e-4
+    )
+    page = page_of_loop(report_of_loop(loop, compare=False), pieces)
+    assert "Against time" in page
+
+
+def test_pieces_that_do_not_fit() -> None:
+    loop = opened(2400)
+    with pytest.raises(InputError, match=r"every_s = 0\.1: expected a number of at least"):
+        turbulence_over_time(loop, 0.1)
+    with pytest.raises(InputError, match="every_s = 1000: expected at most the recording's"):
+        turbulence_over_time(loop, 1000.0)
