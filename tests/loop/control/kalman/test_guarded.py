@@ -47,6 +47,23 @@ def test_nonsense_is_replaced() -> None:
     assert guarded.chosen == 1
 
 
+def test_the_plain_controller_continues_from_the_mirrors_commands() -> None:
+    """Its own commands, made for a mirror that exists only in numbers, may be far from them."""
+    line = CommandDelayLine(12, 2)
+    guarded, seen = _guarded(line, Runaway), False
+    plain = guarded._lines[1]
+    for slopes in FRAMES.open_loop_px[:200]:
+        was_chosen = guarded.chosen
+        guarded.update(slopes + INTERACTION @ line.acting, np.full(18, 0.2))
+        if guarded.chosen > was_chosen:
+            seen = True
+            np.testing.assert_array_equal(plain.latest, line.latest)
+            np.testing.assert_array_equal(plain.acting, line.acting)
+        elif guarded.chosen and seen:
+            np.testing.assert_array_equal(plain.latest, line.latest)  # without an offset
+    assert seen
+
+
 class Still:
     """A controller whose command is always the same."""
 
