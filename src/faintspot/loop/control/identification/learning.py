@@ -96,12 +96,14 @@ def learn_controller(
     identification = Identification(whole, site, rate_hz, AVERAGED[:1])
     tried = []
     earlier = start if start is not None and start.is_layered and winds == LEARNT else None
-    if earlier is None:  # else the comparison was made before
-        tried.append(identification.anywhere())
     if winds == LEARNT:
         tried.append(identification.layers(earlier))
     elif winds == ASSUMED:
         tried.append(identification.of_winds(site.wind_m_per_s))
+    if earlier is None:  # else the comparison was made before
+        anywhere = identification.anywhere()
+        # A line that the winds explain is no vibration in either model.
+        tried.append(replace(anywhere, vibrations=tried[0].vibrations) if tried else anywhere)
     models = []
     total = len(tried) * sum(steps for _, steps in STEPS)
     done = itertools.count(1)
