@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -159,8 +160,8 @@ def recorded(flux_e: float, loop_gain: float) -> Recording:
     air = open_loop(loop_gain, _LEARNING_SEED, LEARNING_FRAMES)
     run = drive(Integrator(loop_gain), air, flux_e, _LEARNING_SEED)
     rows, where = slice(100, None), (geometry().interaction, geometry().cells, RATE_HZ)
-    scale = {"subaperture_m": _SIDE_M, "pixel_scale_arcsec": _PIXEL_ARCSEC}
-    return Recording(run.slopes[rows], run.commands[rows], *where, **scale)
+    loop = Recording(run.slopes[rows], run.commands[rows], *where)
+    return replace(loop, subaperture_m=_SIDE_M, pixel_scale_arcsec=_PIXEL_ARCSEC)
 
 
 def learnt(

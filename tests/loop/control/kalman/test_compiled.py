@@ -97,8 +97,7 @@ def test_nonsense_is_replaced_by_the_integrator() -> None:
         if plainly:
             took_over = took_over or number
         if took_over and number >= took_over + HANDOVER_FRAMES:
-            # The integrator forgets in the loop where it took over.
-            np.testing.assert_allclose(other.latest, line.latest, rtol=0, atol=3e-3)
+            np.testing.assert_allclose(other.latest, line.latest, rtol=0, atol=1e-9)
             assert fast.expected().std_px is None
         np.testing.assert_allclose(other.latest, one.latest, rtol=0, atol=2e-3)
         np.testing.assert_allclose(fast.expected().mean_px, slow.expected().mean_px, rtol=0, atol=2e-3)

@@ -19,6 +19,7 @@ from tests.loop.control.control_cases import (
 
 from faintspot.loop.control import slope_product
 from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.kalman.choice import EXCESS, MOST_EXCESS
 from faintspot.loop.control.kalman.guarded import Guarded
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter
@@ -35,7 +36,7 @@ def wrong_filter() -> dict[str, Any]:
     return {**arrays, "weights": -0.5 * arrays["weights"]}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def both() -> tuple[list[Guarded], list[CommandDelayLine]]:
     """Return the controllers, plain and fast."""
     arrays = wrong_filter()
@@ -62,14 +63,21 @@ def both() -> tuple[list[Guarded], list[CommandDelayLine]]:
     return [slow, fast], lines
 
 
+@pytest.mark.parametrize("fails", [False, True], ids=["computed", "measured"])
 def test_it_does_the_same_before_and_after_the_integrator_takes_over(
-    both: tuple[list[Guarded], list[CommandDelayLine]],
+    both: tuple[list[Guarded], list[CommandDelayLine]], fails: bool
 ) -> None:
-    """The tolerances are those of float32 in a filter that diverges."""
+    """By computed residuals, or because the filter's measured one is too large.
+
+    The tolerances are those of float32 in a filter that diverges.
+    """
     controllers, lines = both
     rng, chosen = np.random.default_rng(2), []
     for number, slopes in enumerate(FRAMES.open_loop_px):
         error: np.ndarray = np.where(rng.random(M) < 0.1, np.inf, 0.3 * rng.uniform(0.5, 1.5, M))
+        if fails and number == 10:
+            for controller in controllers:
+                controller._guard[EXCESS] = 2 * MOST_EXCESS
         if number == 200:
             for controller, line in zip(controllers, lines, strict=True):
                 line.hold(np.full(COMMANDS, 0.1))
@@ -84,6 +92,7 @@ def test_it_does_the_same_before_and_after_the_integrator_takes_over(
         chosen.append(controllers[0].chosen)
     assert chosen[0] == 0
     assert chosen[-1] == 1
+    assert (chosen[9:11] == [0, 1]) == fails
     assert np.abs(lines[1].latest).max() > 0.1
 
 

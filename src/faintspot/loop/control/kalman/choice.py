@@ -24,7 +24,7 @@ _ENOUGH = 16.0  # sum of the differences, in their standard deviations, for the 
 _LEAST_DEVIATION, _MOST_DEVIATIONS = 0.03, 5.0  # of a difference, and in one frame
 _SETTLING = 15  # frames after a change whose residuals belong to both
 _MEASURED, _MEASURED_MEMORY = 20, 200  # frames of the integrator's residual: fewest, and memory
-_ALLOWED, _MOST_EXCESS, _IN_ONE_FRAME = 1.1, 16.0, 20.0
+_ALLOWED, MOST_EXCESS, _IN_ONE_FRAME = 1.1, 16.0, 20.0
 """Residual of the filter in those of the integrator: allowed; sum of the excess; largest that counts."""
 _LATE, _RUNAWAY = 10, 2.0
 """Frames, and their mean residual in those of the integrator, with which a filter fails for good."""
@@ -38,7 +38,7 @@ _PROVEN = 2000  # frames after which the wait is the first one again
 # the integrator, its frames, and of the filter of late; sum of the filter's excess; the integrator's computed
 # residual; frames to wait, now and the next time.
 CHOSEN, SENT, FRAMES, _MEAN, _SQUARE, _EVIDENCE, BLENDED, _SINCE, _BEFORE = range(9)
-_PLAIN, _PLAIN_FRAMES, _OF_LATE, _EXCESS, _COMPUTED, _WAIT, _NEXT_WAIT = range(9, 16)
+_PLAIN, _PLAIN_FRAMES, _OF_LATE, EXCESS, _COMPUTED, _WAIT, _NEXT_WAIT = range(9, 16)
 GUARD_NUMBERS = 16
 
 
@@ -60,7 +60,7 @@ def choose(guard: Any, learnt: Any, plain: Any) -> None:
     guard[_SQUARE] += share * (difference * difference - guard[_SQUARE])
     if guard[_BEFORE] != guard[CHOSEN]:
         guard[_BEFORE], guard[_SINCE] = guard[CHOSEN], 0.0
-        guard[_EVIDENCE] = guard[_EXCESS] = guard[_OF_LATE] = 0.0
+        guard[_EVIDENCE] = guard[EXCESS] = guard[_OF_LATE] = 0.0
     guard[_SINCE] += 1.0
     if guard[CHOSEN] > 0.0:
         if guard[_SINCE] > _SETTLING:
@@ -70,8 +70,8 @@ def choose(guard: Any, learnt: Any, plain: Any) -> None:
         usual = guard[_PLAIN] if guard[_PLAIN_FRAMES] >= _MEASURED else _ASSUMED * guard[_COMPUTED]
         residual = min(learnt / max(usual, 1e-30), _IN_ONE_FRAME)
         guard[_OF_LATE] += (residual - guard[_OF_LATE]) / min(guard[_SINCE], _LATE)
-        guard[_EXCESS] = max(0.0, guard[_EXCESS] + residual - _ALLOWED)
-        if guard[_EXCESS] > _MOST_EXCESS:
+        guard[EXCESS] = max(0.0, guard[EXCESS] + residual - _ALLOWED)
+        if guard[EXCESS] > MOST_EXCESS:
             is_runaway = guard[_OF_LATE] > _RUNAWAY
             guard[CHOSEN], guard[_WAIT] = 1.0, _LONGEST_WAIT if is_runaway else guard[_NEXT_WAIT]
             guard[_NEXT_WAIT] = min(2.0 * guard[_NEXT_WAIT], _LONGEST_WAIT)
@@ -113,4 +113,4 @@ def prepare(guard: Any, prefers_plain: bool, plain_residual: float, plain_frames
 
 def restart(guard: Any) -> None:
     """Forget the differences of earlier frames; what was measured of the integrator stays."""
-    guard[FRAMES : _SINCE + 1] = guard[_EXCESS] = 0.0
+    guard[FRAMES : _SINCE + 1] = guard[EXCESS] = 0.0

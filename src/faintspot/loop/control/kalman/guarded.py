@@ -14,8 +14,10 @@ from faintspot.loop.control.kalman.choice import (
     BLENDED,
     CHOOSE,
     CHOSEN,
+    EXCESS,
     GUARD_NUMBERS,
     HANDOVER_FRAMES,
+    MOST_EXCESS,
     SENT,
     prepare,
     restart,
@@ -31,9 +33,9 @@ class Guarded:
     Both send commands in every frame, each to a mirror of its own that exists only in numbers; the slopes
     that each would have had follow from the open-loop slopes. So what they leave can be compared in the same
     frames, and either can take over without a jump in its own state. As long as the difference is within its
-    error, nothing changes. When the learnt controller takes over, the commands sent differ from its own by an
-    offset, which falls from the whole difference to zero in `HANDOVER_FRAMES` equal steps; the plain one
-    continues from the mirror's commands.
+    error, nothing changes. When another controller takes over, the commands sent differ from its own by an
+    offset, which falls from the whole difference to zero in `HANDOVER_FRAMES` equal steps. After a failure by
+    its measured residual the plain one continues from the mirror's commands instead.
 
     Parameters
     ----------
@@ -126,17 +128,17 @@ class Guarded:
         self._choose(*variances)
 
     def _choose(self, learnt: float, plain: float) -> bool:
-        """Select a controller by the squared residuals; return whether the plain one takes over.
+        """Select a controller by the squared residuals; return whether the learnt one has failed.
 
-        It continues from the mirror's commands: its own are as wrong as the model of the loop.
+        The plain one then continues from the mirror's commands: its own are as wrong as the model.
         """
         before = self.chosen
         CHOOSE(self._guard, learnt, plain)
-        takes_over = self.chosen > before
-        if takes_over:
+        has_failed = self.chosen > before and bool(self._guard[EXCESS] > MOST_EXCESS)
+        if has_failed:
             self._lines[1].copy_from(self._line)
             self._guard[SENT], self._guard[BLENDED] = 1.0, 0.0
-        return takes_over
+        return has_failed
 
     def _send(self) -> None:
         """Send the chosen controller's command, with what is left of the offset."""

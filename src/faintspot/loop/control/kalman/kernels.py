@@ -14,7 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from faintspot.loop.control.kalman import choice
-from faintspot.loop.control.kalman.choice import BLENDED, CHOSEN, HANDOVER_FRAMES, SENT, choose
+from faintspot.loop.control.kalman.choice import (
+    BLENDED,
+    CHOSEN,
+    EXCESS,
+    HANDOVER_FRAMES,
+    MOST_EXCESS,
+    SENT,
+    choose,
+)
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.loop.control.telemetry import LEAST_SHARE, LEAST_VARIANCE_PX2
 from faintspot.slopes.kernels.compilation.compiling import Direct, _kernel
@@ -308,7 +316,7 @@ def go_on(numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) 
         plain += wavefronts[1, c] * wavefronts[1, c]
     was_chosen = memory.guard[CHOSEN]
     choose(memory.guard, learnt, plain)
-    if memory.guard[CHOSEN] > was_chosen:
+    if memory.guard[CHOSEN] > was_chosen and memory.guard[EXCESS] > MOST_EXCESS:
         _adopt(lines, next_rows, memory.guard)
     _advance(matrices, memory)
     return total
@@ -316,7 +324,7 @@ def go_on(numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) 
 
 @_compiled
 def _adopt(lines: Any, next_rows: Any, guard: Any) -> None:
-    """Let the integrator continue from the mirror's commands; its own are not yet counted as sent."""
+    """Let the integrator continue from the mirror's commands; the row of its own is not yet sent."""
     row, _, of_plain = next_rows
     length = lines.true.shape[0]
     for later in range(length):
