@@ -17,7 +17,7 @@ from faintspot.loop.control.identification.vibrations import (
 _RATE_HZ, _FRAMES, _SLOPES = 250.0, 3000, 72
 BUMP = oscillator(17.5, 0.12, 0.08)
 """As wide as the maximum that a wind of 12 m/s makes with sub-apertures of .6 m on 3.6 m: 12 / 3.6 Hz."""
-POSITIONS_M = 0.6 * np.argwhere(np.ones((7, 7)))[:, ::-1]
+POSITIONS_M = np.asarray(0.6 * np.argwhere(np.ones((7, 7)))[:, ::-1], np.float64)
 WIND = np.array([[3.0, 12.1]])
 
 
