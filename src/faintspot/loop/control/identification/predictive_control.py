@@ -260,21 +260,26 @@ def learn(recording: Recording, start: Identified | None = None) -> PredictiveCo
 
     Examples
     --------
-    A loop of 2 x 4 sub-apertures and 12 actuators on slopes that change at random:
+    A loop of 3 x 3 sub-apertures and the 16 actuators at their corners, under waves that the wind carries:
 
     >>> import numpy as np
     >>> from faintspot.loop.control import Recording, learn
     >>> rng = np.random.default_rng(1)
-    >>> matrix = rng.standard_normal((16, 12))
-    >>> turbulence = np.cumsum(rng.standard_normal((800, 16)), axis=0)
-    >>> slopes, commands = np.zeros((800, 16)), np.zeros((800, 12))
+    >>> corners, cells = np.argwhere(np.ones((4, 4))), np.argwhere(np.ones((3, 3)))
+    >>> apart = corners - cells[:, None]
+    >>> inside = ((apart == 0) | (apart == 1)).all(axis=2)
+    >>> matrix = np.vstack([inside * (apart[..., axis] - 0.5) for axis in (1, 0)])
+    >>> waves, moved = rng.standard_normal((40, 2)), 0.05 * np.arange(800)[:, None, None]
+    >>> heights = np.cos((corners - moved) @ waves.T + 6 * rng.random(40)) @ (1 / np.hypot(*waves.T))
+    >>> turbulence = heights @ matrix.T + 0.2 * rng.standard_normal((800, 18))
+    >>> slopes, commands = np.zeros((800, 18)), np.zeros((800, 16))
     >>> for k in range(2, 800):
-    ...     slopes[k] = turbulence[k] - turbulence[k].mean() + matrix @ commands[k - 2]
+    ...     slopes[k] = turbulence[k] + matrix @ commands[k - 2]
     ...     commands[k] = 0.99 * commands[k - 1] - 0.3 * np.linalg.pinv(matrix) @ slopes[k]
-    >>> recording = Recording(slopes, commands, matrix, np.ones((2, 4)), frame_rate_hz=250)
+    >>> recording = Recording(slopes, commands, matrix, cells, frame_rate_hz=250)
     >>> control = learn(recording)
     >>> control(slopes[0]).shape
-    (12,)
+    (16,)
     """
     if recording.commands is None or recording.interaction_matrix is None:
         absent = "commands" if recording.commands is None else "interaction_matrix"
