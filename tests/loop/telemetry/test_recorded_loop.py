@@ -254,7 +254,6 @@ def test_slopes_of_frames_are_those_of_an_open_loop(tmp_path: Path) -> None:
     layout.save(tmp_path / "faintspot.toml")
     fs.Settings("centroid").save(tmp_path / "faintspot.toml")
     rng = np.random.default_rng(1)
-    shape = {"n_frames": 20, "n_subapertures": 9}
     values = {name: np.zeros((20, 9)) for name in ("flux", "valid", "flags", "iterations", "bad_pixels")}
     x, y = rng.normal(0, 1, (2, 20, 9))
     values["flags"][3, 4], values["flags"][5, 6] = SubapertureFlag.NO_FLUX, SubapertureFlag.AT_SEARCH_LIMIT
@@ -264,7 +263,9 @@ def test_slopes_of_frames_are_those_of_an_open_loop(tmp_path: Path) -> None:
         "keep": ["limited"],
     }
     for name in ("slopes.zarr", "slopes.npz"):
-        with create_writer(tmp_path / name, attributes=attributes, coordinates={}, **shape) as writer:
+        with create_writer(
+            tmp_path / name, n_frames=20, n_subapertures=9, attributes=attributes, coordinates={}
+        ) as writer:
             writer.append(0, {"x": x, "y": y, **values})
         with pytest.raises(InputError, match="frame_rate_hz: unknown; give it with --frame-rate-hz"):
             read_recorded_loop(tmp_path / name)
