@@ -12,7 +12,7 @@ CELLS = np.argwhere(np.hypot(*(np.indices((7, 7)) - 3)) < 3.6)
 
 
 def site(r0_m: float, outer_scale_m: float = 25.0) -> SlopeTurbulence:
-    positions = 0.6 * CELLS[:, ::-1]
+    positions = np.asarray(0.6 * CELLS[:, ::-1], np.float64)
     return SlopeTurbulence(positions, 0.6, 0.3 * ARCSEC, r0_m, outer_scale_m, np.ones(1), np.zeros((1, 2)))
 
 

@@ -299,7 +299,10 @@ def _strength(
         gain_spread=_GAIN_SPREAD * abs(1 - delay.gain),
         outer_scale_m=loop.outer_scale_m,
     )
-    values = [*outer_scale_and_r0(strength, loop.outer_scale_m), *_image_motion(open_loop, site)]
+    outer, r0 = outer_scale_and_r0(strength, loop.outer_scale_m)
+    if not loop.is_closed:
+        r0 = replace(r0, remark="for a centroid gain of 1, which only a loop shows")
+    values = [outer, r0, *_image_motion(open_loop, site)]
     seeing = 0.98 * R0_WAVELENGTH_M / strength.r0_m / ARCSEC
     relative = strength.r0_error_m / strength.r0_m
     return [*values, Measured("seeing at 500 nm", "arcsec", seeing, seeing * relative, "0.98 λ / r0", True)]
