@@ -240,8 +240,8 @@ def _control(across: int, rng: np.random.Generator) -> tuple[PredictiveControl, 
     dense |= {"variance_px2": np.ones(m), "covariance_xy_px2": np.zeros(m // 2)}
     arrays = dense if m <= _MOST_SLOPES else random_filter(cells, rng)
     model = ControlModel(KALMAN, arrays, 0.3, 1.0, (1.0, 2.0), np.eye(commands))
-    measured = np.array([2.0, 0.1, 1.0, 0.1])
-    loop = LoopOfControl(interaction, np.ones(m), 1.0, 1.0, measured, np.zeros((0, 6)), 1.0, 0.3, 0)
+    measured = np.array([2.0, 0.1, 1.0, 0.1, 1.0, 0.1])
+    loop = LoopOfControl(interaction, np.ones(m), np.ones(m), 1.0, measured, np.zeros((0, 6)), 1.0, 0.3, 0)
     none = np.zeros((commands, 0))
     reconstructor = Reconstructor(interaction.T, none, none, interaction.T)
     learnt = LearntControl(LoopPlant(interaction, reconstructor, 2, 0.01), model)

@@ -90,8 +90,8 @@ def test_a_gain_between_curves_that_bend_differently_is_not_that_of_lines() -> N
     """Stars 1.5 magnitudes apart: lines are wrong by more than the error, which both results state."""
     faint = np.arange(7.0, 14.5, 1.5)
     one, other = (0.6 / (1 + np.exp((faint - middle) / 0.5)) for middle in (11.0, 10.25))
-    runs = [np.tile(curve[:, None], 6) for curve in (one, other)]
-    gain = magnitude_gain(faint, *runs, 0.15)
+    runs, others = (np.tile(curve[:, None], 6) for curve in (one, other))
+    gain = magnitude_gain(faint, runs, others, 0.15)
     assert gain.interpolation_error > 0.02
     assert abs(gain.magnitude.value - 0.75) < 2 * gain.interpolation_error
     found = gain.estimate
@@ -101,8 +101,8 @@ def test_a_gain_between_curves_that_bend_differently_is_not_that_of_lines() -> N
 def test_two_stars_show_no_bend_and_the_interval_says_so() -> None:
     faint = [9.0, 10.5]
     one, other = (0.6 / (1 + np.exp((np.array(faint) - middle) / 0.5)) for middle in (10.4, 9.8))
-    runs = [np.tile(curve[:, None], 6) for curve in (one, other)]
-    found = magnitude_gain(faint, *runs, 0.35).estimate
+    runs, others = (np.tile(curve[:, None], 6) for curve in (one, other))
+    found = magnitude_gain(faint, runs, others, 0.35).estimate
     assert found.standard_error == pytest.approx(1.5 * math.sqrt(2 / 12))
     assert found.low < 0.6 < found.high
     assert abs(found.value - 0.6) > 0.05
