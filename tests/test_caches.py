@@ -16,6 +16,7 @@ OF_THE_PROGRAM = {
     "engine/streams/shared_streams.py _keeps_order",
     "adapters/checks.py check_version",
     "adapters/pyrtc.py camera",
+    "adapters/pyrtc.py loop",
     "adapters/pyrtc.py slopes_process",
     "slopes/camera/dark_frames.py _one_level_limit",
     "slopes/estimators/registry.py _load",

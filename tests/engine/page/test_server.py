@@ -208,7 +208,7 @@ def test_errors_are_logged_at_the_servers_pace(
     def fail(value: object) -> None:
         raise RuntimeError("a fault")
 
-    monkeypatch.setattr(server_module, "plain", fail)
+    monkeypatch.setattr(server_module, "to_json", fail)
     monkeypatch.setattr(server_module, "_rate_limit", server_module._RateLimit())
 
     async def check(server: LiveServer) -> None:

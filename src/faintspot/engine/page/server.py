@@ -301,7 +301,7 @@ def _parsed(message: str | bytes) -> dict[str, Any]:
     """Return a request: a JSON object with "do", whose values can be sent back as JSON."""
     try:
         request = parse_json(message) if isinstance(message, str) else None
-        json.dumps(request, ensure_ascii=False).encode()  # lone surrogates
+        json.dumps(request, ensure_ascii=False, allow_nan=False).encode()  # lone surrogates, -1e999
     except (ValueError, RecursionError):
         request = None
     if not isinstance(request, dict) or not isinstance(request.get("do"), str):

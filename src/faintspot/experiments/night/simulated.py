@@ -102,7 +102,8 @@ def run_night(
         choices = {unit.key: stored(found[unit.key]).choice for unit in trials}
     pool.say("observing")
     units = _units(configuration, plan, choices, paired)
-    results = dict(results_of("night", observe, units, stages[1]))
+    observed = results_of("night", observe, units, stages[1])
+    results = {unit.key: observed[unit.key] for unit in units}
     night = _night(configuration, plan, choices, results)
     night.save(folder / NIGHT_STORE)
     return night

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.base.json_text import parse_json
 
 _MANIFEST = "session.json"
 _SLOPES, _COMMANDS = "signal", "wfc"
@@ -32,7 +32,7 @@ def read_session(path: Path) -> dict[str, Any]:
         When a file is missing or damaged, or the streams have no frames in common.
     """
     try:
-        listed = json.loads((path / _MANIFEST).read_text(encoding="utf-8"))["streams"]
+        listed = parse_json((path / _MANIFEST).read_text(encoding="utf-8"))["streams"]
         streams = {record["name"]: record for record in listed}
     except (OSError, ValueError, TypeError, KeyError):
         raise InputError(

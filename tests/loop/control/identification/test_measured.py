@@ -6,6 +6,7 @@ import math
 
 import pytest
 
+from faintspot.base.json_text import plain_values
 from faintspot.loop.control.identification.measured import Measured, outer_scale_and_r0
 from faintspot.loop.turbulence.strength import Strength
 
@@ -15,7 +16,7 @@ def test_interval() -> None:
     assert Measured("noise", "px", 1.0, 0.8).interval == pytest.approx((-0.568, 2.568))
     low, high = Measured("r0", "m", 1.0, 0.8, is_positive=True).interval
     assert low * high == pytest.approx(1.0)
-    assert Measured("r0", "m", remark="why").as_values() == {
+    assert plain_values(Measured("r0", "m", remark="why").as_values()) == {
         "name": "r0",
         "unit": "m",
         "remark": "why",

@@ -69,7 +69,7 @@ def test_commands_of_another_loop() -> None:
         ({"interaction_matrix": np.ones((36, 50))}, r"interaction_matrix: expected shape \(50, 36\)"),
         ({"commands": np.ones((10, 36))}, "commands: expected 2550 frames"),
         ({"cells": np.ones((3, 3))}, "cells: expected shape"),
-        ({"cells": np.ones((25, 2))}, "cells: expected 25 sub-apertures in different places"),
+        ({"cells": np.ones((25, 2))}, "cells: expected another row or column for each sub-aperture"),
         ({"frame": np.zeros(2550)}, "frame: expected 2550 increasing numbers"),
         ({"sent_after_frames": -1}, "sent_after_frames"),
         ({"frame_rate_hz": 0.0}, "frame_rate_hz"),
