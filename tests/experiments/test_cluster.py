@@ -42,7 +42,9 @@ class Cluster:
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self) -> None:
-        """Start what is not running."""
+        """Start what is not running; workers end with their scheduler, though not at once."""
+        if self.processes and self.processes["scheduler"].poll() is not None:
+            self.stop()
         at = ["--host", "127.0.0.1", "--port", str(self._port)]
         worker = [self.address, "--no-nanny", "--nthreads", "1"]
         for name, arguments in (("scheduler", at), ("worker 1", worker), ("worker 2", worker)):
@@ -55,6 +57,11 @@ class Cluster:
         with distributed.Client(self.address, set_as_default=False, timeout=120) as client:
             client.wait_for_workers(2, timeout=120)
 
+    def stop(self) -> None:
+        for process in self.processes.values():
+            process.kill()
+            process.wait()
+
     def pool(self, progress: Callable[[int, int], None] | None = None) -> WorkerPool:
         return WorkerPool(progress=progress, scheduler=self.address)
 
@@ -65,9 +72,7 @@ def shared_cluster() -> Iterator[Cluster]:
     try:
         yield cluster
     finally:
-        for process in cluster.processes.values():
-            process.kill()
-            process.wait()
+        cluster.stop()
 
 
 @pytest.fixture
