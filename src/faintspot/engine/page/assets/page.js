@@ -224,7 +224,7 @@ function keyOf(kind, words) {
 
 // Charts -------------------------------------------------------------------------------------------------
 
-function showStrips({ strip: names, strip_s: seconds }, { data, shape }) {
+function showStrips({ strip: names, strip_s: seconds, flux_of: whose }, { data, shape }) {
   const column = (name) => Float32Array.from({ length: shape[0] }, (_, i) => data[i * shape[1] + names.indexOf(name)]);
   const times = column("time_s");
   const last = (values) => values.findLast(Number.isFinite);
@@ -237,7 +237,7 @@ function showStrips({ strip: names, strip_s: seconds }, { data, shape }) {
   drawStrip(byId("rms"), times, seconds, [{ values: rms, colour: "first" }], { from: 0 });
   say("rms-caption", `about the mean slopes: ${inWords(last(rms))} px`);
   drawStrip(byId("mean-flux"), times, seconds, [{ values: light, colour: "first" }], { from: 0 });
-  say("mean-flux-caption", `${values.flux_of}, per sub-aperture: ${inWords(last(light))} e⁻`);
+  say("mean-flux-caption", `${whose}, per sub-aperture: ${inWords(last(light))} e⁻`);
   const strehl = column("strehl"), some = strehl.some(Number.isFinite);
   byId("strehl-figure").hidden = !some;
   if (some) {
