@@ -150,7 +150,7 @@ exit $code
 """
 """In a mount namespace of its own, so that nobody else sees it, and it goes with the process."""
 UNSHARE = ["unshare", "--user", "--map-root-user", "--mount"]
-LARGEST_FILE, PAUSE_S = 20_000, 0.01
+LARGEST_FILE, PAUSE_S = 120_000, 0.01
 REASONS = {"disk": "the disk is full", "file": "File too large"}
 
 

@@ -53,7 +53,6 @@ HANDLERS: dict[str, control.Handler] = {
     "echo": dict,
     "arrays": lambda fields: {"one": np.float32(0.5), "many": np.arange(3), "path": Path("a")},
     "nan": lambda fields: {"value": float("nan")},
-    "odd": lambda fields: {"value": object()},
     "large": lambda fields: {"text": "x" * fields["length"]},
 }
 
@@ -103,6 +102,7 @@ def test_a_request_is_answered(server: ControlServer) -> None:
     fields: dict[str, Any] = {"changes": {"noise_std": 2.5}, "where": [1, 2], "text": "µ\n", "none": None}
     assert request(server.path, "echo", **fields) == fields
     assert request(server.path, "arrays") == {"one": 0.5, "many": [0, 1, 2], "path": "a"}
+    assert request(server.path, "nan") == {"value": None}
 
 
 @pytest.mark.parametrize(
@@ -111,8 +111,6 @@ def test_a_request_is_answered(server: ControlServer) -> None:
         ("refuse", "noise_std = -1: expected more"),
         ("fail", "ZeroDivisionError: no way"),
         ("add", "KeyError"),
-        ("nan", "ValueError"),
-        ("odd", "TypeError"),
         ("none such", "command = 'none such': expected one of add, arrays"),
     ],
 )
