@@ -170,7 +170,7 @@ def small_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("full", ["disk", "file"])
 def test_no_space_for_a_recording(sky: Sky, files: tuple[Path, Control], full: str, tmp_path: Path) -> None:
-    """A file system of 300 kB is full, or files may not be larger than 20 kB.
+    """A file system of 300 kB is full, or files may not be larger than 120 kB.
 
     The recorder says so in a line, what it had written before is whole, and the loop goes on.
     """
