@@ -15,7 +15,7 @@ from faintspot.cli.shared.options import SCHEDULER, WORKERS
 from faintspot.cli.shared.progress import progress_bar
 
 
-@needs("loop", "hcipy", "zarr", "matplotlib", "jinja2")
+@needs("loop", "hcipy", "joblib", "zarr", "matplotlib", "jinja2")
 @click.command("night", short_help="Alternate with and without TV, as on the telescope.")
 @click.argument("configuration", metavar="[CONFIG]", default="canary")
 @option(
