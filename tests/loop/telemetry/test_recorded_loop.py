@@ -16,7 +16,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.flags import SubapertureFlag
 from faintspot.io import create_writer
 from faintspot.loop.control.identification.recording import NUMBERS, Recording, prepared
-from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
+from faintspot.loop.telemetry.recorded_loop import frame_rate, read_recorded_loop
 
 WORDS = """
 slope_unit = "px"
@@ -213,6 +213,13 @@ def test_columns_are_times_and_frame_numbers(tmp_path: Path) -> None:
     np.savez(tmp_path / "night.npz", **small(), time_s=COLUMN / 125, frame=2 * COLUMN)
     loop = read_recorded_loop(tmp_path / "night.npz")
     assert np.array_equal(loop.frame, 2 * np.arange(20))
+
+
+def test_frame_rate_of_frames_that_were_buffered() -> None:
+    """Time stamps of ten frames lie close together; a gap, and a pause, are no frames."""
+    frame = np.delete(np.arange(1000), slice(400, 420))
+    time_s = (frame // 10 * 10) / 250 + frame % 10 * 1e-6 + 7.0 * (frame > 700)
+    assert frame_rate(time_s, frame) == pytest.approx(250, rel=1e-3)
 
 
 @pytest.mark.parametrize(

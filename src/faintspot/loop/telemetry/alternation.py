@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from faintspot.loop.control.identification.open_loop import noise_variance
 from faintspot.loop.control.phase import residual_phase
 from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.telemetry.recorded_loop import frame_rate
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.turbulence.strength import OUTER_SCALE_M
 
@@ -58,9 +59,8 @@ class AlternatingLoop:
 
     @cached_property
     def frame_rate_hz(self) -> float:
-        """One over the median interval between consecutive frames."""
-        consecutive = np.diff(self.frame) == 1
-        return float(1 / np.median(np.diff(self.time_s)[consecutive])) if consecutive.any() else math.nan
+        """See `frame_rate`."""
+        return frame_rate(self.time_s, self.frame)
 
     @property
     def site(self) -> SlopeTurbulence:

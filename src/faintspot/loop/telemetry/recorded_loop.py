@@ -302,13 +302,28 @@ def _usable(slopes: Floats, flags: NDArray[np.uint8] | None) -> tuple[Floats, st
 
 def _timing(values: dict[str, Any], frames: int, rate: float | None) -> tuple[NDArray[np.int64], float]:
     """Return frame numbers and the frame rate."""
-    time = values.get("time_s")
+    time, frame = values.get("time_s"), values.get("frame")
+    if frame is not None:
+        frame = increasing("frame", frame, frames, integer=True)
     if time is not None:
         time = increasing("time_s", time, frames)
-        rate = rate or float(1 / np.median(np.diff(time))) if frames > 1 else rate
-    if rate is None:
+        rate = rate or frame_rate(time, frame)
+    if rate is None or math.isnan(rate):
         raise InputError("frame_rate_hz: unknown; give it with --frame-rate-hz")
-    frame = values.get("frame")
     if frame is None:
         frame = np.arange(frames) if time is None else np.rint((time - time[0]) * rate)
-    return increasing("frame", frame, frames, integer=True), rate
+        frame = increasing("frame", frame, frames, integer=True)
+    return frame, rate
+
+
+def frame_rate(time_s: Floats, frame: NDArray[Any] | None = None) -> float:
+    """Return the median frame rate over spans of up to 100 frames without a gap; NaN if it is not known.
+
+    Time stamps of buffered frames lie close together. Without frame numbers, single intervals have to do.
+    """
+    number = np.arange(len(time_s)) if frame is None else frame
+    for span in (1,) if frame is None else (100, 30, 10, 3, 1):
+        whole = number[span:] - number[:-span] == span
+        if whole.any():
+            return float(span / np.median((time_s[span:] - time_s[:-span])[whole]))
+    return math.nan
