@@ -65,8 +65,8 @@ def tv_denoise(
     g: ArrayLike,
     noise_std: float,
     algorithm: str = "fgp",
-    tolerance: float = 1e-2,
-    max_iterations: int = 200,
+    tolerance: float = 2.5e-3,
+    max_iterations: int = 480,
     lower: bool = False,
 ) -> Denoised:
     """Constrained TV of one image: minimise TV(u) subject to ||u - g||^2 = N noise_std^2.
@@ -91,7 +91,7 @@ def tv_denoise(
         return Denoised(np.full_like(g, mean), multiplier=np.inf, infeasible=True, margin=margin)
     radius = np.sqrt(g.size) * strength
     p, multiplier = flat_field(gc, strength)
-    previous = p
+    previous, then = p, divergence(*p)
     age, momentum, converged = 4.0, 0.0, False
     for iteration in range(1, max_iterations + 1):
         if algorithm == "fgp":
@@ -113,9 +113,10 @@ def tv_denoise(
         momentum, age = (age - 1.0) / next_age, next_age
         if np.linalg.norm(d) > 0:
             multiplier = radius / np.linalg.norm(d)
-        if iteration % 24 == 0 or iteration == max_iterations:
+        if iteration % 24 == 0:
             d = divergence(*p)
-            change = np.linalg.norm(d - divergence(*previous))
+            change = np.linalg.norm(d - then)
+            then = d
             bound = tolerance * np.linalg.norm(d - gc / multiplier)
             if bound > 0:
                 margin = min(margin, abs(change / bound - 1.0))
@@ -315,7 +316,7 @@ def light(
         return Light(none, none)
     unit = noise * np.sqrt(box**2 + 0.2982 * box**4 / ((ny + nx) / 2))
     peaks = np.array([peak_in_box(window, box) for window in windows])
-    needed = max(25 * unit, 100)
+    needed = max(50 * unit, 100)
     trials = ny * nx * min(8 / box**2, 1)
     limit = NormalDist().inv_cdf(0.999 ** (1 / trials)) * unit
     suspect = (flux < 0.5 * flux[typical[len(typical) // 2]]) & np.asarray(measured)

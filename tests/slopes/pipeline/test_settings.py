@@ -34,12 +34,21 @@ class TestSettings:
         settings = fs.Settings(noise_std=1.0)
         assert settings.values("keep_brightest", 3, 256).tolist() == [20] * 3
         assert settings.values("keep_brightest", 1, 16).tolist() == [5]
-        assert settings.values("tolerance", 2, 16).tolist() == [0.02, 0.02]
+        assert settings.values("tolerance", 2, 16).tolist() == [0.0, 0.0]
+        assert settings.values("max_iterations", 2, 16).tolist() == [24, 24]
         fast = settings.replace(preset="fast")
         assert fast.values("tolerance", 2, 16).tolist() == [0.0, 0.0]
         assert fast.values("max_iterations", 2, 16).tolist() == [8, 8]
         assert fast.replace(max_iterations=5).values("max_iterations", 1, 16).tolist() == [5]
         assert fs.Settings("brightest").values("keep_brightest", 2, 16).tolist() == [5, 5]
+
+    def test_iterations_follow_the_number_of_pixels_kept(self) -> None:
+        settings = fs.Settings(noise_std=1.0, keep_brightest=[32, 33])
+        assert settings.values("tolerance", 2, 256).tolist() == [0.0, 0.0025]
+        assert settings.values("max_iterations", 2, 256).tolist() == [24, 480]
+        stated = settings.replace(where=[0], tolerance=0.01)
+        assert stated.values("tolerance", 2, 256).tolist() == [0.01, 0.0025]
+        assert stated.values("max_iterations", 2, 256).tolist() == [480, 480]
 
     @pytest.mark.parametrize(
         ("words", "arguments"),

@@ -32,7 +32,6 @@ NaN: the numbers could not be looked up; they are not guessed.
 """
 
 _KEPT_OPTION, _STRENGTH_OPTION = "keep_brightest", "noise_std"
-_ITERATIONS, _TOLERANCE = 100, 1e-3  # strengths near infeasible ones are far from done after ten iterations
 
 
 @dataclass(frozen=True)
@@ -173,9 +172,8 @@ class NightPlan:
         if name == NONE:
             return Method(label, Settings(BrightestPixels(**values)), gain)
         factors: Any = np.array(self.strength_factors or 1.0)
-        limits = {"max_iterations": _ITERATIONS, "tolerance": _TOLERANCE}
         values[_STRENGTH_OPTION] = strength_e * factors if self.strength_factors else strength_e
-        return Method(label, Settings(TotalVariation(**{**limits, **values})), gain)
+        return Method(label, Settings(TotalVariation(**values)), gain)
 
 
 def kind_of(name: str) -> MethodKind:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.config.options import PerSubaperture, is_auto, option
-from faintspot.base.config.presets import PRESETS, of_denoising
+from faintspot.base.config.presets import FEW_KEPT, PRESETS, of_denoising
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.algorithms.automatic import automatic_strength
 from faintspot.slopes.estimators.algorithms.noise import suggested_strength
@@ -27,6 +27,7 @@ from faintspot.slopes.kernels.total_variation.flat_start import flat_start_table
 
 _STRENGTHS = (1.0, 0.4, 0.6, 0.8, 1.25)  # multiples of the automatic strength
 _LEAST_STRENGTH_E = 1e-3
+_LIMITS = "tolerance", "max_iterations"
 
 
 @register
@@ -45,13 +46,19 @@ class TotalVariation(KeepingBrightest):
     )
     tolerance: Any = option(
         None,
-        "Relative change at which the denoising of a sub-aperture stops; see `faintspot.tv_denoise`. "
-        'Default: that of the preset, 0.02; with "fast" 0 (only the iteration limit applies).',
+        "Relative change in 24 iterations at which the denoising of a sub-aperture stops; see "
+        "`faintspot.tv_denoise`. Default: 0.0025 where more than 32 pixels are kept; else, and with the "
+        'preset "fast", 0 (only the iteration limit applies).',
         low=0.0,
         high=1.0,
     )
     max_iterations: Any = option(
-        None, "Iteration limit. Default: that of the preset, 200 or 8.", low=1, high=2**24, whole=True
+        None,
+        "Iteration limit. Default: 24, or 480 where more than 32 pixels are kept or a tolerance is set; with "
+        'the preset "fast" 8.',
+        low=1,
+        high=2**24,
+        whole=True,
     )
     algorithm: str = option(
         "fgp", "Algorithm of the denoising.", choices=tuple(ALGORITHMS), per_subaperture=False
@@ -100,10 +107,17 @@ class TotalVariation(KeepingBrightest):
         """Do not denoise: a noise-free image has nothing to remove."""
         return self.without_denoising().for_bright_flux()
 
-    def default_of(self, name: str, pixels: int) -> Any:
-        """See `Options`."""
-        usual = of_denoising(self.preset)
-        return usual[name] if name in usual else super().default_of(name, pixels)
+    def values(self, name: str, n_subapertures: int, pixels: int) -> NDArray[Any]:
+        """See `Options`; tolerance and iteration limit depend on the number of pixels kept."""
+        values = super().values(name, n_subapertures, pixels)
+        if name not in _LIMITS:
+            return values
+        kept = self.values("keep_brightest", n_subapertures, pixels)
+        keeps_few = np.full(n_subapertures, True) if is_auto(self.keep_brightest) else kept <= FEW_KEPT
+        if name == "max_iterations":
+            keeps_few &= np.isnan(super().values("tolerance", n_subapertures, pixels))
+        usual = [of_denoising(self.preset, keeps_few=few)[name] for few in (False, True)]
+        return np.where(np.isnan(values), np.where(keeps_few, usual[1], usual[0]), values)
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:
         """See `Estimator`."""
@@ -113,9 +127,7 @@ class TotalVariation(KeepingBrightest):
             denoised = int(np.count_nonzero(self.values("noise_std", n_subapertures, pixels)))
             if denoised < n_subapertures:
                 where = f" in {denoised} of {n_subapertures} sub-apertures"
-        tolerance, limit = (
-            self._span(name, n_subapertures, pixels) for name in ("tolerance", "max_iterations")
-        )
+        tolerance, limit = (self._span(name, n_subapertures, pixels) for name in _LIMITS)
         return (
             f"total-variation denoising{where} of strength {strength}{unit} ({self.algorithm}, tolerance "
             f"{tolerance}, at most {limit} iterations); {self.kept_in_words(n_subapertures, pixels)}"
@@ -137,7 +149,7 @@ class TotalVariation(KeepingBrightest):
         """See `KeepingBrightest`."""
         if is_auto(self.noise_std):
             return None  # the strength depends on the flux
-        limits = {name: getattr(self, name) for name in ("tolerance", "max_iterations")}
+        limits = {name: getattr(self, name) for name in _LIMITS}
         result: NDArray[np.float32] = tv_denoise(
             images,
             self.noise_std,

@@ -68,7 +68,7 @@ def gravity_scratch(lanes: Lanes, ny: int, nx: int) -> GravityScratch:
     width, pixels = lanes.width, ny * nx
     return GravityScratch(
         aligned_zeros(STATE_VECTORS * pixels * width, lanes.dtype),
-        aligned_zeros((pixels + 2 * nx + 3) * width, lanes.dtype),
+        aligned_zeros(total_variation.row_vectors(ny, nx) * width, lanes.dtype),
         aligned_zeros(total_variation.LANE_ROWS * width, lanes.dtype),
         np.zeros(total_variation.COUNT_ROWS * width, np.int64),
         aligned_zeros(brightest.LANE_ROWS * width, lanes.dtype),

@@ -34,9 +34,8 @@ from faintspot.slopes.kernels.total_variation.sweeps import (
     twice_divergence,
 )
 
-# Iterations between two convergence tests. Where a wide, shallow residue is left, an iteration changes little
-# and tests see nothing; only iterations help. Many tests cost as much as those, as a group goes on until its
-# slowest lane has finished.
+# Iterations between two convergence tests, which compare the images of both. Where a wide, shallow residue is
+# left, a single iteration changes little. A group goes on until its slowest lane has finished.
 CHECK_INTERVAL = 24
 # In units of the image's own rms: a strength above the first is too strong for the image, and is lowered to
 # the second where that is asked for. Chosen by the slope error of simulated spots, docs/automatic.md.
@@ -59,12 +58,21 @@ LIMIT, ITERATIONS, CONVERGED, INFEASIBLE, ACTIVE = 0, 1, 2, 3, 4
 COUNT_ROWS = 5
 
 
+def row_vectors(ny: int, nx: int) -> int:
+    """Return the size of `rows` of `denoise_group`, in vectors."""
+    return 2 * ny * nx + 2 * nx + 3
+
+
 @compiled
 def _measure_change(
-    lanes: Any, state: Any, ny: Any, nx: Any, current: Any, inverse: Any, lane_values: Any
+    lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, inverse: Any, lane_values: Any
 ) -> None:
-    """Sum ||div p - div p_previous||^2 and ||div p - g / lambda||^2 per lane, both times 4, for the test."""
+    """Sum ||div p - div p_then||^2 and ||div p - g / lambda||^2 per lane, both times 4, since the last test.
+
+    div p is kept in `rows`, behind what the sweeps use, for the next test.
+    """
     width = width_of(lanes)
+    kept = (ny * nx + 2 * nx + 3) * width
     zero = splat(lanes, 0.0)
     minus_inverse = splat(lanes, -2.0) * inverse
     pixel, line = STATE_VECTORS * width, nx * STATE_VECTORS * width
@@ -73,7 +81,9 @@ def _measure_change(
         for x in range(nx):
             place = y * line + x * pixel
             d = twice_divergence(lanes, state, place, current * width, y, x, line, pixel)
-            move = d - twice_divergence(lanes, state, place, (2 - current) * width, y, x, line, pixel)
+            then = kept + (y * nx + x) * width
+            move = d - load(lanes, rows, then)
+            store(rows, then, d)
             v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d)
             change = multiply_add(move, move, change)
             size = multiply_add(v, v, size)
@@ -214,7 +224,7 @@ def _next_limit(width: Any, counts: Any) -> Any:
 
 
 @compiled
-def _mark_finished(width: Any, iteration: Any, measured: Any, lane_values: Any, counts: Any) -> Any:
+def _mark_finished(width: Any, iteration: Any, tested: Any, lane_values: Any, counts: Any) -> Any:
     """Mark the active lanes that have converged or reached their limit; return how many."""
     finished = 0
     for lane in range(width):
@@ -224,7 +234,6 @@ def _mark_finished(width: Any, iteration: Any, measured: Any, lane_values: Any, 
         tolerance = lane_values[TOLERANCE * width + lane]
         bound = tolerance * tolerance * lane_values[SIZE * width + lane]
         ends = iteration >= counts[LIMIT * width + lane]
-        tested = measured and (ends or iteration % CHECK_INTERVAL == 0)  # not when only another lane ends
         converged = tested and tolerance > 0.0 and lane_values[CHANGE * width + lane] <= bound
         if converged or ends:
             counts[CONVERGED * width + lane] = 1 if converged else 0
@@ -265,7 +274,7 @@ def denoise_group(
     image, output : (ny * nx * W,) arrays
         Input, which is not modified, and result: all lanes of a pixel side by side.
     state, rows : arrays
-        Scratch of STATE_VECTORS * ny * nx * W and (ny * nx + 2 * nx + 3) * W numbers.
+        Scratch of STATE_VECTORS * ny * nx * W and `row_vectors(ny, nx)` * W numbers.
     lane_values : (LANE_ROWS * W,) array
         STRENGTH and TOLERANCE are read, MULTIPLIER is written, the rest is scratch.
     counts : (COUNT_ROWS * W,) int64 array
@@ -286,6 +295,8 @@ def denoise_group(
     inverse = start_flat(lanes, state, rows, ny, nx, table, inverse_radius)
     limit = _next_limit(width, counts)
     momentum, momentum_age, current, iteration = 0.0, MOMENTUM_AGE, 0, 0
+    if test_change:
+        _measure_change(lanes, state, rows, ny, nx, current, inverse, lane_values)
     while active > 0:
         iteration += 1
         if algorithm is FGP:
@@ -296,11 +307,11 @@ def denoise_group(
         inverse = select(norm > zero, square_root(norm) * inverse_radius, inverse)
         next_age = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * momentum_age * momentum_age))
         momentum, momentum_age = (momentum_age - 1.0) / next_age, next_age
-        measured = test_change and (iteration % CHECK_INTERVAL == 0 or iteration >= limit)
-        if measured:
-            _measure_change(lanes, state, ny, nx, current, inverse, lane_values)
-        if measured or iteration >= limit:
-            finished = _mark_finished(width, iteration, measured, lane_values, counts)
+        tested = test_change and iteration % CHECK_INTERVAL == 0
+        if tested:
+            _measure_change(lanes, state, rows, ny, nx, current, inverse, lane_values)
+        if tested or iteration >= limit:
+            finished = _mark_finished(width, iteration, tested, lane_values, counts)
             if finished > 0:
                 _write_finished(lanes, state, rows, output, ny, nx, current, lane_values)
                 active -= finished
