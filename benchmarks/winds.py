@@ -104,7 +104,8 @@ def drifting(case: Case, learnt: LearntControl, realisation: int) -> Drifted:
             own = run.slopes[last]
             successor.follow(run.line, own, run.errors[last], np.zeros(len(own) // 2), own, None)
         elif successor is not None:
-            controller, run.line = successor.take_over(run.line)[1:3]
+            controller = successor.take_over(run.line).controller
+            run.line = controller.line
             successor, at_handover[run.frame : run.frame + HANDOVER_FRAMES] = None, 1.0
         if run.frame % every == 0 and run.frame < len(run.strehl):
             telemetry = run.telemetry(run.frame - every, run.frame)
@@ -112,9 +113,8 @@ def drifting(case: Case, learnt: LearntControl, realisation: int) -> Drifted:
             found = relearn(case.plant, running, telemetry, case.site, case.rate_hz, start)
         if run.frame % every == later and found is not None and found.is_better:
             running, line = found.learnt.model, CommandDelayLine(len(run.line.latest), run.line.delay_frames)
-            successor = ControllerSuccessor(
-                PreparedController(KALMAN, found.learnt.controller(line), line, False, True, True, 1.0, False)
-            )
+            ready = PreparedController(KALMAN, found.learnt.controller(line), False, 1.0)
+            successor = ControllerSuccessor(ready)
     run.strehl[:SETTLE], change[:SETTLE] = np.nan, 0.0
     largest = float((at_handover * change).max()), float((change - at_handover * change).max())
     count = round(at_handover.sum() / HANDOVER_FRAMES)

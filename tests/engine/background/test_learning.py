@@ -19,10 +19,10 @@ from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import ControlServer
 from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.loop.control.base import ASSUMED
+from faintspot.loop.control.base import ASSUMED, SETTLE_FRAMES
 from faintspot.loop.control.configuration import Control, ControlOptions, save_control
 from faintspot.loop.control.identification.learning import KALMAN, learn_controller
-from faintspot.loop.control.identification.model import SETTLE_FRAMES, ControlModel, LearntControl, LoopPlant
+from faintspot.loop.control.identification.model import ControlModel, LearntControl, LoopPlant
 from faintspot.loop.control.identification.relearning import RelearntControl
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.slopes.pipeline import configuration as configuration_file

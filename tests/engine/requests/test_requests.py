@@ -281,7 +281,7 @@ def test_clients_that_go_away_are_forgotten(server: ControlServer) -> None:
             with connected(server.path) as connection:
                 connection.sendall(message)
     assert is_well(server.path)
-    wait_for(lambda: not server._connections)
+    wait_for(lambda: not server._listener.connections)
 
 
 def test_many_clients_at_once(server: ControlServer) -> None:

@@ -17,11 +17,9 @@ from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.timing import Latencies
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.compiled import MEAN_SQUARE, CompiledIntegrator, true_slopes
+from faintspot.loop.control.compiled import MEAN_SQUARE, true_slopes
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.identification.model import ControlModel
-from faintspot.loop.control.kalman.compiled import CompiledKalman
-from faintspot.loop.control.kalman.guarded import Guarded
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.kernels.driver.products import ProductPart
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
@@ -92,7 +90,7 @@ class ControlLoop:
     @property
     def _line(self) -> CommandDelayLine:
         """Delay line to the mirror."""
-        return self._on.line
+        return self._on.controller.line
 
     # The engine's thread ----------------------------------------------------------------------------
 
@@ -104,7 +102,7 @@ class ControlLoop:
         """
         on = self._on
         parts: Sequence[ProductPart] = ()
-        if not self.closed or self._begins or self._removed_modes or not on.begins:
+        if not self.closed or self._begins or self._removed_modes:
             return parts
         try:
             parts = on.controller.begin_product(self._threads, 1.0 / on.centroid_gain)
@@ -152,8 +150,7 @@ class ControlLoop:
             line.hold(np.zeros_like(line.latest))
         if self.closed:
             on = self._on
-            if on.takes_prior:
-                on.controller.prior_std_px = prior_std_px if on.predicts else None
+            on.controller.prior_std_px = prior_std_px if on.predicts else None
             self._update(on)
         else:
             line.put(line.latest)
@@ -184,7 +181,7 @@ class ControlLoop:
         """Let a new controller follow the last frame, or take over if it has settled or the loop is open."""
         on, prior = self._on, self._prior
         if self.closed and not self._begins and successor.is_settling:
-            std = on.controller.prior_std_px if prior is not None and on.takes_prior else None
+            std = on.controller.prior_std_px if prior is not None and on.controller.is_guarded else None
             mean = self._slopes if prior is None else prior.mean_px.reshape(-1).astype(np.float64)
             per_px = on.centroid_gain / successor.ready.centroid_gain
             covariance = per_px**2 * self._covariance
@@ -202,8 +199,7 @@ class ControlLoop:
     def _close_again(self) -> None:
         """Close a loop that the guard has opened; a learnt controller leaves the mirror to its integrator."""
         reason = self.opened_because
-        if isinstance(self._on.controller, Guarded | CompiledKalman):
-            self._on.controller.fall_back()
+        self._on.controller.fall_back()
         self.close()
         self.closed_again_because = reason
 
@@ -215,7 +211,7 @@ class ControlLoop:
         new = self._ready[self.control.options.controller if kind is None else kind]
         if new is self._on:
             return
-        new.line.copy_from(self._line)
+        new.controller.line.copy_from(self._line)
         self._on = new
         self._expect(begins=self.closed and not self._begins)
 
@@ -225,10 +221,10 @@ class ControlLoop:
         try:
             if begins:
                 on.controller.begin()
-            if self.closed and not self._begins and (on.predicts or on.completes):
-                expected = on.controller.expected()
+            if self.closed and not self._begins:
+                on.controller.complete()
                 if prior is not None and on.predicts:
-                    prior.expect(*expected)
+                    prior.expect(*on.controller.expected())
                     return
         except Exception as error:  # nothing raises in the frame path
             self._fail(error)
@@ -276,7 +272,7 @@ class ControlLoop:
             When the model is for another loop, or its commands are not finite.
         """
         ready = _prepared(self.control.with_model(model))
-        if ready.takes_prior:
+        if ready.controller.is_guarded:
             self._successor = ControllerSuccessor(ready)
         else:
             self._ready[model.kind] = ready
@@ -285,8 +281,7 @@ class ControlLoop:
     @property
     def controller(self) -> Controller:
         """Controller of the last frame."""
-        controller: Controller = self._on.controller
-        return controller
+        return self._on.controller
 
     def close(self) -> None:
         """Close the loop, starting from the mirror's present commands; no effect if it is closed."""
@@ -336,9 +331,9 @@ class ControlLoop:
         integrator.gain = number_between("gain", gain, 0, 2)
 
     @property
-    def _integrator(self) -> CompiledIntegrator | None:
+    def _integrator(self) -> Controller | None:
         controllers = [ready.controller for ready in list(self._ready.values())]
-        return next((made for made in controllers if isinstance(made, CompiledIntegrator)), None)
+        return next((made for made in controllers if made.gain is not None), None)
 
     @property
     def state(self) -> str:

@@ -7,8 +7,9 @@ import contextlib
 import json
 import logging
 import socket
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib.resources import files
@@ -23,7 +24,6 @@ from faintspot.engine.page.latest_messages import LatestMessages
 from faintspot.engine.page.messages import packed
 from faintspot.engine.page.page import UPDATE_S, Page
 from faintspot.engine.pixels.camera import StopEvent
-from faintspot.engine.requests.requests import in_thread
 
 try:
     from tornado.httpserver import HTTPServer
@@ -260,7 +260,7 @@ class Client(_Guarded, WebSocketHandler):
             reply = {"ok": False, "error": "read-only: changes need the token that was printed at the start"}
         else:
             # In a thread, because the engine may take long to answer.
-            reply = await in_thread(partial(answered, self.server.client_requests, request))
+            reply = await _in_thread(partial(answered, self.server.client_requests, request))
         with contextlib.suppress(WebSocketClosedError):
             await self.write_message(to_json({"id": number, **reply}))
         if self._feeding is None:
@@ -307,3 +307,21 @@ def _parsed(message: str | bytes) -> dict[str, Any]:
     if not isinstance(request, dict) or not isinstance(request.get("do"), str):
         raise InputError('expected a JSON object with "do"')
     return request
+
+
+async def _in_thread(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Run a function in a daemon thread and wait for its result."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[dict[str, Any]] = loop.create_future()
+
+    def finish(reply: dict[str, Any]) -> None:
+        if not done.done():  # else the caller was cancelled
+            done.set_result(reply)
+
+    def run() -> None:
+        reply = work()
+        with contextlib.suppress(RuntimeError):  # the server may have closed
+            loop.call_soon_threadsafe(finish, reply)
+
+    threading.Thread(target=run, name="faintspot-command", daemon=True).start()
+    return await done

@@ -6,16 +6,15 @@ A request is one line of JSON, {"command": NAME, ...}. The reply is one line too
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
 import socket
+import socketserver
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping
-from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
@@ -32,8 +31,6 @@ from faintspot.engine.requests.private_socket import (
 Handler = Callable[[dict[str, Any]], Mapping[str, Any]]
 """Function of a command: takes the fields of the request, returns the fields of the reply."""
 
-Result = TypeVar("Result")
-
 LARGEST_REQUEST = 64 * 1024
 LENGTHY_TIMEOUT_S = 180.0
 """Time that a client waits for a command that prepares something new and may compile [s]."""
@@ -43,6 +40,7 @@ _LARGEST_REPLY = 16 * 1024 * 1024
 _MOST_CONNECTIONS = 64
 _IDLE_S = 30.0  # idle time after which a connection is closed
 _PAUSE_S = 0.1  # when the system has no file descriptor left
+_LOOK_S = 0.1  # between two looks whether it is to close
 
 
 def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fields: Any) -> dict[str, Any]:
@@ -99,11 +97,10 @@ def since(frame: int | None) -> str:
 
 
 class ControlServer(Closing):
-    """Server that answers requests in a separate thread until closed.
+    """Server that answers requests, each connection in a thread of its own, until closed.
 
     Clients that hang, send garbage or disconnect neither stop the server nor delay others. Commands named in
-    `lengthy` run one after another in a second thread; all others are answered meanwhile. Processes of other
-    users are refused.
+    `lengthy` run one after another; all others are answered meanwhile. Processes of other users are refused.
 
     Parameters
     ----------
@@ -125,94 +122,35 @@ class ControlServer(Closing):
     ) -> None:
         self.path = Path(path)
         self._handlers, self._lengthy = dict(handlers), frozenset(lengthy)
-        self._connections: dict[asyncio.Task[None], None] = {}  # ordered by idle time, longest first
+        self._brief_one, self._lengthy_one = threading.Lock(), threading.Lock()
         self._lock_file = locked_beside(self.path)
         try:
-            self._listener = bound_listener(self.path)
+            self._listener = _Listener(self.path, self._reply)
         except BaseException:
             os.close(self._lock_file)
             raise
         self._inode = os.stat(self.path).st_ino
-        self._loop = asyncio.new_event_loop()
-        self._closing = asyncio.Event()
-        self._one_at_a_time = asyncio.Lock()
         self._thread = threading.Thread(target=self._run, name="faintspot-control", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Stop answering and remove the socket; repeated calls do nothing."""
-        with contextlib.suppress(RuntimeError):  # already closed
-            self._loop.call_soon_threadsafe(self._closing.set)
-        if threading.current_thread() is not self._thread:
-            self._thread.join()
+        self._listener.shutdown()
+        self._thread.join()
 
     def _run(self) -> None:
         """Run the server thread until it is closed."""
         try:
-            with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
-                runner.run(self._serve())
+            self._listener.serve_forever(_LOOK_S)
         finally:
             with contextlib.suppress(OSError):  # remove the socket file only if it is still this server's
                 if os.stat(self.path).st_ino == self._inode:
                     os.unlink(self.path)
                     os.unlink(lock_path(self.path))
-            self._listener.close()
+            self._listener.server_close()
             os.close(self._lock_file)
 
-    async def _serve(self) -> None:
-        self._listen()
-        await self._closing.wait()  # afterwards the runner cancels the connections
-
-    def _listen(self) -> None:
-        self._loop.add_reader(self._listener, self._accept)
-
-    def _accept(self) -> None:
-        try:
-            connection, _ = self._listener.accept()
-        except BlockingIOError:
-            return
-        except OSError:  # usually: no file descriptor left
-            self._make_room()
-            self._loop.remove_reader(self._listener)
-            self._loop.call_later(_PAUSE_S, self._listen)
-            return
-        if len(self._connections) >= _MOST_CONNECTIONS:
-            self._make_room()
-        connection.setblocking(False)
-        task = self._loop.create_task(self._converse(connection))
-        self._connections[task] = None
-        task.add_done_callback(partial(self._end, connection))
-
-    def _make_room(self) -> None:
-        """Close the connection that was idle longest."""
-        if self._connections:
-            task = next(iter(self._connections))
-            del self._connections[task]
-            task.cancel()
-
-    def _end(self, connection: socket.socket, task: asyncio.Task[None]) -> None:
-        self._connections.pop(task, None)
-        connection.close()
-
-    async def _converse(self, connection: socket.socket) -> None:
-        """Answer the requests of one connection until it ends or is idle for too long."""
-        # Not with asyncio's streams: each leaves a reference cycle, and collection is off while frames
-        # come.
-        task, inbox = asyncio.current_task(), bytearray()
-        with contextlib.suppress(OSError, TimeoutError):
-            try:
-                if peer_uid(connection) != os.geteuid():
-                    kind, _ = server_of(self.path)
-                    raise InputError(f"this {kind} answers only the user that runs it")
-                while line := await _next_line(connection, inbox):
-                    await _send(connection, await self._reply(line))
-                    if task in self._connections:  # move it to the end: least idle
-                        self._connections[task] = self._connections.pop(task)
-                    await asyncio.sleep(0)  # many requests of one client must not delay others
-            except InputError as error:
-                await _send(connection, _encoded(_refusal(str(error))))
-
-    async def _reply(self, line: bytes) -> bytes:
+    def _reply(self, line: bytes) -> bytes:
         """Carry out one request; always return a reply."""
         try:
             fields = _parsed_request(line)
@@ -222,50 +160,99 @@ class ControlServer(Closing):
                 raise InputError(f"command = {command!r:.80}: expected one of {commands}")
         except InputError as error:
             return _encoded(_refusal(str(error)))
-        work = partial(_answer, self._handlers[command], fields)
-        if command not in self._lengthy:
-            return work()
-        async with self._one_at_a_time:
-            return await in_thread(work)
+        with self._lengthy_one if command in self._lengthy else self._brief_one:
+            return _answer(self._handlers[command], fields)
 
 
-async def _next_line(connection: socket.socket, inbox: bytearray) -> bytes:
-    """Wait for a complete line; return b"" when the connection ends, raise InputError when it is too long."""
-    loop = asyncio.get_running_loop()
-    async with asyncio.timeout(_IDLE_S):
-        while not (size := inbox.find(b"\n") + 1) and len(inbox) < LARGEST_REQUEST:
-            data = await loop.sock_recv(connection, LARGEST_REQUEST)
-            if not data:
-                return b""
-            inbox += data
-    if not 0 < size <= LARGEST_REQUEST:
-        raise InputError(f"request: expected at most {LARGEST_REQUEST} bytes in one line")
-    line = bytes(inbox[:size])
-    del inbox[:size]
-    return line
+class _Listener(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
+    """Socket of a server, and its connections."""
+
+    daemon_threads = True
+    server_address: str
+
+    def __init__(self, path: Path, reply: Callable[[bytes], bytes]) -> None:
+        self.path, self.reply = path, reply
+        self.connections: dict[socket.socket, None] = {}  # ordered by idle time, longest first
+        self._changing = threading.Lock()
+        super().__init__(os.fspath(path), _Conversation, bind_and_activate=False)
+        self.socket.close()
+        self.socket = bound_listener(path)
+
+    def get_request(self) -> tuple[socket.socket, Any]:
+        """Accept a connection; if there are too many, end the one that was idle longest."""
+        try:
+            connection, address = super().get_request()
+        except BlockingIOError:
+            raise
+        except OSError:  # usually: no file descriptor left
+            self._make_room()
+            time.sleep(_PAUSE_S)
+            raise
+        if len(self.connections) >= _MOST_CONNECTIONS:
+            self._make_room()
+        self.touch(connection)
+        return connection, address
+
+    def touch(self, connection: socket.socket) -> None:
+        """Note that a connection is in use."""
+        with self._changing:
+            self.connections.pop(connection, None)
+            self.connections[connection] = None
+
+    def _make_room(self) -> None:
+        with self._changing:
+            connection = next(iter(self.connections), None)
+            if connection is not None:
+                _end(connection, socket.SHUT_RDWR)
+                del self.connections[connection]
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        with self._changing:
+            self.connections.pop(request, None)
+        super().shutdown_request(request)
+
+    def server_close(self) -> None:
+        """Close the socket; connections end with the reply that they are about to send."""
+        super().server_close()
+        with self._changing:
+            for connection in self.connections:
+                _end(connection, socket.SHUT_RD)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print nothing: a connection that fails is closed."""
 
 
-async def _send(connection: socket.socket, reply: bytes) -> None:
-    async with asyncio.timeout(_IDLE_S):
-        await asyncio.get_running_loop().sock_sendall(connection, reply)
+def _end(connection: socket.socket, how: int) -> None:
+    with contextlib.suppress(OSError):
+        connection.shutdown(how)
 
 
-async def in_thread(work: Callable[[], Result]) -> Result:
-    """Run a function in a daemon thread and wait for its result."""
-    loop = asyncio.get_running_loop()
-    done: asyncio.Future[Result] = loop.create_future()
+class _Conversation(socketserver.StreamRequestHandler):
+    """Requests of one connection, answered until it ends or is idle for too long."""
 
-    def finish(reply: Result) -> None:
-        if not done.done():  # else the caller was cancelled
-            done.set_result(reply)
+    server: _Listener
 
-    def run() -> None:
-        reply = work()
-        with contextlib.suppress(RuntimeError):  # the server may have closed
-            loop.call_soon_threadsafe(finish, reply)
+    def setup(self) -> None:
+        """Limit the time for which a client may be idle."""
+        self.timeout = _IDLE_S
+        super().setup()
 
-    threading.Thread(target=run, name="faintspot-command", daemon=True).start()
-    return await done
+    def handle(self) -> None:
+        """Answer request after request."""
+        with contextlib.suppress(OSError):  # it is gone, or idle
+            if peer_uid(self.connection) != os.geteuid():
+                kind, _ = server_of(self.server.path)
+                self.wfile.write(_encoded(_refusal(f"this {kind} answers only the user that runs it")))
+                return
+            while line := self.rfile.readline(LARGEST_REQUEST):
+                if not line.endswith(b"\n"):
+                    if len(line) == LARGEST_REQUEST:
+                        text = f"request: expected at most {LARGEST_REQUEST} bytes in one line"
+                        self.wfile.write(_encoded(_refusal(text)))
+                    return
+                self.wfile.write(self.server.reply(line))
+                self.server.touch(self.connection)
 
 
 # Messages -------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Expected
+from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.slope_product import SlopeProduct
 from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
@@ -141,7 +141,7 @@ def integrate(
 _INTEGRATE = Direct(integrate)
 
 
-class CompiledIntegrator:
+class CompiledIntegrator(Controller):
     """Compiled `control.integrator.Integrator` with equal weights of all slopes.
 
     Parameters
@@ -157,31 +157,24 @@ class CompiledIntegrator:
         Part of the command that is forgotten in every frame.
     """
 
-    undoes_prior = False
+    gain: float
 
     def __init__(
         self, line: CommandDelayLine, interaction: Floats, reconstruct: Floats, gain: float, leak: float
     ) -> None:
-        self._line, self._interaction = line, interaction
+        super().__init__(line, interaction)
         self._wavefront = SlopeProduct(reconstruct)
         self.gain, self._keep = float(gain), 1.0 - leak
-
-    def expected(self) -> Expected:
-        """See `Controller`."""
-        return Expected(self._interaction @ (self._line.acting - self._line.latest), None)
-
-    def begin(self) -> None:
-        """See `Controller`; the delay line is the only state."""
 
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
     ) -> None:
         """See `Controller`; invalid slopes are 0, and all count the same."""
-        line, product = self._line, self._wavefront
+        line, product = self.line, self._wavefront
         numbers = self.gain, self._keep, line.largest
         total = _INTEGRATE(slopes_px, product.columns, *numbers, line.rows, line.next_row, product.memory)
         line.sent(total)
 
     def begin_product(self, threads: int, scale: float) -> Sequence[ProductPart]:
-        """Return the parts of the next frame's product with its slopes; see `SlopeProduct.parts`."""
+        """See `Controller`."""
         return self._wavefront.parts(threads, scale)

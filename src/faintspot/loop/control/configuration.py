@@ -27,7 +27,6 @@ from faintspot.loop.control.identification.model import (
     MODAL,
     POLC,
     ControlModel,
-    LearntControl,
     LoopPlant,
 )
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
@@ -332,7 +331,8 @@ class Control:
             modes = self.reconstructor.modes
             matrix = (modes * self.model.arrays["gains"]) @ modes.T @ matrix
             return CompiledIntegrator(line, self.controlled, matrix, 1.0, options.leak)
-        return LearntControl(self.plant, self.model).controller(line)
+        guarded: Controller = self.model.guarded(self.plant, line)
+        return guarded
 
     def rehearse(self) -> None:
         """Compile the controller and run it on test frames, the last without a valid slope.

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Expected
+from faintspot.loop.control.base import Controller, Expected
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.reconstructor import Reconstructor
 
 Floats = NDArray[np.float64]
 
 
-class Integrator:
+class Integrator(Controller):
     """Integrator with leak: subtracts a fraction of each frame's wavefront from the command.
 
     Parameters
@@ -32,8 +32,6 @@ class Integrator:
         the wavefront.
     """
 
-    undoes_prior = False
-
     def __init__(
         self,
         line: CommandDelayLine,
@@ -45,18 +43,15 @@ class Integrator:
         weighted: bool = False,
         sees_mirror: bool = True,
     ) -> None:
-        self._line, self._interaction, self._reconstructor = line, interaction, reconstructor
-        self._gain, self._leak = gain, leak
+        super().__init__(line, interaction)
+        self._reconstructor, self._gain, self._leak = reconstructor, gain, leak
         self._weighted, self._sees_mirror = weighted, sees_mirror
 
     def expected(self) -> Expected:
-        """See `Controller`; assumes that the latest command is right for this frame."""
-        line = self._line
-        commands = line.acting - line.latest if self._sees_mirror else -line.latest
-        return Expected(self._interaction @ commands, None)
-
-    def begin(self) -> None:
-        """See `Controller`; the delay line is the only state."""
+        """See `Controller`."""
+        return (
+            super().expected() if self._sees_mirror else Expected(self._interaction @ -self.line.latest, None)
+        )
 
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
@@ -76,4 +71,4 @@ class Integrator:
         else:
             step = self._gain * wavefront
         forgotten = self._leak if self._sees_mirror else self._gain
-        self._line.put((1 - forgotten) * self._line.latest - step)
+        self.line.put((1 - forgotten) * self.line.latest - step)

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import mean_by_blocks
+from faintspot.loop.control.base import SETTLE_FRAMES
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.learning import GAINS, KALMAN, MODAL, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.measured import Measured
-from faintspot.loop.control.identification.model import SETTLE_FRAMES, ControlModel, LoopPlant
+from faintspot.loop.control.identification.model import ControlModel, LoopPlant
 from faintspot.loop.control.identification.open_loop import OpenLoop
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.kalman.predictor import steady_covariance

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from faintspot.base.checks import numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays, save_arrays
-from faintspot.loop.control.base import Controller
+from faintspot.loop.control.base import SETTLE_FRAMES, Controller, Predictor
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.replay import mean_residual, replayed_frames, replayed_integrators
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.compiled import CompiledKalman
-from faintspot.loop.control.kalman.guarded import Guarded
+from faintspot.loop.control.kalman.guarded import Guard, Guarded
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_shapes
 from faintspot.loop.control.kalman.predictive import Predictive, PseudoOpenLoop
@@ -42,8 +42,6 @@ CONTROLS = {
 }
 """Kinds of control and their names in reports."""
 
-SETTLE_FRAMES = 200
-"""Frames after which a replayed controller has settled; predictive filters take longer than integrators."""
 _LOCAL = "local kalman"  # in files: KALMAN for a large sensor
 _OF_KIND = {
     MODAL: ("gains",),
@@ -156,26 +154,28 @@ class ControlModel:
             return PseudoOpenLoop(line, plant.interaction, *covariances, clean, float(arrays["gain"]))
         return Predictive(line, plant.interaction, self.predictor(), clean, from_latest=self.is_local)
 
-    def compiled(
+    def guarded(self, plant: LoopPlant, line: CommandDelayLine, **options: Any) -> Guard:
+        """Return the learnt controller with the integrator beside it; for the options see `Guard`."""
+        options |= {
+            "noise_factor": self.noise_factor,
+            "prefers_plain": self.left[1] < self.left[0],
+            "plain_residual": self.left[1],
+        }
+        interaction, gain = plant.interaction, self.plain_gain
+        if self.is_local:
+            of_loop = interaction, plant.reconstructor, self.phase_of_commands
+            return LargeGuarded(line, *of_loop, self.arrays, gain, plant.leak, **options)
+        if self.kind == KALMAN:
+            return self._compiled(plant, line, self.phase(plant), **options)
+        learnt, plain = partial(self.controller, plant), partial(plant.integrator, gain)
+        return Guarded(line, interaction, self.phase(plant), learnt, plain, **options)
+
+    def _compiled(
         self, plant: LoopPlant, line: CommandDelayLine, phase: Floats, **options: Any
     ) -> CompiledKalman:
-        """Return the Kalman filter of a small sensor with its fallback, see `CompiledKalman`."""
-        predictor, reconstructor = self.predictor(), plant.reconstructor
-        assert isinstance(predictor, SlopePredictor)
-        return CompiledKalman(
-            line,
-            plant.interaction,
-            reconstructor.matrix,
-            phase,
-            predictor,
-            reconstructor.clean,
-            self.plain_gain,
-            plant.leak,
-            noise_factor=self.noise_factor,
-            prefers_plain=self.left[1] < self.left[0],
-            plain_residual=self.left[1],
-            **options,
-        )
+        reconstruct, clean = plant.reconstructor.matrix, plant.reconstructor.clean
+        of_filter = phase, self.slope_predictor, clean, self.plain_gain, plant.leak
+        return CompiledKalman(line, plant.interaction, reconstruct, *of_filter, **options)
 
     def replayed(self, plant: LoopPlant, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
         """Return the squared residual that the learnt controller would have left; see `replayed_frames`."""
@@ -183,7 +183,7 @@ class ControlModel:
             scaled = telemetry.scaled(self.noise_factor)
             return plant.replayed(partial(self.controller, plant), scaled, phase)
         line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames)
-        return self.compiled(plant, line, phase).replayed(telemetry)
+        return self._compiled(plant, line, phase, noise_factor=self.noise_factor).replayed(telemetry)
 
     def phase(self, plant: LoopPlant) -> Floats:
         """Return the matrix (commands, m) from slopes to what is compared."""
@@ -206,10 +206,13 @@ class ControlModel:
         """(m,): standard deviations of the predicted slopes; None if unknown."""
         return self.predictor().std_px if self.kind == KALMAN else None
 
-    def predictor(self) -> SlopePredictor | LocalPredictor:
+    def predictor(self) -> Predictor:
         """Return the Kalman filter of the model."""
-        if self.is_local:
-            return LocalPredictor(self.arrays)
+        return LocalPredictor(self.arrays) if self.is_local else self.slope_predictor
+
+    @property
+    def slope_predictor(self) -> SlopePredictor:
+        """Kalman filter of a small sensor."""
         return SlopePredictor(self._slopes, *self._noise, covariance=self._covariance)
 
     def with_noise(self, scale: float) -> ControlModel:
@@ -326,22 +329,6 @@ class LearntControl:
 
     def controller(
         self, line: CommandDelayLine, prior_std_px: Floats | None = None, plain_frames: int = 0
-    ) -> Guarded | CompiledKalman:
+    ) -> Guard:
         """Return the controller, with the estimator's prior if it has one; see `choice.prepare`."""
-        plant, model = self.plant, self.model
-        if model.kind == KALMAN and not model.is_local:
-            guard: dict[str, Any] = {"prior_std_px": prior_std_px, "plain_frames": plain_frames}
-            return model.compiled(plant, line, model.phase(plant), **guard)
-        options: dict[str, Any] = {
-            "prior_std_px": prior_std_px,
-            "noise_factor": model.noise_factor,
-            "prefers_plain": model.left[1] < model.left[0],
-            "plain_residual": model.left[1],
-            "plain_frames": plain_frames,
-        }
-        interaction, gain = plant.interaction, model.plain_gain
-        if model.is_local:
-            of_loop = interaction, plant.reconstructor, model.phase_of_commands
-            return LargeGuarded(line, *of_loop, model.arrays, gain, plant.leak, **options)
-        learnt, plain = partial(model.controller, plant), partial(plant.integrator, gain)
-        return Guarded(line, interaction, model.phase(plant), learnt, plain, **options)
+        return self.model.guarded(self.plant, line, prior_std_px=prior_std_px, plain_frames=plain_frames)

@@ -134,8 +134,7 @@ class PredictiveControl:
 
         Call it once a command was sent. Without it the next call does this first; commands are the same.
         """
-        if self.model.is_local:  # a small sensor's filter leaves nothing for later
-            self._controller.expected()
+        self._controller.complete()
 
     def __call__(self, slopes: ArrayLike, standard_errors: ArrayLike | None = None) -> Floats:
         """Return the command to send after a frame.

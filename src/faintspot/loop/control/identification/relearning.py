@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.loop.control.base import SETTLE_FRAMES
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.learning import KALMAN, LearntControl, LoopPlant, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.model import SETTLE_FRAMES, ControlModel
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 

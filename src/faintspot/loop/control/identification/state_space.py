@@ -16,7 +16,6 @@ from faintspot.base.npz import save_arrays
 from faintspot.io.arrays.fits_units import write_images
 from faintspot.loop.control.identification.model import ControlModel, LoopPlant
 from faintspot.loop.control.kalman.local_covariance import slopes_ahead, state_of_state, state_of_surprise
-from faintspot.loop.control.kalman.predictor import SlopePredictor
 
 Floats = NDArray[np.float64]
 Matrices = dict[str, Any]
@@ -50,8 +49,7 @@ def state_space(model: ControlModel, plant: LoopPlant, scale: Floats | float, si
     """
     if model.is_local:
         return _sparse(model.arrays, plant, scale, sign)
-    predictor = model.predictor()
-    assert isinstance(predictor, SlopePredictor)
+    predictor = model.slope_predictor
     gain = np.linalg.solve(predictor.usual_px2, predictor.with_slopes.T).T
     rest = np.eye(predictor.model.states) - gain @ predictor.model.observation
     command = -sign * plant.reconstructor.clean @ predictor.model.ahead(plant.delay_frames)

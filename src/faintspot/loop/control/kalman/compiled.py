@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.loop.control.base import Expected
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.kalman.choice import CHOSEN, GUARD_NUMBERS, SENT, prepare, restart
+from faintspot.loop.control.kalman.choice import CHOSEN
+from faintspot.loop.control.kalman.guarded import Guard
 from faintspot.loop.control.kalman.kernels import (
     COMMAND_ROWS,
     FOLLOW,
@@ -34,8 +35,8 @@ STEPS = 4
 _NO_PRIOR = np.zeros(0)
 
 
-class CompiledKalman:
-    """`guarded.Guarded` with `predictive.Predictive` and the integrator beside it, in compiled code.
+class CompiledKalman(Guard):
+    """Guard of `Predictive` and the integrator, in compiled code.
 
     How much each slope corrects follows the noise of each frame, as in `SlopePredictor`; in place of solving
     its equations to the end it takes `STEPS` steps of conjugate gradients, which is products with matrices.
@@ -57,17 +58,11 @@ class CompiledKalman:
         The wavefront, as commands that cause it, from open-loop slopes without noise.
     plain_gain, leak : float
         Of the integrator.
-    prior_std_px : (m,) array, optional
-        Prior of the estimator, whose mean is `expected`. Default: it has none.
-    noise_factor : float
-        What to multiply the variances of standard errors by.
-    prefers_plain, plain_residual, plain_frames
-        See `choice.prepare`.
     steps : int
         Of conjugate gradients.
+    options
+        As for `Guard`.
     """
-
-    undoes_prior = False
 
     def __init__(
         self,
@@ -80,19 +75,11 @@ class CompiledKalman:
         plain_gain: float,
         leak: float,
         *,
-        prior_std_px: Floats | None = None,
-        noise_factor: float = 1.0,
-        prefers_plain: bool = False,
-        plain_residual: float = math.inf,
-        plain_frames: int = 0,
         steps: int = STEPS,
+        **options: Any,
     ) -> None:
-        self._line, self._interaction = line, interaction
+        super().__init__(line, interaction, **options)
         slopes, commands = interaction.shape
-        self._learnt, self._plain = (
-            CommandDelayLine(commands, line.delay_frames, line.largest) for _ in range(2)
-        )
-        self.prior_std_px = prior_std_px
         ahead = -clean @ predictor.model.ahead(line.delay_frames)
         usual = predictor.usual_px2
         self._matrices = Matrices(
@@ -106,20 +93,13 @@ class CompiledKalman:
             np.ascontiguousarray(predictor.model.both.swapaxes(1, 2)),
             np.ascontiguousarray(ahead.T),
         )
-        self._lines = Lines(line.rows, self._learnt.rows, self._plain.rows)
+        self._rows = Lines(line.rows, *(own_line.rows for own_line in self._lines))
         self._memory = Memory(
             np.zeros((predictor.model.layers, 2, slopes)),
-            np.zeros(GUARD_NUMBERS),
+            self._guard,
             np.zeros((SLOPE_ROWS, slopes)),
             np.zeros((COMMAND_ROWS, commands)),
         )
-        prepare(
-            self._memory.guard,
-            prefers_plain=prefers_plain,
-            plain_residual=plain_residual,
-            plain_frames=plain_frames,
-        )
-        self._noise_factor = float(noise_factor)
         self._numbers = float(plain_gain), 1.0 - leak, float(line.largest), steps
         self._std_px, self._shares = predictor.std_px, shares(predictor.model)
         self._independent = np.zeros(slopes // 2)
@@ -127,40 +107,21 @@ class CompiledKalman:
         self._held_at = -1
         """Position of the delay line at which the acting command was turned into slopes."""
 
-    @property
-    def chosen(self) -> int:
-        """0: the filter's commands are sent; 1: the integrator's."""
-        self._catch_up()
-        return int(self._memory.guard[CHOSEN])
-
     def expected(self) -> Expected:
         """See `Controller`."""
-        self._catch_up()
+        self.complete()
         rows = self._memory.slopes
-        if self._memory.guard[CHOSEN]:
+        if self._guard[CHOSEN]:
             return Expected(rows[HELD] - rows[LATEST_PLAIN], None)
         return Expected(rows[HELD] + rows[PREDICTED], self._std_px)
 
-    def fall_back(self) -> None:
-        """See `Guarded`."""
-        self._catch_up()
-        self._memory.guard[CHOSEN] = 1.0
-
     def begin(self) -> None:
         """See `Controller`; open-loop slopes are assumed to equal the mirror's correction."""
-        latest = self._line.latest
-        for line in (self._learnt, self._plain):
-            line.hold(latest)
-        open_loop = -(self._interaction @ latest)
+        super().begin()
+        open_loop = -(self._interaction @ self.line.latest)
         self._memory.state[:] = self._shares[:, None, None] * open_loop
         self._memory.slopes[PREDICTED] = open_loop
-        restart(self._memory.guard)
-        self._memory.guard[SENT] = self._memory.guard[CHOSEN]
         self._is_behind, self._held_at = False, -1
-
-    def hand_over(self) -> None:
-        """See `Guarded`."""
-        self._memory.guard[SENT] = -1.0
 
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
@@ -172,7 +133,7 @@ class CompiledKalman:
         ArithmeticError
             When a controller's commands are not finite.
         """
-        self._catch_up()
+        self.complete()
         prior = self.prior_std_px
         total = FOLLOW(
             slopes_px,
@@ -182,11 +143,11 @@ class CompiledKalman:
             self._noise_factor,
             self._numbers,
             self._matrices,
-            self._lines,
+            self._rows,
             self._next_rows(),
             self._memory,
         )
-        self._line.sent(total)
+        self.line.sent(total)
         self._is_behind = True
 
     def replayed(self, telemetry: OpenLoopTelemetry) -> Floats:
@@ -199,21 +160,22 @@ class CompiledKalman:
         slopes, trust = telemetry.open_loop_px, telemetry.trust
         covariance = self._noise_factor * telemetry.covariances_px2
         self._memory.state[:], self._memory.slopes[PREDICTED] = 0.0, 0.0
-        line = np.zeros_like(self._lines.learnt)
+        line = np.zeros_like(self._rows.learnt)
         recorded = slopes, variance, covariance, trust
         replay(*recorded, self._numbers[-1], self._matrices, line, self._memory, squares)
         return squares
 
-    def _catch_up(self) -> None:
-        """Complete the previous frame."""
+    def complete(self) -> None:
+        """See `Controller`."""
         if self._is_behind:
             self._is_behind, self._held_at = False, -1
-            total = GO_ON(self._numbers, self._matrices, self._lines, self._next_rows(), self._memory)
-            self._learnt.sent(total)
-            self._plain.sent(total)
-        if self._held_at != self._line.next_row:
-            HOLD(self._matrices, self._lines, self._next_rows(), self._memory)
-            self._held_at = self._line.next_row
+            total = GO_ON(self._numbers, self._matrices, self._rows, self._next_rows(), self._memory)
+            for line in self._lines:
+                line.sent(total)
+        if self._held_at != self.line.next_row:
+            HOLD(self._matrices, self._rows, self._next_rows(), self._memory)
+            self._held_at = self.line.next_row
 
     def _next_rows(self) -> tuple[int, int, int]:
-        return self._line.next_row, self._learnt.next_row, self._plain.next_row
+        learnt, plain = self._lines
+        return self.line.next_row, learnt.next_row, plain.next_row

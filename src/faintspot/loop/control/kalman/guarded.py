@@ -1,9 +1,10 @@
-"""Two controllers on the same slopes, of which the one with the smaller residual drives the mirror."""
+"""Learnt and plain controller on the same slopes, of which the one with less residual drives the mirror."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +28,8 @@ from faintspot.loop.control.telemetry import as_estimated, without_prior
 Floats = NDArray[np.float64]
 
 
-class Guarded:
-    """Learnt controller, replaced by a plain one while its residual is larger.
+class Guard(Controller):
+    """Learnt controller, replaced by a plain one while its residual is larger; subclasses compute both.
 
     Both send commands in every frame, each to a mirror of its own that exists only in numbers; the slopes
     that each would have had follow from the open-loop slopes. So what they leave can be compared in the same
@@ -42,10 +43,6 @@ class Guarded:
     line : CommandDelayLine
         To the true mirror.
     interaction : (m, commands) array
-    phase : (k, m) array
-        From slopes to what is compared, see `residual_phase`.
-    learnt, plain : callable
-        Return a controller, given where its commands go.
     prior_std_px : (m,) array, optional
         Prior of the estimator, whose mean is `expected`. Default: it has none.
     noise_factor : float
@@ -54,15 +51,12 @@ class Guarded:
         See `choice.prepare`.
     """
 
-    undoes_prior = False
+    is_guarded = True
 
     def __init__(
         self,
         line: CommandDelayLine,
         interaction: Floats,
-        phase: Floats,
-        learnt: Callable[[CommandDelayLine], Controller],
-        plain: Callable[[CommandDelayLine], Controller],
         *,
         prior_std_px: Floats | None = None,
         noise_factor: float = 1.0,
@@ -70,12 +64,10 @@ class Guarded:
         plain_residual: float = math.inf,
         plain_frames: int = 0,
     ) -> None:
-        self._line, self._interaction, self._phase = line, interaction, phase
+        super().__init__(line, interaction)
         sizes = interaction.shape[1], line.delay_frames, line.largest
         self._lines = [CommandDelayLine(*sizes) for _ in range(2)]
-        makers = (learnt, plain)
-        self.controllers = [make(own_line) for make, own_line in zip(makers, self._lines, strict=True)]
-        self.prior_std_px, self._noise_factor = prior_std_px, noise_factor
+        self.prior_std_px, self._noise_factor = prior_std_px, float(noise_factor)
         self._guard, self._offset = np.zeros(GUARD_NUMBERS), np.zeros(interaction.shape[1])
         prepare(
             self._guard, prefers_plain=prefers_plain, plain_residual=plain_residual, plain_frames=plain_frames
@@ -84,29 +76,92 @@ class Guarded:
     @property
     def chosen(self) -> int:
         """0: the learnt controller; 1: the plain one."""
+        self.complete()
+        return self._chosen
+
+    @property
+    def _chosen(self) -> int:
+        """The same, while a frame is not complete."""
         return int(self._guard[CHOSEN])
 
-    def expected(self) -> Expected:
-        """See `Controller`."""
-        mean, std = self.controllers[self.chosen].expected()
-        offset = self._line.acting - self._lines[self.chosen].acting
-        return Expected(mean + self._interaction @ offset, std)
-
     def fall_back(self) -> None:
-        """Let the plain controller drive the mirror until the learnt one leaves less."""
+        """See `Controller`."""
+        self.complete()
         self._guard[CHOSEN] = 1.0
 
     def begin(self) -> None:
         """See `Controller`; both restart from there."""
-        for controller, line in zip(self.controllers, self._lines, strict=True):
-            line.hold(self._line.latest)
-            controller.begin()
+        for line in self._lines:
+            line.hold(self.line.latest)
         restart(self._guard)
         self._guard[SENT] = self._guard[CHOSEN]
 
     def hand_over(self) -> None:
-        """Let the next commands follow on from the latest, which another filter has sent."""
+        """See `Controller`."""
         self._guard[SENT] = -1.0
+
+    def _choose(self, learnt: float, plain: float) -> bool:
+        """Select a controller by the squared residuals; return whether the learnt one has failed.
+
+        The plain one then continues from the mirror's commands: its own are as wrong as the model.
+        """
+        before = self._chosen
+        CHOOSE(self._guard, learnt, plain)
+        has_failed = self._chosen > before and bool(self._guard[EXCESS] > MOST_EXCESS)
+        if has_failed:
+            self._lines[1].copy_from(self.line)
+            self._guard[SENT], self._guard[BLENDED] = 1.0, 0.0
+        return has_failed
+
+    def _send(self) -> None:
+        """Send the chosen controller's command, with what is left of the offset."""
+        command, guard = self._lines[self._chosen].latest, self._guard
+        if guard[SENT] != guard[CHOSEN]:
+            guard[SENT], guard[BLENDED] = guard[CHOSEN], HANDOVER_FRAMES
+            self._offset = self.line.latest - command
+        guard[BLENDED] = max(0.0, guard[BLENDED] - 1.0)
+        self.line.put(command + guard[BLENDED] / HANDOVER_FRAMES * self._offset)
+
+
+class Guarded(Guard):
+    """Any two controllers side by side.
+
+    Parameters
+    ----------
+    line : CommandDelayLine
+    interaction : (m, commands) array
+    phase : (k, m) array
+        From slopes to what is compared, see `residual_phase`.
+    learnt, plain : callable
+        Return a controller, given where its commands go.
+    options
+        As for `Guard`.
+    """
+
+    def __init__(
+        self,
+        line: CommandDelayLine,
+        interaction: Floats,
+        phase: Floats,
+        learnt: Callable[[CommandDelayLine], Controller],
+        plain: Callable[[CommandDelayLine], Controller],
+        **options: Any,
+    ) -> None:
+        super().__init__(line, interaction, **options)
+        self._phase, makers = phase, (learnt, plain)
+        self._controllers = [make(own_line) for make, own_line in zip(makers, self._lines, strict=True)]
+
+    def expected(self) -> Expected:
+        """See `Controller`."""
+        mean, std = self._controllers[self.chosen].expected()
+        offset = self.line.acting - self._lines[self.chosen].acting
+        return Expected(mean + self._interaction @ offset, std)
+
+    def begin(self) -> None:
+        """See `Controller`."""
+        super().begin()
+        for controller in self._controllers:
+            controller.begin()
 
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
@@ -114,37 +169,15 @@ class Guarded:
         """See `Controller`."""
         expected = self.expected().mean_px
         slopes, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
-        open_loop = slopes - self._interaction @ self._line.acting
+        open_loop = slopes - self._interaction @ self.line.acting
         error = np.sqrt(self._noise_factor * variance)
         covariance = None  # of an estimator with a prior, that of the frame alone is not known
         if covariance_xy_px2 is not None and self.prior_std_px is None:
             covariance = self._noise_factor * covariance_xy_px2
         variances = []
-        for controller, line in zip(self.controllers, self._lines, strict=True):
+        for controller, line in zip(self._controllers, self._lines, strict=True):
             residual = open_loop + self._interaction @ line.acting
             variances.append(float(np.square(self._phase @ (trust * residual)).sum()))
             controller.update(as_estimated(residual, trust, controller), error, covariance)
         self._send()
         self._choose(*variances)
-
-    def _choose(self, learnt: float, plain: float) -> bool:
-        """Select a controller by the squared residuals; return whether the learnt one has failed.
-
-        The plain one then continues from the mirror's commands: its own are as wrong as the model.
-        """
-        before = self.chosen
-        CHOOSE(self._guard, learnt, plain)
-        has_failed = self.chosen > before and bool(self._guard[EXCESS] > MOST_EXCESS)
-        if has_failed:
-            self._lines[1].copy_from(self._line)
-            self._guard[SENT], self._guard[BLENDED] = 1.0, 0.0
-        return has_failed
-
-    def _send(self) -> None:
-        """Send the chosen controller's command, with what is left of the offset."""
-        command, guard = self._lines[self.chosen].latest, self._guard
-        if guard[SENT] != guard[CHOSEN]:
-            guard[SENT], guard[BLENDED] = guard[CHOSEN], HANDOVER_FRAMES
-            self._offset = self._line.latest - command
-        guard[BLENDED] = max(0.0, guard[BLENDED] - 1.0)
-        self._line.put(command + guard[BLENDED] / HANDOVER_FRAMES * self._offset)

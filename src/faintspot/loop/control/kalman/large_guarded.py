@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 
 from faintspot.loop.control.base import Expected
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.integrator import Integrator
-from faintspot.loop.control.kalman.guarded import Guarded
+from faintspot.loop.control.kalman.guarded import Guard
 from faintspot.loop.control.kalman.local_covariance import replies
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor
-from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.loop.control.reconstructor import Reconstructor
 from faintspot.loop.control.slope_product import SlopeProduct
 from faintspot.loop.control.telemetry import without_prior
@@ -48,8 +46,8 @@ class _Frame(NamedTuple):
         return (1 - self.trust) * (self.by_plain - self.by_latest_plain)
 
 
-class LargeGuarded(Guarded):
-    """`Guarded` with `Predictive` and the integrator, for large sensors.
+class LargeGuarded(Guard):
+    """Guard of `Predictive` and the integrator, for large sensors.
 
     Reading matrices takes most of the time of a frame. They are kept in float32. The predictive command is
     linear in what the slopes differ from their prediction; the matrix of that is computed beforehand, and so
@@ -69,8 +67,10 @@ class LargeGuarded(Guarded):
     plain_gain, leak : float
         Of the integrator.
     options
-        As for `Guarded`.
+        As for `Guard`.
     """
+
+    settle_frames = 0  # a frame has no time for two filters
 
     def __init__(
         self,
@@ -83,16 +83,8 @@ class LargeGuarded(Guarded):
         leak: float,
         **options: Any,
     ) -> None:
-        predictor = LocalPredictor(arrays)
-
-        def learnt(line: CommandDelayLine) -> Predictive:
-            return Predictive(line, interaction, predictor, reconstructor.clean, from_latest=True)
-
-        def plain(line: CommandDelayLine) -> Integrator:
-            return Integrator(line, interaction, reconstructor, plain_gain, leak)
-
-        super().__init__(line, interaction, phase_of_commands, learnt, plain, **options)
-        self._predictor, self._gain, self._keep = predictor, plain_gain, 1.0 - leak
+        super().__init__(line, interaction, **options)
+        self._predictor, self._gain, self._keep = LocalPredictor(arrays), plain_gain, 1.0 - leak
         self._product, self._reconstruct = SlopeProduct(interaction), SlopeProduct(reconstructor.matrix)
         self._clean, self._compare = SlopeProduct(reconstructor.clean), SlopeProduct(phase_of_commands)
         matrices = replies(arrays, line.delay_frames)
@@ -113,19 +105,15 @@ class LargeGuarded(Guarded):
 
     def expected(self) -> Expected:
         """See `Controller`."""
-        self._complete()
-        if self.chosen == _PLAIN:
+        self.complete()
+        if self._chosen == _PLAIN:
             return Expected(self._held - self._of_line(_PLAIN, 0), None)
         return Expected(self._predicted, self._predictor.std_px)
 
-    def fall_back(self) -> None:
-        """See `Guarded`."""
-        self._complete()
-        super().fall_back()
-
     def begin(self) -> None:
-        """See `Controller`; both restart from there."""
+        """See `Controller`; open-loop slopes are assumed to equal the mirror's correction."""
         super().begin()
+        self._predictor.begin(-(self._interaction @ self.line.latest))
         self._frame, self._restarted = None, True
 
     def update(
@@ -137,7 +125,7 @@ class LargeGuarded(Guarded):
         caused = self._of_line(_LEARNT, 1), self._of_line(_PLAIN, 1), self._of_line(_PLAIN, 0)
         open_loop, surprise = slopes - self._held, slopes - self._predicted
         self._frame = frame = _Frame(open_loop, surprise, self._noise_factor * variance, trust, *caused)
-        if self.chosen == _LEARNT:
+        if self._chosen == _LEARNT:
             self._predict(frame)
         else:
             residual = trust * (slopes - (self._held - frame.by_plain))
@@ -145,13 +133,10 @@ class LargeGuarded(Guarded):
         self._send()
 
     def begin_product(self, threads: int, scale: float) -> Sequence[ProductPart]:
-        """Return the parts of the next frame's product with its slopes; see `SlopeProduct.parts`.
-
-        There are none before everything is known of the frame before, and of estimators with a prior.
-        """
-        if self._frame is not None or self._held_at != self._line.next_row or self.prior_std_px is not None:
+        """See `Controller`; there are none before a frame is complete, and of estimators with a prior."""
+        if self._frame is not None or self._held_at != self.line.next_row or self.prior_std_px is not None:
             return ()
-        if self.chosen == _PLAIN:
+        if self._chosen == _PLAIN:
             return self._reconstruct.parts(threads, scale, self._held - self._of_line(_PLAIN, 1))
         return self._replies[self._level].parts(threads, scale, self._predicted)
 
@@ -165,8 +150,8 @@ class LargeGuarded(Guarded):
         line = self._lines[_PLAIN]
         line.put(self._keep * line.latest - self._gain * wavefront)
 
-    def _complete(self) -> None:
-        """Complete the previous frame, and compute what does not need the slopes of this one."""
+    def complete(self) -> None:
+        """See `Controller`; also compute what does not need the slopes of the next frame."""
         frame, self._frame = self._frame, None
         if frame is not None:
             learnt, plain = self._compare.several(*self._follow_up(frame))
@@ -174,13 +159,13 @@ class LargeGuarded(Guarded):
             self._predictor.advance()
             if self._choose(float(learnt @ learnt), float(plain @ plain)):
                 self._caused[_PLAIN] = self._product.several(*self._lines[_PLAIN].rows)
-        if frame is not None or self._restarted or self._held_at != self._line.next_row:
+        if frame is not None or self._restarted or self._held_at != self.line.next_row:
             self._follow_mirror(is_new=frame is not None or self._restarted)
 
     def _follow_up(self, frame: _Frame) -> Floats:
         """Compute the command that was not sent; return the wavefronts that both leave, as commands."""
         residuals, missing = frame.residuals, frame.missing
-        if self.chosen == _PLAIN:
+        if self._chosen == _PLAIN:
             self._predict(frame)
             return self._reconstruct.several(*residuals)
         if not missing.any():
@@ -193,7 +178,7 @@ class LargeGuarded(Guarded):
 
     def _follow_mirror(self, *, is_new: bool) -> None:
         """Compute the slopes that commands cause and, if the latest are new, the prediction."""
-        lines, mirror = self._lines, self._line
+        lines, mirror = self._lines, self.line
         commands = [line.latest for line in lines] if is_new else []
         same = [np.array_equal(line.acting, mirror.acting) for line in lines]
         if not any(same):

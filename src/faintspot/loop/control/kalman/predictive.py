@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Expected
+from faintspot.loop.control.base import Controller, Expected, Predictor
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.kalman.local_predictor import LocalPredictor
-from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2, SlopePredictor
+from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.loop.control.noise import add_noise
 
 Floats = NDArray[np.float64]
 
 
-class PseudoOpenLoop:
+class PseudoOpenLoop(Controller):
     """Pseudo-open-loop control: maximum a posteriori wavefront from open-loop slopes.
 
     Gilles 2005, Appl. Opt. 44, 993. Slopes count by their noise in each frame, x and y by their
@@ -46,21 +45,14 @@ class PseudoOpenLoop:
         reconstruct: Floats,
         gain: float,
     ) -> None:
-        self._line, self._interaction, self._gain = line, interaction, gain
-        self._now, self._ahead = now_px2, reconstruct @ ahead_px2
-
-    def expected(self) -> Expected:
-        """See `Controller`."""
-        return Expected(self._interaction @ (self._line.acting - self._line.latest), None)
-
-    def begin(self) -> None:
-        """See `Controller`; the delay line is the only state."""
+        super().__init__(line, interaction)
+        self._gain, self._now, self._ahead = gain, now_px2, reconstruct @ ahead_px2
 
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
     ) -> None:
         """See `Controller`."""
-        line, gain = self._line, self._gain
+        line, gain = self.line, self._gain
         variance = np.minimum(np.square(standard_error_px), LARGEST_VARIANCE_PX2)
         noisy = self._now.copy()
         share = gain / (2 - gain)
@@ -69,14 +61,14 @@ class PseudoOpenLoop:
         line.put((1 - gain) * line.latest - gain * wavefront)
 
 
-class Predictive:
+class Predictive(Controller):
     """Predictive control: commands from the Kalman filter's prediction for the frame in which they act.
 
     Parameters
     ----------
     line : CommandDelayLine
     interaction : (m, commands) array
-    predictor : SlopePredictor or LocalPredictor
+    predictor : Predictor
     reconstruct : (commands, m) array
         The wavefront, as commands that cause it, from open-loop slopes without noise.
     from_latest : bool
@@ -90,30 +82,30 @@ class Predictive:
         self,
         line: CommandDelayLine,
         interaction: Floats,
-        predictor: SlopePredictor | LocalPredictor,
+        predictor: Predictor,
         reconstruct: Floats,
         *,
         from_latest: bool = False,
     ) -> None:
-        self._line, self._interaction, self.predictor = line, interaction, predictor
-        self._reconstruct, self._from_latest = reconstruct, from_latest
+        super().__init__(line, interaction)
+        self.predictor, self._reconstruct, self._from_latest = predictor, reconstruct, from_latest
 
     def expected(self) -> Expected:
         """See `Controller`."""
-        mean = self.predictor.mean_px + self._interaction @ self._line.acting
+        mean = self.predictor.mean_px + self._interaction @ self.line.acting
         return Expected(mean, self.predictor.std_px)
 
     def begin(self) -> None:
         """See `Controller`; open-loop slopes are assumed to equal the mirror's correction."""
-        self.predictor.begin(-(self._interaction @ self._line.latest))
+        self.predictor.begin(-(self._interaction @ self.line.latest))
 
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
     ) -> None:
         """See `Controller`."""
-        open_loop = slopes_px - self._interaction @ self._line.acting
+        open_loop = slopes_px - self._interaction @ self.line.acting
         self.predictor.correct(open_loop, np.square(standard_error_px), covariance_xy_px2)
-        start = self._line.latest if self._from_latest else np.zeros_like(self._line.latest)
-        open_loop_ = self.predictor.ahead(self._line.delay_frames) + self._interaction @ start
-        self._line.put(start - self._reconstruct @ open_loop_)
+        start = self.line.latest if self._from_latest else np.zeros_like(self.line.latest)
+        open_loop_ = self.predictor.ahead(self.line.delay_frames) + self._interaction @ start
+        self.line.put(start - self._reconstruct @ open_loop_)
         self.predictor.advance()
