@@ -20,7 +20,7 @@ from tests.experiments.night.recorded_cases import write_recording
 from tests.loop.telemetry.alternation_cases import MATRIX, PIXEL_ARCSEC, SIDE, SUBAPERTURE_M, alternating
 from tests.loop.telemetry.loop_cases import recorded
 
-from faintspot.engine.pixels.pixel_segment import FOLDER
+from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes

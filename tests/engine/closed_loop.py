@@ -18,7 +18,7 @@ from tests.loop.simulation.loop_cases import faint
 import faintspot as fs
 from faintspot.engine.engine import Engine
 from faintspot.engine.loop.control_loop import ControlLoop
-from faintspot.engine.pixels.pixel_segment import FOLDER
+from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryReader
 from faintspot.engine.telescope.simulated_telescope import TRUTH, SimulatedTelescope
 from faintspot.loop.control.configuration import Control, load_control

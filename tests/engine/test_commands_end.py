@@ -11,7 +11,7 @@ from tests.engine.commands import start
 from tests.patience import LIMIT_S, wait_for
 
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.pixel_segment import FOLDER
+from faintspot.engine.pixels.segment import FOLDER
 
 pyshmem = pytest.importorskip("pyshmem")
 pytestmark = [

@@ -16,7 +16,7 @@ from tests.engine.bench import SETTINGS, Bench, make, simulated
 from tests.patience import LIMIT_S
 
 from faintspot.engine.path.lateness import CAUSES, INCOMPLETE
-from faintspot.engine.pixels.pixel_segment import FOLDER
+from faintspot.engine.pixels.segment import FOLDER
 
 pyshmem = pytest.importorskip("pyshmem")
 

@@ -16,7 +16,7 @@ from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written
 
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime.record import export, record
-from faintspot.engine.pixels.pixel_segment import FOLDER
+from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
 

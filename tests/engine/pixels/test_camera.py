@@ -23,7 +23,7 @@ from faintspot.cli.realtime.camera import camera
 from faintspot.engine.pixels import camera as camera_module
 from faintspot.engine.pixels.camera import Camera, SpotMotion, readout_type
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.pixel_segment import FOLDER
+from faintspot.engine.pixels.segment import FOLDER
 from faintspot.slopes.simulate import Detector
 
 pytestmark = [

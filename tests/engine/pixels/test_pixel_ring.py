@@ -18,8 +18,8 @@ from tests.patience import LIMIT_S, wait_for
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.pixel_ring import ARRIVALS, CLOSED, FRAME, ROWS, PixelRing
-from faintspot.engine.pixels.pixel_segment import FOLDER
+from faintspot.engine.pixels.pixel_ring import ARRIVALS, FRAME, ROWS, PixelRing
+from faintspot.engine.pixels.segment import CLOSED, FOLDER
 
 pytestmark = [
     pytest.mark.machine_time("clocks, threads and other processes"),
@@ -130,7 +130,7 @@ def test_rows_frames_and_laps(name: str) -> None:
     with PixelRing.create(name, SHAPE, np.uint16, slots=3) as ring, PixelRing.attach(name) as reader:
         assert (reader.name, reader.shape, reader.dtype.str, reader.slots) == (name, SHAPE, "<u2", 3)
         assert reader.creator_pid == os.getpid()
-        assert reader.generation == ring.generation
+        assert reader.identity == ring.identity
         assert reader.progress() == (-1, 0)
         assert not reader.intact(0)
         slot = ring.begin()
@@ -280,15 +280,15 @@ def test_the_ring_of_a_killed_writer_is_replaced(name: str) -> None:
         assert is_stale(reader)
         np.testing.assert_array_equal(reader.slot(0), 9.0)  # the old memory stays as it was
         again = PixelRing.attach(name)
-        assert again.generation == ring.generation != reader.generation
+        assert again.identity == ring.identity != reader.identity
         assert again.shape == (8, 8)
         assert not is_stale(again)
 
 
 @pytest.mark.usefixtures("killed_writer")
 def test_a_cut_ring_of_a_killed_writer_is_replaced(name: str) -> None:
-    os.truncate(FOLDER / name, 4096)
-    with pytest.raises(InputError, match="cut short: 4096 of"):
+    os.truncate(FOLDER / name, 8192)
+    with pytest.raises(InputError, match="cut short: 8192 of"):
         PixelRing.attach(name)
     with PixelRing.create(name, SHAPE, np.float32):
         assert not is_stale(PixelRing.attach(name))
@@ -312,7 +312,7 @@ def test_of_many_that_replace_a_dead_ring_one_wins(name: str) -> None:
         thread.join()
     assert len(made) == 1
     assert len(said) == 7
-    assert PixelRing.attach(name).generation == made[0].generation
+    assert PixelRing.attach(name).identity == made[0].identity
     made[0].close()
 
 

@@ -19,8 +19,8 @@ from faintspot.cli.realtime import sources as realtime_sources
 from faintspot.cli.realtime.sources import replay
 from faintspot.engine.pixels import replay as replay_module
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.pixel_segment import FOLDER
 from faintspot.engine.pixels.replay import Replay, ring_type
+from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.requests.scheduling import quick_switching
 from faintspot.io import FrameSource, open_frames
 

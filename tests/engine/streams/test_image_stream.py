@@ -17,7 +17,7 @@ from tests.patience import LIMIT_S, wait_for
 
 from faintspot.base.errors import InputError
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.pixel_segment import FOLDER
+from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.streams.bridge import StreamBridge
 from faintspot.engine.streams.image_layout import IncompatibleStreamError
 from faintspot.engine.streams.image_stream import ImageStream, ImageStreamWriter

@@ -16,7 +16,7 @@ from tests.patience import LIMIT_S
 
 from faintspot.base.errors import InputError
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.pixel_segment import FOLDER
+from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryReader, TelemetryRing
 from faintspot.slopes.sensor.layout import Layout
 
@@ -184,7 +184,7 @@ def test_the_ring_of_a_dead_engine_is_replaced(name: str) -> None:
     with process(write_on, name, ready, enough) as writer:
         assert ready.wait(LIMIT_S)
         reader = TelemetryReader.attach(name)
-        with pytest.raises(InputError, match=f"telemetry of {name}: .*process {writer.pid} "):
+        with pytest.raises(InputError, match=f"{name}_telemetry: process {writer.pid} already writes"):
             TelemetryRing.create(name, LAYOUT)
     assert is_stale(reader)
     with TelemetryRing.create(name, LAYOUT) as ring:
@@ -196,7 +196,7 @@ def test_the_ring_of_a_dead_engine_is_replaced(name: str) -> None:
 def test_what_is_not_telemetry_is_refused(name: str, tmp_path: Path) -> None:
     with (
         PixelRing.create(f"{name}_telemetry", (4, 4), np.uint8),
-        pytest.raises(InputError, match="expected telemetry"),
+        pytest.raises(InputError, match="expected a ring of telemetry, got a pixel ring"),
     ):
         TelemetryReader.attach(name)
     for wrong in ({"records": 1}, {"records": 1e9}, {"image_slots": 0}):

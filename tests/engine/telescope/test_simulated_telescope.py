@@ -31,7 +31,7 @@ from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime.telescope import telescope_set, telescope_status
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.pixel_segment import FOLDER
+from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
 from faintspot.engine.requests.requests import ControlServer, request
 from faintspot.engine.telescope.orders import Conditions

@@ -4,126 +4,81 @@ One process writes; any number of processes of the same user read. A camera neve
 using pixels, a reader checks with `PixelRing.intact` whether they were overwritten meanwhile. One reader, the
 engine, publishes its position (`PixelRing.follow`), so that a writer that can wait loses no frame.
 
-Memory layout, in bytes from the start of the segment::
+The cells of the segment (see `faintspot.engine.pixels.segment`) are: closed, arriving frame, its complete
+rows, arrivals (frames begun so far), then one for each slot with the frame number (-1 while it is replaced),
+arrival and time of the last row. Frame n lies in slot n % slots.
 
-    0      header, written once, with a checksum: magic, version, creator, generation, shape, type, slots
-        128    written by the engine: number of arrivals done, frames lost, its process id and start time
-        256    progress cells, 128 bytes apart to avoid sharing a cache line or a prefetched pair of lines:
-               arriving frame, its complete rows, closed, arrivals (frames begun so far),
-               then one cell per slot: frame number (-1 while it is replaced), arrival, time of its last row
-    then   the slots, each of (rows, columns) pixels; frame n lies in slot n % slots
-
-Nothing is locked. The writer stores pixels first and progress afterwards, each cell as one aligned 8-byte
-store. The reader loads progress first, and checks the slot's cell again after using the pixels.
+The writer stores pixels first and progress afterwards, each number as one aligned 8-byte store. The reader
+loads progress first, and checks the slot's cell again after using the pixels.
 `faintspot.slopes.kernels.compilation.ordered` enforces this order on processors with weaker memory ordering.
 """
 
 from __future__ import annotations
 
-import mmap
 import os
 import time
-from contextlib import suppress
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.pixel_segment import (
-    ARRIVALS,
-    CELL_BYTES,
-    CLOSED,
-    FIRST_SLOT,
-    FOLDER,
+from faintspot.engine.pixels.processes import process_lives, process_start
+from faintspot.engine.pixels.segment import (
+    CELL,
     FOLLOWED,
     FOLLOWER,
     FOLLOWER_START,
-    FRAME,
     LOST,
-    ROWS,
-    SLOT_ARRIVAL,
-    SLOT_FRAME,
-    SLOT_TIME,
-    Header,
-    cells_of,
-    create_segment,
-    follower_of,
-    identity_of,
-    new_header,
-    open_segment,
-    segment_path,
+    Segment,
+    up_to_pages,
 )
-from faintspot.engine.pixels.processes import process_lives, process_start
 from faintspot.slopes.kernels.compilation.ordered import fence, load, store
 
-__all__ = [
-    "ARRIVALS",
-    "CLOSED",
-    "FIRST_SLOT",
-    "FRAME",
-    "ROWS",
-    "SLOT_ARRIVAL",
-    "SLOT_FRAME",
-    "SLOT_TIME",
-    "PixelRing",
-]
+FRAME, ROWS, ARRIVALS, FIRST_SLOT = range(1, 5)
+"""Rows of `PixelRing.cells`; the value is in column 0."""
+SLOT_FRAME, SLOT_ARRIVAL, SLOT_TIME = range(3)
+"""Columns of `PixelRing.cells` from row FIRST_SLOT on."""
 
-_LINE = CELL_BYTES // 8
+_DTYPES = ("u1", "u2", "u4", "i2", "i4", "f4", "f8")
+_LARGEST_SIDE = 1 << 16
 
 
-class PixelRing:
+class PixelRing(Segment):
     """A ring of frames in shared memory, made by `create` (the writer) or `attach` (a reader).
-
-    Readable and writable by the same user only. As a context manager it closes itself.
 
     Attributes
     ----------
-    name : str
     shape : (int, int)
         Rows and columns of a frame.
     dtype : numpy.dtype
     slots : int
         Frames in the ring.
-    generation : int
-        Number that differs each time the ring is created.
-    creator_pid : int
-        Process that created it.
-    cells : ndarray, int64, shape (4 + slots, 16)
-        Progress cells for compiled readers; see `FRAME`, `SLOT_FRAME` and their
-        neighbours.
     pixels : ndarray, shape (slots, rows, columns)
         All slots, read-only for a reader.
-    follower : ndarray, int64, shape (4,)
-        Progress of the engine.
     """
 
-    def __init__(
-        self,
-        name: str,
-        memory: mmap.mmap,
-        header: Header,
-        identity: tuple[int, int],
-        follower: NDArray[np.int64] | None = None,
-    ) -> None:
+    what, writer = "pixel ring", "camera"
+
+    def __init__(self, *parts: Any) -> None:
         """Use `create` or `attach` instead."""
-        self.name, self.slots = name, header.slots
-        self.shape, self.dtype = (header.rows, header.columns), np.dtype(header.dtype)
-        self.generation, self.creator_pid = header.generation, header.pid
-        self._creator_start, self._identity = header.start, identity
-        self.cells = cells_of(memory, header)
-        self._flat = self.cells.reshape(-1)
-        itemsize = self.dtype.itemsize
+        super().__init__(*parts)
+        rows, columns = self.description["shape"]
+        self.shape, self.slots = (rows, columns), self.description["slots"]
+        self.dtype = np.dtype(self.description["dtype"])
+        strides = _slot_bytes(self.description), columns * self.dtype.itemsize, self.dtype.itemsize
         self.pixels: NDArray[Any] = np.ndarray(
-            (header.slots, *self.shape),
-            self.dtype,
-            memory,
-            offset=header.first_pixel,
-            strides=(header.slot_bytes, header.columns * itemsize, itemsize),
+            (self.slots, rows, columns), self.dtype, self.rings["pixels"].data, strides=strides
         )
-        self.follower = follower_of(memory) if follower is None else follower
-        self._writes = self.cells.flags.writeable
-        self._open, self._follows = True, False
+        self._follows = False
+
+    @classmethod
+    def contents(cls, description: Mapping[str, Any]) -> tuple[int, dict[str, tuple[np.dtype[Any], int]]]:
+        """See `Segment`."""
+        slots = description["slots"]
+        return FIRST_SLOT + slots, {"pixels": (np.dtype(np.uint8), slots * _slot_bytes(description))}
 
     @classmethod
     def create(cls, name: str, shape: tuple[int, int], dtype: DTypeLike, *, slots: int = 4) -> PixelRing:
@@ -148,10 +103,18 @@ class PixelRing:
             When a living process owns the name, something else has it, shared memory is short, or a value is
             out of range.
         """
-        path = segment_path(name)
-        header = new_header(shape, dtype, slots)
-        memory, identity = create_segment(path, header)
-        return cls(name, memory, header, identity)
+        sides = numbers_between("shape", shape, 1, _LARGEST_SIDE, integer=True)
+        if sides.shape != (2,):
+            raise InputError(f"shape: expected (rows, columns), got shape {sides.shape}")
+        pixel = np.dtype(dtype)
+        if pixel.str[1:] not in _DTYPES or not pixel.isnative:
+            raise InputError(f"dtype = {pixel.str}: expected one of {', '.join(_DTYPES)}, native byte order")
+        count = int(number_between("slots", slots, 2, 1024, integer=True))
+        return cls._created(name, {"shape": sides.astype(int), "dtype": pixel.str, "slots": count})
+
+    def _prepare(self) -> None:
+        self.cells[FRAME, 0] = -1
+        self.cells[FIRST_SLOT:, SLOT_FRAME] = -1
 
     @classmethod
     def attach(cls, name: str, *, follows: bool = False) -> PixelRing:
@@ -162,7 +125,7 @@ class PixelRing:
         InputError
             When there is no such ring, or it is not a complete pixel ring of this version and user.
         """
-        return cls(name, *open_segment(segment_path(name), follows))
+        return cls._attached(name, follows=follows)
 
     # ---- writer
 
@@ -172,23 +135,23 @@ class PixelRing:
         `frame_number` may repeat or skip; by default it is one more than the last, from 0. A frame that is
         not ended stays incomplete.
         """
-        if not (self._writes and self._open):
+        if not (self._writes and self._is_open):
             raise InputError(f"pixel ring {self.name}: writable by its creator only, until closed")
         flat = self._flat
         number = self._look(FRAME) + 1 if frame_number is None else int(frame_number)
         if number < 0:
             raise InputError(f"frame_number = {number}: expected a number of at least 0")
         slot = number % self.slots
-        header = (FIRST_SLOT + slot) * _LINE
+        header = (FIRST_SLOT + slot) * CELL
         arrival = self._look(ARRIVALS) + 1
         # The order is the protocol: the slot's old frame number is cleared first, the new one is set last.
         store(flat, header + SLOT_FRAME, -1)
         store(flat, header + SLOT_TIME, 0)
         store(flat, header + SLOT_ARRIVAL, arrival)
-        store(flat, ROWS * _LINE, 0)
+        store(flat, ROWS * CELL, 0)
         store(flat, header + SLOT_FRAME, number)
-        store(flat, FRAME * _LINE, number)
-        store(flat, ARRIVALS * _LINE, arrival)
+        store(flat, FRAME * CELL, number)
+        store(flat, ARRIVALS * CELL, arrival)
         fence()  # before its first pixel is overwritten
         view: NDArray[Any] = self.pixels[slot]
         return view
@@ -202,8 +165,8 @@ class PixelRing:
             )
         if rows == self.shape[0]:
             header = FIRST_SLOT + number % self.slots
-            store(self._flat, header * _LINE + SLOT_TIME, time.monotonic_ns())
-        store(self._flat, ROWS * _LINE, rows)
+            store(self._flat, header * CELL + SLOT_TIME, time.monotonic_ns())
+        store(self._flat, ROWS * CELL, rows)
 
     def end(self) -> None:
         """Mark the frame as complete."""
@@ -254,23 +217,6 @@ class PixelRing:
         """Frames begun since the ring was created; counts up even when a frame number repeats."""
         return self._look(ARRIVALS)
 
-    @property
-    def closed(self) -> bool:
-        """Whether the writer has closed the ring."""
-        return bool(self._look(CLOSED))
-
-    @property
-    def stale(self) -> bool:
-        """Whether no more frames come: the creator has died, or the name leads to another ring or to none.
-
-        This asks the operating system (tens of microseconds): do not use it for every frame.
-        """
-        try:
-            named = identity_of(os.stat(FOLDER / self.name))
-        except OSError:
-            return True
-        return named != self._identity or not process_lives(self.creator_pid, self._creator_start)
-
     def progress(self) -> tuple[int, int]:
         """Return the number of the arriving frame, -1 before the first, and the number of its complete rows.
 
@@ -316,30 +262,8 @@ class PixelRing:
         holds_frame = self._look(slot, SLOT_FRAME) == frame
         return holds_frame and (arrival is None or self._look(slot, SLOT_ARRIVAL) == arrival)
 
-    # ---- both
 
-    def _look(self, row: int, column: int = 0) -> int:
-        """Return a cell; everything that its writer wrote before is visible from here on."""
-        value: int = load(self._flat, row * _LINE + column)
-        return value
-
-    def close(self) -> None:
-        """Close the ring; its creator also removes its name and notifies readers. Repeated calls do nothing.
-
-        Views that are still in use keep their memory.
-        """
-        if not self._open:
-            return
-        self._open = False
-        if self._writes and self.creator_pid == os.getpid():
-            store(self._flat, CLOSED * _LINE, 1)
-            path = FOLDER / self.name
-            with suppress(OSError):
-                if identity_of(path.stat()) == self._identity:
-                    path.unlink()
-
-    def __enter__(self) -> PixelRing:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+def _slot_bytes(description: Mapping[str, Any]) -> int:
+    """Return the bytes from one slot to the next, whole pages."""
+    rows, columns = description["shape"]
+    return up_to_pages(rows * columns * np.dtype(description["dtype"]).itemsize)

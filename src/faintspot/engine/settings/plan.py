@@ -13,8 +13,7 @@ from faintspot.engine.path.python_path import PythonPath, tried
 from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.time_limit import call_within
 from faintspot.engine.path.workers import Workers
-from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.pixel_segment import ARRIVALS, ROWS
+from faintspot.engine.pixels.pixel_ring import ARRIVALS, ROWS, PixelRing
 from faintspot.engine.settings.interleaving import Interleaving
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.registry import estimator_named

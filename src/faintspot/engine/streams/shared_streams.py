@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.engine.pixels.pixel_segment import FOLDER, new_memory
 from faintspot.engine.pixels.processes import process_age_s
+from faintspot.engine.pixels.segment import FOLDER, new_memory
 
 LOCK_LIMIT_S = 1.0
 _LOOK_S = 0.01

@@ -4,24 +4,15 @@ The engine's thread writes; any number of processes of the same user read. The w
 that is too slow loses the oldest records and gets their number. One segment, NAME_telemetry, holds three
 rings: a record for every frame, pixel images of some frames, and changes of settings.
 
-The segment is a pixel ring with a single slot of bytes (see `engine.pixels.pixel_segment`), so that it
-is created, recognised as stale and replaced in the same way. The slot holds::
-
-    magic, length and checksum of the description; the description, JSON text
-    three counts, 128 bytes apart: records, images, changes ever written
-        the three rings; item k of a ring is in place k % length
-
-An item is written first and counted afterwards (`kernels.compilation.ordered`). The next item overwrites the
-oldest, so a reader already counts the oldest as lost.
+Item k of a ring is in place k % length (see `engine.pixels.segment`). An item is written first and counted
+afterwards (`kernels.compilation.ordered`). The next item overwrites the oldest, which a reader already counts
+as lost.
 """
 
 from __future__ import annotations
 
-import os
-import secrets
 import struct
 import time
-import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -29,61 +20,41 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between
-from faintspot.base.closing import Closing
-from faintspot.base.errors import InputError
 from faintspot.base.json_text import parse_json, to_json
-from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.pixel_segment import Header, create_segment, segment_path
-from faintspot.engine.pixels.processes import process_start
 from faintspot.engine.telemetry.segment import (
     CHANGE_BYTES,
-    CHANGE_SLOTS,
-    PAGE,
-    Rings,
+    TelemetrySegment,
     image_type,
-    kinds_of,
     layout_values,
     record_type,
-    up_to_pages,
 )
-from faintspot.slopes.kernels.compilation.ordered import fence
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 
 __all__ = ["TelemetryReader", "TelemetryRing"]
 
-_MAGIC = b"fstelem1"
-_START = struct.Struct("<8sII")
 _HEAD = struct.Struct("<10q")
-_BYTE = np.dtype(np.uint8)
 _RECORD_BYTES, _IMAGE_BYTES = 1 << 25, 1 << 24  # small enough for a container's 64 MiB of shared memory
 
 
-class TelemetryRing(Closing):
+class TelemetryRing(TelemetrySegment):
     """Writer of an engine's telemetry, made by `create`. As a context manager it closes itself.
 
     Records, images and changes may be written from three threads, each kind from one thread only.
-
-    Attributes
-    ----------
-    name : str
-        Name of the engine.
     """
 
-    def __init__(self, name: str, ring: PixelRing, begin: int, description: Mapping[str, Any]) -> None:
+    def __init__(self, *parts: Any) -> None:
         """Use `create` instead."""
-        self.name, self._ring = name, ring
-        self._memory = ring.pixels[0, 0].data
-        self._rings = rings = Rings(ring.pixels[0, 0], begin, description)
-        self._written = 0
-        items = rings.records.items
-        self._slots, self._itemsize, self._begin = len(items), items.itemsize, rings.first_record
+        super().__init__(*parts)
+        items = self.records.items
+        self._memory, self._written = items.view(np.uint8).data, 0
+        self._slots, self._itemsize = len(items), items.itemsize
         # One array per field; each row is the target of one copy, without temporary objects.
         self._x, self._y, self._flux = items["x"], items["y"], items["flux"]
         self._error_x, self._error_y = items["standard_error_x"], items["standard_error_y"]
         self._covariance_xy = items["covariance_xy"]
         self._iterations, self._flags = items["iterations"], items["flags"]
-        if description["commands"]:
+        if self.description["commands"]:
             self._loop, self._commands = items["loop"], items["commands"]
 
     @classmethod
@@ -148,10 +119,8 @@ class TelemetryRing(Closing):
             "control": control,
             "records": int(number_between("records", records, 2, 1 << 24, integer=True)),
             "image_slots": int(number_between("image_slots", image_slots, 2, 1 << 16, integer=True)),
-            "change_slots": CHANGE_SLOTS,
         }
-        ring, begin = _segment(name, description)
-        return cls(name, ring, begin, description)
+        return cls._created(f"{name}_telemetry", description)
 
     def write(
         self,
@@ -189,7 +158,7 @@ class TelemetryRing(Closing):
         slot = written % self._slots
         _HEAD.pack_into(
             self._memory,
-            self._begin + slot * self._itemsize,
+            slot * self._itemsize,
             written,
             frame,
             method,
@@ -206,11 +175,11 @@ class TelemetryRing(Closing):
         if commands is not None:
             self._loop[slot], self._commands[slot] = loop, commands
         self._written = written = written + 1
-        self._rings.records.count(written)
+        self.records.count(written)
 
     def write_images(self, frame: int, raw: ArrayLike, denoised: ArrayLike) -> None:
         """Write images of one frame: the frame itself (h, w), ADU, and denoised (n, ny, nx), electrons."""
-        ring = self._rings.images
+        ring = self.images
         written = ring.written
         item = ring.items[written % len(ring.items)]
         item["sequence"], item["image_frame"] = written, frame
@@ -243,41 +212,29 @@ class TelemetryRing(Closing):
             names = dict.fromkeys(list(changes)[:20], "too long")
             short = {**head, "changes": names, "where": "too long", "too_long_bytes": len(text)}
             text = to_json(short).encode()
-        ring = self._rings.changes
+        ring = self.changes
         written = ring.written
         item = ring.items[written % len(ring.items)]
         item["length"] = len(text)
         item["text"][: len(text)] = np.frombuffer(text, np.uint8)
         ring.count(written + 1)
 
-    def close(self) -> None:
-        """Remove the segment's name and notify readers of the end. Repeated calls do nothing."""
-        self._ring.close()
 
-
-class TelemetryReader:
+class TelemetryReader(TelemetrySegment):
     """Reader of an engine's telemetry, made by `attach`.
 
     Attributes
     ----------
-    name : str
-        Name of the engine.
-    records, images : Ring
-        Records of all frames, and images of some; see `record_type` and `image_type`.
     layout : Layout
     settings : str
         Initial settings of the engine: TOML text.
-    description : dict
-        The writer's description of itself, as plain values.
     """
 
-    def __init__(self, name: str, ring: PixelRing, begin: int, description: dict[str, Any]) -> None:
+    def __init__(self, *parts: Any) -> None:
         """Use `attach` instead."""
-        self.name, self._ring, self.description = name, ring, description
-        self.layout = Layout(**description["layout"])
-        self.settings: str = description["settings"]
-        rings = Rings(ring.pixels[0, 0], begin, description)
-        self.records, self.images, self._changes = rings.records, rings.images, rings.changes
+        super().__init__(*parts)
+        self.layout = Layout(**self.description["layout"])
+        self.settings: str = self.description["settings"]
 
     @classmethod
     def attach(cls, name: str) -> TelemetryReader:
@@ -288,55 +245,13 @@ class TelemetryReader:
         InputError
             When there is no such telemetry, or it is not of this version and user.
         """
-        path = segment_path(f"{name}_telemetry")
-        if not path.exists():
-            raise InputError(f"{path}: no telemetry of {name!r}; start the engine first")
-        ring = PixelRing.attach(path.name)
-        memory = ring.pixels[0, 0]
-        magic, length, checksum = _START.unpack_from(memory) if len(memory) >= _START.size else (b"", 0, 0)
-        text = memory[_START.size : _START.size + length].tobytes()
-        if magic != _MAGIC or zlib.crc32(text) != checksum:
-            raise InputError(f"{path}: expected telemetry of this version of faintspot")
-        return cls(name, ring, up_to_pages(_START.size + length), parse_json(text))
-
-    @property
-    def stale(self) -> bool:
-        """Whether no more data come: the engine has ended or died, or another one has taken its name.
-
-        Existing data can still be read.
-        """
-        return self._ring.closed or self._ring.stale
+        return cls._attached(f"{name}_telemetry")
 
     def changes_since(self, cursor: int) -> tuple[list[dict[str, Any]], int, int]:
         """Return the changes of settings from a cursor on, as `Ring.since` does.
 
         Each has frame, number, changes (values by name) and where (sub-apertures, None for all).
         """
-        items, cursor, dropped = self._changes.since(cursor)
+        items, cursor, dropped = self.changes.since(cursor)
         changes = [parse_json(item["text"][: item["length"]].tobytes()) for item in items]
         return changes, cursor, dropped
-
-    def close(self) -> None:
-        """Close the segment."""
-        self._ring.close()
-
-
-def _segment(name: str, description: Mapping[str, Any]) -> tuple[PixelRing, int]:
-    """Create the segment, with its description and empty rings; return it and the offset of the rings."""
-    text = to_json(description).encode()
-    begin = up_to_pages(_START.size + len(text))
-    rings = sum(up_to_pages(kind.itemsize * slots) for kind, slots in kinds_of(description))
-    pid, segment = os.getpid(), f"{name}_telemetry"
-    size = begin + PAGE + rings
-    header = Header(pid, process_start(pid), secrets.randbits(64), 1, size, 1, _BYTE.str)
-    try:
-        memory, identity = create_segment(segment_path(segment), header)
-    except InputError as error:
-        raise InputError(f"telemetry of {name}: {error}") from None
-    ring = PixelRing(segment, memory, header, identity)
-    slot = ring.pixels[0, 0]
-    slot[::PAGE] = 0  # touch every page before the first frame
-    slot[_START.size : _START.size + len(text)] = np.frombuffer(text, np.uint8)
-    fence()
-    _START.pack_into(slot.data, 0, _MAGIC, len(text), zlib.crc32(text))  # last: from here on it can be read
-    return ring, begin

@@ -1,4 +1,4 @@
-"""Layout of a telemetry segment: the types of its three rings, and reading and writing them."""
+"""Segment of telemetry: the types of its three rings, and reading and writing them."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.json_text import plain_values
+from faintspot.engine.pixels.segment import CLOSED, Segment
 from faintspot.slopes.kernels.compilation.ordered import fence, load, store
 from faintspot.slopes.sensor.layout import Layout
 
 CHANGE_BYTES = 4096
 """Bytes per place in the ring of changes: the length of the text (8 bytes), then the text."""
 CHANGE_SLOTS = 256
-PAGE = 4096
-_CELL_BYTES = 128  # distance of the counts, so that no two share a cache line or a prefetched pair
 
 
 def record_type(n: int, commands: int = 0) -> np.dtype[np.void]:
@@ -64,8 +63,8 @@ class Ring:
         Type of an item.
     """
 
-    def __init__(self, cells: NDArray[np.int64], row: int, items: NDArray[Any]) -> None:
-        self.items, self.kind, self._cell = items, items.dtype, cells[row]
+    def __init__(self, cell: NDArray[np.int64], items: NDArray[Any]) -> None:
+        self.items, self.kind, self._cell = items, items.dtype, cell
 
     @property
     def written(self) -> int:
@@ -105,39 +104,39 @@ class Ring:
         return copies[overwritten:], last, first - cursor + overwritten
 
 
-class Rings:
-    """The three rings in the segment's memory."""
+class TelemetrySegment(Segment):
+    """The three rings of an engine's telemetry, whose cells count the items ever written.
 
-    def __init__(self, memory: NDArray[np.uint8], begin: int, description: Mapping[str, Any]) -> None:
-        cells = memory[begin : begin + PAGE].view(np.int64).reshape(-1, _CELL_BYTES // 8)
-        begin += PAGE
-        self.first_record = begin
-        rings = []
-        for row, (kind, slots) in enumerate(kinds_of(description)):
-            size = kind.itemsize * slots
-            rings.append(Ring(cells, row, memory[begin : begin + size].view(kind)))
-            begin += up_to_pages(size)
-        self.records, self.images, self.changes = rings
+    Attributes
+    ----------
+    records, images, changes : Ring
+        Records of all frames, images of some, and changes of settings; see `record_type` and `image_type`.
+    """
 
+    what, writer = "ring of telemetry", "engine"
 
-def kinds_of(description: Mapping[str, Any]) -> list[tuple[np.dtype[np.void], int]]:
-    """Return the type and number of places of each of the three rings."""
-    layout = description["layout"]
-    n, shape, window = len(layout["corners"]), tuple(layout["frame_shape"]), tuple(layout["window"])
-    change = np.dtype([("length", np.int64), ("text", np.uint8, (CHANGE_BYTES - 8,))])
-    return [
-        (record_type(n, description.get("commands", 0)), description["records"]),
-        (image_type(shape, n, window), description["image_slots"]),
-        (change, description["change_slots"]),
-    ]
+    def __init__(self, *parts: Any) -> None:
+        """Use `create` or `attach` instead."""
+        super().__init__(*parts)
+        self.records, self.images, self.changes = (
+            Ring(self.cells[row], items) for row, items in enumerate(self.rings.values(), CLOSED + 1)
+        )
+
+    @classmethod
+    def contents(cls, description: Mapping[str, Any]) -> tuple[int, dict[str, tuple[np.dtype[Any], int]]]:
+        """See `Segment`."""
+        layout = description["layout"]
+        n, shape, window = len(layout["corners"]), tuple(layout["frame_shape"]), tuple(layout["window"])
+        change = np.dtype([("length", np.int64), ("text", np.uint8, (CHANGE_BYTES - 8,))])
+        rings = {
+            "records": (record_type(n, description["commands"]), description["records"]),
+            "images": (image_type(shape, n, window), description["image_slots"]),
+            "changes": (change, CHANGE_SLOTS),
+        }
+        return CLOSED + 1 + len(rings), rings
 
 
 def layout_values(layout: Layout) -> dict[str, Any]:
     """Return a layout as plain values, from which `Layout` can be rebuilt."""
     values: dict[str, Any] = plain_values(vars(layout))
     return values
-
-
-def up_to_pages(size: int) -> int:
-    """Round a number of bytes up to whole pages."""
-    return -(-size // PAGE) * PAGE
