@@ -188,7 +188,7 @@ def _table(flux_e: float) -> Table:
     for loop_gain in WINDS:
         right = learnt(flux_e, loop_gain, 1.0)
         for factor in FACTORS:
-            wrong = learnt(flux_e, loop_gain, factor, right._learnt.identified)
+            wrong = learnt(flux_e, loop_gain, factor, right.model.identified)
             rows.append(row(f"gain x {factor:g} in learning", wrong, flux_e, loop_gain, CENTROID_GAIN))
         for factor in FACTORS:
             if loop_gain * CENTROID_GAIN / factor <= _STABLE and factor != 1:

@@ -89,15 +89,16 @@ def _table(name: str, case: Large) -> Table:
     tuning = case.observed(make_telemetry, _TUNING, _TUNING_FRAMES * 2)[1]
     gain, integrator = case.tuned_integrator(tuning)
     modal = learn_controller(MODAL, case.plant, learnt_from, case.site, case.rate_hz)
-    makes, seconds = {INTEGRATOR: integrator, MODES: modal.controller}, {INTEGRATOR: 0.0, MODES: 0.0}
+    makes: dict[str, Make] = {INTEGRATOR: integrator, MODES: partial(modal.guarded, case.plant)}
+    seconds = {INTEGRATOR: 0.0, MODES: 0.0}
     for each, most_slopes in ((NEIGHBOURS, 0), (ALL, 10**6)):
         if each == ALL and (case.name != "diffraction_limit" or not _DENSE):
             continue
         begun = time.process_time()
         with mock.patch.object(learning, "_MOST_SLOPES", most_slopes):
             learnt = case.learnt(learnt_from)
-        makes[each], seconds[each] = learnt.controller, time.process_time() - begun
-        print(f"{name}, {each}: {learnt.model.description}", flush=True)
+        makes[each], seconds[each] = partial(learnt.guarded, case.plant), time.process_time() - begun
+        print(f"{name}, {each}: {learnt.description}", flush=True)
     if importlib.util.find_spec("pyrtc") is not None:
         begun = time.process_time()
         makes[RIVAL] = _rival(case, learnt_from, tuning)

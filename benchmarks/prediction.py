@@ -24,7 +24,7 @@ from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.base import LEARNT, Controller, Expected
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn_controller
-from faintspot.loop.control.identification.model import LearntControl
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.phase import residual_phase
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
@@ -89,7 +89,7 @@ class Shaken:
         return self.layers.wavefront_nm(time_s) + value * self._shape
 
 
-class Rival:
+class Rival(Controller):
     """A modal predictor of pyRTC as a controller: the command goes part of the way to the prediction."""
 
     undoes_prior = True
@@ -97,13 +97,14 @@ class Rival:
     def __init__(
         self, line: CommandDelayLine, plant: LoopPlant, to_modes: Floats, predictor: Any, gain: float
     ):
-        self._line, self._plant, self._to_modes, self._gain = line, plant, to_modes, gain
+        super().__init__(line, plant.interaction)
+        self._plant, self._to_modes, self._gain = plant, to_modes, gain
         self._predictor = predictor
         self.begin()
 
     def expected(self) -> Expected:
         """See `Controller`."""
-        return Expected(self._plant.interaction @ self._line.acting, None)
+        return Expected(self._plant.interaction @ self.line.acting, None)
 
     def begin(self) -> None:
         """See `Controller`."""
@@ -113,7 +114,7 @@ class Rival:
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
     ) -> None:
         """See `Controller`."""
-        line, modes = self._line, self._plant.reconstructor.modes
+        line, modes = self.line, self._plant.reconstructor.modes
         open_loop = slopes_px - self._plant.interaction @ line.acting
         self._predictor.update(self._to_modes @ np.where(np.isfinite(standard_error_px), open_loop, 0.0))
         wanted = modes @ np.asarray(self._predictor.predict(), np.float64)
@@ -158,7 +159,7 @@ class Case:
             run.step(controller)
         return float(run.strehl[SETTLE:].mean()), run.telemetry(SETTLE, frames)
 
-    def learnt(self, telemetry: OpenLoopTelemetry, winds: str = LEARNT) -> LearntControl:
+    def learnt(self, telemetry: OpenLoopTelemetry, winds: str = LEARNT) -> ControlModel:
         """Return our filter."""
         return learn_controller(KALMAN, self.plant, telemetry, self.site, self.rate_hz, winds)
 
@@ -185,7 +186,10 @@ class Case:
             for name in _GRIDS
         }
         if ours:
-            found |= {"integrator": self.integrator(tuning), OURS: self.learnt(learning).controller}
+            found |= {
+                "integrator": self.integrator(tuning),
+                OURS: partial(self.learnt(learning).guarded, self.plant),
+            }
         return found
 
 

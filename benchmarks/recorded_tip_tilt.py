@@ -64,8 +64,8 @@ def _replayed(delay: int) -> Table:
         earlier = first.part(0, half - TUNED_FRAMES)
         makes["least_squares"] = best(list(rivals("least_squares", plant, earlier)))
     learnt = learn_controller(KALMAN, plant, first, site, RATE_HZ)
-    makes["learnt"] = partial(learnt.model.controller, plant)
-    makes["learnt, guarded"] = learnt.controller
+    makes["learnt"] = partial(learnt.controller, plant)
+    makes["learnt, guarded"] = partial(learnt.guarded, plant)
     left = {"as it ran": np.square(seen.residual[half:]).sum(axis=1)}
     for name, make in makes.items():
         left[name] = replayed_frames(make, second, np.eye(2), phase, delay)
@@ -83,4 +83,4 @@ def _replayed(delay: int) -> Table:
     noise = 1e3 * float(np.sqrt(seen.variance.sum()))
     note = f"noise of {noise:.3g} mas included; delay of {delay} frames assumed"
     title = f"A recorded tip-tilt loop, replayed with a delay of {delay} frames"
-    return Table(f"recorded-tip-tilt-{delay}", title, rows, [note, learnt.model.description])
+    return Table(f"recorded-tip-tilt-{delay}", title, rows, [note, learnt.description])

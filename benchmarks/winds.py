@@ -6,7 +6,8 @@ on other turbulence. In winds that drift, the filter is learnt again and handed 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -14,10 +15,10 @@ from benchmarks.measuring import Row, Table
 from benchmarks.prediction import SETTLE, VIBRATION_NM, Case, Floats, Run
 from faintspot.base.statistics import paired_mean
 from faintspot.engine.loop.successor import ControllerSuccessor, PreparedController
-from faintspot.loop.control.base import ASSUMED, WINDS
+from faintspot.loop.control.base import ASSUMED, WINDS, Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.learning import KALMAN
-from faintspot.loop.control.identification.model import LearntControl
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.identification.relearning import RelearntControl, relearn
 from faintspot.loop.control.kalman.choice import HANDOVER_FRAMES
 
@@ -40,7 +41,7 @@ def winds_table(name: str, case: Case) -> Table:
     """Measure the filter with each kind of winds, and the integrator."""
     learning, tuning = case.telemetry()
     makes = {"integrator": case.integrator(tuning)}
-    makes |= {winds: case.learnt(learning, winds).controller for winds in WINDS}
+    makes |= {winds: partial(case.learnt(learning, winds).guarded, case.plant) for winds in WINDS}
     strehl = {
         each: np.array([case.observed(make, realisation, FRAMES)[0] for realisation in range(REALISATIONS)])
         for each, make in makes.items()
@@ -85,11 +86,11 @@ class Drifted(NamedTuple):
     """Largest rms change of commands from frame to frame: at a handover, and otherwise."""
 
 
-def drifting(case: Case, learnt: LearntControl, realisation: int) -> Drifted:
+def drifting(case: Case, learnt: ControlModel, realisation: int) -> Drifted:
     """Simulate a run; filters are learnt and handed over as beside an engine."""
     every, later = (round(each * case.rate_hz) for each in (LEARN_EVERY_S, LEARNING_TAKES_S))
     run = Run(case, realisation, round(DRIFT_S * case.rate_hz))
-    controller, running = learnt.controller(run.line), learnt.model
+    running, controller = learnt, cast(Controller, learnt.guarded(case.plant, run.line))
     change, at_handover = np.zeros((2, len(run.strehl)))
     wind, successor = run.model.atmosphere.velocity, None
     found: RelearntControl | None = None
@@ -112,8 +113,8 @@ def drifting(case: Case, learnt: LearntControl, realisation: int) -> Drifted:
             start = None if found is None else found.learnt.identified
             found = relearn(case.plant, running, telemetry, case.site, case.rate_hz, start)
         if run.frame % every == later and found is not None and found.is_better:
-            running, line = found.learnt.model, CommandDelayLine(len(run.line.latest), run.line.delay_frames)
-            ready = PreparedController(KALMAN, found.learnt.controller(line), False, 1.0)
+            running, line = found.learnt, CommandDelayLine(len(run.line.latest), run.line.delay_frames)
+            ready = PreparedController(KALMAN, found.learnt.guarded(case.plant, line), False, 1.0)
             successor = ControllerSuccessor(ready)
     run.strehl[:SETTLE], change[:SETTLE] = np.nan, 0.0
     largest = float((at_handover * change).max()), float((change - at_handover * change).max())

@@ -260,15 +260,13 @@ def closed_loop(configuration: LoopConfiguration, realisations: int) -> None:
     method, learnt = learnt_control(configuration, kind.method(configuration, choice), configuration.run.seed)
     assert learnt is not None
     model, settle = Model.of(configuration), configuration.run.settle_frames
-    print(
-        f"{configuration.name}, {configuration.photons:g} photo-electrons, filter: {learnt.model.description}"
-    )
+    print(f"{configuration.name}, {configuration.photons:g} photo-electrons, filter: {learnt.description}")
     found = []
     for realisation in range(realisations):
         which = np.zeros(configuration.run.frames, np.int64)
         what = configuration, [(method, learnt)], which, configuration.run.seed, realisation, DisabledErrors()
         by_slopes, by_pixels = _Loop(*what), PixelLoop(*what)
-        by_pixels.begin(model, learnt.model.predictor())
+        by_pixels.begin(model, learnt.predictor())
         found.append([each.run(None).truth[0, settle:].mean() for each in (by_slopes, by_pixels)])
         print(
             f"  Strehl ratio corrected by slopes {found[-1][0]:.3f}, by pixels {found[-1][1]:.3f}", flush=True

@@ -25,7 +25,7 @@ def modal_matrix(recording: Recording) -> np.ndarray[Any, np.dtype[np.float64]]:
     reconstructor = make_reconstructor(loop.interaction_matrix)
     plant = LoopPlant(loop.interaction_matrix, reconstructor, max(1, round(delay.delay_frames)), _LEAK)
     slopes = open_loop_of(loop, delay).telemetry
-    model = learn_controller(MODAL, plant, slopes, site_of_loop(loop), loop.frame_rate_hz).model
+    model = learn_controller(MODAL, plant, slopes, site_of_loop(loop), loop.frame_rate_hz)
     modes = reconstructor.modes * model.arrays["gains"]
     return np.asarray(modes @ reconstructor.modes.T @ reconstructor.matrix / delay.gain / loop.unit)
 

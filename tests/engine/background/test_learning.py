@@ -22,7 +22,7 @@ from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.loop.control.base import ASSUMED, SETTLE_FRAMES
 from faintspot.loop.control.configuration import Control, ControlOptions, save_control
 from faintspot.loop.control.identification.learning import KALMAN, learn_controller
-from faintspot.loop.control.identification.model import ControlModel, LearntControl, LoopPlant
+from faintspot.loop.control.identification.model import ControlModel, LoopPlant
 from faintspot.loop.control.identification.relearning import RelearntControl
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.slopes.pipeline import configuration as configuration_file
@@ -39,7 +39,7 @@ OPTIONS = ControlOptions(controller=KALMAN)
 @pytest.fixture(scope="module")
 def model() -> ControlModel:
     frames = telemetry(500, NOISE_PX, seed=9, model=LAYERS)
-    return learn_controller(KALMAN, PLANT, frames, TURBULENCE, 1 / FRAME_S, ASSUMED).model
+    return learn_controller(KALMAN, PLANT, frames, TURBULENCE, 1 / FRAME_S, ASSUMED)
 
 
 def outdated(model: ControlModel) -> ControlModel:
@@ -133,7 +133,7 @@ def test_a_better_filter_is_handed_to_the_engine(
         found = frames.open_loop_px
         rows = [OPEN_LOOP[first : first + 298] for first in (2, 302)]
         assert any(np.allclose(found, slopes - slopes.mean(axis=0), atol=1e-3) for slopes in rows)
-        return RelearntControl(LearntControl(plant, model), 1.0, 1.0 if running is model else 2.0, 3.0, 0.1)
+        return RelearntControl(model, 1.0, 1.0 if running is model else 2.0, 3.0, 0.1)
 
     monkeypatch.setattr("faintspot.engine.background.learning.relearn", relearnt)
     monkeypatch.setattr("faintspot.engine.background.learning.FEWEST_FRAMES", 90)

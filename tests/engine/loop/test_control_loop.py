@@ -51,7 +51,7 @@ class PlainControl(Control):
 
 @cache
 def learnt(kind: str) -> ControlModel:
-    return learn_controller(kind, PLANT, telemetry(200, 0.3), TURBULENCE, 1 / FRAME_S).model
+    return learn_controller(kind, PLANT, telemetry(200, 0.3), TURBULENCE, 1 / FRAME_S)
 
 
 def scaled(draw: Any, array: np.ndarray) -> np.ndarray:

@@ -16,8 +16,7 @@ from faintspot.engine.page import recording_source
 from faintspot.engine.page.client_requests import answered
 from faintspot.engine.page.recording_source import RecordingSource, indices_of
 from faintspot.engine.telemetry.segment import image_type, layout_values
-from faintspot.io.telemetry.parts import StoredTelemetry
-from faintspot.io.telemetry.recording import TelemetryStore
+from faintspot.io.telemetry.recording import StoredTelemetry, TelemetryStore
 
 FRAMES = 10_000
 """100 s; chunks of slopes hold 8192 frames."""

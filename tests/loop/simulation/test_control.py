@@ -115,13 +115,13 @@ def test_the_centroid_gain_is_learnt() -> None:
     _, learnt = learnt_control(loop, method, loop.run.seed, simulate_loop)
     record = simulate_loop(loop, [method])
     assert learnt is not None
-    assert learnt.model.centroid_gain == pytest.approx(float(record.centroid_gain[0]), rel=0.2)
-    assert learnt.model.centroid_gain < 0.9
+    assert learnt.centroid_gain == pytest.approx(float(record.centroid_gain[0]), rel=0.2)
+    assert learnt.centroid_gain < 0.9
     assert record.mean_strehl() > simulate_loop(loop, [replace(method, control=INTEGRATOR)]).mean_strehl()
     uncorrected = replace(method, correct_gain=False)
     _, learnt = learnt_control(loop, uncorrected, loop.run.seed, simulate_loop)
     assert learnt is not None
-    assert learnt.model.centroid_gain == 1.0
+    assert learnt.centroid_gain == 1.0
 
 
 def test_names_of_methods_say_their_control() -> None:

@@ -116,14 +116,14 @@ def _learn_from(
     with progress_bar("Filter", "steps") as show:
         learnt = learn_controller(kind, control.plant, telemetry, *known, progress=show)
     path = derived(config, ".model.npz")
-    replace(learnt.model, centroid_gain=delay.gain).save(path)
+    replace(learnt, centroid_gain=delay.gain).save(path)
     save_control(config, controller=kind, model=path.name)
-    left, left_out = learnt.model.left, leave_out(night.flags)[1]
+    left, left_out = learnt.left, leave_out(night.flags)[1]
     if left_out:
         click.echo(left_out)
     click.echo(
         f"{len(telemetry)} frames at {rate_hz:.0f} a second: {kind} leaves {left[0] / left[1]:.2f} of the "
-        f"phase variance that the integrator with gain {learnt.model.plain_gain:g} leaves"
+        f"phase variance that the integrator with gain {learnt.plain_gain:g} leaves"
     )
     click.echo(f"{unknown}; the centroid gain of [control] is used" if unknown else delay.gain_summary)
-    click.echo(f"{learnt.model.description}; {path} and [control] of {config} written")
+    click.echo(f"{learnt.description}; {path} and [control] of {config} written")

@@ -7,13 +7,15 @@ import tempfile
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from faintspot.base.errors import InputError
 from faintspot.engine.requests.child_processes import ChildProcesses
 from faintspot.engine.requests.private_socket import socket_path
+from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
 from faintspot.engine.requests.scheduling import lowest_priority
 from faintspot.engine.telemetry.ring import TelemetryReader
 
@@ -44,6 +46,22 @@ class BackgroundProcess(ABC):
 
     def __init__(self, name: str) -> None:
         self._path, self._reader = socket_path(name), TelemetryReader.attach(name)
+
+    def tell(self, command: str, models: Mapping[str, Any], **fields: Any) -> dict[str, Any]:
+        """Send the engine a command, with a file of each model that is not None; return its answer.
+
+        Raises
+        ------
+        InputError
+            When the engine refuses it, or does not answer.
+        """
+        with tempfile.TemporaryDirectory(prefix="faintspot-models-") as folder:
+            files: dict[str, str | None] = {}
+            for name, model in models.items():
+                files[name] = None if model is None else f"{folder}/{name}.npz"
+                if model is not None:
+                    model.save(files[name])
+            return request(self._path, command, timeout_s=LENGTHY_TIMEOUT_S, **files, **fields)
 
     def close(self) -> None:
         """Close the telemetry."""

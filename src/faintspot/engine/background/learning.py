@@ -6,7 +6,6 @@ prepared in another thread than that which measures. If the process ends or hang
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.engine.background.background_process import BackgroundProcess, background_process
 from faintspot.engine.engine import Engine
-from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
+from faintspot.engine.requests.requests import request
 from faintspot.io.telemetry.recording import Telemetry, stored_names
 from faintspot.loop.control.configuration import Control, load_control, prior_std_px
 from faintspot.loop.control.identification.model import KALMAN
@@ -127,9 +126,10 @@ class BackgroundLearning(BackgroundProcess):
             None if unknown else delay,
         )
         self._count += 1
-        self._report(relearnt)
-        if relearnt.is_better:
-            self._control = self._control.with_model(relearnt.learnt.model)
+        new = relearnt.learnt if relearnt.is_better else None
+        self.tell("learnt", {"model": new}, found=relearnt.summary())
+        if new is not None:
+            self._control = self._control.with_model(new)
         return relearnt, relearnt.is_better
 
     def _prior_std_px(self) -> NDArray[np.float64] | None:
@@ -137,20 +137,6 @@ class BackgroundLearning(BackgroundProcess):
         values = request(self._path, "get")["settings"]
         stated = {name: value for name, value in values.items() if value is not None}
         return prior_std_px(Settings(stated.pop("estimator"), **stated), self._layout)
-
-    def _report(self, relearnt: RelearntControl) -> None:
-        """Tell the engine what was found, and hand the new filter to it if it is better."""
-        with tempfile.TemporaryDirectory(prefix="faintspot-learn-") as folder:
-            path = Path(folder) / "model.npz"
-            if relearnt.is_better:
-                relearnt.learnt.model.save(path)
-            request(
-                self._path,
-                "learnt",
-                timeout_s=LENGTHY_TIMEOUT_S,
-                found=relearnt.summary(),
-                model=f"{path}" if relearnt.is_better else None,
-            )
 
 
 @contextmanager

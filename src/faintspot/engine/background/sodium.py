@@ -7,7 +7,6 @@ the process ends or hangs, the engine goes on with the last profile.
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,7 +21,6 @@ from faintspot.base.errors import InputError
 from faintspot.base.validity import are_valid
 from faintspot.engine.background.background_process import BackgroundProcess, background_process
 from faintspot.engine.engine import Engine
-from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
 from faintspot.loop.control.configuration import load_control
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.spots.laser_spots import load_laser, matched_filter
@@ -158,20 +156,11 @@ class SodiumFollower(BackgroundProcess):
         """
         before = self._star.focused(self._laser.profile) if self._in_use is None else self._in_use.fit.profile
         psf = sodium.psf(self._layout.window)
-        with tempfile.TemporaryDirectory(prefix="faintspot-follow-") as folder:
-            files = {"psf": f"{folder}/psf.npz", "score": None}
-            psf.save(f"{folder}/psf.npz")
-            if self._laser.matched_filter:
-                flux = np.maximum(sodium.fit.flux_e, 1.0)
-                files["score"] = f"{folder}/score.npz"
-                matched_filter(psf, self._layout, self._calibration, flux).save(f"{folder}/score.npz")
-            answer = request(
-                self._path,
-                "spots",
-                timeout_s=LENGTHY_TIMEOUT_S,
-                **files,
-                sodium=_as_values(sodium, before),
-            )
+        score = None
+        if self._laser.matched_filter:
+            flux = np.maximum(sodium.fit.flux_e, 1.0)
+            score = matched_filter(psf, self._layout, self._calibration, flux)
+        answer = self.tell("spots", {"psf": psf, "score": score}, sodium=_as_values(sodium, before))
         self._in_use = sodium
         frame: int | None = answer["frame"]
         return frame

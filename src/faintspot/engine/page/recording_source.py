@@ -16,8 +16,7 @@ from faintspot.base.errors import InputError
 from faintspot.engine.page.batch import Batch, Floats, Picture
 from faintspot.engine.page.client_requests import ClientRequest
 from faintspot.engine.telemetry.segment import image_type, record_type
-from faintspot.io.telemetry.parts import StoredTelemetry
-from faintspot.io.telemetry.recording import stored_names
+from faintspot.io.telemetry.recording import StoredTelemetry, stored_names
 from faintspot.slopes.sensor.layout import Layout
 
 _MOST_RECORDS = 4096  # per read; faster playback shows the newest

@@ -235,7 +235,7 @@ class _Conversation(socketserver.StreamRequestHandler):
 
     def setup(self) -> None:
         """Limit the time for which a client may be idle."""
-        self.timeout = _IDLE_S
+        self.request.settimeout(_IDLE_S)
         super().setup()
 
     def handle(self) -> None:

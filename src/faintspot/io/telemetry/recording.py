@@ -7,7 +7,8 @@ are replaced. However the recording ends, the store is valid and the counters co
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -241,39 +242,98 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
     >>> night = read_telemetry("night.zarr", images=False)  # doctest: +SKIP
     >>> night.x.std(axis=0), night.latency_s.max()  # doctest: +SKIP
     """
-    store = Path(path)
-    attributes = attributes_of(store)
-    try:
-        group: Any = open_store(store)
-        finished = {"frame": int(attributes[_FRAMES]), "image": int(attributes[_IMAGES]) if images else 0}
-        arrays = {}
-        total = sum(
-            array.nbytes
-            for name, array in group.arrays()
-            if images or "image" not in _dimensions(name, array.ndim)
-        )
-        check_bytes(store, total, memory_bytes() // 2, "telemetry")
-        for name in _ARRAYS:
-            if name in NOT_IN_ALL and name not in group:
-                arrays[name] = zeros_for(name, finished["frame"], group["x"].shape[1])
-                continue
-            array = group[name]
-            count = finished[_dimensions(name, array.ndim)[0]]
-            if count > array.shape[0]:
-                raise ValueError(f"{name}: expected {count}, found {array.shape[0]}")
-            arrays[name] = read_items(store, array, 0, count)
-        changes = attributes.pop("changes")
-    except InputError:
-        raise
-    except Exception as error:  # zarr raises many kinds of errors on broken stores
-        raise InputError(f"{store}: the store is damaged ({one_line(error)})") from None
-    return Telemetry(**arrays, changes=changes, attributes=attributes)
+    stored = StoredTelemetry(path)
+    check_bytes(stored.path, stored.size(images=images), memory_bytes() // 2, "telemetry")
+    counts = {"frame": stored.frames, "image": stored.images if images else 0}
+    arrays = {name: stored.read(name, 0, counts[_DIMENSIONS.get(name, ("frame",))[0]]) for name in _ARRAYS}
+    return Telemetry(**arrays, changes=stored.changes, attributes=stored.attributes)
 
 
-def zeros_for(name: str, frames: int, n: int) -> NDArray[Any]:
-    """Return what stands for an array of `NOT_IN_ALL` that a recording of n sub-apertures lacks."""
-    shape = {"commands": (frames, 0), "covariance_xy": (frames, n)}.get(name, (frames,))
-    return np.zeros(shape, NOT_IN_ALL[name])
+class StoredTelemetry:
+    """A telemetry store at the time of opening, even while it is being written, read in parts.
+
+    Parameters
+    ----------
+    path : path
+        The Zarr store.
+
+    Attributes
+    ----------
+    path : Path
+    attributes : dict
+        See `Telemetry.attributes`.
+    changes : list of dict
+        See `Telemetry.changes`.
+    frames, images : int
+        Numbers of complete frames and images in the store.
+
+    Raises
+    ------
+    InputError
+        When it is not a telemetry store, or damaged.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.attributes = attributes_of(self.path)
+        with self._damage():
+            self._group: Any = open_store(self.path)
+            self.frames, self.images = (int(self.attributes[name]) for name in (_FRAMES, _IMAGES))
+            self.changes: list[dict[str, Any]] = self.attributes.pop("changes")
+            self.frames_together = int(self._group["x"].chunks[0])
+            """Number of frames in a chunk of slopes, which is read as a whole."""
+
+    def __contains__(self, name: str) -> bool:
+        """Return whether the store has an array."""
+        return name in self._group
+
+    def size(self, *, images: bool) -> int:
+        """Return the bytes of all arrays in memory."""
+        with self._damage():
+            arrays = list(self._group.arrays())
+        counted = (array for name, array in arrays if images or "image" not in _dimensions(name, array.ndim))
+        return sum(array.nbytes for array in counted)
+
+    def check_shapes(self, kinds: Sequence[np.dtype[np.void]]) -> None:
+        """Refuse a store whose arrays do not have these types of records and images.
+
+        Raises
+        ------
+        InputError
+            When an array is missing, or its items have another shape.
+        """
+        for kind in kinds:
+            for name in stored_names(kind):
+                wanted = kind[name].shape
+                if self.read(name, 0, 0).shape[1:] != wanted:
+                    raise InputError(
+                        f"{self.path}: the store is damaged ({name}: expected items of {wanted})"
+                    )
+
+    def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Return items `start` to `stop` of an array, by its name in `Telemetry`.
+
+        Raises
+        ------
+        InputError
+            When the store is damaged there.
+        """
+        count = stop - start
+        with self._damage():
+            if name in NOT_IN_ALL and name not in self:
+                shape = {"commands": (count, 0), "covariance_xy": (count, self._group["x"].shape[1])}
+                return np.zeros(shape.get(name, (count,)), NOT_IN_ALL[name])
+            array = self._group[name]
+        if stop > array.shape[0]:
+            raise InputError(f"{self.path}: the store is damaged ({name}: {array.shape[0]} of {stop})")
+        return np.asarray(read_items(self.path, array, start, stop))
+
+    @contextmanager
+    def _damage(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # zarr raises many kinds of errors on broken stores
+            raise InputError(f"{self.path}: the store is damaged ({one_line(error)})") from None
 
 
 def attributes_of(store: Path) -> dict[str, Any]:
@@ -297,11 +357,6 @@ def attributes_of(store: Path) -> dict[str, Any]:
     if not (is_telemetry and is_store(store)):
         raise InputError(f"{store}: expected a Zarr store of telemetry from `faintspot realtime record`")
     return attributes
-
-
-def finished_of(attributes: Mapping[str, Any]) -> tuple[int, int]:
-    """Return the numbers of complete frames and images in a store with these attributes."""
-    return int(attributes[_FRAMES]), int(attributes[_IMAGES])
 
 
 def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mapping[str, Any]) -> None:

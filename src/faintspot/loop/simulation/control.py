@@ -16,11 +16,11 @@ from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.learning import (
     INTEGRATOR,
     KALMAN,
-    LearntControl,
     LoopPlant,
     learn_controller,
 )
 from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.identification.open_loop import measured_delay, open_loop_of
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import Integrator
@@ -48,12 +48,13 @@ def make_controller(
     configuration: LoopConfiguration,
     optics: LoopOptics,
     method: Method,
-    learnt: LearntControl | None,
+    learnt: ControlModel | None,
     line: CommandDelayLine,
 ) -> Controller:
     """Return the controller of a method, which sends its commands to `line`."""
     if learnt is not None:
-        return learnt.controller(line, prior_std_px(method, len(optics.interaction)))
+        std_px = prior_std_px(method, len(optics.interaction))
+        return learnt.guarded(_plant(configuration, optics), line, prior_std_px=std_px)
     control = configuration.control
     return Integrator(
         line,
@@ -68,7 +69,7 @@ def make_controller(
 
 def learnt_control(
     configuration: LoopConfiguration, method: Method, seed: int, simulate: Simulate
-) -> tuple[Method, LearntControl | None]:
+) -> tuple[Method, ControlModel | None]:
     """Return the learnt controller of a method (None for the integrator), and the adapted method.
 
     The prior of an estimator that has one becomes as wide as the control is sure.
@@ -159,19 +160,23 @@ def _learnt(
     noise_scale: float,
     seed: int,
     simulate: Simulate,
-) -> LearntControl:
+) -> ControlModel:
     from faintspot.loop.simulation.telescope.model import prepare
 
     if kind == KALMAN and noise_scale != 1.0:  # learning takes long
         usual = _learnt(configuration, method, kind, 1.0, seed, simulate)
-        return replace(usual, model=usual.model.with_noise(noise_scale))
+        return usual.with_noise(noise_scale)
     optics, control = prepare(configuration), configuration.control
     telemetry, gain = _telemetry(_without_assumed(configuration), method, seed, simulate)
     site = slope_turbulence(configuration, optics.sensor.layout.cells)
-    plant = LoopPlant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
     known = site, control.frame_rate_hz, control.winds, noise_scale
-    learnt = learn_controller(kind, plant, telemetry, *known)
-    return replace(learnt, model=replace(learnt.model, centroid_gain=gain))
+    learnt = learn_controller(kind, _plant(configuration, optics), telemetry, *known)
+    return replace(learnt, centroid_gain=gain)
+
+
+def _plant(configuration: LoopConfiguration, optics: LoopOptics) -> LoopPlant:
+    control = configuration.control
+    return LoopPlant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
 
 
 @lru_cache(maxsize=1)  # for several controls; 170 MB with 40 x 40 sub-apertures

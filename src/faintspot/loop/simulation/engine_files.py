@@ -94,8 +94,8 @@ def write_engine_files(
     seed = configuration.run.seed
     _, learnt = learnt_control(configuration, method, seed, simulate_loop)
     if learnt is not None:
-        replace(learnt.model, centroid_gain=1.0).save(folder / MODEL)
-        measured |= {"controller": control, "model": MODEL, "centroid_gain": learnt.model.centroid_gain}
+        replace(learnt, centroid_gain=1.0).save(folder / MODEL)
+        measured |= {"controller": control, "model": MODEL, "centroid_gain": learnt.centroid_gain}
     elif method.correct_gain:
         pipeline = make_pipeline(configuration, optics.sensor, method)
         measured["centroid_gain"] = float(measure_gains(configuration, [pipeline], seed=seed)[0])

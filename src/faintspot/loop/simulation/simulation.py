@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.learning import INTEGRATOR, LearntControl
+from faintspot.loop.control.identification.learning import INTEGRATOR
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED, RunLength
 from faintspot.loop.simulation.control import learnt_control, make_controller
@@ -183,7 +184,7 @@ class _Loop:
     def __init__(
         self,
         configuration: LoopConfiguration,
-        ready: Sequence[tuple[Method, LearntControl | None]],
+        ready: Sequence[tuple[Method, ControlModel | None]],
         schedule: NDArray[np.int64],
         seed: int,
         realisation: int,
@@ -263,7 +264,7 @@ class _Loop:
         divisors = np.where([method.correct_gain for method in self.methods], gains, 1.0)
         for number, learnt in enumerate(self.learnt):
             if learnt is not None:  # from its telemetry, as at a telescope
-                divisors[number] = learnt.model.centroid_gain
+                divisors[number] = learnt.centroid_gain
         return gains, divisors
 
     def run(self, progress: Callable[[int, int], None] | None) -> _Loop:

@@ -131,7 +131,7 @@ def compared_choices(
     first = open_loop.telemetry.part(0, frames // 2)
     if len(open_loop.variance) <= _MOST_SLOPES:
         modal, learnt = (
-            learn_controller(kind, plant, first, site, loop.frame_rate_hz).model for kind in (MODAL, KALMAN)
+            learn_controller(kind, plant, first, site, loop.frame_rate_hz) for kind in (MODAL, KALMAN)
         )
         choices.append(compare(BEST, *integrators([learnt.plain_gain]), gain=learnt.plain_gain))
         gains = modal.arrays["gains"]

@@ -14,7 +14,7 @@ from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.configuration import Control, ControlOptions
 from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, learn_controller
-from faintspot.loop.control.identification.model import ControlModel, LearntControl
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.slopes.camera.calibration import Calibration
 
@@ -23,7 +23,7 @@ FRAMES = telemetry(600, 0.3)
 
 
 @pytest.fixture(scope="module")
-def learnt() -> dict[str, LearntControl]:
+def learnt() -> dict[str, ControlModel]:
     return {kind: learn_controller(kind, PLANT, FRAMES, TURBULENCE, 1 / FRAME_S) for kind in KINDS}
 
 
@@ -37,14 +37,12 @@ def commands(controller: Any, line: CommandDelayLine, frames: int = 60) -> np.nd
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, LearntControl], tmp_path: Path) -> None:
+def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, ControlModel], tmp_path: Path) -> None:
     path = tmp_path / "model.npz"
-    learnt[kind].model.save(path)
+    learnt[kind].save(path)
     lines = [CommandDelayLine(12, 2) for _ in range(2)]
-    again = LearntControl(PLANT, ControlModel.load(path, PLANT))
-    sent = [
-        commands(each.controller(line), line) for each, line in zip((learnt[kind], again), lines, strict=True)
-    ]
+    models = zip((learnt[kind], ControlModel.load(path, PLANT)), lines, strict=True)
+    sent = [commands(model.guarded(PLANT, line), line) for model, line in models]
     np.testing.assert_array_equal(sent[0], sent[1])
     assert np.abs(sent[0]).max() > 0.1
     options = ControlOptions(controller=kind, leak=PLANT.leak, gain=1.0)
@@ -55,15 +53,15 @@ def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, LearntControl],
     if kind == "modal":  # not guarded: the gains are in the compiled integrator's matrix, in float32
         tolerance = 1e-6
         other = CommandDelayLine(12, 2)
-        expected = commands(learnt[kind].model.controller(PLANT, other), other)
+        expected = commands(learnt[kind].controller(PLANT, other), other)
     np.testing.assert_allclose(engines, expected, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, LearntControl]) -> None:
+def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, ControlModel]) -> None:
     """Slopes of a mirror that takes off all there is: the next command is nearly the same."""
     line = CommandDelayLine(12, 2)
-    controller = learnt[kind].controller(line)
+    controller = learnt[kind].guarded(PLANT, line)
     commands(controller, line)
     held = -PLANT.reconstructor.clean @ COVARIANCES[0] @ np.random.default_rng(2).standard_normal(18)
     line.hold(held)
@@ -72,9 +70,9 @@ def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, Lear
     assert np.linalg.norm(line.latest - held) < 0.35 * np.linalg.norm(held)
 
 
-def test_another_controller_of_the_same_loop(learnt: dict[str, LearntControl]) -> None:
+def test_another_controller_of_the_same_loop(learnt: dict[str, ControlModel]) -> None:
     """The integrator needs no model; only the filter tells estimators what it expects, if nothing is said."""
-    control = Control(INTERACTION, None, ControlOptions(gain=0.3), learnt["kalman"].model)
+    control = Control(INTERACTION, None, ControlOptions(gain=0.3), learnt["kalman"])
     filtered = control.with_controller("kalman")
     assert isinstance(filtered.controller(filtered.line()), CompiledKalman)
     assert (control.prediction, filtered.prediction) == ("none", "controller")
@@ -84,9 +82,9 @@ def test_another_controller_of_the_same_loop(learnt: dict[str, LearntControl]) -
         control.with_controller("modal")
 
 
-def test_what_is_refused(learnt: dict[str, LearntControl], tmp_path: Path) -> None:
+def test_what_is_refused(learnt: dict[str, ControlModel], tmp_path: Path) -> None:
     path = tmp_path / "model.npz"
-    model = learnt["kalman"].model
+    model = learnt["kalman"]
 
     def refused(message: str, options: ControlOptions, file: Any = path) -> None:
         with pytest.raises(InputError) as caught:
@@ -116,10 +114,10 @@ def test_what_is_refused(learnt: dict[str, LearntControl], tmp_path: Path) -> No
     refused("model.npz", kalman)
 
 
-def test_centroid_gain_in_the_file(learnt: dict[str, LearntControl], tmp_path: Path) -> None:
+def test_centroid_gain_in_the_file(learnt: dict[str, ControlModel], tmp_path: Path) -> None:
     """Slopes are divided by it and by the configured one; the integrator knows the latter only."""
     path = tmp_path / "model.npz"
-    replace(learnt["kalman"].model, centroid_gain=0.4).save(path)
+    replace(learnt["kalman"], centroid_gain=0.4).save(path)
     control = Control(INTERACTION, None, ControlOptions(controller="kalman", centroid_gain=0.5), path)
     assert control.centroid_gain == pytest.approx(0.2)
     assert control.with_controller("integrator").centroid_gain == 0.5

@@ -58,7 +58,7 @@ def test_the_learnt_filter_beats_the_best_integrator() -> None:
     assert learnt.identified is not None
     assert learnt.identified.oscillators
     gain, plain = plant.best_gain(GAINS, scoring, np.eye(2))
-    left = plant.residual(partial(learnt.model.controller, plant), scoring, np.eye(2))
+    left = plant.residual(partial(learnt.controller, plant), scoring, np.eye(2))
     # Noise is 0.5 of either, whatever the control; of the rest, the filter leaves at most three quarters.
     assert left - 2 * _NOISE**2 < 0.75 * (plain - 2 * _NOISE**2), gain
 

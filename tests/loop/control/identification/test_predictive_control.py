@@ -85,7 +85,7 @@ def test_exported_matrices(control: PredictiveControl, recording: Recording, tmp
     control.export(tmp_path / "controller.npz")
     file = dict(np.load(tmp_path / "controller.npz"))
     line = CommandDelayLine(36, 2)
-    alone = control.model.controller(control._learnt.plant, line)
+    alone = control.model.controller(control._plant, line)
     state, held = np.zeros(len(file["state_of_state"])), np.zeros((int(file["delay_frames"]), 36))
     error = np.sqrt(control.model.arrays["variance_px2"])
     for slopes in recording.slopes[:300]:

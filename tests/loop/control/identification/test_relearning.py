@@ -11,7 +11,7 @@ from faintspot.base.errors import InputError
 from faintspot.loop.control.base import ASSUMED
 from faintspot.loop.control.identification.learning import KALMAN, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.model import LearntControl
+from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.identification.relearning import relearn
 
 RATE_HZ = 1 / FRAME_S
@@ -19,7 +19,7 @@ FRAMES = telemetry(1200, 0.3, model=LAYERS)
 
 
 @pytest.fixture(scope="module")
-def now() -> LearntControl:
+def now() -> ControlModel:
     """Return a filter for the present turbulence, from other frames."""
     return learn_controller(
         KALMAN, PLANT, telemetry(800, 0.3, seed=9, model=LAYERS), TURBULENCE, RATE_HZ, ASSUMED
@@ -27,11 +27,11 @@ def now() -> LearntControl:
 
 
 @pytest.mark.slow
-def test_a_filter_for_other_turbulence_is_replaced(now: LearntControl) -> None:
+def test_a_filter_for_other_turbulence_is_replaced(now: ControlModel) -> None:
     """The running filter takes slopes for nearly constant."""
-    arrays = now.model.arrays
+    arrays = now.arrays
     slow = {**arrays, "first": 0.1 * arrays["first"], "second": 0.0 * arrays["second"]}
-    running = replace(now.model, arrays=slow)
+    running = replace(now, arrays=slow)
     found = relearn(PLANT, running, FRAMES, TURBULENCE, RATE_HZ, now.identified)
     assert found.is_better
     assert found.residual < 0.9 * found.by_running
@@ -39,24 +39,22 @@ def test_a_filter_for_other_turbulence_is_replaced(now: LearntControl) -> None:
 
 
 @pytest.mark.slow
-def test_a_filter_that_is_as_good_stays(now: LearntControl) -> None:
-    found = relearn(PLANT, now.model, FRAMES, TURBULENCE, RATE_HZ, now.identified)
+def test_a_filter_that_is_as_good_stays(now: ControlModel) -> None:
+    found = relearn(PLANT, now, FRAMES, TURBULENCE, RATE_HZ, now.identified)
     assert not found.is_better
     assert found.residual == pytest.approx(found.by_running, rel=0.05)
 
 
-def test_too_few_frames_are_refused(now: LearntControl) -> None:
+def test_too_few_frames_are_refused(now: ControlModel) -> None:
     with pytest.raises(InputError, match="frames to judge a filter, got 300"):
-        relearn(PLANT, now.model, FRAMES.part(0, 300), TURBULENCE, RATE_HZ)
+        relearn(PLANT, now, FRAMES.part(0, 300), TURBULENCE, RATE_HZ)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("gain", "taken"), [(0.5, True), (0.97, False)])
-def test_another_centroid_gain_is_taken(now: LearntControl, gain: float, taken: bool) -> None:
+def test_another_centroid_gain_is_taken(now: ControlModel, gain: float, taken: bool) -> None:
     """A filter for the same turbulence is replaced if its gain is wrong beyond the error."""
-    found = relearn(
-        PLANT, now.model, FRAMES, TURBULENCE, RATE_HZ, now.identified, LoopDelay(2.0, 0.0, gain, 0.03)
-    )
+    found = relearn(PLANT, now, FRAMES, TURBULENCE, RATE_HZ, now.identified, LoopDelay(2.0, 0.0, gain, 0.03))
     assert found.is_better == found.gain_changed == taken
-    assert found.learnt.model.centroid_gain == gain
+    assert found.learnt.centroid_gain == gain
     assert f"centroid gain {gain:.3f}" in found.summary()

@@ -34,7 +34,7 @@ def test_integrators_are_replayed_together() -> None:
 
 def test_the_compiled_filter_is_replayed() -> None:
     """Four steps of conjugate gradients are within 1e-3 of the solution."""
-    model = learn_controller(KALMAN, PLANT, FRAMES, TURBULENCE, 1 / FRAME_S, ASSUMED).model
+    model = learn_controller(KALMAN, PLANT, FRAMES, TURBULENCE, 1 / FRAME_S, ASSUMED)
     seen = partly_trusted()
     expected = PLANT.replayed(partial(model.controller, PLANT), seen.scaled(model.noise_factor), PHASE)
     np.testing.assert_allclose(model.replayed(PLANT, seen, PHASE), expected, rtol=0.02, atol=1e-3)

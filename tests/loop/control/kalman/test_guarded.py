@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from tests.loop.control.control_cases import COVARIANCES, INTERACTION, PHASE, PLANT, telemetry
 
-from faintspot.loop.control.base import Expected
+from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification.model import Make
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.choice import EXCESS, MOST_EXCESS
 from faintspot.loop.control.kalman.guarded import Guarded
@@ -16,30 +17,26 @@ from faintspot.loop.control.kalman.predictive import PseudoOpenLoop
 FRAMES = telemetry(900, 0.2)
 
 
-class Runaway:
+class Runaway(Controller):
     """A controller that has learnt nonsense."""
 
     undoes_prior = True
 
-    def __init__(self, line: CommandDelayLine) -> None:
-        self._line = line
-
-    def expected(self) -> Expected:
-        return Expected(np.zeros(18), None)
-
     def update(self, slopes_px: np.ndarray, standard_error_px: np.ndarray, covariance: object = None) -> None:
-        self._line.put(0.9 * self._line.latest + 0.4 * (PLANT.reconstructor(slopes_px)))
+        self.line.put(0.9 * self.line.latest + 0.4 * (PLANT.reconstructor(slopes_px)))
 
 
-def _guarded(line: CommandDelayLine, learnt: object, prior: np.ndarray | None = None) -> Guarded:
-    plain = partial(PLANT.integrator, 0.4)
-    return Guarded(line, INTERACTION, PHASE, learnt, plain, prior_std_px=prior)  # type: ignore[arg-type]
+def _guarded(line: CommandDelayLine, learnt: Make, prior: np.ndarray | None = None) -> Guarded:
+    return Guarded(line, INTERACTION, PHASE, learnt, partial(PLANT.integrator, 0.4), prior_std_px=prior)
 
 
 def test_nonsense_is_replaced() -> None:
     """A hundred frames after the start the integrator has taken over, as if it had been there always."""
     lines = [CommandDelayLine(12, 2) for _ in range(2)]
-    guarded, alone = _guarded(lines[0], Runaway), PLANT.integrator(0.4, lines[1])
+    guarded, alone = (
+        _guarded(lines[0], partial(Runaway, interaction=INTERACTION)),
+        PLANT.integrator(0.4, lines[1]),
+    )
     for number, slopes in enumerate(FRAMES.open_loop_px):
         for controller, line in zip((guarded, alone), lines, strict=True):
             controller.update(slopes + INTERACTION @ line.acting, np.full(18, 0.2))
@@ -51,7 +48,7 @@ def test_nonsense_is_replaced() -> None:
 def test_after_a_failure_the_plain_controller_continues_from_the_mirrors_commands() -> None:
     """Its own commands, made for a mirror that exists only in numbers, may be far from them."""
     line = CommandDelayLine(12, 2)
-    guarded = _guarded(line, Runaway)
+    guarded = _guarded(line, partial(Runaway, interaction=INTERACTION))
     plain = guarded._lines[1]
     for number, slopes in enumerate(FRAMES.open_loop_px[:15]):
         if number == 10:
@@ -64,21 +61,17 @@ def test_after_a_failure_the_plain_controller_continues_from_the_mirrors_command
             np.testing.assert_array_equal(plain.acting, line.acting)
 
 
-class Still:
+class Still(Controller):
     """A controller whose command is always the same."""
 
     undoes_prior = True
 
     def __init__(self, line: CommandDelayLine, value: float) -> None:
-        self._line, self._command = line, np.full(12, value)
-
-    def expected(self) -> Expected:
-        return Expected(np.zeros(18), None)
-
-    def begin(self) -> None: ...
+        super().__init__(line, INTERACTION)
+        self._command = np.full(12, value)
 
     def update(self, slopes_px: np.ndarray, standard_error_px: np.ndarray, covariance: object = None) -> None:
-        self._line.put(self._command)
+        self.line.put(self._command)
 
 
 def test_commands_go_over_from_one_controller_to_another_in_equal_steps() -> None:

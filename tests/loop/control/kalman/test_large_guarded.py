@@ -20,7 +20,7 @@ from tests.loop.control.control_cases import (
 from faintspot.loop.control import slope_product
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.kalman.choice import EXCESS, MOST_EXCESS
-from faintspot.loop.control.kalman.guarded import Guarded
+from faintspot.loop.control.kalman.guarded import Guarded, GuardedController
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter
 from faintspot.loop.control.kalman.predictive import Predictive
@@ -37,7 +37,7 @@ def wrong_filter() -> dict[str, Any]:
 
 
 @pytest.fixture
-def both() -> tuple[list[Guarded], list[CommandDelayLine]]:
+def both() -> tuple[list[GuardedController], list[CommandDelayLine]]:
     """Return the controllers, plain and fast."""
     arrays = wrong_filter()
     lines = [CommandDelayLine(COMMANDS, 2, 0.8) for _ in range(2)]
@@ -65,7 +65,7 @@ def both() -> tuple[list[Guarded], list[CommandDelayLine]]:
 
 @pytest.mark.parametrize("fails", [False, True], ids=["computed", "measured"])
 def test_it_does_the_same_before_and_after_the_integrator_takes_over(
-    both: tuple[list[Guarded], list[CommandDelayLine]], fails: bool
+    both: tuple[list[GuardedController], list[CommandDelayLine]], fails: bool
 ) -> None:
     """By computed residuals, or because the filter's measured one is too large.
 

@@ -14,7 +14,7 @@ from tests.loop.control.frozen_flow import frozen_slopes
 from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification import learning
-from faintspot.loop.control.identification.learning import KALMAN, LearntControl, learn_controller
+from faintspot.loop.control.identification.learning import KALMAN, learn_controller
 from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.kalman import local_covariance, local_model
 from faintspot.loop.control.kalman import local_predictor as local_kalman
@@ -250,16 +250,16 @@ def test_large_sensors_learn_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
         KALMAN, PLANT, frames, TURBULENCE, 1 / FRAME_S, progress=lambda *each: shown.append(each)
     )
     assert shown[-1][0] == shown[-1][1] == len(shown)
-    assert learnt.model.is_local
-    assert learnt.model.left[0] < learnt.model.left[1]
+    assert learnt.is_local
+    assert learnt.left[0] < learnt.left[1]
     path = tmp_path / "model.npz"
-    learnt.model.save(path)
+    learnt.save(path)
     again = ControlModel.load(path, PLANT)
     assert again.is_local
     sent = []
-    for model in (learnt.model, again):
+    for model in (learnt, again):
         line = CommandDelayLine(12, 2)
-        controller = LearntControl(PLANT, model).controller(line)
+        controller = model.guarded(PLANT, line)
         for slopes in frames.open_loop_px[:40]:
             controller.update(slopes + PLANT.interaction @ line.acting, np.full(18, 0.3))
         sent.append(line.latest.copy())

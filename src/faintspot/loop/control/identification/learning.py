@@ -20,7 +20,6 @@ from faintspot.loop.control.identification.model import (
     MODAL,
     POLC,
     ControlModel,
-    LearntControl,
     LoopPlant,
 )
 from faintspot.loop.control.kalman.local_covariance import STEPS
@@ -36,7 +35,6 @@ __all__ = [
     "KALMAN",
     "MODAL",
     "POLC",
-    "LearntControl",
     "LoopPlant",
     "learn_controller",
 ]
@@ -64,8 +62,8 @@ def learn_controller(
     start: Identified | None = None,
     progress: Callable[[int, int], None] | None = None,
     identification: Identification | None = None,
-) -> LearntControl:
-    """Return a controller of the given kind, learnt from telemetry.
+) -> ControlModel:
+    """Return the model of a controller of the given kind, learnt from telemetry.
 
     Parameters
     ----------
@@ -95,7 +93,7 @@ def learn_controller(
     gain, plain_residual = plant.best_gain(GAINS, telemetry, of_commands @ plant.reconstructor.matrix)
     plain = ControlModel(kind, {}, gain, 1.0, (math.inf, plain_residual), of_commands)
     if kind == MODAL:
-        return LearntControl(plant, _modal(plain, plant, telemetry))
+        return _modal(plain, plant, telemetry)
     if identification is None:
         identification = Identification(whole, site, rate_hz)
     identification = identification.among(AVERAGED[:1])
@@ -121,9 +119,9 @@ def learn_controller(
     for identified in tried:
         text = f"{identified.summary()}, noise variance x {identified.noise_factor:.2f}"
         model = replace(plain, noise_factor=identified.noise_factor, description=text)
-        models.append((make(model, plant, telemetry, identified), identified))
-    model, identified = min(models, key=lambda pair: pair[0].left[0])
-    return LearntControl(plant, model.with_noise(noise_scale) if kind == KALMAN else model, identified)
+        models.append(replace(make(model, plant, telemetry, identified), identified=identified))
+    best = min(models, key=lambda model: model.left[0])
+    return best.with_noise(noise_scale) if kind == KALMAN else best
 
 
 def _kalman(

@@ -21,7 +21,7 @@ from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.replay import mean_residual, replayed_frames, replayed_integrators
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.compiled import CompiledKalman
-from faintspot.loop.control.kalman.guarded import Guard, Guarded
+from faintspot.loop.control.kalman.guarded import Guarded, GuardedController
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_shapes
 from faintspot.loop.control.kalman.predictive import Predictive, PseudoOpenLoop
@@ -142,6 +142,8 @@ class ControlModel:
     """Centroid gain of the slopes, by which they are divided before they come to the controller."""
     covariance: Floats | None = None
     """(states, states) px^2: as from `steady_covariance`, where it is known already."""
+    identified: Identified | None = None
+    """Turbulence that the model follows from; None for modal gains and models read from a file."""
 
     def controller(self, plant: LoopPlant, line: CommandDelayLine) -> Controller:
         """Return the learnt controller."""
@@ -154,8 +156,8 @@ class ControlModel:
             return PseudoOpenLoop(line, plant.interaction, *covariances, clean, float(arrays["gain"]))
         return Predictive(line, plant.interaction, self.predictor(), clean, from_latest=self.is_local)
 
-    def guarded(self, plant: LoopPlant, line: CommandDelayLine, **options: Any) -> Guard:
-        """Return the learnt controller with the integrator beside it; for the options see `Guard`."""
+    def guarded(self, plant: LoopPlant, line: CommandDelayLine, **options: Any) -> GuardedController:
+        """Return the learnt controller with the integrator beside it; options are those of the guard."""
         options |= {
             "noise_factor": self.noise_factor,
             "prefers_plain": self.left[1] < self.left[0],
@@ -306,29 +308,3 @@ def _checked(arrays: Mapping[str, Any], plant: LoopPlant) -> dict[str, Floats]:
         if array.shape != shapes.get(name, ()):
             raise InputError(f"{name}: expected shape {shapes.get(name, ())}, got {array.shape}")
     return numbers
-
-
-@dataclass(frozen=True, eq=False)
-class LearntControl:
-    """Learnt model with its loop, from which controllers are made."""
-
-    plant: LoopPlant
-    model: ControlModel
-    identified: Identified | None = None
-    """Turbulence that the model follows from; None for modal gains and models read from a file."""
-
-    @property
-    def noise_factor(self) -> float:
-        """Factor on the variances of standard errors."""
-        return self.model.noise_factor
-
-    @property
-    def expected_std_px(self) -> Floats | None:
-        """(m,): standard deviations of the predicted slopes; None if unknown."""
-        return self.model.expected_std_px
-
-    def controller(
-        self, line: CommandDelayLine, prior_std_px: Floats | None = None, plain_frames: int = 0
-    ) -> Guard:
-        """Return the controller, with the estimator's prior if it has one; see `choice.prepare`."""
-        return self.model.guarded(self.plant, line, prior_std_px=prior_std_px, plain_frames=plain_frames)

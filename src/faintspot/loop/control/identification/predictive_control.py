@@ -18,7 +18,7 @@ from faintspot.loop.control.identification.layers import Identification, Identif
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.measured import Measured, Wind, winds_of
-from faintspot.loop.control.identification.model import KALMAN, ControlModel, LearntControl, LoopPlant
+from faintspot.loop.control.identification.model import KALMAN, ControlModel, LoopPlant
 from faintspot.loop.control.identification.open_loop import (
     OpenLoop,
     measured_delay,
@@ -73,14 +73,11 @@ class PredictiveControl:
     called with every frame, in order. Made by `learn`; not by hand.
     """
 
-    def __init__(self, loop: LoopOfControl, learnt: LearntControl) -> None:
-        self._loop, self._learnt = loop, learnt
-        self.reset()
-
-    @property
-    def model(self) -> ControlModel:
+    def __init__(self, loop: LoopOfControl, model: ControlModel) -> None:
+        self._loop, self._plant = loop, loop.plant()
+        self.model = model
         """Model of the filter and of its fallback."""
-        return self._learnt.model
+        self.reset()
 
     @property
     def delay_frames(self) -> Measured:
@@ -122,9 +119,9 @@ class PredictiveControl:
         command : (commands,) array, optional
             What the mirror holds. Default: it is flat.
         """
-        plant, limit = self._learnt.plant, self._loop.largest_command
+        plant, limit = self._plant, self._loop.largest_command
         self._line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames, limit)
-        self._controller = self._learnt.controller(self._line, plain_frames=_MEASURED_FRAMES)
+        self._controller = self.model.guarded(plant, self._line, plain_frames=_MEASURED_FRAMES)
         if command is not None:
             self._line.hold(self._loop.sign * np.asarray(command, np.float64))
             self._controller.begin()
@@ -169,9 +166,9 @@ class PredictiveControl:
         """
         if recording.sent_after_frames is None:
             recording = replace(recording, sent_after_frames=self._loop.sent_after_frames)
-        again = learn(recording, self._learnt.identified)
+        again = learn(recording, self.model.identified)
         latest = self._loop.sign * self._line.latest
-        self._loop, self._learnt = again._loop, again._learnt
+        self._loop, self._plant, self.model = again._loop, again._plant, again.model
         self.reset(latest)
         return self
 
@@ -200,8 +197,7 @@ class PredictiveControl:
         try:
             plain = {name: array.item() if array.ndim == 0 else array for name, array in values.items()}
             loop = LoopOfControl(**plain)
-            plant = loop.plant()
-            return cls(loop, LearntControl(plant, ControlModel.load(path, plant)))
+            return cls(loop, ControlModel.load(path, loop.plant()))
         except (ValueError, TypeError, IndexError):
             raise InputError(f"{path}: expected {_CONTENTS}, got arrays of another shape") from None
 
@@ -223,7 +219,7 @@ class PredictiveControl:
         InputError
             When the file cannot be written.
         """
-        plant = self._learnt.plant
+        plant = self._plant
         matrices = state_space(self.model, plant, self._loop.scale, self._loop.sign)
         matrices["delay_frames"] = np.array(plant.delay_frames)
         write_matrices(path, {**matrices, "largest_command": np.array(self._loop.largest_command)})
@@ -329,18 +325,17 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> P
         identification=observed.identification,
     )
     # The fallback is the integrator that has run, whatever the gain found.
-    plain = ready.loop_gain * gain if math.isfinite(ready.loop_gain) else learnt.model.plain_gain
+    plain = ready.loop_gain * gain if math.isfinite(ready.loop_gain) else learnt.plain_gain
     described = replace(
         described,
         largest_command=_largest_command(loop, seen, plant),
-        integrator_gain=learnt.model.plain_gain / gain,
+        integrator_gain=learnt.plain_gain / gain,
     )
     identified = learnt.identified
     if identified is not None and identified.is_layered:
         described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
-    description = "; ".join([learnt.model.description, *loop.remarks])
-    model = replace(learnt.model, plain_gain=plain, description=description)
-    return PredictiveControl(described, replace(learnt, model=model))
+    description = "; ".join([learnt.description, *loop.remarks])
+    return PredictiveControl(described, replace(learnt, plain_gain=plain, description=description))
 
 
 def _largest_command(loop: Recording, seen: OpenLoop, plant: LoopPlant) -> float:

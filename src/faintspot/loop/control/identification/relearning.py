@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import SETTLE_FRAMES
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learning import KALMAN, LearntControl, LoopPlant, learn_controller
+from faintspot.loop.control.identification.learning import KALMAN, LoopPlant, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import ControlModel
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
@@ -35,7 +35,7 @@ class RelearntControl:
     All are computed for the centroid gain that was found.
     """
 
-    learnt: LearntControl
+    learnt: ControlModel
     residual: float
     by_running: float
     by_integrator: float
@@ -63,7 +63,7 @@ class RelearntControl:
         of_integrator = self.residual / self.by_integrator
         gain = "" if self.delay is None else f"{self.delay.gain_summary}, "
         return (
-            f"{gain}{self.learnt.model.description}; phase variance {part:.3f} +- {error:.3f} of the running "
+            f"{gain}{self.learnt.description}; phase variance {part:.3f} +- {error:.3f} of the running "
             f"filter's, {of_integrator:.2f} of the integrator's"
         )
 
@@ -106,8 +106,8 @@ def relearn(
     if frames < FEWEST_FRAMES:
         raise InputError(f"telemetry: expected {FEWEST_FRAMES} frames to judge a filter, got {frames}")
     first = frames - round(JUDGED_PART * frames)
-    learnt = learn_controller(KALMAN, plant, telemetry.part(0, first), site, rate_hz, start=start)
-    new, begin = learnt.model, max(0, first - SETTLE_FRAMES)
+    new = learn_controller(KALMAN, plant, telemetry.part(0, first), site, rate_hz, start=start)
+    identified, begin = new.identified, max(0, first - SETTLE_FRAMES)
     replayed = telemetry.part(begin, None)  # all have settled when the part begins that they are judged on
     phase = new.phase(plant)
     by_integrator = plant.replayed_integrators([new.plain_gain], replayed, phase)[0]
@@ -119,9 +119,9 @@ def relearn(
         new, by_new = replace(running, plain_gain=new.plain_gain), by_running
     means = float(by_new.mean()), float(by_running.mean()), float(by_integrator.mean())
     # By the residuals the engine chooses what begins.
-    scored = replace(new, left=(means[0], means[2]), centroid_gain=gain)
+    learnt = replace(new, left=(means[0], means[2]), centroid_gain=gain, identified=identified)
     error = _error_of_mean(by_running - by_new)
-    return RelearntControl(replace(learnt, model=scored), *means, error, delay, changed)
+    return RelearntControl(learnt, *means, error, delay, changed)
 
 
 def _error_of_mean(values: Floats) -> float:

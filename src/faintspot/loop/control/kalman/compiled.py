@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from faintspot.loop.control.base import Expected
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.kalman.choice import CHOSEN
-from faintspot.loop.control.kalman.guarded import Guard
+from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.kernels import (
     COMMAND_ROWS,
     FOLLOW,
@@ -35,7 +35,7 @@ STEPS = 4
 _NO_PRIOR = np.zeros(0)
 
 
-class CompiledKalman(Guard):
+class CompiledKalman(GuardedController):
     """Guard of `Predictive` and the integrator, in compiled code.
 
     How much each slope corrects follows the noise of each frame, as in `SlopePredictor`; in place of solving
@@ -61,7 +61,7 @@ class CompiledKalman(Guard):
     steps : int
         Of conjugate gradients.
     options
-        As for `Guard`.
+        As for `GuardedController`.
     """
 
     def __init__(

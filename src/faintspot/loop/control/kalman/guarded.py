@@ -28,7 +28,7 @@ from faintspot.loop.control.telemetry import as_estimated, without_prior
 Floats = NDArray[np.float64]
 
 
-class Guard(Controller):
+class GuardedController(Controller):
     """Learnt controller, replaced by a plain one while its residual is larger; subclasses compute both.
 
     Both send commands in every frame, each to a mirror of its own that exists only in numbers; the slopes
@@ -123,7 +123,7 @@ class Guard(Controller):
         self.line.put(command + guard[BLENDED] / HANDOVER_FRAMES * self._offset)
 
 
-class Guarded(Guard):
+class Guarded(GuardedController):
     """Any two controllers side by side.
 
     Parameters
@@ -135,7 +135,7 @@ class Guarded(Guard):
     learnt, plain : callable
         Return a controller, given where its commands go.
     options
-        As for `Guard`.
+        As for `GuardedController`.
     """
 
     def __init__(

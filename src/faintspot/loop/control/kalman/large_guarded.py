@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.loop.control.base import Expected
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.kalman.guarded import Guard
+from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.local_covariance import replies
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor
 from faintspot.loop.control.reconstructor import Reconstructor
@@ -46,7 +46,7 @@ class _Frame(NamedTuple):
         return (1 - self.trust) * (self.by_plain - self.by_latest_plain)
 
 
-class LargeGuarded(Guard):
+class LargeGuarded(GuardedController):
     """Guard of `Predictive` and the integrator, for large sensors.
 
     Reading matrices takes most of the time of a frame. They are kept in float32. The predictive command is
@@ -67,7 +67,7 @@ class LargeGuarded(Guard):
     plain_gain, leak : float
         Of the integrator.
     options
-        As for `Guard`.
+        As for `GuardedController`.
     """
 
     settle_frames = 0  # a frame has no time for two filters
