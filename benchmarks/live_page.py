@@ -26,7 +26,7 @@ from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from benchmarks.measuring import Row, Table, Times, median_ratio, spread
 from benchmarks.realtime_processes import SMALL, USUAL, engine_and_camera
-from faintspot.engine.telemetry.ring import TelemetryReader
+from faintspot.engine.telemetry.ring import TelemetryRing
 
 RATE_HZ, TURN_S, TURNS = 300, 5.0, 8
 READING, SLOW = 4, 1
@@ -72,7 +72,7 @@ async def _turns(
     name: str, server: subprocess.Popen[str], url: str
 ) -> tuple[dict[str, list[NDArray[np.float64]]], float]:
     """Return latencies (us) of every turn by method, and how often a client was told of new frames."""
-    reader = TelemetryReader.attach(name)
+    reader = TelemetryRing.attach(name)
     clients = [await client(url) for _ in range(READING + SLOW)]
     counts = [0] * READING
     reading = [asyncio.ensure_future(read(each, counts, i)) for i, each in enumerate(clients[:READING])]

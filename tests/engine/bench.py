@@ -17,7 +17,7 @@ import faintspot as fs
 from faintspot.base.closing import Closing
 from faintspot.engine.engine import Engine
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.telemetry.ring import TelemetryReader
+from faintspot.engine.telemetry.ring import TelemetryRing
 
 LAYOUT = fs.Layout.grid((4, 4), pixels=8)
 CALIBRATION = fs.Calibration(100.0, read_noise_e=1.0)
@@ -42,7 +42,7 @@ class Bench(Closing):
         self._ring: PixelRing | None = None
         self.engine = Engine(self.name, make, SETTINGS, **options)
         self._thread = threading.Thread(target=self.engine.run)
-        self.telemetry = TelemetryReader.attach(self.name)
+        self.telemetry = TelemetryRing.attach(self.name)
         self._thread.start()
 
     def ring(self, dtype: Any = np.uint16, shape: tuple[int, int] = LAYOUT.frame_shape) -> PixelRing:

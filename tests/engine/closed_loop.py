@@ -19,7 +19,7 @@ import faintspot as fs
 from faintspot.engine.engine import Engine
 from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.pixels.segment import FOLDER
-from faintspot.engine.telemetry.ring import TelemetryReader
+from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope.simulated_telescope import TRUTH, SimulatedTelescope
 from faintspot.loop.control.configuration import Control, load_control
 from faintspot.loop.control.identification.model import INTEGRATOR
@@ -64,7 +64,7 @@ class RunningEngine:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self.telemetry = TelemetryReader.attach(engine.name)
+        self.telemetry = TelemetryRing.attach(engine.name)
         self._thread = threading.Thread(target=engine.run)
         self._thread.start()
 

@@ -17,7 +17,7 @@ from faintspot.engine.requests.child_processes import ChildProcesses
 from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
 from faintspot.engine.requests.scheduling import lowest_priority
-from faintspot.engine.telemetry.ring import TelemetryReader
+from faintspot.engine.telemetry.ring import TelemetryRing
 
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _WATCH_S = 1.0
@@ -45,7 +45,7 @@ class BackgroundProcess(ABC):
     """Words for what an answer could not do."""
 
     def __init__(self, name: str) -> None:
-        self._path, self._reader = socket_path(name), TelemetryReader.attach(name)
+        self._path, self._reader = socket_path(name), TelemetryRing.attach(name)
 
     def tell(self, command: str, models: Mapping[str, Any], **fields: Any) -> dict[str, Any]:
         """Send the engine a command, with a file of each model that is not None; return its answer.

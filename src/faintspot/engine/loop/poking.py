@@ -11,7 +11,7 @@ from faintspot.base.checks import number_between
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
 from faintspot.engine.streams.shared_streams import create_stream
-from faintspot.engine.telemetry.ring import TelemetryReader
+from faintspot.engine.telemetry.ring import TelemetryRing
 
 Floats = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class StreamedMirror(Closing):
         self.commands = int(number_between("commands", commands, 1, 100_000, integer=True))
         self._settle = int(number_between("settle_frames", settle_frames, 1, 10_000, integer=True))
         self._frames = int(number_between("frames", frames, 2, 100_000, integer=True))
-        self._name, self._reader = name, TelemetryReader.attach(name)
+        self._name, self._reader = name, TelemetryRing.attach(name)
         if self._reader.stale:
             raise InputError(f"the engine {name} has ended; start one with faintspot realtime run")
         if self._reader.description.get("commands"):

@@ -22,7 +22,7 @@ from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import request
 from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
-from faintspot.engine.telemetry.ring import TelemetryReader
+from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope.simulated_telescope import TRUTH
 from faintspot.loop.control.configuration import CONTROLLER, save_control
 from faintspot.loop.control.identification.model import INTEGRATOR, KALMAN
@@ -275,7 +275,7 @@ class _Watcher(Closing):
 
     def __init__(self, name: str, shown: Shown, looks_hz: float) -> None:
         self._shown, self._look_s = shown, max(1 / looks_hz, _LEAST_LOOK_S)
-        self._reader = TelemetryReader.attach(name)
+        self._reader = TelemetryRing.attach(name)
         self._truth = Follower(f"{name}_truth")
         self._cursor = self._reader.records.written
 

@@ -10,7 +10,7 @@ import numpy as np
 from faintspot.base.errors import InputError
 from faintspot.engine.page.batch import Batch, Picture
 from faintspot.engine.streams.stream import Follower
-from faintspot.engine.telemetry.ring import TelemetryReader
+from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope.simulated_telescope import TRUTH
 from faintspot.slopes.sensor.layout import Layout
 
@@ -38,7 +38,7 @@ class EngineSource:
         self.name = name
         self.layout: Layout | None = None
         self.methods: list[str] = []
-        self._reader: TelemetryReader | None = None
+        self._reader: TelemetryRing | None = None
         self._truth, self._commands = Follower(f"{name}_truth"), Follower(f"{name}_commands")
         self._cursors = [0, 0, 0]  # records, images, changes
         self._asked_s = 0.0
@@ -87,7 +87,7 @@ class EngineSource:
     def _attached(self) -> bool:
         """Look for the engine's telemetry; return whether it is available."""
         try:
-            reader = TelemetryReader.attach(self.name)
+            reader = TelemetryRing.attach(self.name)
         except InputError:
             return False
         if reader.stale:
@@ -98,7 +98,7 @@ class EngineSource:
         self._cursors = [reader.records.written, max(0, reader.images.written - 1), 0]
         return True
 
-    def _let_go_if_stale(self, reader: TelemetryReader) -> None:
+    def _let_go_if_stale(self, reader: TelemetryRing) -> None:
         """Close the telemetry of an engine that has ended, after reading all of it."""
         if time.monotonic() - self._asked_s < _STALE_S:
             return

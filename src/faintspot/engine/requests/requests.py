@@ -52,7 +52,7 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
         Socket of the engine; see `socket_path`.
     command : str
     timeout_s : float
-        Time to wait for the whole reply.
+        Time to wait for the connection, and for the reply.
     **fields
         Other fields of the request, as JSON values.
 
@@ -69,15 +69,18 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
         raise InputError(f"request: expected what JSON can hold ({error})") from None
     if len(line) > LARGEST_REQUEST:
         raise InputError(f"request: expected at most {LARGEST_REQUEST} bytes, got {len(line)}")
-    end = time.monotonic() + timeout_s
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection,
+        connection.makefile("rb") as stream,
+    ):
+        connection.settimeout(timeout_s)
         try:
-            _connect(connection, Path(path), end)
+            _connect(connection, Path(path), time.monotonic() + timeout_s)
             if peer_uid(connection) != os.geteuid():
                 raise InputError(f"the {kind} {name} belongs to another user")
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # its reply may hold the reason
                 connection.sendall(line)
-            reply = _received_line(connection, end)
+            reply = stream.readline(_LARGEST_REPLY + 1)
         except TimeoutError:
             raise InputError(f"the {kind} {name} does not answer: waited {timeout_s:g} s") from None
         except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
@@ -308,30 +311,12 @@ def changes_of(fields: dict[str, Any]) -> dict[str, Any]:
 
 def _connect(connection: socket.socket, path: Path, end: float) -> None:
     while True:
-        _set_timeout(connection, end)
         try:
             return connection.connect(os.fspath(path))
         except BlockingIOError:  # many others are connecting
+            if time.monotonic() > end:
+                raise TimeoutError from None
             time.sleep(0.01)
-
-
-def _received_line(connection: socket.socket, end: float) -> bytes:
-    """Receive up to the end of a line, or until the connection closes."""
-    received = bytearray()
-    while len(received) <= _LARGEST_REPLY:
-        _set_timeout(connection, end)
-        data = connection.recv(1 << 20)
-        received += data
-        if not data or b"\n" in data:
-            break
-    return bytes(received)
-
-
-def _set_timeout(connection: socket.socket, end: float) -> None:
-    remaining = end - time.monotonic()
-    if remaining <= 0:
-        raise TimeoutError
-    connection.settimeout(remaining)
 
 
 def _checked_reply(server: str, line: bytes) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.engine.pixels.camera import StopEvent
 from faintspot.engine.settings.interleaving import methods_after
-from faintspot.engine.telemetry.ring import TelemetryReader
+from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io.telemetry.recording import TelemetryStore
 
 _POLL_S = 0.01
@@ -74,7 +74,7 @@ class _Waiting:
     frames_read: int = 0
     n_bytes: int = 0
 
-    def read(self, reader: TelemetryReader, limit: int) -> bool:
+    def read(self, reader: TelemetryRing, limit: int) -> bool:
         """Read what is available, up to `limit` frames in total; return whether there was anything."""
         most = min(limit - self.frames_read, _MOST_RECORDS)
         records, self.record_cursor, dropped = reader.records.since(self.record_cursor, most)
@@ -91,14 +91,14 @@ class _Waiting:
         self.frames_read += len(records)
         return bool(len(records) or len(images))
 
-    def taken(self, reader: TelemetryReader) -> tuple[NDArray[Any], NDArray[Any]]:
+    def taken(self, reader: TelemetryRing) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the buffered records and images, and clear the buffers."""
         records = np.concatenate([np.empty(0, reader.records.kind), *self.records])
         images = np.concatenate([np.empty(0, reader.images.kind), *self.images])
         self.records, self.images, self.n_bytes = [], [], 0
         return records, images
 
-    def attributes(self, reader: TelemetryReader) -> dict[str, Any]:
+    def attributes(self, reader: TelemetryRing) -> dict[str, Any]:
         """Return the store's attributes."""
         return {
             "methods": methods_after(reader.description["methods"], self.changes)[0],
@@ -126,7 +126,7 @@ class Recorder:
     """
 
     def __init__(self, name: str, path: str | Path) -> None:
-        self._reader = reader = TelemetryReader.attach(name)
+        self._reader = reader = TelemetryRing.attach(name)
         self._waiting = _Waiting(reader.records.written, reader.images.written)
         attributes = {
             "name": name,

@@ -14,6 +14,7 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.json_text import parse_json, to_json
+from faintspot.engine.pixels.segment import CLOSED, Segment
 from faintspot.engine.telemetry.segment import (
     CHANGE_BYTES,
-    TelemetrySegment,
+    CHANGE_SLOTS,
+    Ring,
     image_type,
     layout_values,
     record_type,
@@ -31,31 +34,60 @@ from faintspot.engine.telemetry.segment import (
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 
-__all__ = ["TelemetryReader", "TelemetryRing"]
-
 _HEAD = struct.Struct("<10q")
+_OF_SLOPES = (
+    *("x", "y", "flux", "standard_error_x", "standard_error_y", "covariance_xy"),
+    *("iterations", "flags"),
+)
+_VALUES = attrgetter(*_OF_SLOPES)
 _RECORD_BYTES, _IMAGE_BYTES = 1 << 25, 1 << 24  # small enough for a container's 64 MiB of shared memory
 
 
-class TelemetryRing(TelemetrySegment):
-    """Writer of an engine's telemetry, made by `create`. As a context manager it closes itself.
+class TelemetryRing(Segment):
+    """An engine's telemetry, made by `create` (the writer) or `attach` (a reader).
 
     Records, images and changes may be written from three threads, each kind from one thread only.
+
+    Attributes
+    ----------
+    records, images, changes : Ring
+        Records of all frames, images of some, and changes of settings; see `record_type` and `image_type`.
+        Their cells count the items ever written.
+    layout : Layout
+    settings : str
+        Initial settings of the engine: TOML text.
     """
 
+    what, writer = "ring of telemetry", "engine"
+
     def __init__(self, *parts: Any) -> None:
-        """Use `create` instead."""
+        """Use `create` or `attach` instead."""
         super().__init__(*parts)
+        self.records, self.images, self.changes = (
+            Ring(self.cells[row], items) for row, items in enumerate(self.rings.values(), CLOSED + 1)
+        )
+        self.layout = Layout(**self.description["layout"])
+        self.settings: str = self.description["settings"]
         items = self.records.items
         self._memory, self._written = items.view(np.uint8).data, 0
         self._slots, self._itemsize = len(items), items.itemsize
         # One array per field; each row is the target of one copy, without temporary objects.
-        self._x, self._y, self._flux = items["x"], items["y"], items["flux"]
-        self._error_x, self._error_y = items["standard_error_x"], items["standard_error_y"]
-        self._covariance_xy = items["covariance_xy"]
-        self._iterations, self._flags = items["iterations"], items["flags"]
+        self._targets = [items[name] for name in _OF_SLOPES]
         if self.description["commands"]:
             self._loop, self._commands = items["loop"], items["commands"]
+
+    @classmethod
+    def contents(cls, description: Mapping[str, Any]) -> tuple[int, dict[str, tuple[np.dtype[Any], int]]]:
+        """See `Segment`."""
+        layout = description["layout"]
+        n, shape, window = len(layout["corners"]), tuple(layout["frame_shape"]), tuple(layout["window"])
+        change = np.dtype([("length", np.int64), ("text", np.uint8, (CHANGE_BYTES - 8,))])
+        rings = {
+            "records": (record_type(n, description["commands"]), description["records"]),
+            "images": (image_type(shape, n, window), description["image_slots"]),
+            "changes": (change, CHANGE_SLOTS),
+        }
+        return CLOSED + 1 + len(rings), rings
 
     @classmethod
     def create(
@@ -122,6 +154,17 @@ class TelemetryRing(TelemetrySegment):
         }
         return cls._created(f"{name}_telemetry", description)
 
+    @classmethod
+    def attach(cls, name: str) -> TelemetryRing:
+        """Open the telemetry of an engine.
+
+        Raises
+        ------
+        InputError
+            When there is no such telemetry, or it is not of this version and user.
+        """
+        return cls._attached(f"{name}_telemetry")
+
     def write(
         self,
         frame: int,
@@ -168,10 +211,8 @@ class TelemetryRing(TelemetrySegment):
             time.time_ns() - time.monotonic_ns(),
             *causes,
         )
-        self._x[slot], self._y[slot], self._flux[slot] = slopes.x, slopes.y, slopes.flux
-        self._error_x[slot], self._error_y[slot] = slopes.standard_error_x, slopes.standard_error_y
-        self._covariance_xy[slot] = slopes.covariance_xy
-        self._iterations[slot], self._flags[slot] = slopes.iterations, slopes.flags
+        for target, values in zip(self._targets, _VALUES(slopes), strict=True):
+            target[slot] = values
         if commands is not None:
             self._loop[slot], self._commands[slot] = loop, commands
         self._written = written = written + 1
@@ -218,34 +259,6 @@ class TelemetryRing(TelemetrySegment):
         item["length"] = len(text)
         item["text"][: len(text)] = np.frombuffer(text, np.uint8)
         ring.count(written + 1)
-
-
-class TelemetryReader(TelemetrySegment):
-    """Reader of an engine's telemetry, made by `attach`.
-
-    Attributes
-    ----------
-    layout : Layout
-    settings : str
-        Initial settings of the engine: TOML text.
-    """
-
-    def __init__(self, *parts: Any) -> None:
-        """Use `attach` instead."""
-        super().__init__(*parts)
-        self.layout = Layout(**self.description["layout"])
-        self.settings: str = self.description["settings"]
-
-    @classmethod
-    def attach(cls, name: str) -> TelemetryReader:
-        """Open the telemetry of an engine.
-
-        Raises
-        ------
-        InputError
-            When there is no such telemetry, or it is not of this version and user.
-        """
-        return cls._attached(f"{name}_telemetry")
 
     def changes_since(self, cursor: int) -> tuple[list[dict[str, Any]], int, int]:
         """Return the changes of settings from a cursor on, as `Ring.since` does.

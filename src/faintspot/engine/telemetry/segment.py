@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.json_text import plain_values
-from faintspot.engine.pixels.segment import CLOSED, Segment
 from faintspot.slopes.kernels.compilation.ordered import fence, load, store
 from faintspot.slopes.sensor.layout import Layout
 
@@ -102,38 +100,6 @@ class Ring:
         fence()  # before checking what was overwritten meanwhile
         overwritten = min(max(self.written - slots + 1 - first, 0), len(copies))
         return copies[overwritten:], last, first - cursor + overwritten
-
-
-class TelemetrySegment(Segment):
-    """The three rings of an engine's telemetry, whose cells count the items ever written.
-
-    Attributes
-    ----------
-    records, images, changes : Ring
-        Records of all frames, images of some, and changes of settings; see `record_type` and `image_type`.
-    """
-
-    what, writer = "ring of telemetry", "engine"
-
-    def __init__(self, *parts: Any) -> None:
-        """Use `create` or `attach` instead."""
-        super().__init__(*parts)
-        self.records, self.images, self.changes = (
-            Ring(self.cells[row], items) for row, items in enumerate(self.rings.values(), CLOSED + 1)
-        )
-
-    @classmethod
-    def contents(cls, description: Mapping[str, Any]) -> tuple[int, dict[str, tuple[np.dtype[Any], int]]]:
-        """See `Segment`."""
-        layout = description["layout"]
-        n, shape, window = len(layout["corners"]), tuple(layout["frame_shape"]), tuple(layout["window"])
-        change = np.dtype([("length", np.int64), ("text", np.uint8, (CHANGE_BYTES - 8,))])
-        rings = {
-            "records": (record_type(n, description["commands"]), description["records"]),
-            "images": (image_type(shape, n, window), description["image_slots"]),
-            "changes": (change, CHANGE_SLOTS),
-        }
-        return CLOSED + 1 + len(rings), rings
 
 
 def layout_values(layout: Layout) -> dict[str, Any]:

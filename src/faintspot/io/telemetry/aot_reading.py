@@ -31,20 +31,6 @@ NOISE_COLUMNS = "VAR_X", "VAR_Y", "COV_XY"
 FLAGS_COLUMN = "FLAGS"
 
 
-@dataclass(frozen=True, eq=False)
-class AotLoop:
-    """A control loop of an AOT file that a sensor drives; missing data are None."""
-
-    is_closed: bool
-    commands: NDArray[np.float64] | None
-    """(t, commands)"""
-    control_matrix: NDArray[np.float64] | None
-    """(commands, 2 n): slopes all x, then all y."""
-    frame_rate_hz: float | None
-    delay_frames: float | None
-    """From the middle of an exposure to the middle of its command."""
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class AotSensor:
     """A Shack-Hartmann sensor of an AOT file, with the data that the file holds; missing data are None.
@@ -88,13 +74,20 @@ class AotSensor:
     """Flux as stored, (t, n)."""
     interaction: NDArray[np.float64] | None
     """Interaction matrix of the first loop with one, (2 n, commands): all x, then all y, per unit command."""
-    loop: AotLoop | None
-    """First loop with commands, else the first one."""
     cells: NDArray[np.int64] | None
     """(n, 2): row and column of each sub-aperture."""
     diameter_m: float | None
     """Diameter of the telescope's pupil."""
     pixel_scale_arcsec: float | None
+    is_closed: bool = True
+    """Whether the loop is closed that the sensor drives: the first one with commands, else the first one."""
+    commands: NDArray[np.float64] | None = None
+    """(t, commands)"""
+    control_matrix: NDArray[np.float64] | None = None
+    """(commands, 2 n): slopes all x, then all y."""
+    frame_rate_hz: float | None = None
+    delay_frames: float | None = None
+    """From the middle of an exposure to the middle of its command."""
 
     def __repr__(self) -> str:
         """Return the name, the number of sub-apertures and the available data."""
@@ -253,30 +246,30 @@ def _sensor(path: Path, sensor: Any, system: Any, loops: list[Any], noise: Any, 
         times,
         flux,
         _interaction([loop for loop in loops if loop.interaction_matrix], n),
-        _loop(loops, n),
         _cells(sensor, n),
         _number(system.main_telescope, "enclosing_diameter"),
         None if scale is None else scale * 180 / np.pi * 3600,
+        **_loop(loops, n),
     )
 
 
-def _loop(loops: list[Any], n: int) -> AotLoop | None:
-    """Return the first loop with commands, else the first one."""
+def _loop(loops: list[Any], n: int) -> dict[str, Any]:
+    """Return the values of the first loop with commands, else of the first one."""
     if not loops:
-        return None
+        return {}
     loop = next((loop for loop in loops if _data_of(loop, "commands") is not None), loops[0])
     commands, control = (_data_of(loop, name) for name in ("commands", "control_matrix"))
     if commands is not None and commands.ndim != 2:
         raise InputError(f"commands: expected shape (t, commands), got {commands.shape}")
     if control is not None and control.shape[1:] != (2, n):
         raise InputError(f"control_matrix: expected shape (commands, 2, {n}), got {control.shape}")
-    return AotLoop(
-        bool(loop.closed),
-        None if commands is None else commands.astype(np.float64),
-        None if control is None else control.reshape(len(control), -1).astype(np.float64),
-        _number(loop, "framerate"),
-        _number(loop, "delay"),
-    )
+    return {
+        "is_closed": bool(loop.closed),
+        "commands": None if commands is None else commands.astype(np.float64),
+        "control_matrix": None if control is None else control.reshape(len(control), -1).astype(np.float64),
+        "frame_rate_hz": _number(loop, "framerate"),
+        "delay_frames": _number(loop, "delay"),
+    }
 
 
 def _number(owner: Any, name: str) -> float | None:

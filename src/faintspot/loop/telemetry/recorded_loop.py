@@ -35,6 +35,10 @@ UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
 """Units of slopes, in arcsec."""
 _OF_AOT = {"pix": "px", "pixel": "px", "px": "px", "arcsec": "arcsec", "rad": "rad"}
 _ARRAYS = ("slopes", "commands", "interaction_matrix", "control_matrix", "cells", "time_s", "frame", "flags")
+_OF_SENSOR = (
+    *("flags", "frame", "cells", "diameter_m", "pixel_scale_arcsec"),
+    *("commands", "control_matrix", "frame_rate_hz", "delay_frames"),
+)
 _SCALES = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
 """What a layout knows of the telescope."""
 _WORDS = ("slope_unit", "slope_order", "loop")
@@ -226,27 +230,16 @@ def _of_aot(path: Path) -> dict[str, Any]:
     from faintspot.io.telemetry.aot_reading import read_aot
 
     sensor = read_aot(path)
-    loop = sensor.loop
     if sensor.slopes is None:
         raise InputError(f"{path}: expected slopes (measurements of the sensor), found none")
     values: dict[str, Any] = {
         "slopes": sensor.slopes.reshape(len(sensor.slopes), -1),
-        "loop": "closed" if loop is None or loop.is_closed else "open",
+        "loop": "closed" if sensor.is_closed else "open",
     }
     if sensor.unit.lower() in _OF_AOT:
         values["slope_unit"] = _OF_AOT[sensor.unit.lower()]
-    optional: dict[str, Any] = {
-        "flags": sensor.flags,
-        "frame": sensor.frame,
-        "time_s": sensor.unix_time_s,
-        "cells": sensor.cells,
-        "interaction_matrix": sensor.interaction,
-        "diameter_m": sensor.diameter_m,
-        "pixel_scale_arcsec": sensor.pixel_scale_arcsec,
-    }
-    if loop is not None:
-        names = ("commands", "control_matrix", "frame_rate_hz", "delay_frames")
-        optional |= {name: getattr(loop, name) for name in names}
+    optional = {name: getattr(sensor, name) for name in _OF_SENSOR}
+    optional |= {"time_s": sensor.unix_time_s, "interaction_matrix": sensor.interaction}
     return values | {name: value for name, value in optional.items() if value is not None and np.size(value)}
 
 
