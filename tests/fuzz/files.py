@@ -138,7 +138,7 @@ def _originals() -> Path:
     from tests.io import frame_files, slope_files, telemetry_files
 
     from faintspot.io import read_telemetry, write_aot
-    from faintspot.io.telemetry.recording import TelemetryStore
+    from faintspot.io.telemetry.writing import TelemetryStore
 
     keep = tempfile.TemporaryDirectory()
     _kept.append(keep)

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from faintspot.io.telemetry.recording import item_type
+
 N, SHAPE, WINDOW = 8, (24, 24), (8, 8)
 ATTRIBUTES: dict[str, Any] = {
     "name": "bench",
@@ -30,23 +32,9 @@ CHANGES = [
     {"frame": 20, "number": 2, "changes": {"noise_std": [i / 7 for i in range(200)]}, "where": None},
 ]
 FLOATS = "x", "y", "flux", "standard_error_x", "standard_error_y", "covariance_xy"
-RECORD = np.dtype(
-    [
-        *[(name, np.int64) for name in ("sequence", "frame", "method", "change")],
-        *[(name, np.int64) for name in ("last_row_time_ns", "published_time_ns", "clock_offset_ns")],
-        *[(name, np.float32, (N,)) for name in FLOATS],
-        ("iterations", np.int32, (N,)),
-        ("flags", np.uint8, (N,)),
-    ]
-)
-IMAGE = np.dtype(
-    [
-        ("sequence", np.int64),
-        ("image_frame", np.int64),
-        ("raw", np.float32, SHAPE),
-        ("denoised", np.float32, (N, *WINDOW)),
-    ]
-)
+SIZES = {"subaperture": N, "row": 24, "column": 24, "window_row": 8, "window_column": 8}
+LATER = ("late", "lost", "lost_because", "loop", "commands")
+RECORD, IMAGE = item_type("frame", SIZES, LATER), item_type("image", SIZES)
 START_NS = 1_700_000_000_000_000_000
 
 

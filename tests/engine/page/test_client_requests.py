@@ -79,7 +79,7 @@ def test_client_requests_reach_the_control_channel_as_the_command_line_sends_the
         ({"do": "record", "file": "/tmp/night.zarr"}, "without a folder"),
         ({"do": "record", "file": "night"}, "expected a name such as night.zarr"),
         ({"do": "record", "file": None}, "expected a name such as night.zarr"),
-        ({"do": "record", "file": "night.zarr"}, "no telemetry of"),
+        ({"do": "record", "file": "night.zarr"}, "no such ring of telemetry"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(

@@ -16,7 +16,8 @@ from faintspot.engine.page import recording_source
 from faintspot.engine.page.client_requests import answered
 from faintspot.engine.page.recording_source import RecordingSource, indices_of
 from faintspot.engine.telemetry.segment import image_type, layout_values
-from faintspot.io.telemetry.recording import StoredTelemetry, TelemetryStore
+from faintspot.io.telemetry.recording import StoredTelemetry
+from faintspot.io.telemetry.writing import TelemetryStore
 
 FRAMES = 10_000
 """100 s; chunks of slopes hold 8192 frames."""

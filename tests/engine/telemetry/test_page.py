@@ -14,7 +14,8 @@ from faintspot.engine.telemetry.figures import latency_figure
 from faintspot.engine.telemetry.numbers import change_rows, gaps, methods_in_turn, quantities, timing
 from faintspot.engine.telemetry.page import report_of_telemetry
 from faintspot.engine.telemetry.segment import image_type, layout_values, record_type
-from faintspot.io.telemetry.recording import Telemetry, TelemetryStore, read_telemetry
+from faintspot.io.telemetry.recording import Telemetry, read_telemetry
+from faintspot.io.telemetry.writing import TelemetryStore
 from faintspot.slopes.sensor.layout import Layout
 
 LAYOUT = Layout.grid((4, 4), pixels=8)

@@ -27,7 +27,7 @@ from faintspot.engine.telemetry import recorder
 from faintspot.engine.telemetry.recorder import Recorder
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
-from faintspot.io.telemetry.recording import TelemetryStore
+from faintspot.io.telemetry.writing import TelemetryStore
 
 pytestmark = [
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
@@ -83,7 +83,7 @@ def test_a_time(engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.M
 def test_an_engine_that_ends(engine: Engine, name: str, tmp_path: Path) -> None:
     """All that it has left behind is in the store."""
     recording = Recorder(name, tmp_path / "night.zarr")
-    before = recording._waiting.record_cursor
+    before = recording._records.cursor
     threading.Timer(0.3, engine.stop).start()
     report = recording.run()
     assert (report.ended_because, report.frames) == ("engine ended", engine.frames - before)

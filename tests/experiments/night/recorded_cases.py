@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.engine.telemetry.segment import image_type, layout_values, record_type
-from faintspot.io.telemetry.recording import TelemetryStore
+from faintspot.io.telemetry.writing import TelemetryStore
 from faintspot.loop.control.configuration import Control, ControlOptions
 from faintspot.loop.control.recorded import packed_control
 from faintspot.slopes.sensor.layout import Layout

@@ -18,7 +18,7 @@ from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.io import open_frames, read_aot, read_slopes, read_telemetry, write_aot
-from faintspot.io.telemetry.recording import TelemetryStore
+from faintspot.io.telemetry.writing import TelemetryStore
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.recorded import measure_recorded
 

@@ -25,7 +25,7 @@ from tests.io.telemetry_files import (
 
 from faintspot.base.errors import InputError
 from faintspot.io import Telemetry, read_telemetry, write_aot
-from faintspot.io.telemetry.recording import TelemetryStore
+from faintspot.io.telemetry.writing import TelemetryStore
 from faintspot.slopes.sensor.layout import Layout
 
 # A sensor alone has neither, of which the reader of AOT files complains.

@@ -95,10 +95,7 @@ class ImageStream:
             descriptor, writable = os.open(self._path, os.O_RDONLY | _OPEN), False
         try:
             status = os.fstat(descriptor)
-            size, head = status.st_size, METADATA
-            if not stat.S_ISREG(status.st_mode) or size <= head.itemsize:
-                raise IncompatibleStreamError(f"{self._path} is not a stream")
-            metadata = np.frombuffer(os.pread(descriptor, head.itemsize, 0), head)[0]
+            size, metadata = status.st_size, _metadata_of(descriptor, status)
             places, self.shape, self.dtype, self._circular = checked(metadata, size)
             access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
             memory = mmap.mmap(descriptor, size, access=access)
@@ -298,9 +295,7 @@ def _check_free(path: Path) -> None:
         raise InputError(f"{ISIO}:{path}: cannot be opened ({error.strerror})") from None
     try:
         status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode) or status.st_size <= METADATA.itemsize:
-            raise IncompatibleStreamError("is not a stream")
-        head = np.frombuffer(os.pread(descriptor, METADATA.itemsize, 0), METADATA)[0]
+        head = _metadata_of(descriptor, status)
         checked(head, status.st_size)
     except IncompatibleStreamError as error:
         raise InputError(f"{ISIO}:{path}: {error}; remove it or choose another name") from None
@@ -311,6 +306,13 @@ def _check_free(path: Path) -> None:
         raise InputError(
             f"{ISIO}:{path}: a living process made this stream (pid {maker}); stop it or choose another name"
         )
+
+
+def _metadata_of(descriptor: int, status: os.stat_result) -> Any:
+    """Return the metadata of an open file; refuse what can have none."""
+    if not stat.S_ISREG(status.st_mode) or status.st_size <= METADATA.itemsize:
+        raise IncompatibleStreamError("is not a stream")
+    return np.frombuffer(os.pread(descriptor, METADATA.itemsize, 0), METADATA)[0]
 
 
 def _clock() -> tuple[int, int]:

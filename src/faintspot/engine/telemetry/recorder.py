@@ -21,7 +21,8 @@ from faintspot.base.errors import InputError
 from faintspot.engine.pixels.camera import StopEvent
 from faintspot.engine.settings.interleaving import methods_after
 from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.io.telemetry.recording import TelemetryStore
+from faintspot.engine.telemetry.segment import Ring
+from faintspot.io.telemetry.writing import TelemetryStore
 
 _POLL_S = 0.01
 _FLUSH_S = 1.0
@@ -59,54 +60,26 @@ class RecordingReport:
 
 
 @dataclass
-class _Waiting:
-    """Data read but not yet stored, and the positions in the rings."""
+class _Reading:
+    """Position in a ring, and the items read from there but not yet stored."""
 
-    record_cursor: int
-    image_cursor: int
-    change_cursor: int = 0  # from the first one, to know the settings at the start
-    records: list[NDArray[Any]] = field(default_factory=list)
-    images: list[NDArray[Any]] = field(default_factory=list)
-    changes: list[dict[str, Any]] = field(default_factory=list)
+    ring: Ring
+    cursor: int
+    items: list[NDArray[Any]] = field(default_factory=list)
     dropped: int = 0
-    dropped_images: int = 0
-    dropped_changes: int = 0
-    frames_read: int = 0
-    n_bytes: int = 0
 
-    def read(self, reader: TelemetryRing, limit: int) -> bool:
-        """Read what is available, up to `limit` frames in total; return whether there was anything."""
-        most = min(limit - self.frames_read, _MOST_RECORDS)
-        records, self.record_cursor, dropped = reader.records.since(self.record_cursor, most)
-        images, self.image_cursor, dropped_images = reader.images.since(self.image_cursor, _MOST_IMAGES)
-        changes, self.change_cursor, dropped_changes = reader.changes_since(self.change_cursor)
+    def read(self, most: int) -> int:
+        """Read what is available, up to `most` items; return their number."""
+        items, self.cursor, dropped = self.ring.since(self.cursor, most)
         self.dropped += dropped
-        self.dropped_images += dropped_images
-        self.dropped_changes += dropped_changes
-        self.changes += changes
-        for items, kept in ((records, self.records), (images, self.images)):
-            if len(items):
-                kept.append(items)
-                self.n_bytes += items.nbytes
-        self.frames_read += len(records)
-        return bool(len(records) or len(images))
+        if len(items):
+            self.items.append(items)
+        return len(items)
 
-    def taken(self, reader: TelemetryRing) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the buffered records and images, and clear the buffers."""
-        records = np.concatenate([np.empty(0, reader.records.kind), *self.records])
-        images = np.concatenate([np.empty(0, reader.images.kind), *self.images])
-        self.records, self.images, self.n_bytes = [], [], 0
-        return records, images
-
-    def attributes(self, reader: TelemetryRing) -> dict[str, Any]:
-        """Return the store's attributes."""
-        return {
-            "methods": methods_after(reader.description["methods"], self.changes)[0],
-            "changes": self.changes,
-            "dropped_records": self.dropped,
-            "dropped_images": self.dropped_images,
-            "dropped_changes": self.dropped_changes,
-        }
+    def taken(self) -> NDArray[Any]:
+        """Return the items, and forget them."""
+        items, self.items = self.items, []
+        return np.concatenate([np.empty(0, self.ring.kind), *items])
 
 
 class Recorder:
@@ -127,17 +100,21 @@ class Recorder:
 
     def __init__(self, name: str, path: str | Path) -> None:
         self._reader = reader = TelemetryRing.attach(name)
-        self._waiting = _Waiting(reader.records.written, reader.images.written)
+        self._records, self._images = (
+            _Reading(ring, ring.written) for ring in (reader.records, reader.images)
+        )
+        self._change_cursor = self._dropped_changes = (
+            0  # from the first one, to know the settings at the start
+        )
+        self._changes: list[dict[str, Any]] = []
+        described = ("layout", "settings", "reference", "parts", "control")
         attributes = {
             "name": name,
-            "layout": reader.description["layout"],
-            "settings": reader.settings,
-            "reference": reader.description.get("reference"),
-            "parts": reader.description.get("parts"),
-            "control": reader.description.get("control"),
-            **self._waiting.attributes(reader),
+            **{key: reader.description[key] for key in described},
+            **self._attributes(),
         }
         self._store = TelemetryStore(path, reader.records.kind, reader.images.kind, attributes)
+        self._frames_read = 0
         self._longest_write_s = self._written_at = self._asked_at = 0.0
 
     def run(
@@ -169,10 +146,10 @@ class Recorder:
         limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
         duration = np.inf if seconds is None else number_between("seconds", seconds, 0, low_open=True)
         start = self._written_at = time.monotonic()
-        waiting, ended, gone = self._waiting, "", False
+        ended, gone = "", False
         while not ended:
-            something = waiting.read(self._reader, sys.maxsize if limit is None else limit)
-            if limit is not None and waiting.frames_read >= limit:
+            something = self._read(sys.maxsize if limit is None else limit)
+            if limit is not None and self._frames_read >= limit:
                 ended = "frames"
             elif time.monotonic() - start >= duration:
                 ended = "seconds"
@@ -181,7 +158,7 @@ class Recorder:
             elif gone and not something:  # all remaining data has been read
                 ended = "engine ended"
             if progress is not None:
-                progress(waiting.frames_read)
+                progress(self._frames_read)
             self._write_in_turn()
             if not (something or ended):
                 gone = self._gone()
@@ -189,6 +166,25 @@ class Recorder:
         self._write({"complete": True, "ended_because": ended})
         self._reader.close()
         return self._report(time.monotonic() - start, ended)
+
+    def _read(self, limit: int) -> bool:
+        """Read what is available, up to `limit` frames in total; return whether there was anything."""
+        frames = self._records.read(min(limit - self._frames_read, _MOST_RECORDS))
+        self._frames_read += frames
+        changes, self._change_cursor, dropped = self._reader.changes_since(self._change_cursor)
+        self._changes += changes
+        self._dropped_changes += dropped
+        return bool(self._images.read(_MOST_IMAGES) + frames)
+
+    def _attributes(self) -> dict[str, Any]:
+        """Return attributes of the store that change."""
+        return {
+            "methods": methods_after(self._reader.description["methods"], self._changes)[0],
+            "changes": self._changes,
+            "dropped_records": self._records.dropped,
+            "dropped_images": self._images.dropped,
+            "dropped_changes": self._dropped_changes,
+        }
 
     def _gone(self) -> bool:
         """Return whether the engine has ended; checks only now and then."""
@@ -199,29 +195,29 @@ class Recorder:
 
     def _write_in_turn(self) -> None:
         """Write the buffered data if it is time, or if there is much of it."""
-        if time.monotonic() - self._written_at > _FLUSH_S or self._waiting.n_bytes > _FLUSH_BYTES:
+        waiting = sum(items.nbytes for items in (*self._records.items, *self._images.items))
+        if time.monotonic() - self._written_at > _FLUSH_S or waiting > _FLUSH_BYTES:
             self._write({})
             self._written_at = time.monotonic()
 
     def _write(self, attributes: dict[str, Any]) -> None:
         """Write the buffered data."""
         start = time.monotonic()
-        records, images = self._waiting.taken(self._reader)
+        records, images = self._records.taken(), self._images.taken()
         try:
-            self._store.append(records, images, {**self._waiting.attributes(self._reader), **attributes})
+            self._store.append(records, images, {**self._attributes(), **attributes})
         except InputError as error:
             raise InputError(f"{error}; {self._store.frames} frames are in the store") from None
         self._longest_write_s = max(self._longest_write_s, time.monotonic() - start)
 
     def _report(self, seconds: float, ended: str) -> RecordingReport:
-        waiting, store = self._waiting, self._store
         return RecordingReport(
-            store.frames,
-            store.images,
-            len(waiting.changes),
-            waiting.dropped,
-            waiting.dropped_images,
-            waiting.dropped_changes,
+            self._store.frames,
+            self._store.images,
+            len(self._changes),
+            self._records.dropped,
+            self._images.dropped,
+            self._dropped_changes,
             seconds,
             self._longest_write_s,
             ended,

@@ -34,6 +34,7 @@ from faintspot.engine.telemetry.segment import (
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 
+_SUFFIX = "_telemetry"
 _HEAD = struct.Struct("<10q")
 _OF_SLOPES = (
     *("x", "y", "flux", "standard_error_x", "standard_error_y", "covariance_xy"),
@@ -50,6 +51,8 @@ class TelemetryRing(Segment):
 
     Attributes
     ----------
+    name : str
+        Name of the engine.
     records, images, changes : Ring
         Records of all frames, images of some, and changes of settings; see `record_type` and `image_type`.
         Their cells count the items ever written.
@@ -63,6 +66,7 @@ class TelemetryRing(Segment):
     def __init__(self, *parts: Any) -> None:
         """Use `create` or `attach` instead."""
         super().__init__(*parts)
+        self.name = self.name.removesuffix(_SUFFIX)
         self.records, self.images, self.changes = (
             Ring(self.cells[row], items) for row, items in enumerate(self.rings.values(), CLOSED + 1)
         )
@@ -152,7 +156,7 @@ class TelemetryRing(Segment):
             "records": int(number_between("records", records, 2, 1 << 24, integer=True)),
             "image_slots": int(number_between("image_slots", image_slots, 2, 1 << 16, integer=True)),
         }
-        return cls._created(f"{name}_telemetry", description)
+        return cls._created(f"{name}{_SUFFIX}", description)
 
     @classmethod
     def attach(cls, name: str) -> TelemetryRing:
@@ -163,7 +167,7 @@ class TelemetryRing(Segment):
         InputError
             When there is no such telemetry, or it is not of this version and user.
         """
-        return cls._attached(f"{name}_telemetry")
+        return cls._attached(f"{name}{_SUFFIX}")
 
     def write(
         self,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.json_text import plain_values
+from faintspot.io.telemetry.recording import item_type
 from faintspot.slopes.kernels.compilation.ordered import fence, load, store
 from faintspot.slopes.sensor.layout import Layout
 
@@ -17,37 +18,19 @@ CHANGE_SLOTS = 256
 
 
 def record_type(n: int, commands: int = 0) -> np.dtype[np.void]:
-    """Return the type of a record of n sub-apertures; units as in `faintspot.Slopes`.
+    """Return the type of a record of n sub-apertures; see `faintspot.io.Telemetry`.
 
-    `sequence` counts the records from 0, `frame` is the camera's number, `method` the number of the
-    interleaved configuration, `change` that of the last change of settings that applies. Times are of
-    CLOCK_MONOTONIC, ns; `clock_offset_ns` added to them gives Unix time by the wall clock at that moment.
-    `late` is 0 for a frame in time, else the cause (`faintspot.engine.path.lateness.CAUSES`). `lost` is the
-    number of frames lost since the record before, and `lost_because` the cause.
-    With commands, the record also has those that follow from the frame, in the interaction matrix's unit, and
-    the loop's state `loop`: 1 open, 2 closed.
+    `sequence` counts the records from 0. Without commands, it has neither these nor the loop's state.
     """
-    numbers = ("sequence", "frame", "method", "change", "last_row_time_ns", "published_time_ns")
-    head = [(name, np.int64) for name in (*numbers, "clock_offset_ns", "late", "lost", "lost_because")]
-    floats = ("x", "y", "flux", "standard_error_x", "standard_error_y", "covariance_xy")
-    body = [(name, np.float32, (n,)) for name in floats]
-    control = [("loop", np.int64), ("commands", np.float32, (commands,))] if commands else []
-    return np.dtype(
-        [*head, *body, ("iterations", np.int32, (n,)), ("flags", np.uint8, (n,)), *control], align=True
-    )
+    without = () if commands else ("loop", "commands")
+    return item_type("frame", {"subaperture": n, "command": commands}, without, align=True)
 
 
 def image_type(frame_shape: tuple[int, int], n: int, window: tuple[int, int]) -> np.dtype[np.void]:
     """Return the type of an item of the ring of images: the frame, ADU, and denoised images, electrons."""
-    return np.dtype(
-        [
-            ("sequence", np.int64),
-            ("image_frame", np.int64),
-            ("raw", np.float32, frame_shape),
-            ("denoised", np.float32, (n, *window)),
-        ],
-        align=True,
-    )
+    names = ("row", "column", "window_row", "window_column")
+    sizes = dict(zip(names, (*frame_shape, *window), strict=True))
+    return item_type("image", {**sizes, "subaperture": n}, align=True)
 
 
 class Ring:

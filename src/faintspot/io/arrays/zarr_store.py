@@ -69,7 +69,7 @@ def stored_attributes(path: Path) -> dict[str, Any]:
 
 
 def holds_telemetry(path: Path) -> bool:
-    """Return whether a path is a telemetry store written by `faintspot.io.telemetry.recording`."""
+    """Return whether a path is a telemetry store written by `faintspot.io.telemetry.writing`."""
     try:
         return bool(stored_attributes(path)["format"] == TELEMETRY)
     except (OSError, ValueError, KeyError, TypeError):

@@ -219,9 +219,7 @@ def _sensor(path: Path, sensor: Any, system: Any, loops: list[Any], noise: Any, 
         reference = None if details["SUBTRACT"] is None else np.asarray(details["SUBTRACT"], np.float64)
     else:
         reference = _reference(sensor, n)
-    slopes, flux = _data_of(sensor, "measurements"), _data_of(sensor, "subaperture_intensities")
-    if slopes is not None and slopes.shape[1:] != (2, n):
-        raise InputError(f"measurements: expected shape (t, 2, {n}), got {slopes.shape}")
+    slopes, flux = _data_of(sensor, "measurements", "t", 2, n), _data_of(sensor, "subaperture_intensities")
     if noise is not None and (slopes is None or noise.shape != (len(slopes), 3, n)):
         raise InputError(f"{NOISE}: expected as many variances and covariances as slopes, got {noise.shape}")
     if flags is not None and (slopes is None or flags.shape != (len(slopes), n)):
@@ -258,11 +256,8 @@ def _loop(loops: list[Any], n: int) -> dict[str, Any]:
     if not loops:
         return {}
     loop = next((loop for loop in loops if _data_of(loop, "commands") is not None), loops[0])
-    commands, control = (_data_of(loop, name) for name in ("commands", "control_matrix"))
-    if commands is not None and commands.ndim != 2:
-        raise InputError(f"commands: expected shape (t, commands), got {commands.shape}")
-    if control is not None and control.shape[1:] != (2, n):
-        raise InputError(f"control_matrix: expected shape (commands, 2, {n}), got {control.shape}")
+    commands = _data_of(loop, "commands", "t", "commands")
+    control = _data_of(loop, "control_matrix", "commands", 2, n)
     return {
         "is_closed": bool(loop.closed),
         "commands": None if commands is None else commands.astype(np.float64),
@@ -308,31 +303,33 @@ def _cells(sensor: Any, n: int) -> NDArray[np.int64] | None:
 
 def _reference(sensor: Any, n: int) -> NDArray[np.float64] | None:
     """Return the reference slopes if they are in pixels."""
-    values = _data_of(sensor, "ref_measurements")
-    if values is None or str(sensor.ref_measurements.unit).lower() not in _PIXELS:
+    image = sensor.ref_measurements
+    if image is None or str(image.unit).lower() not in _PIXELS:
         return None
-    if values.shape != (2, n):
-        raise InputError(f"ref_measurements: expected shape (2, {n}), got {values.shape}")
+    values = _data_of(sensor, "ref_measurements", 2, n)
+    if values is None:
+        return None
     return finite_array("ref_measurements", values).astype(np.float64).reshape(-1)
 
 
 def _interaction(loops: list[Any], n: int) -> NDArray[np.float64] | None:
     """Return the interaction matrix, (2 n, commands)."""
-    if not loops:
+    values = _data_of(loops[0], "interaction_matrix", n, 2, "commands") if loops else None
+    if values is None:
         return None
-    values = np.asarray(loops[0].interaction_matrix.data)
-    if values.ndim != 3 or values.shape[:2] != (n, 2):
-        raise InputError(f"interaction_matrix: expected shape ({n}, 2, commands), got {values.shape}")
     matrix: NDArray[np.float64] = values.swapaxes(0, 1).reshape(2 * n, -1).astype(np.float64)
     return matrix
 
 
-def _data_of(owner: Any, name: str) -> Any:
-    """Return an image's data in native byte order, or None."""
+def _data_of(owner: Any, name: str, *shape: int | str) -> Any:
+    """Return an image's data in native byte order, or None; of this shape, in which words are any number."""
     image = None if owner is None else getattr(owner, name)
     if image is None or image.data is None:
         return None
     data = np.asarray(image.data)
+    wanted = [size if isinstance(word, str) else word for word, size in zip(shape, data.shape, strict=False)]
+    if shape and (len(shape) != data.ndim or list(data.shape) != wanted):
+        raise InputError(f"{name}: expected shape ({', '.join(map(str, shape))}), got {data.shape}")
     return data.astype(data.dtype.newbyteorder("="), copy=False)
 
 

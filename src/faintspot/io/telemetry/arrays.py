@@ -1,0 +1,29 @@
+"""How the arrays of telemetry are stored: types, dimensions and units."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from faintspot.io.stored.slopes_format import VARIABLES
+
+
+class StoredArray(NamedTuple):
+    """How an array of telemetry is stored."""
+
+    dtype: np.dtype[Any]
+    dimensions: tuple[str, ...]
+    units: str
+    in_all: bool
+    """Whether all recordings have it; else it is read as zeros, e.g. commands of an engine without any."""
+
+
+def array(dtype: Any, dimensions: str, units: str = "1", *, in_all: bool = True) -> dict[str, StoredArray]:
+    """Return the metadata of a field of `Telemetry`; dimensions are words."""
+    return {"stored": StoredArray(np.dtype(dtype), tuple(dimensions.split()), units, in_all)}
+
+
+def of_slopes(name: str, dtype: Any, *, in_all: bool = True) -> dict[str, StoredArray]:
+    """Return those of a quantity of each slope."""
+    return array(dtype, "frame subaperture", VARIABLES[name].units, in_all=in_all)
