@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("xarray")
 
-from faintspot.experiments import StudySpecification, Sweep, run
+from faintspot.experiments import StudySpecification, Sweep, WorkerPool, run
 from faintspot.experiments.paper.tables import gains_by_mode
 
 
@@ -18,7 +18,7 @@ def test_gains_of_every_mode_and_none_where_there_is_no_crossing() -> None:
         StudySpecification(
             "gains", sweeps, realisations=600, estimators=("brightest", "tv"), fixed_k=(20, 40)
         ),
-        workers=0,
+        pool=WorkerPool(0),
     )
     table = gains_by_mode(dataset)
     assert [configuration.read_noise_e for configuration in table] == [0.1]

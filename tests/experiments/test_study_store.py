@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,6 @@ from faintspot.experiments import StudySpecification, measure_cell, open_study
 pytest.importorskip("zarr")
 xarray = pytest.importorskip("xarray")
 
-from faintspot.experiments.store import MemoryStore  # noqa: E402
 from faintspot.experiments.study.run import VARIABLES, dataset_of, new_dataset, stored_units  # noqa: E402
 
 OTHER = replace(SPECIFICATION, seed=2)
@@ -44,14 +44,13 @@ def test_schema() -> None:
 
 def test_store_is_memory(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
-    stored, memory = stored_units(SPECIFICATION, path), MemoryStore()
+    stored, memory = stored_units(SPECIFICATION, path), dict[str, Any]()
     assert_identical(open_study(path), dataset_of(SPECIFICATION, memory))
     for index in (2, 0):
         results = measure_cell(SPECIFICATION.cells()[index], SPECIFICATION)
-        stored.write(str(index), results)
-        memory.write(str(index), results)
+        stored[str(index)] = memory[str(index)] = results
     assert_identical(open_study(path), dataset_of(SPECIFICATION, memory))
-    assert [index for index in range(N_CELLS) if stored.done(str(index))] == [0, 2]
+    assert [index for index in range(N_CELLS) if str(index) in stored] == [0, 2]
     # One chunk a cell and variable.
     assert sorted(p.name for p in (path / "error" / "c").iterdir()) == ["0", "2"]
     # A window of 6 x 6 pixels has no more than 35 k.

@@ -113,8 +113,8 @@ def in_stages(pool: WorkerPool, sizes: Sequence[int]) -> list[WorkerPool]:
 
 def run_units(
     function: Callable[..., Arrays], units: list[Unit], store: UnitStore, pool: WorkerPool
-) -> Results:
-    """Run the units whose results are not stored yet, store each as it finishes; return all results, by key.
+) -> UnitStore:
+    """Run the units whose results are not stored yet, and store each as it finishes; return the store.
 
     Results do not depend on where units run, in which order, or on interruptions.
 
@@ -133,23 +133,13 @@ def run_units(
     InputError
         When workers die repeatedly, the scheduler cannot be reached, or results cannot be written.
     """
-    missing = sorted((unit for unit in units if not store.done(unit.key)), key=lambda unit: -unit.size)
+    missing = sorted((unit for unit in units if unit.key not in store), key=lambda unit: -unit.size)
     if missing:
         count = _Count(missing, sum(unit.size for unit in units), pool.progress)
         for number, result in _finished(function, dict(enumerate(missing)), pool, count):
-            store.write(missing[number].key, result)
+            store[missing[number].key] = result
             count.at(number, missing[number].size)
-    return Results(store)
-
-
-@dataclass(frozen=True)
-class Results:
-    """Results of units by key, read when they are asked for."""
-
-    store: UnitStore
-
-    def __getitem__(self, key: str) -> Arrays:
-        return self.store.read(key)
+    return store
 
 
 class _Count:

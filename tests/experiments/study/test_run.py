@@ -10,6 +10,7 @@ import pytest
 from tests.experiments.study_runs import N_CELLS, SPECIFICATION, assert_identical, assert_same
 
 from faintspot import InputError, experiments
+from faintspot.experiments import WorkerPool
 from faintspot.experiments.study.run import VARIABLES
 
 pytest.importorskip("zarr")
@@ -19,14 +20,18 @@ xarray = pytest.importorskip("xarray")
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("study") / "whole.zarr"
-    experiments.run(SPECIFICATION, path, workers=0)
+    experiments.run(SPECIFICATION, path, pool=WorkerPool(0))
     return path
+
+
+def counting(counts: list[tuple[int, ...]]) -> WorkerPool:
+    return WorkerPool(0, lambda *count: counts.append(count))
 
 
 @pytest.mark.slow
 def test_in_memory(uninterrupted: Path) -> None:
-    counts = []
-    result = experiments.run(SPECIFICATION, workers=0, progress=lambda *count: counts.append(count))
+    counts: list[tuple[int, ...]] = []
+    result = experiments.run(SPECIFICATION, pool=counting(counts))
     assert counts == [(i, N_CELLS) for i in range(N_CELLS + 1)]
     assert result["done"].all()
     assert_identical(result, experiments.open_study(uninterrupted))
@@ -41,20 +46,20 @@ def test_interrupted_and_started_again(tmp_path: Path, uninterrupted: Path) -> N
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        experiments.run(SPECIFICATION, path, progress=stop, workers=0)
+        experiments.run(SPECIFICATION, path, pool=WorkerPool(0, stop))
     assert int(experiments.open_study(path)["done"].sum()) == 4
-    counts = []
-    experiments.run(SPECIFICATION, path, workers=0, progress=lambda *count: counts.append(count))
+    counts: list[tuple[int, ...]] = []
+    experiments.run(SPECIFICATION, path, pool=counting(counts))
     assert counts == [(finished, N_CELLS) for finished in range(4, N_CELLS + 1)]
     assert_same(path, uninterrupted)
-    experiments.run(SPECIFICATION, path, workers=0, progress=lambda *count: counts.append(count))
+    experiments.run(SPECIFICATION, path, pool=counting(counts))
     assert len(counts) == N_CELLS - 4 + 1  # a complete study tells nothing
 
 
 def test_other_cells_do_not_matter(uninterrupted: Path) -> None:
     whole = experiments.open_study(uninterrupted)
     sweep = experiments.Sweep("one", flux_e=[300, 30], pixels=8)
-    part = experiments.run(replace(SPECIFICATION, sweeps=[sweep]), workers=0)
+    part = experiments.run(replace(SPECIFICATION, sweeps=[sweep]), pool=WorkerPool(0))
     for cell in range(2):
         chosen = (whole["flux_e"] == part["flux_e"][cell]) & (whole["pixels"] == 8)
         chosen &= whole["read_noise_e"] == 0.1
@@ -65,6 +70,6 @@ def test_other_cells_do_not_matter(uninterrupted: Path) -> None:
 
 def test_bad_arguments() -> None:
     with pytest.raises(InputError, match="workers = -1"):
-        experiments.run(SPECIFICATION, workers=-1)
+        experiments.run(SPECIFICATION, pool=WorkerPool(-1))
     with pytest.raises(InputError, match="expected a StudySpecification"):
-        experiments.run("mine.toml", workers=0)  # type: ignore[arg-type]
+        experiments.run("mine.toml")  # type: ignore[arg-type]

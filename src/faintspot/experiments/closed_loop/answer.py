@@ -16,8 +16,8 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import derived, write_atomically
 from faintspot.base.json_text import parse_json
 from faintspot.base.statistics import Estimate, paired_mean
+from faintspot.experiments.closed_loop.experiment import with_flux
 from faintspot.experiments.closed_loop.limits import Limit, falling, magnitude_gain, magnitude_limit
-from faintspot.experiments.closed_loop.magnitude import with_flux
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, NOISE_SCALE, MethodKind, method_kind
 from faintspot.experiments.closed_loop.question import (
     BASELINE,

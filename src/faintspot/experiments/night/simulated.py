@@ -92,7 +92,11 @@ def run_night(
         return run_units(function, units, store, stage)
 
     plan.made(plan.configuration(configuration, 0), 0, {})  # refuses what does not fit before any work
-    trials = _trials(configuration, plan, QUICK if quick else Search()) if tuned else []
+    search = QUICK if quick else Search()
+    trials = [
+        Unit(name, (kind, configuration, search, None), tuning_frames(kind, configuration, search))
+        for name, kind in ({name: kind_of(name) for name in plan.methods} if tuned else {}).items()
+    ]
     units = _units(configuration, plan, {}, paired)
     stages = in_stages(pool, [sum(unit.size for unit in each) for each in (trials, units)])
     choices: dict[str, Choice] = {}
@@ -107,15 +111,6 @@ def run_night(
     night = _night(configuration, plan, choices, results)
     night.save(folder / NIGHT_STORE)
     return night
-
-
-def _trials(configuration: LoopConfiguration, plan: NightPlan, search: Search) -> list[Unit]:
-    """Return the units that tune the methods of a plan."""
-    kinds = {name: kind_of(name) for name in plan.methods}
-    return [
-        Unit(name, (kind, configuration, search, None), tuning_frames(kind, configuration, search))
-        for name, kind in kinds.items()
-    ]
 
 
 def _units(
@@ -203,26 +198,28 @@ def _night(
 ) -> Night:
     """Put the sets together."""
     rate = configuration.control.frame_rate_hz
-    columns: dict[str, list[Any]] = {
-        name: [] for name in ("set_number", "method", "strength_e", "start_s", *_VALUES, "paired_strehl")
-    }
     methods: dict[str, Method] = {}
+    sets = []
     for number in range(plan.sets):
         entries, count = plan.entries(number), plan.blocks(number)
-        for method in plan.made(plan.configuration(configuration, number), number, choices):
+        made = plan.made(plan.configuration(configuration, number), number, choices)
+        for method in made:
             methods.setdefault(method.label, method)
-        made = [method.label for method in plan.made(configuration, number, choices)]
-        order = np.arange(count) % len(entries)
+        numbers = np.array([list(methods).index(method.label) for method in made])
+        order, observed = np.arange(count) % len(entries), results[_key(number, False)]
         first = plan.first_frame(number) + plan.settle_in_block + plan.block_frames * np.arange(count)
         alone = results.get(_key(number, True), {}).get("strehl", np.full(count, np.nan))
-        columns["set_number"].append(np.full(count, number))
-        columns["method"].append(np.array([list(methods).index(made[entry]) for entry in order]))
-        columns["strength_e"].append(np.array([entries[entry][1] for entry in order]))
-        columns["start_s"].append(first / rate)
-        columns["paired_strehl"].append(alone[:count])
-        for name in _VALUES:
-            columns[name].append(results[_key(number, False)][name][:count])
-    values: dict[str, Any] = {name: np.concatenate(parts) for name, parts in columns.items()}
+        sets.append(
+            {
+                "set_number": np.full(count, number),
+                "method": numbers[order],
+                "strength_e": np.array([strength for _, strength in entries])[order],
+                "start_s": first / rate,
+                "paired_strehl": alone[:count],
+                **{name: observed[name][:count] for name in _VALUES},
+            }
+        )
+    values: dict[str, Any] = {name: np.concatenate([part[name] for part in sets]) for name in sets[0]}
     scored = plan.block_frames - plan.settle_in_block
     return Night(
         labels=tuple(methods),
