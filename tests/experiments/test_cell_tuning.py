@@ -25,7 +25,7 @@ METHODS = CellMethods(CELL, SPECIFICATION, 30.0)
 
 
 def tuning() -> Tuning:
-    return Tuning(METHODS, SPECIFICATION)
+    return Tuning(METHODS)
 
 
 def test_choices_are_those_of_the_smallest_error() -> None:
@@ -68,6 +68,6 @@ def test_images_may_come_in_parts() -> None:
 def test_nothing_to_choose_needs_no_images() -> None:
     specification = StudySpecification("s", [Sweep("a")], estimators=["ml", "trained"], fixed_k=[])
     methods = CellMethods(specification.cells()[0], specification)
-    choices = Tuning(methods, specification).choices()
+    choices = Tuning(methods).choices()
     assert choices["ml", "best"].candidate == (("blur_px", 0.0), ("model_error", 0.0))
     assert choices["trained", "best"].candidate == ()

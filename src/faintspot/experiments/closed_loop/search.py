@@ -117,8 +117,6 @@ class Tuned:
     choice: Choice
     strehl: float
     """Mean of the tuning runs; the best of many, so higher than that of other runs."""
-    tried: int
-    """Settings that were looked at."""
 
 
 def tune(
@@ -155,7 +153,7 @@ def tune(
         slopes = tune(with_integrator(kind), configuration, search, advance).choice
     search, tuned = _searched(kind, configuration, search, slopes)
     if all(len(tunable.values) == 1 for tunable in tuned.values()):
-        return Tuned({name: tunable.values[0] for name, tunable in tuned.items()}, math.nan, 0)
+        return Tuned({name: tunable.values[0] for name, tunable in tuned.items()}, math.nan)
     return _Trials(kind, configuration, search, tuned, advance).best()
 
 
@@ -199,7 +197,6 @@ def tuning_unit(
     return {
         "choice": np.asarray(to_json(tuned.choice)),
         "strehl": np.asarray(tuned.strehl),
-        "tried": np.asarray(tuned.tried),
     }
 
 
@@ -231,7 +228,7 @@ def smoothed(
 
 def stored(result: Mapping[str, NDArray[Any]]) -> Tuned:
     """Return what `tuning_unit` stored."""
-    return Tuned(parse_json(str(result["choice"])), float(result["strehl"]), int(result["tried"]))
+    return Tuned(parse_json(str(result["choice"])), float(result["strehl"]))
 
 
 def tuning_frames(
@@ -282,7 +279,7 @@ class _Trials:
             finalists = sorted(ranked[: search.finalists], key=self._fine, reverse=True)
             best = max(map(self._climbed, finalists[: search.climbs]), key=self._fine)
             choice, strehl = self._between(best), self._fine
-        return Tuned(choice, strehl(best), len({values for values, _, _ in self._strehl}))
+        return Tuned(choice, strehl(best))
 
     def _coarse(self, choice: Choice) -> float:
         """Return the Strehl ratio in one short run."""

@@ -21,7 +21,6 @@ from faintspot.experiments.study.cell_methods import (
     CellMethods,
     Floats,
     Measured,
-    detector_of,
     errors_of,
     moments_of,
     shown,
@@ -44,8 +43,8 @@ class Choice:
 class Tuning:
     """Errors of all candidates on the first half of a cell's images, and what follows from them."""
 
-    def __init__(self, methods: CellMethods, specification: StudySpecification) -> None:
-        self._methods = methods
+    def __init__(self, methods: CellMethods) -> None:
+        self._methods, specification = methods, methods.specification
         self._modes = specification.kept_pixels(methods.cell)
         self._candidates = {method: methods.candidates(method) for method in specification.estimators}
         self._errors: dict[str, Any] = dict.fromkeys(self._candidates, 0.0)  # sums over images
@@ -109,20 +108,14 @@ STATISTICS = ("gain", "rms", "corrected_rms", "outlier_fraction")
 
 def realisations(cell: Cell, count: int, rng: np.random.Generator) -> Iterator[Block]:
     """Yield blocks of noisy images (n, side, side), the mean background subtracted, and true positions."""
-    detector = detector_of(cell)
     block = _BLOCK_PIXELS // cell.pixels**2
     for start in range(0, count, block):
         images, truth = subapertures(
             min(block, count - start),
-            shape=(cell.pixels, cell.pixels),
             flux_e=cell.flux_e,
-            profile=cell.profile,
-            size=cell.size,
-            elongation=cell.elongation,
-            position_range_px=cell.position_range_px,
             d_over_r0=cell.d_over_r0,
-            detector=detector,
             rng=rng,
+            **cell.conditions,
         )
         yield images - np.float32(cell.background_e), truth
 
@@ -169,20 +162,20 @@ def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDA
         if methods is None:
             flux = np.concatenate([images.sum(axis=(1, 2), dtype=np.float64) for images, _ in stack])
             methods = CellMethods(cell, specification, float(flux.mean()))
-            tuning = Tuning(methods, specification)
+            tuning = Tuning(methods)
         tuning.add(stack)
     assert methods is not None
     scores = Scores(methods, tuning.choices())
     for stack in _stacks(realisations(cell, specification.realisations - half, rng), cell.pixels):
         scores.add(stack)
-    return _results(cell, specification, scores)
+    return _results(scores)
 
 
 class Scores:
     """Positions with the chosen settings, stack after stack."""
 
     def __init__(self, methods: CellMethods, choices: dict[tuple[str, str], Choice]) -> None:
-        self._methods, self.choices = methods, choices
+        self.methods, self.choices = methods, choices
         self._truth: list[Floats] = []
         self._positions: dict[tuple[str, str], list[Floats]] = {key: [] for key in choices}
         self._valid: dict[tuple[str, str], list[Any]] = {key: [] for key in choices}
@@ -202,8 +195,8 @@ class Scores:
         ):
             same = (method, candidate)
             modes = [mode for (a, mode), choice in self.choices.items() if (a, choice.candidate) == same]
-            for images, truth in self._methods.parts(method, blocks):
-                self._add(method, modes, truth, self._methods.positions(method, candidate, images))
+            for images, truth in self.methods.parts(method, blocks):
+                self._add(method, modes, truth, self.methods.positions(method, candidate, images))
 
     def _add(self, method: str, modes: list[str], truth: Floats, measured: Measured) -> None:
         """Add positions that a method measured for the modes that chose its candidate."""
@@ -234,9 +227,10 @@ class Scores:
         return np.concatenate(self._stated[method]) if method in self._stated else None
 
 
-def _results(cell: Cell, specification: StudySpecification, scores: Scores) -> dict[str, NDArray[Any]]:
+def _results(scores: Scores) -> dict[str, NDArray[Any]]:
     """Arrange choices and scores as the dataset has them."""
-    methods, modes, truth = specification.estimators, specification.modes, scores.truth
+    cell, specification, truth = scores.methods.cell, scores.methods.specification, scores.truth
+    methods, modes = specification.estimators, specification.modes
     names = ["error", "error_se", "chosen_k", "chosen_candidate", "chosen_model_error", "invalid_fraction"]
     names += [name for statistic in STATISTICS for name in (statistic, f"{statistic}_se")]
     results: dict[str, NDArray[Any]] = {name: np.full((len(methods), len(modes)), np.nan) for name in names}
@@ -287,18 +281,10 @@ def _against_the_bound(cell: Cell, errors: Floats) -> dict[str, NDArray[Any]]:
     """Cramer-Rao bound and photon efficiency; NaN for speckled spots, whose bound is not known."""
     bounds, efficiency = np.full(2, np.nan), np.full(errors.shape, np.nan)
     if cell.d_over_r0 == 0:
-        conditions: dict[str, Any] = {
-            "shape": (cell.pixels, cell.pixels),
-            "profile": cell.profile,
-            "size": cell.size,
-            "elongation": cell.elongation,
-            "detector": detector_of(cell),
-            "position_range_px": cell.position_range_px,
-        }
-        bound = cramer_rao(cell.flux_e, **conditions)
+        bound = cramer_rao(cell.flux_e, **cell.conditions)
         bounds = np.array([MEAN_ABSOLUTE * bound.mean(), np.sqrt(np.mean(np.square(bound)))])
         measured = errors > 0
-        efficiency[measured] = photon_efficiency(errors[measured], cell.flux_e, **conditions)
+        efficiency[measured] = photon_efficiency(errors[measured], cell.flux_e, **cell.conditions)
     return {"bound": bounds[0], "bound_rms": bounds[1], "photon_efficiency": efficiency}
 
 

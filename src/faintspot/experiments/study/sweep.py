@@ -14,6 +14,7 @@ import numpy as np
 from faintspot.base.checks import numbers_between, one_of
 from faintspot.base.config.options import Option
 from faintspot.base.errors import InputError
+from faintspot.slopes.camera.detector import Detector
 
 PROFILES = ("diffraction", "gaussian")
 
@@ -88,6 +89,19 @@ class Cell:
         """Standard deviation of a mean pixel's noise: read noise and the flux's, spread over all pixels."""
         flux = self.flux_e / self.pixels**2 + self.background_e
         return float(np.sqrt(self.read_noise_e**2 + self.excess_noise * flux))
+
+    @property
+    def detector(self) -> Detector:
+        """The camera."""
+        return Detector(
+            self.read_noise_e * self.em_gain, background_e=self.background_e, em_gain=self.em_gain
+        )
+
+    @property
+    def conditions(self) -> dict[str, Any]:
+        """Window, spots and camera by the names that simulations and bounds give them."""
+        names = ("profile", "size", "elongation", "position_range_px", "detector")
+        return {"shape": (self.pixels, self.pixels), **{name: getattr(self, name) for name in names}}
 
     def seed(self, study_seed: int) -> np.random.SeedSequence:
         """Return the cell's own seed, from the study's seed and its coordinates alone."""
