@@ -105,9 +105,7 @@ class ZarrStore:
             self._arrays: dict[str, Any] = dict(self._group.arrays())
             stored = list(self._group.attrs[_UNITS])
             self._rows = {key: row for row, key in enumerate(dict.fromkeys([*stored, *units]))}
-            self._is_done = np.zeros(len(self._rows), bool)
-            before = np.asarray(self._arrays[DONE][: len(stored)]).astype(bool)
-            self._is_done[: len(before)] = before
+            self._done = {stored[row] for row in np.flatnonzero(self._arrays[DONE][: len(stored)])}
         except Exception as error:  # broken metadata makes zarr raise many things
             raise InputError(
                 f"{self.path}: damaged, it cannot be resumed: delete it ({one_line(error)})"
@@ -116,7 +114,7 @@ class ZarrStore:
             self._lengthen()
 
     def __contains__(self, key: object) -> bool:
-        return bool(self._is_done[self._rows[key]])
+        return key in self._done
 
     def __setitem__(self, key: str, result: Arrays) -> None:
         """Keep the result of a unit: each variable is one chunk; then it is noted that the unit is done."""
@@ -129,7 +127,7 @@ class ZarrStore:
                 array = self._arrays[name]
                 array[row : row + 1] = _chunk(array, values)
             self._arrays[DONE][row] = True
-        self._is_done[row] = True
+        self._done.add(key)
 
     def __getitem__(self, key: str) -> dict[str, NDArray[Any]]:
         """Return the result of a unit.
@@ -224,10 +222,7 @@ def _chunk(array: Any, values: NDArray[Any]) -> NDArray[Any]:
     if shape[1:] == values.shape:
         return values[None].astype(object) if values.dtype.kind in "UT" else values[None]
     chunk = np.full(shape, np.nan)
-    if values.ndim:
-        chunk[0, ..., : values.shape[-1]] = values
-    else:
-        chunk[0] = values
+    chunk[0, ..., : values.shape[-1]] = values
     return chunk
 
 

@@ -16,7 +16,7 @@ from faintspot.experiments.night.blocks import NIGHT_STORE, Night
 from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan, kind_of
 from faintspot.experiments.night.seeing import r0_of_slopes
 from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
-from faintspot.experiments.store import ZarrStore, fingerprint_of
+from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.control import slope_turbulence
 from faintspot.loop.simulation.files import make_folder
@@ -85,7 +85,7 @@ def run_night(
     pool, folder = pool or WorkerPool(), make_folder(folder)
     identity = fingerprint_of(configuration.to_text(), str(asdict(plan)), f"tuned: {tuned}, quick: {quick}")
 
-    def results_of(name: str, function: Any, units: list[Unit], stage: WorkerPool) -> Any:
+    def results_of(name: str, function: Any, units: list[Unit], stage: WorkerPool) -> UnitStore:
         path = make_folder(folder / "units") / f"{name}.zarr"
         keys, attributes = [unit.key for unit in units], {"name": configuration.name}
         store = ZarrStore(path, KIND, identity, keys, attributes=attributes, overwrite=overwrite)
@@ -106,9 +106,7 @@ def run_night(
         choices = {unit.key: stored(found[unit.key]).choice for unit in trials}
     pool.say("observing")
     units = _units(configuration, plan, choices, paired)
-    observed = results_of("night", observe, units, stages[1])
-    results = {unit.key: observed[unit.key] for unit in units}
-    night = _night(configuration, plan, choices, results)
+    night = _night(configuration, plan, choices, results_of("night", observe, units, stages[1]))
     night.save(folder / NIGHT_STORE)
     return night
 
@@ -194,7 +192,7 @@ def _mean(values: Floats) -> tuple[float, float]:
 
 
 def _night(
-    configuration: LoopConfiguration, plan: NightPlan, choices: dict[str, Choice], results: dict[str, Any]
+    configuration: LoopConfiguration, plan: NightPlan, choices: dict[str, Choice], results: UnitStore
 ) -> Night:
     """Put the sets together."""
     rate = configuration.control.frame_rate_hz
@@ -208,7 +206,8 @@ def _night(
         numbers = np.array([list(methods).index(method.label) for method in made])
         order, observed = np.arange(count) % len(entries), results[_key(number, False)]
         first = plan.first_frame(number) + plan.settle_in_block + plan.block_frames * np.arange(count)
-        alone = results.get(_key(number, True), {}).get("strehl", np.full(count, np.nan))
+        key = _key(number, True)
+        alone = results[key]["strehl"] if key in results else np.full(count, np.nan)
         sets.append(
             {
                 "set_number": np.full(count, number),

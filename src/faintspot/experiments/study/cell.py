@@ -7,7 +7,6 @@ with the number of realisations.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,14 +29,8 @@ from faintspot.experiments.study.sweep import Cell
 from faintspot.slopes.simulate import subapertures
 from faintspot.slopes.spots.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency
 
-
-@dataclass(frozen=True)
-class Choice:
-    """Choice of a method in a mode."""
-
-    candidate: Candidate
-    column: int | None
-    """Number of kept pixels less one; None where every k is not measured."""
+Chosen = tuple[Candidate, int | None]
+"""Candidate and number of kept pixels less one of a method in a mode; None where every k is not measured."""
 
 
 class Tuning:
@@ -63,27 +56,27 @@ class Tuning:
                 if CORRECTED in self._modes:
                     self._moments[method] += np.stack([moments_of(xy, truth) for xy in estimates], axis=1)
 
-    def choices(self) -> dict[tuple[str, str], Choice]:
+    def choices(self) -> dict[tuple[str, str], Chosen]:
         """Return the choice of every method and mode."""
         chosen = {}
         for method, candidates in self._candidates.items():
             for mode, kept in self._modes.items():
                 if np.ndim(self._errors[method]) == 0:
-                    chosen[method, mode] = Choice(candidates[0], None)
+                    chosen[method, mode] = candidates[0], None
                     continue
                 errors = _corrected_rms(self._moments[method]) if mode == CORRECTED else self._errors[method]
                 chosen[method, mode] = _smallest(candidates, errors, kept)
         return chosen
 
 
-def _smallest(candidates: Sequence[Candidate], errors: Floats, kept: int | None) -> Choice:
+def _smallest(candidates: Sequence[Candidate], errors: Floats, kept: int | None) -> Chosen:
     """Return the candidate, and where `kept` is None the k, of a table's smallest error (candidates, K)."""
     if errors.shape[1] == 1:
-        return Choice(candidates[int(np.argmin(errors))], None)
+        return candidates[int(np.argmin(errors))], None
     if kept is not None:
-        return Choice(candidates[int(np.argmin(errors[:, kept - 1]))], kept - 1)
+        return candidates[int(np.argmin(errors[:, kept - 1]))], kept - 1
     row, column = np.unravel_index(np.argmin(errors), errors.shape)
-    return Choice(candidates[int(row)], int(column))
+    return candidates[int(row)], int(column)
 
 
 def _corrected_rms(moments: Floats) -> Floats:
@@ -174,7 +167,7 @@ def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDA
 class Scores:
     """Positions with the chosen settings, stack after stack."""
 
-    def __init__(self, methods: CellMethods, choices: dict[tuple[str, str], Choice]) -> None:
+    def __init__(self, methods: CellMethods, choices: dict[tuple[str, str], Chosen]) -> None:
         self.methods, self.choices = methods, choices
         self._truth: list[Floats] = []
         self._positions: dict[tuple[str, str], list[Floats]] = {key: [] for key in choices}
@@ -190,11 +183,10 @@ class Scores:
     def add(self, blocks: Sequence[Block]) -> None:
         """Score images."""
         self._truth += [truth for _, truth in blocks]
-        for method, candidate in dict.fromkeys(
-            (method, c.candidate) for (method, _), c in self.choices.items()
-        ):
-            same = (method, candidate)
-            modes = [mode for (a, mode), choice in self.choices.items() if (a, choice.candidate) == same]
+        modes_of: dict[tuple[str, Candidate], list[str]] = {}
+        for (method, mode), (candidate, _) in self.choices.items():
+            modes_of.setdefault((method, candidate), []).append(mode)
+        for (method, candidate), modes in modes_of.items():
             for images, truth in self.methods.parts(method, blocks):
                 self._add(method, modes, truth, self.methods.positions(method, candidate, images))
 
@@ -202,7 +194,7 @@ class Scores:
         """Add positions that a method measured for the modes that chose its candidate."""
         positions, valid, stated = measured
         for mode in modes:
-            column = self.choices[method, mode].column or 0
+            column = self.choices[method, mode][1] or 0
             self._positions[method, mode].append(positions[:, column])
             self._valid[method, mode].append(valid[:, column])
         if BEST not in modes:
@@ -245,10 +237,10 @@ def _results(scores: Scores) -> dict[str, NDArray[Any]]:
         results["error_se"][:, j] = np.sqrt(np.diag(covariance))
         results["error_covariance"][j] = covariance
         for i, method in enumerate(methods):
-            choice = scores.choices[method, mode]
-            results["chosen_k"][i, j] = np.nan if choice.column is None else choice.column + 1
-            results["chosen_candidate"][i, j] = shown(choice.candidate)
-            results["chosen_model_error"][i, j] = shown(choice.candidate, "model_error")
+            candidate, column = scores.choices[method, mode]
+            results["chosen_k"][i, j] = np.nan if column is None else column + 1
+            results["chosen_candidate"][i, j] = shown(candidate)
+            results["chosen_model_error"][i, j] = shown(candidate, "model_error")
             results["invalid_fraction"][i, j] = 1.0 - scores.valid(method, mode).mean()
             statistics = slope_statistics(positions[i][:, 0], positions[i][:, 1], truth)
             for name in STATISTICS:
