@@ -194,8 +194,7 @@ def _by_joblib(
         else:
             pool.say(f"{processes} processes on this machine")
             told = stack.enter_context(_followed(count))
-            begin = {"initializer": _begin_worker, "initargs": (os.getpid(),)}
-            with parallel_config("loky", inner_max_num_threads=1, **begin):
+            with parallel_config("loky", inner_max_num_threads=1, initializer=_begin, initargs=[os.getpid()]):
                 parallel = Parallel(processes, **how)
         own = [kind for kind in estimators().values() if not kind.__module__.startswith("faintspot.")]
         # In tuples: other large arguments would stay with one worker, and be lost with it.
@@ -225,7 +224,7 @@ def _in_worker(work: tuple[Any, ...], place: tuple[int, Path | None], package: t
         raise InputError(" ".join(str(error).split())) from None
 
 
-def _begin_worker(parent: int) -> None:
+def _begin(parent: int) -> None:
     """Leave interruptions to the parent, and end with it: joblib would go on with what is queued."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
