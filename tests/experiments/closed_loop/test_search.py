@@ -11,16 +11,16 @@ from tests.experiments.experiment_cases import SEARCH, small
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop import search as tuning
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Choice, method_kind
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Choice, MethodKind, method_kind
 from faintspot.experiments.closed_loop.search import (
     FIRST_TUNING_REALISATION,
     Search,
+    Tuned,
     coordinate_search,
     corrected_badness,
     smoothed,
     stored,
     tune,
-    tuning_unit,
 )
 
 
@@ -63,6 +63,10 @@ GAINS = BRIGHTEST.tuned(small())[LOOP_GAIN]
 TOP = 0.55  # between two values on offer
 
 
+def tuned(kind: MethodKind, search: Search, *more: Any) -> Tuned:
+    return stored(tune(kind, small(), search, *more))
+
+
 class _Record:
     def __init__(self, strehl: float) -> None:
         self._strehl = strehl
@@ -87,7 +91,7 @@ def hill(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_finds_the_top(hill: list[int]) -> None:
     told: list[int] = []
-    found = tune(BRIGHTEST, small(), Search(rounds=9), told.append)
+    found = tuned(BRIGHTEST, Search(rounds=9), None, told.append)
     assert found.choice == {LOOP_GAIN: TOP, "keep_brightest": BEST}
     assert found.strehl == pytest.approx(1, abs=0.01)  # of the nearest values on offer
     assert min(hill) >= FIRST_TUNING_REALISATION
@@ -108,7 +112,7 @@ def test_climbs_the_second_hill_too(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(tuning, "simulate_loop", simulate)
     for climbs, top in ((1, high), (2, low - 1)):  # the first is the best of the coarse ones
-        found = tune(BRIGHTEST, small(), Search(climbs=climbs)).choice[LOOP_GAIN]
+        found = tuned(BRIGHTEST, Search(climbs=climbs)).choice[LOOP_GAIN]
         assert GAINS.nearest(found).values == (GAINS.values[top],)
 
 
@@ -125,14 +129,14 @@ def test_looks_at_no_choice_twice(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_without_rounds_the_best_coarse_choice(hill: list[int]) -> None:
-    found = tune(BRIGHTEST, small(), tuning.QUICK)
+    found = tuned(BRIGHTEST, tuning.QUICK)
     nearest = min(KEPT.first, key=lambda kept: abs(np.log(kept / BEST)))
     assert found.choice == {LOOP_GAIN: GAINS.first[-1], "keep_brightest": nearest}
 
 
 def test_is_repeatable_and_stored() -> None:
     centroid = method_kind("centroid")
-    one, other = (tuning_unit(centroid, small(), SEARCH, None, lambda frames: None) for _ in range(2))
+    one, other = (tune(centroid, small(), SEARCH) for _ in range(2))
     assert stored(one) == stored(other)
     np.testing.assert_array_equal(one["strehl"], other["strehl"])
     assert 0 < one["strehl"] < 1
@@ -147,7 +151,7 @@ def test_search_is_checked() -> None:
 
 def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[int]) -> None:
     kind = method_kind("brightest+modal")
-    found = tune(kind, small(), Search(rounds=9), slopes={LOOP_GAIN: 0.9, "keep_brightest": BEST + 1})
+    found = tuned(kind, Search(rounds=9), {LOOP_GAIN: 0.9, "keep_brightest": BEST + 1})
     highest = max(kind.tuned(small())[LOOP_GAIN].values)
     assert found.choice == {LOOP_GAIN: highest, "keep_brightest": BEST + 1}
     assert not hill  # nothing is left to tune
@@ -155,7 +159,7 @@ def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[int]) -
 
 def test_of_known_slopes_only_the_gain_is_tuned(hill: list[int]) -> None:
     slopes = {LOOP_GAIN: GAINS.values[-3], "keep_brightest": BEST + 1}
-    assert tune(BRIGHTEST, small(), slopes=slopes).choice == {**slopes, LOOP_GAIN: TOP}
+    assert tuned(BRIGHTEST, Search(), slopes).choice == {**slopes, LOOP_GAIN: TOP}
 
 
 def test_options_follow_a_power_of_the_flux() -> None:

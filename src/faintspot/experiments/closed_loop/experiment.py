@@ -20,8 +20,8 @@ from faintspot.experiments.closed_loop.search import (
     learning_frames,
     smoothed,
     stored,
+    tune,
     tuning_frames,
-    tuning_unit,
     with_integrator,
 )
 from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
@@ -138,7 +138,7 @@ class Experiment:
         units = self._tuning(kinds, stars, slopes)
         if not units:
             return {}
-        results = self._run(stage, tuning_unit, units, pool, "-tuning")
+        results = self._run(stage, tune, units, pool, "-tuning")
         return {key: stored(results[unit.key]) for key, unit in units.items()}
 
     def _tuning(

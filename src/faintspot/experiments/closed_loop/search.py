@@ -122,11 +122,10 @@ class Tuned:
 def tune(
     kind: MethodKind,
     configuration: LoopConfiguration,
-    search: Search | None = None,
-    advance: Advance | None = None,
-    *,
+    search: Search,
     slopes: Choice | None = None,
-) -> Tuned:
+    advance: Advance | None = None,
+) -> dict[str, NDArray[Any]]:
     """Find the settings of a method that give the highest Strehl ratio at the configuration's flux.
 
     All combinations of a few values of each option first, then steps from the best ones to
@@ -141,20 +140,26 @@ def tune(
     ----------
     kind : MethodKind
     configuration : LoopConfiguration
-    search : Search, optional
-    advance : callable, optional
-        Told the number of frames simulated, after every run.
+    search : Search
     slopes : mapping, optional
         Settings of the slopes with the integrator, of which only the loop gain is searched again, from the
         given one. Default: searched; for control that learns, first.
+    advance : callable, optional
+        Told the number of frames simulated, after every run.
+
+    Returns
+    -------
+    dict
+        What `stored` reads.
     """
-    search = Search() if search is None else search
     if slopes is None and kind.control != INTEGRATOR:
-        slopes = tune(with_integrator(kind), configuration, search, advance).choice
+        slopes = stored(tune(with_integrator(kind), configuration, search, None, advance)).choice
     search, tuned = _searched(kind, configuration, search, slopes)
     if all(len(tunable.values) == 1 for tunable in tuned.values()):
-        return Tuned({name: tunable.values[0] for name, tunable in tuned.items()}, math.nan)
-    return _Trials(kind, configuration, search, tuned, advance).best()
+        best = Tuned({name: tunable.values[0] for name, tunable in tuned.items()}, math.nan)
+    else:
+        best = _Trials(kind, configuration, search, tuned, advance).best()
+    return {"choice": np.asarray(to_json(best.choice)), "strehl": np.asarray(best.strehl)}
 
 
 def _searched(
@@ -185,21 +190,6 @@ def _is_scale(values: Sequence[Any]) -> bool:
     return all(isinstance(value, float) and value > 0 for value in values)
 
 
-def tuning_unit(
-    kind: MethodKind,
-    configuration: LoopConfiguration,
-    search: Search,
-    slopes: Choice | None,
-    advance: Advance,
-) -> dict[str, NDArray[Any]]:
-    """Return what `tune` found, as arrays that can be stored."""
-    tuned = tune(kind, configuration, search, advance, slopes=slopes)
-    return {
-        "choice": np.asarray(to_json(tuned.choice)),
-        "strehl": np.asarray(tuned.strehl),
-    }
-
-
 def smoothed(
     kind: MethodKind, stars: Sequence[LoopConfiguration], choices: Sequence[Choice]
 ) -> list[dict[str, Any]]:
@@ -227,7 +217,7 @@ def smoothed(
 
 
 def stored(result: Mapping[str, NDArray[Any]]) -> Tuned:
-    """Return what `tuning_unit` stored."""
+    """Return what `tune` found."""
     return Tuned(parse_json(str(result["choice"])), float(result["strehl"]))
 
 

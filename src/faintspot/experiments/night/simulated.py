@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.experiments.closed_loop.methods import Choice
-from faintspot.experiments.closed_loop.search import QUICK, Search, stored, tuning_frames, tuning_unit
+from faintspot.experiments.closed_loop.search import QUICK, Search, stored, tune, tuning_frames
 from faintspot.experiments.night.blocks import NIGHT_STORE, Night
 from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan, kind_of
 from faintspot.experiments.night.seeing import r0_of_slopes
@@ -102,7 +102,7 @@ def run_night(
     choices: dict[str, Choice] = {}
     if trials:
         pool.say("tuning")
-        found = results_of("tuning", tuning_unit, trials, stages[0])
+        found = results_of("tuning", tune, trials, stages[0])
         choices = {unit.key: stored(found[unit.key]).choice for unit in trials}
     pool.say("observing")
     units = _units(configuration, plan, choices, paired)
