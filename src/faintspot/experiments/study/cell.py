@@ -58,7 +58,7 @@ class Tuning:
 
     def choices(self) -> dict[tuple[str, str], Chosen]:
         """Return the choice of every method and mode."""
-        chosen = {}
+        chosen: dict[tuple[str, str], Chosen] = {}
         for method, candidates in self._candidates.items():
             for mode, kept in self._modes.items():
                 if np.ndim(self._errors[method]) == 0:
