@@ -12,7 +12,8 @@ from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.base.sizes import MOST_NUMBERS, check_size
-from faintspot.experiments.study.specification import StudySpecification, Sweep
+from faintspot.experiments.study.specification import StudySpecification
+from faintspot.experiments.study.sweep import Sweep
 from faintspot.io import open_frames
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.slopes.estimators import spot_tables

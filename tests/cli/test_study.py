@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from tests.cli.cli_cases import Commands, command_line
 
-from faintspot.experiments import StudySpecification, Sweep, open_study, run
+from faintspot.experiments import StudySpecification, Sweep, WorkerPool, open_study, run
 from faintspot.experiments.study import built_in as estimators
 
 pytest.importorskip("zarr")
@@ -98,7 +98,7 @@ def test_killed_and_started_again(folder: Path, run: Commands) -> None:
 
 
 def uninterrupted(path: Path) -> None:
-    run(StudySpecification.from_text(SLOW), path, workers=0)
+    run(StudySpecification.from_text(SLOW), path, pool=WorkerPool(0))
 
 
 def test_report_of_a_study(folder: Path, run: Commands) -> None:

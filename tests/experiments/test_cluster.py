@@ -22,7 +22,6 @@ from tests.refusals import refused
 
 from faintspot.experiments import StudySpecification, Sweep, running
 from faintspot.experiments.running import Unit, WorkerPool, run_units
-from faintspot.experiments.store import MemoryStore
 
 distributed = pytest.importorskip("distributed", reason="needs distributed, of the extra `cluster`")
 pytestmark = [
@@ -98,20 +97,20 @@ def test_a_cluster_gives_the_same(cluster: Cluster) -> None:
     said: list[str] = []
     counts: list[tuple[int, int]] = []
     pool = WorkerPool(None, lambda *count: counts.append(count), said.append, cluster.address)
-    assert values(run_units(double, UNITS, MemoryStore(), pool)) == [0, 2, 4, 6]
+    assert values(run_units(double, UNITS, {}, pool)) == [0, 2, 4, 6]
     assert counts[-1] == (40, 40)
     assert cluster.address in said[0]
     with refused("refused"):
-        run_units(impossible, UNITS, MemoryStore(), cluster.pool())
+        run_units(impossible, UNITS, {}, cluster.pool())
 
 
 def test_studies_are_the_same_bit_for_bit_wherever_they_run(cluster: Cluster) -> None:
     experiments = pytest.importorskip("faintspot.experiments.study.run")
     sweep = Sweep("flux", flux_e=[30, 100, 300, 1000], pixels=8)
     study = StudySpecification("small", [sweep], realisations=200, estimators=["smoothed", "ml"], fixed_k=[])
-    alone = experiments.run(study, workers=1)
-    for where in ({"workers": 2}, {"workers": 4}, {"scheduler": cluster.address}):
-        assert experiments.run(study, **where).identical(alone), where
+    alone = experiments.run(study, pool=WorkerPool(1))
+    for pool in (WorkerPool(2), WorkerPool(4), cluster.pool()):
+        assert experiments.run(study, pool=pool).identical(alone), pool
 
 
 def test_a_killed_worker_loses_no_finished_unit(cluster: Cluster) -> None:
@@ -144,13 +143,13 @@ def run_with(pool: Callable[[Callable[[int, int], None]], WorkerPool], harm: Cal
     return max(store.written.values())
 
 
-class CountingStore(MemoryStore):
+class CountingStore(dict[str, Any]):
     def __init__(self) -> None:
         super().__init__()
         self.written: dict[str, int] = {}
 
-    def write(self, key: str, result: Any) -> None:
-        super().write(key, result)
+    def __setitem__(self, key: str, result: Any) -> None:
+        super().__setitem__(key, result)
         self.written[key] = self.written.get(key, 0) + 1
 
 
@@ -158,7 +157,7 @@ def test_a_scheduler_that_dies_is_one_line_and_loses_no_finished_unit(
     cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(running, "_CONNECT_S", 1)
-    store = MemoryStore()
+    store: dict[str, Any] = {}
 
     def kill(done: int, total: int) -> None:
         if done == 10:
@@ -166,7 +165,7 @@ def test_a_scheduler_that_dies_is_one_line_and_loses_no_finished_unit(
 
     with refused(cluster.address, "cannot be reached"):
         run_units(slowly, UNITS, store, cluster.pool(kill))
-    assert any(store.done(unit.key) for unit in UNITS)
+    assert any(unit.key in store for unit in UNITS)
     again = run_units(slowly, UNITS, store, WorkerPool(0))
     assert values(again) == [0, 2, 4, 6]
 
@@ -176,7 +175,7 @@ def test_units_that_kill_their_workers_are_given_up(
 ) -> None:
     monkeypatch.setattr(running, "_ATTEMPTS", 1)  # two workers would not do for three
     with refused("lost repeatedly", "kept"):
-        run_units(die, UNITS, MemoryStore(), cluster.pool())
+        run_units(die, UNITS, {}, cluster.pool())
 
 
 CLIENT = """
@@ -186,9 +185,9 @@ from faintspot.experiments.store import ZarrStore
 from tests.experiments.test_cluster import slowly
 units = [Unit(str(number), (number,)) for number in range(12)]
 store = ZarrStore(sys.argv[1], "test", "fingerprint", [unit.key for unit in units])
-before = sum(store.done(unit.key) for unit in units)
+before = sum(unit.key in store for unit in units)
 run_units(slowly, units, store, WorkerPool(scheduler=sys.argv[2]))
-print(before, [int(store.read(unit.key)["twice"]) for unit in units])
+print(before, [int(store[unit.key]["twice"]) for unit in units])
 """
 
 
@@ -211,7 +210,7 @@ def test_schedulers_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(running, "_CONNECT_S", 0.3)
     for address in ("nowhere", "tcp://127.0.0.1:1", "xyz://127.0.0.1:1", "tls://127.0.0.1:1"):
         with refused(f"scheduler = {address!r}", "cannot be reached"):
-            run_units(double, UNITS, MemoryStore(), WorkerPool(scheduler=address))
+            run_units(double, UNITS, {}, WorkerPool(scheduler=address))
 
 
 class Relay:

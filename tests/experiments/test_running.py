@@ -19,7 +19,7 @@ from tests.refusals import refused
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.experiments.running import Unit, WorkerPool, run_units
-from faintspot.experiments.store import MemoryStore, ZarrStore
+from faintspot.experiments.store import ZarrStore
 
 pytestmark = pytest.mark.machine_time("starts other processes")
 
@@ -114,7 +114,7 @@ def test_units_are_run_once(tmp_path: Path) -> None:
 
 
 def test_interrupted_and_started_again() -> None:
-    store = MemoryStore()
+    store: dict[str, Any] = {}
 
     def stop(done: int, total: int) -> None:
         if done == 25:  # within the third unit
@@ -122,7 +122,7 @@ def test_interrupted_and_started_again() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         run_units(double, UNITS, store, WorkerPool(workers=0, progress=stop))
-    assert [store.done(unit.key) for unit in UNITS] == [True, True, False, False]
+    assert [unit.key in store for unit in UNITS] == [True, True, False, False]
     assert values(run_units(double, UNITS, store, WorkerPool(workers=0))) == [0, 2, 4, 6]
 
 
@@ -130,19 +130,19 @@ def test_processes_give_the_same() -> None:
     said: list[str] = []
     counts: list[tuple[int, int]] = []
     place = WorkerPool(2, lambda *count: counts.append(count), said.append)
-    assert values(run_units(double, UNITS, MemoryStore(), place)) == [0, 2, 4, 6]
+    assert values(run_units(double, UNITS, {}, place)) == [0, 2, 4, 6]
     assert counts[-1] == (40, 40)
     assert said == ["2 processes on this machine"]
     for function, message in ((impossible, "refused"), (without_package, "pip install")):
         with pytest.raises(InputError, match=message):
-            run_units(function, UNITS, MemoryStore(), WorkerPool(2))
+            run_units(function, UNITS, {}, WorkerPool(2))
 
 
 def test_a_process_dies(tmp_path: Path) -> None:
     units = [Unit(unit.key, (str(tmp_path), *unit.arguments)) for unit in UNITS]
-    assert values(run_units(die_once, units, MemoryStore(), WorkerPool(2))) == [0, 2, 4, 6]
+    assert values(run_units(die_once, units, {}, WorkerPool(2))) == [0, 2, 4, 6]
     with refused("lost repeatedly", "kept"):
-        run_units(die, UNITS, MemoryStore(), WorkerPool(2))
+        run_units(die, UNITS, {}, WorkerPool(2))
 
 
 def test_the_bar_moves_within_units() -> None:
@@ -151,31 +151,30 @@ def test_the_bar_moves_within_units() -> None:
     def progress(done: int, total: int) -> None:
         counts.append(done)
 
-    run_units(half, UNITS[:2], MemoryStore(), WorkerPool(2, progress))
+    run_units(half, UNITS[:2], {}, WorkerPool(2, progress))
     assert 5 in counts or 10 in counts[:-2]
     assert counts == sorted(counts)
     assert counts[-1] == 20
 
 
 def test_interruption_does_not_wait_for_units() -> None:
-    store = MemoryStore()
+    store: dict[str, Any] = {}
     units = [Unit("short", (0,), 2), Unit("long", (1,), 1), Unit("longer", (2,), 1)]
 
     def stop(done: int, total: int) -> None:
-        if store.done("short") and threading.current_thread() is threading.main_thread():
+        if "short" in store and threading.current_thread() is threading.main_thread():
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         run_units(sleep, units, store, WorkerPool(2, progress=stop))
-    assert gone(int(store.read("short")["process"]))
+    assert gone(int(store["short"]["process"]))
 
 
 CHILD = """
 from faintspot.experiments.running import Unit, WorkerPool, run_units
-from faintspot.experiments.store import MemoryStore
 from tests.experiments.test_running import note_and_sleep
 units = [Unit(str(number), ({folder!r}, number)) for number in range(4)]
-run_units(note_and_sleep, units, MemoryStore(), WorkerPool(2))
+run_units(note_and_sleep, units, dict(), WorkerPool(2))
 """
 
 
@@ -192,7 +191,7 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
 
 OWN = """
 from dataclasses import dataclass
-from faintspot.experiments import StudySpecification, Sweep, run
+from faintspot.experiments import StudySpecification, Sweep, WorkerPool, run
 from faintspot.slopes.estimators import Estimator, register
 
 @register
@@ -205,7 +204,7 @@ class Middle(Estimator):
 
 sweep = Sweep("flux", flux_e=[30, 100, 300], pixels=8)
 study = StudySpecification("own", [sweep], realisations=20, estimators=["middle"], fixed_k=[])
-print(float(run(study, workers=2)["error"].mean()))
+print(float(run(study, pool=WorkerPool(2))["error"].mean()))
 """
 
 

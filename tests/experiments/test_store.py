@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tests.refusals import refused
 
 from faintspot import InputError
-from faintspot.experiments.store import MemoryStore, ZarrStore, kind_of_store
+from faintspot.experiments.store import UnitStore, ZarrStore, kind_of_store
 
 pytest.importorskip("zarr")
 
@@ -43,26 +43,27 @@ def assert_equal(found: Any, expected: dict[str, NDArray[Any]]) -> None:
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
-    for store in (MemoryStore(), ZarrStore(path, "study", "one", ["a", "b/c"])):
-        assert not store.done("b/c")
-        store.write("b/c", RESULT)
-        assert store.done("b/c")
-        assert not store.done("a")
-        assert_equal(store.read("b/c"), RESULT)
+    stores: tuple[UnitStore, ...] = {}, ZarrStore(path, "study", "one", ["a", "b/c"])
+    for store in stores:
+        assert "b/c" not in store
+        store["b/c"] = RESULT
+        assert "b/c" in store
+        assert "a" not in store
+        assert_equal(store["b/c"], RESULT)
     again = ZarrStore(path, "study", "one", ["a", "b/c"])
-    assert again.done("b/c")
-    assert_equal(again.read("b/c"), RESULT)
+    assert "b/c" in again
+    assert_equal(again["b/c"], RESULT)
 
 
 def test_more_units_later(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
-    ZarrStore(path, "study", "one", ["a"]).write("a", RESULT)
+    ZarrStore(path, "study", "one", ["a"])["a"] = RESULT
     store = ZarrStore(path, "study", "one", ["b", "a"])
-    assert store.done("a")
-    store.write("b", {**RESULT, "number": np.asarray(1.0)})
+    assert "a" in store
+    store["b"] = {**RESULT, "number": np.asarray(1.0)}
     fewer = ZarrStore(path, "study", "one", ["b"])
-    assert fewer.read("b")["number"] == 1.0
-    assert_equal(fewer.read("a"), RESULT)
+    assert fewer["b"]["number"] == 1.0
+    assert_equal(fewer["a"], RESULT)
 
 
 def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
@@ -74,7 +75,7 @@ def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
         ZarrStore(path, "loop", "one", ["a"], overwrite=True)
     ZarrStore(path, "study", "other", ["a"], overwrite=True)
     assert kind_of_store(path) == "study"
-    assert not ZarrStore(path, "study", "other", ["a"]).done("a")
+    assert "a" not in ZarrStore(path, "study", "other", ["a"])
     folder = tmp_path / "folder"
     folder.mkdir()
     with pytest.raises(InputError, match="not the store of a study"):
@@ -86,12 +87,12 @@ def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
 def test_damaged(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
     store = ZarrStore(path, "study", "one", ["a"])
-    store.write("a", RESULT)
+    store["a"] = RESULT
     for chunk in (path / "image" / "c").rglob("*"):
         if chunk.is_file():
             chunk.write_bytes(b"rubbish")
     with refused("damaged"):
-        ZarrStore(path, "study", "one", ["a"]).read("a")
+        ZarrStore(path, "study", "one", ["a"])["a"]
     metadata = json.loads((path / "done" / "zarr.json").read_text())
     metadata["shape"] = "many"
     (path / "done" / "zarr.json").write_text(json.dumps(metadata))
@@ -107,7 +108,7 @@ def test_killed_while_it_writes(tmp_path: Path) -> None:
         store = ZarrStore(sys.argv[1], "study", "one", [str(i) for i in range(10_000)])
         print("ready", flush=True)
         for i in range(10_000):
-            store.write(str(i), {"a": np.full(500, float(i)), "b": np.asarray(str(i))})
+            store[str(i)] = {"a": np.full(500, float(i)), "b": np.asarray(str(i))}
             print(i, flush=True)
     """
     path = tmp_path / "s.zarr"
@@ -124,9 +125,9 @@ def test_killed_while_it_writes(tmp_path: Path) -> None:
     (path / "a" / "c" / "0" / "0.abc.partial").write_bytes(b"half")
     store = ZarrStore(path, "study", "one", [str(i) for i in range(10_000)])
     assert not list(path.rglob("*.partial"))
-    done = [i for i in range(10_000) if store.done(str(i))]
+    done = [i for i in range(10_000) if str(i) in store]
     assert len(done) >= 6
     for i in done:
-        found = store.read(str(i))
+        found = store[str(i)]
         np.testing.assert_array_equal(found["a"], float(i))
         assert str(found["b"]) == str(i)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -82,24 +83,26 @@ def read_arrays(
 
 
 class NpzFile:
-    """Object with arrays and numbers that are its constructor's arguments, saved in an .npz file."""
+    """Object with arrays, texts and numbers that are its constructor's arguments, saved in an .npz file."""
 
     WHAT: ClassVar[str]
     """Kind of file, named in errors."""
-    FIELDS: ClassVar[tuple[str, ...]]
-    """Names of the values in a file."""
+    FIELDS: ClassVar[tuple[str, ...]] = ()
+    """Names of the values in a file. Default: the fields of a dataclass."""
     OPTIONAL: ClassVar[tuple[str, ...]] = ("index",)
     """Names of those that may be None."""
+    FORMAT: ClassVar[int | None] = None
+    """Number that a change of the fields changes: files of another one are refused. None: files have none."""
 
     def save(self, path: str | Path) -> None:
-        """Write the values to a file (.npz).
+        """Write the values to a compressed file (.npz), which is never seen half written.
 
         Raises
         ------
         InputError
             If the file cannot be written.
         """
-        values = {name: getattr(self, name) for name in self.FIELDS}
+        values = {"format": self.FORMAT, **{name: getattr(self, name) for name in self._names()}}
         save_arrays(path, {name: value for name, value in values.items() if value is not None})
 
     @classmethod
@@ -111,8 +114,22 @@ class NpzFile:
         InputError
             If the file cannot be read or holds something else.
         """
-        values = read_arrays(path, cls.WHAT, cls.FIELDS, cls.OPTIONAL)
+        values = read_arrays(path, cls.WHAT, cls._names() if cls.FORMAT is None else None, cls.OPTIONAL)
+        version = values.pop("format", None)
+        if cls.FORMAT is not None and (version != cls.FORMAT or set(values) != set(cls._names())):
+            raise InputError(f"{path}: expected {cls.WHAT} of format {cls.FORMAT}, got something else")
         try:
-            return cls(**{name: value if value.ndim else value.item() for name, value in values.items()})
+            return cls(**{name: _restored(value) for name, value in values.items()})
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
+
+    @classmethod
+    def _names(cls) -> tuple[str, ...]:
+        return cls.FIELDS or tuple(item.name for item in fields(cls))  # type: ignore[arg-type]
+
+
+def _restored(value: Any) -> Any:
+    """Return an array as what it was: a row of texts is a tuple, what has no axes a plain number or text."""
+    if value.ndim == 0:
+        return value.item()
+    return tuple(value.tolist()) if value.dtype.kind == "U" and value.ndim == 1 else value

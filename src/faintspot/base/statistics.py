@@ -23,6 +23,7 @@ MAD_TO_STD = 1.4826
 """Standard deviation of a normal distribution in units of its median absolute deviation."""
 _LEVEL = 0.95
 _NORMAL = 1.959964
+_WIDENING = 1.96  # standard errors on each side of an interval
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,14 @@ class Estimate:
     def of_mean(cls, samples: Floats) -> Estimate:
         """Return the mean of many independent samples with its standard error."""
         return cls(float(samples.mean()), float(samples.std() / np.sqrt(samples.size)), count=samples.size)
+
+    def widened(self, error: float) -> Estimate:
+        """Return the estimate with one more, independent standard error."""
+        if math.isnan(self.low):
+            return self
+        value, wide = self.value, _WIDENING * error
+        low, high = value - math.hypot(value - self.low, wide), value + math.hypot(self.high - value, wide)
+        return Estimate(value, math.hypot(self.standard_error, error), low, high, self.count)
 
     @property
     def decided(self) -> int:
@@ -262,7 +271,7 @@ def of_draws(value: float, drawn: Floats, pieces: int, comparisons: int = 1) -> 
     low, high = np.percentile(drawn, [tail, 100 - tail], method="nearest")
     finite = drawn[np.isfinite(drawn)]
     widened = math.sqrt(pieces / (pieces - 1))
-    factor = widened * student(pieces - 1, comparisons) / 1.96
+    factor = widened * student(pieces - 1, comparisons) / _WIDENING
     return Estimate(
         value,
         widened * float(finite.std()) if len(finite) > 1 else math.nan,

@@ -179,8 +179,11 @@ def _measure_and_report(described: StudySpecification, target: str, where: dict[
     click.echo(f"{page}: open it in a browser")
 
 
-def _measure(described: StudySpecification, target: str, **options: Any) -> xarray.Dataset:
+def _measure(
+    described: StudySpecification, target: str, overwrite: bool, workers: int | None, scheduler: str | None
+) -> xarray.Dataset:
     """Run a study with a progress bar."""
+    from faintspot.experiments.running import WorkerPool
     from faintspot.experiments.study.run import run as run_study
 
     realisations, counts = described.realisations, list[int]()
@@ -190,13 +193,8 @@ def _measure(described: StudySpecification, target: str, **options: Any) -> xarr
         advance(finished * realisations, total * realisations)
 
     with progress_bar("study", "realisations") as advance:
-        results = run_study(
-            described,
-            target,
-            progress=advance_by_cells,
-            announce=lambda text: click.echo(text, err=True),
-            **options,
-        )
+        pool = WorkerPool(workers, advance_by_cells, lambda text: click.echo(text, err=True), scheduler)
+        results = run_study(described, target, pool=pool, overwrite=overwrite)
     cells = f"{results.sizes['cell']} cells of {realisations} realisations"
     if counts:
         click.echo(f"{target}: {cells}, {counts[-1] - counts[0]} of them in this run")

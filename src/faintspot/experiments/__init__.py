@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from faintspot.experiments.planner.question import Question as Question
     from faintspot.experiments.planner.recorded import question_from_frames as question_from_frames
     from faintspot.experiments.planner.tuning import tune as tune
+    from faintspot.experiments.running import WorkerPool as WorkerPool
     from faintspot.experiments.study.cell import measure_cell as measure_cell
     from faintspot.experiments.study.run import open_study as open_study
     from faintspot.experiments.study.run import run as run
@@ -39,6 +40,7 @@ _NAMES = {
     "planner.promise": "Promise check_promises",
     "planner.question": "Question",
     "planner.recorded": "question_from_frames",
+    "running": "WorkerPool",
     "study.specification": "StudySpecification",
     "study.run": "open_study run",
     "study.sweep": "Cell Sweep",

@@ -113,8 +113,8 @@ def in_stages(pool: WorkerPool, sizes: Sequence[int]) -> list[WorkerPool]:
 
 def run_units(
     function: Callable[..., Arrays], units: list[Unit], store: UnitStore, pool: WorkerPool
-) -> Results:
-    """Run the units whose results are not stored yet, store each as it finishes; return all results, by key.
+) -> UnitStore:
+    """Run the units whose results are not stored yet, and store each as it finishes; return the store.
 
     Results do not depend on where units run, in which order, or on interruptions.
 
@@ -133,23 +133,13 @@ def run_units(
     InputError
         When workers die repeatedly, the scheduler cannot be reached, or results cannot be written.
     """
-    missing = sorted((unit for unit in units if not store.done(unit.key)), key=lambda unit: -unit.size)
+    missing = sorted((unit for unit in units if unit.key not in store), key=lambda unit: -unit.size)
     if missing:
         count = _Count(missing, sum(unit.size for unit in units), pool.progress)
         for number, result in _finished(function, dict(enumerate(missing)), pool, count):
-            store.write(missing[number].key, result)
+            store[missing[number].key] = result
             count.at(number, missing[number].size)
-    return Results(store)
-
-
-@dataclass(frozen=True)
-class Results:
-    """Results of units by key, read when they are asked for."""
-
-    store: UnitStore
-
-    def __getitem__(self, key: str) -> Arrays:
-        return self.store.read(key)
+    return store
 
 
 class _Count:
@@ -204,8 +194,7 @@ def _by_joblib(
         else:
             pool.say(f"{processes} processes on this machine")
             told = stack.enter_context(_followed(count))
-            begin = {"initializer": _begin_worker, "initargs": (os.getpid(),)}
-            with parallel_config("loky", inner_max_num_threads=1, **begin):
+            with parallel_config("loky", inner_max_num_threads=1, initializer=_begin, initargs=[os.getpid()]):
                 parallel = Parallel(processes, **how)
         own = [kind for kind in estimators().values() if not kind.__module__.startswith("faintspot.")]
         # In tuples: other large arguments would stay with one worker, and be lost with it.
@@ -235,7 +224,7 @@ def _in_worker(work: tuple[Any, ...], place: tuple[int, Path | None], package: t
         raise InputError(" ".join(str(error).split())) from None
 
 
-def _begin_worker(parent: int) -> None:
+def _begin(parent: int) -> None:
     """Leave interruptions to the parent, and end with it: joblib would go on with what is queued."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 

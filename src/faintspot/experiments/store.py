@@ -1,4 +1,4 @@
-"""The results of finished units of work: in memory, or in a Zarr store (format 3) with one chunk a unit.
+"""Results of finished units of work: in a dictionary, or in a Zarr store (format 3) with one chunk a unit.
 
 In a store, all variables of a unit are written first, then that it is done. However the program ends, a unit
 that is done is whole; the others are worked on again.
@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors
-from faintspot.base.json_text import parse_json
 from faintspot.base.version import __version__
+from faintspot.io.arrays.zarr_store import stored_attributes
 from faintspot.io.locations import one_line
+from faintspot.io.optional_packages import load_zarr
 
 if TYPE_CHECKING:
     import xarray
@@ -41,35 +42,11 @@ def fingerprint_of(*identity: str) -> str:
 
 
 class UnitStore(Protocol):
-    """Positions of the units' results, by key."""
+    """Results of finished units by key: a dictionary, or a `ZarrStore`."""
 
-    def done(self, key: str) -> bool:
-        """Return whether the result of a unit is there."""
-
-    def read(self, key: str) -> Arrays:
-        """Return the result of a unit."""
-
-    def write(self, key: str, result: Arrays) -> None:
-        """Keep the result of a unit."""
-
-
-class MemoryStore:
-    """Results in memory."""
-
-    def __init__(self) -> None:
-        self._results: dict[str, Arrays] = {}
-
-    def done(self, key: str) -> bool:
-        """See `UnitStore`."""
-        return key in self._results
-
-    def read(self, key: str) -> Arrays:
-        """See `UnitStore`."""
-        return self._results[key]
-
-    def write(self, key: str, result: Arrays) -> None:
-        """See `UnitStore`."""
-        self._results[key] = result
+    def __contains__(self, key: object, /) -> bool: ...
+    def __getitem__(self, key: str, /) -> Arrays: ...
+    def __setitem__(self, key: str, result: Arrays, /) -> None: ...
 
 
 class ZarrStore:
@@ -115,7 +92,7 @@ class ZarrStore:
         self.path = Path(path)
         own = {**(attributes or {}), _FORMAT: FORMAT, _KIND: kind, _FINGERPRINT: fingerprint}
         _check_path(self.path, own, overwrite=overwrite)
-        zarr = _zarr()
+        zarr = load_zarr()
         with output_errors(self.path):
             if overwrite and self.path.exists():
                 shutil.rmtree(self.path)
@@ -128,9 +105,7 @@ class ZarrStore:
             self._arrays: dict[str, Any] = dict(self._group.arrays())
             stored = list(self._group.attrs[_UNITS])
             self._rows = {key: row for row, key in enumerate(dict.fromkeys([*stored, *units]))}
-            self._is_done = np.zeros(len(self._rows), bool)
-            before = np.asarray(self._arrays[DONE][: len(stored)]).astype(bool)
-            self._is_done[: len(before)] = before
+            self._done = {stored[row] for row in np.flatnonzero(self._arrays[DONE][: len(stored)])}
         except Exception as error:  # broken metadata makes zarr raise many things
             raise InputError(
                 f"{self.path}: damaged, it cannot be resumed: delete it ({one_line(error)})"
@@ -138,12 +113,11 @@ class ZarrStore:
         if len(self._rows) > len(stored):
             self._lengthen()
 
-    def done(self, key: str) -> bool:
-        """See `UnitStore`."""
-        return bool(self._is_done[self._rows[key]])
+    def __contains__(self, key: object) -> bool:
+        return key in self._done
 
-    def write(self, key: str, result: Arrays) -> None:
-        """See `UnitStore`: each variable is one chunk; then it is noted that the unit is done."""
+    def __setitem__(self, key: str, result: Arrays) -> None:
+        """Keep the result of a unit: each variable is one chunk; then it is noted that the unit is done."""
         row = self._rows[key]
         with output_errors(self.path):
             for name, values in result.items():
@@ -153,10 +127,10 @@ class ZarrStore:
                 array = self._arrays[name]
                 array[row : row + 1] = _chunk(array, values)
             self._arrays[DONE][row] = True
-        self._is_done[row] = True
+        self._done.add(key)
 
-    def read(self, key: str) -> dict[str, NDArray[Any]]:
-        """See `UnitStore`.
+    def __getitem__(self, key: str) -> dict[str, NDArray[Any]]:
+        """Return the result of a unit.
 
         Raises
         ------
@@ -193,18 +167,17 @@ class ZarrStore:
 
 def kind_of_store(path: Path) -> str | None:
     """Return what the units of a store are, such as "study"; None when there is something else."""
-    kind = (_attributes(path) or {}).get(_KIND)
+    kind = _attributes(path).get(_KIND)
     return kind if isinstance(kind, str) else None
 
 
-def _attributes(path: Path) -> dict[str, Any] | None:
-    """Return the attributes of a store; None when there is something else."""
+def _attributes(path: Path) -> dict[str, Any]:
+    """Return the attributes of a store of units; none when there is something else."""
     try:
-        text = (path / "zarr.json").read_text(encoding="utf-8")
-        attributes: dict[str, Any] = parse_json(text)["attributes"]
-    except (OSError, ValueError, KeyError):
-        return None
-    return attributes if isinstance(attributes, dict) and _FINGERPRINT in attributes else None
+        attributes = stored_attributes(path)
+        return attributes if _FINGERPRINT in attributes else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
 
 
 def _check_path(path: Path, attributes: Mapping[str, Any], *, overwrite: bool) -> None:
@@ -215,7 +188,7 @@ def _check_path(path: Path, attributes: Mapping[str, Any], *, overwrite: bool) -
     if not path.exists():
         return
     stored = _attributes(path)
-    if stored is None or stored.get(_KIND, kind) != kind:
+    if stored.get(_KIND) != kind:
         raise InputError(f"{path}: already exists and is not the store of a {kind}; choose another name")
     if overwrite:
         return
@@ -249,10 +222,7 @@ def _chunk(array: Any, values: NDArray[Any]) -> NDArray[Any]:
     if shape[1:] == values.shape:
         return values[None].astype(object) if values.dtype.kind in "UT" else values[None]
     chunk = np.full(shape, np.nan)
-    if values.ndim:
-        chunk[0, ..., : values.shape[-1]] = values
-    else:
-        chunk[0] = values
+    chunk[0, ..., : values.shape[-1]] = values
     return chunk
 
 
@@ -260,14 +230,3 @@ def _plain(values: Any) -> NDArray[Any]:
     """Return NumPy's own texts for those of Zarr."""
     array = np.asarray(values)
     return np.asarray(array.tolist(), dtype=np.str_) if array.dtype.kind in "TO" else array
-
-
-def _zarr() -> Any:
-    try:
-        import zarr
-    except ImportError:
-        raise MissingExtraError("zarr", "io", "Keeping finished work in files") from None
-    return zarr
-
-
-__all__ = ["FORMAT", "MemoryStore", "UnitStore", "ZarrStore", "fingerprint_of", "kind_of_store"]

@@ -8,7 +8,7 @@ from tests.cli.cli_cases import Commands
 from tests.experiments.experiment_cases import SEARCH, small
 
 import faintspot.cli
-from faintspot.experiments.closed_loop import budget, magnitude
+from faintspot.experiments.closed_loop import budget, experiment
 from faintspot.experiments.night import protocol
 from faintspot.experiments.night.blocks import load_night
 from faintspot.experiments.night.protocol import NightPlan
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.machine_time("starts other processes")
 @pytest.fixture(autouse=True)
 def _small_experiments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(faintspot.cli._COMMANDS, "loop", "")
-    monkeypatch.setattr(magnitude, "QUICK", SEARCH)
+    monkeypatch.setattr(experiment, "QUICK", SEARCH)
     terms = {name: budget.TERMS[name] for name in ("nothing", "slope error")}
     monkeypatch.setattr(budget, "TERMS", terms)
     monkeypatch.chdir(tmp_path)

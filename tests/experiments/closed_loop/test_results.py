@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.experiments.result_cases import made_up_budget, made_up_magnitude
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
@@ -14,23 +15,6 @@ from faintspot.loop.simulation.files import (
     holds_loop_results,
     make_folder,
 )
-
-
-def magnitude_result() -> MagnitudeResult:
-    rng = np.random.default_rng(1)
-    strehl = rng.uniform(0, 1, (2, 3, 4))
-    strehl[1, 2, 3] = np.nan
-    return MagnitudeResult(
-        ("ml", "b"),
-        ("a", "b"),
-        np.array([10.0, 20.0, 40.0]),
-        np.array([12.0, 11.2, 10.5]),
-        strehl,
-        rng.uniform(0, 1, (2, 3, 4)),
-        np.full((2, 3), "[settings]"),
-        np.full((2, 3), '{"loop_gain": 0.5}'),
-        "name = 'x'",
-    )
 
 
 def assert_equal(one: Any, other: Any) -> None:
@@ -44,7 +28,8 @@ def assert_equal(one: Any, other: Any) -> None:
 
 
 def test_magnitude_is_read_as_written(tmp_path: Path) -> None:
-    result = magnitude_result()
+    result = made_up_magnitude()
+    result.strehl[1, 2, 3] = np.nan
     assert not holds_loop_results(tmp_path)
     result.save(tmp_path / MAGNITUDE_FILE)
     assert holds_loop_results(tmp_path)
@@ -53,8 +38,7 @@ def test_magnitude_is_read_as_written(tmp_path: Path) -> None:
 
 
 def test_budget_is_read_as_written(tmp_path: Path) -> None:
-    values = np.zeros((1, 2, 3)), np.ones((1, 2, 3))
-    result = BudgetResult(("brightest",), ("nothing", "noise"), ("a",), *values)
+    result = made_up_budget()
     result.save(tmp_path / BUDGET_FILE)
     assert_equal(BudgetResult.load(tmp_path / BUDGET_FILE), result)
 
@@ -67,7 +51,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected a magnitude experiment") as error:
         MagnitudeResult.load(path)
     assert "\n" not in str(error.value)
-    magnitude_result().save(path)
+    made_up_magnitude().save(path)
     with pytest.raises(InputError, match="expected an error budget of format 2"):
         BudgetResult.load(path)
 

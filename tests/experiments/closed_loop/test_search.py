@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
+from tests.experiments.experiment_cases import SEARCH, small
 
-from faintspot.experiments.closed_loop.methods import Choice
-from faintspot.experiments.closed_loop.search import coordinate_search, corrected_badness
+from faintspot.base.errors import InputError
+from faintspot.experiments.closed_loop import search as tuning
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Choice, MethodKind, method_kind
+from faintspot.experiments.closed_loop.search import (
+    FIRST_TUNING_REALISATION,
+    Search,
+    Tuned,
+    coordinate_search,
+    corrected_badness,
+    smoothed,
+    stored,
+    tune,
+)
 
 
 def test_choice_follows_the_axes_to_the_minimum() -> None:
@@ -41,3 +54,128 @@ def test_what_measures_nothing_is_behind_all_that_measures_something() -> None:
     assert corrected_badness(truth[:, 0] + noise[0], truth[:, 1] + noise[1], truth) < 1e3
     half = corrected_badness(0.5 * truth[:, 0], 0.5 * truth[:, 1], truth)
     assert half == pytest.approx(0.0, abs=1e-7)
+
+
+BRIGHTEST = method_kind("brightest")
+KEPT = BRIGHTEST.tuned(small())["keep_brightest"]
+BEST = KEPT.values[2]
+GAINS = BRIGHTEST.tuned(small())[LOOP_GAIN]
+TOP = 0.55  # between two values on offer
+
+
+def tuned(kind: MethodKind, search: Search, *more: Any) -> Tuned:
+    return stored(tune(kind, small(), search, *more))
+
+
+class _Record:
+    def __init__(self, strehl: float) -> None:
+        self._strehl = strehl
+
+    def mean_strehl(self) -> float:
+        return self._strehl
+
+
+@pytest.fixture
+def hill(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A loop whose Strehl ratio is highest at TOP and the best number of pixels; realisations used."""
+    used: list[int] = []
+
+    def simulate(configuration: Any, methods: Any, *, realisation: int) -> _Record:
+        used.append(realisation)
+        kept = methods[0].settings.keep_brightest
+        return _Record(1 - np.log(methods[0].gain / TOP) ** 2 - 0.1 * np.log(kept / BEST) ** 2)
+
+    monkeypatch.setattr(tuning, "simulate_loop", simulate)
+    return used
+
+
+def test_finds_the_top(hill: list[int]) -> None:
+    told: list[int] = []
+    found = tuned(BRIGHTEST, Search(rounds=9), None, told.append)
+    assert found.choice == {LOOP_GAIN: TOP, "keep_brightest": BEST}
+    assert found.strehl == pytest.approx(1, abs=0.01)  # of the nearest values on offer
+    assert min(hill) >= FIRST_TUNING_REALISATION
+    assert told == sorted(told)
+
+
+def test_climbs_the_second_hill_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    low, middle, high = (GAINS.values.index(gain) for gain in GAINS.first)
+    assert low > 0
+    assert middle - low >= 3  # a top that no first choice is at
+    heights = np.zeros(len(GAINS.values))
+    heights[low - 1 : low + 2] = 0.6, 0.45, 0.3
+    heights[middle], heights[high] = 0.4, 0.5
+
+    def simulate(configuration: Any, methods: Any, *, realisation: int) -> _Record:
+        kept = methods[0].settings.keep_brightest
+        return _Record(heights[GAINS.values.index(methods[0].gain)] - (kept != KEPT.first[0]))
+
+    monkeypatch.setattr(tuning, "simulate_loop", simulate)
+    for climbs, top in ((1, high), (2, low - 1)):  # the first is the best of the coarse ones
+        found = tuned(BRIGHTEST, Search(climbs=climbs)).choice[LOOP_GAIN]
+        assert GAINS.nearest(found).values == (GAINS.values[top],)
+
+
+def test_looks_at_no_choice_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = []
+
+    def simulate(configuration: Any, methods: Any, *, realisation: int) -> _Record:
+        looks.append((configuration.run.frames, methods[0].gain, methods[0].settings.keep_brightest))
+        return _Record(-abs(methods[0].gain - TOP))
+
+    monkeypatch.setattr(tuning, "simulate_loop", simulate)
+    tune(BRIGHTEST, small(), Search(rounds=9, realisations=1))
+    assert len(looks) == len(set(looks))
+
+
+def test_without_rounds_the_best_coarse_choice(hill: list[int]) -> None:
+    found = tuned(BRIGHTEST, tuning.QUICK)
+    nearest = min(KEPT.first, key=lambda kept: abs(np.log(kept / BEST)))
+    assert found.choice == {LOOP_GAIN: GAINS.first[-1], "keep_brightest": nearest}
+
+
+def test_is_repeatable_and_stored() -> None:
+    centroid = method_kind("centroid")
+    one, other = (tune(centroid, small(), SEARCH) for _ in range(2))
+    assert stored(one) == stored(other)
+    np.testing.assert_array_equal(one["strehl"], other["strehl"])
+    assert 0 < one["strehl"] < 1
+
+
+def test_search_is_checked() -> None:
+    with pytest.raises(InputError, match=r"search.frames"):
+        Search(frames=50, settle_frames=60)
+    with pytest.raises(InputError, match=r"search.rounds"):
+        Search(rounds=-1)
+
+
+def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[int]) -> None:
+    kind = method_kind("brightest+modal")
+    found = tuned(kind, Search(rounds=9), {LOOP_GAIN: 0.9, "keep_brightest": BEST + 1})
+    highest = max(kind.tuned(small())[LOOP_GAIN].values)
+    assert found.choice == {LOOP_GAIN: highest, "keep_brightest": BEST + 1}
+    assert not hill  # nothing is left to tune
+
+
+def test_of_known_slopes_only_the_gain_is_tuned(hill: list[int]) -> None:
+    slopes = {LOOP_GAIN: GAINS.values[-3], "keep_brightest": BEST + 1}
+    assert tuned(BRIGHTEST, Search(), slopes).choice == {**slopes, LOOP_GAIN: TOP}
+
+
+def test_options_follow_a_power_of_the_flux() -> None:
+    """One wrong value among five does not change the line."""
+    kind, fluxes = method_kind("window"), (20.0, 40.0, 80.0, 160.0, 320.0)
+    stars = [small().replace("camera", photons_per_subaperture=flux) for flux in fluxes]
+    power = [2.0 * (flux / 20) ** 0.2 for flux in fluxes]
+    choices = [{LOOP_GAIN: 0.1 * k, "window_fwhm_px": width} for k, width in enumerate(power)]
+    choices[1]["window_fwhm_px"] = 3.5
+    found = smoothed(kind, stars, choices)
+    np.testing.assert_allclose([each["window_fwhm_px"] for each in found], power, rtol=5e-3)
+    assert [each[LOOP_GAIN] for each in found] == [each[LOOP_GAIN] for each in choices]
+    assert smoothed(kind, stars[:2], choices[:2]) == choices[:2]
+
+
+def test_whole_numbers_are_not_smoothed() -> None:
+    stars = [small().replace("camera", photons_per_subaperture=flux) for flux in (20.0, 40.0, 80.0)]
+    choices = [{LOOP_GAIN: 0.1, "keep_brightest": kept} for kept in KEPT.values[:3]]
+    assert smoothed(BRIGHTEST, stars, choices) == choices

@@ -3,11 +3,10 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from tests.experiments.experiment_cases import HERE, StopsAfter, assert_same_units, small
+from tests.experiments.experiment_cases import HERE, small
 from tests.experiments.loop_answer_cases import configuration, made_up
 
 from faintspot.base.errors import InputError
@@ -16,7 +15,6 @@ from faintspot.experiments.closed_loop.methods import LOOP_GAIN, method_kind
 from faintspot.experiments.closed_loop.question import LoopQuestion
 from faintspot.experiments.closed_loop.search import Search
 from faintspot.experiments.closed_loop.tuning import LoopPlan, tune_loop
-from faintspot.experiments.running import WorkerPool
 
 pytest.importorskip("hcipy")
 SEARCH = Search(
@@ -25,24 +23,15 @@ SEARCH = Search(
 PLAN = LoopPlan(fluxes=3, frames=30, settle_frames=10, realisations=2, search=SEARCH)
 
 
-def question(**asked: Any) -> LoopQuestion:
+def tuned(folder: Path, *methods: str) -> LoopAnswer:
     loop = small().replace("control", telemetry_frames=700)
-    return LoopQuestion(loop, magnitudes=(9.0, 11.0), **{"methods": ("window+kalman",), **asked})
-
-
-def tuned(folder: Path, place: WorkerPool = HERE, **asked: Any) -> LoopAnswer:
-    return tune_loop(question(**asked), folder, plan=PLAN, pool=place)
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LoopAnswer]:
-    folder = tmp_path_factory.mktemp("tune")
-    return folder, tuned(folder)
+    question = LoopQuestion(loop, magnitudes=(9.0, 11.0), methods=methods)
+    return tune_loop(question, folder, plan=PLAN, pool=HERE)
 
 
 @pytest.mark.slow
-def test_answer(whole: tuple[Path, LoopAnswer]) -> None:
-    _, answer = whole
+def test_answer(tmp_path: Path) -> None:
+    answer = tuned(tmp_path, "window+kalman")
     assert list(answer.kinds) == ["brightest", "window", "window+kalman"]
     assert (answer.photons.shape, answer.realisations, answer.scored_frames) == ((3,), 2, 20)
     assert answer.measured.strehl.shape == answer.measured.centroid_gain.shape == (3, 3, 2)
@@ -57,18 +46,8 @@ def test_answer(whole: tuple[Path, LoopAnswer]) -> None:
 
 
 @pytest.mark.slow
-def test_interrupted_it_goes_on_to_the_same_answer(tmp_path: Path, whole: tuple[Path, LoopAnswer]) -> None:
-    folder, answer = whole
-    with pytest.raises(KeyboardInterrupt):
-        tuned(tmp_path, WorkerPool(0, progress=StopsAfter(60)))
-    again = tuned(tmp_path)
-    assert_same_units(tmp_path, folder)
-    np.testing.assert_array_equal(again.runs("window+kalman"), answer.runs("window+kalman"))
-
-
-@pytest.mark.slow
 def test_another_loop_in_the_folder_is_refused_or_replaced(tmp_path: Path) -> None:
-    tuned(tmp_path, methods=())
+    tuned(tmp_path)
     other = LoopQuestion(small().replace("camera", read_noise_e=5.0), magnitudes=(9.0, 11.0), methods=())
     with pytest.raises(InputError, match=r"magnitude-tuning\.zarr"):
         tune_loop(other, tmp_path, plan=PLAN, pool=HERE)

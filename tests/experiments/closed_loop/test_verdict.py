@@ -1,16 +1,21 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tests.experiments.result_cases import LABELS, made_up_budget, made_up_magnitude
 from tests.refusals import refused
 
+from faintspot.experiments.closed_loop.budget import TERMS
+from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
 from faintspot.experiments.closed_loop.verdict import (
     NOWHERE,
     LoopResults,
     better_and_worse,
+    loop_summary,
     loop_verdict,
     options_that_may_pay,
     reference_methods,
@@ -62,3 +67,53 @@ def test_gains_are_said_against_the_strongest_baseline_first() -> None:
     against = [line.split(" against ")[1].split(":")[0] for line in lines]
     window, brightest = result.labels[2], result.labels[0]
     assert against == [window, window, window, brightest, brightest]
+
+
+@pytest.fixture
+def result() -> MagnitudeResult:
+    """TV denoising is 0.01 worse than brightest pixels everywhere, give or take 0.002."""
+    atmosphere = np.array([-0.1, 0.0, 0.1, 0.05, -0.05])
+    brightest = np.array([0.2, 0.4, 0.6])[:, None] + atmosphere
+    tv = brightest - 0.01 + 0.002 * np.array([1, -1, 0, 1, -1])
+    return MagnitudeResult(
+        ("brightest", "tv"),
+        ("brightest pixels", "TV denoising"),
+        np.array([10.0, 40.0, 160.0]),
+        np.array([13.0, 11.5, 10.0]),
+        np.stack([brightest, tv]),
+        np.ones((2, 3, 5)),
+        np.full((2, 3), ""),
+        np.full((2, 3), '{"loop_gain": 0.5}'),
+        "",
+    )
+
+
+def summary(result: MagnitudeResult, realisations: int = 5) -> str:
+    few = {name: getattr(result, name)[:, :, :realisations] for name in ("strehl", "centroid_gain")}
+    return loop_summary(LoopResults(magnitude=replace(result, **few)))
+
+
+def test_magnitude(result: MagnitudeResult) -> None:
+    heading, brightest, *rest = summary(result).splitlines()
+    assert "10 e⁻, 13.0 mag" in heading
+    error = np.std([-0.1, 0.0, 0.1, 0.05, -0.05], ddof=1) / np.sqrt(5)
+    words = "brightest pixels", *(f"{value:.3f} ± {error:.3f}" for value in (0.2, 0.4, 0.6))
+    assert brightest.split() == " ".join(words).split()
+    assert any(line.startswith("TV raises the Strehl ratio nowhere beyond its error") for line in rest)
+
+
+def test_few_realisations_have_no_error_and_name_no_gain(result: MagnitudeResult) -> None:
+    single = summary(result, 1)
+    assert "nan" not in single
+    assert "0.100 ±" not in single
+    assert "limiting magnitude" not in summary(result, 2)  # not a figure of a gain whose error is not known
+
+
+def test_budget() -> None:
+    shape = (1, len(TERMS), 3)
+    strehl = np.broadcast_to(np.linspace(0.3, 0.9, len(TERMS))[:, None], shape)
+    residual = np.full(shape, 150.0)
+    result = BudgetResult(("brightest",), tuple(TERMS), ("brightest pixels",), strehl, residual)
+    lines = loop_summary(LoopResults(budget=result)).splitlines()
+    assert len(lines) == 1 + len(TERMS)
+    assert lines[1].split() == ["brightest", "pixels", "–", "0.300", "±", "0.000", "150", "±", "0"]

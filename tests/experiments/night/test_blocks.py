@@ -61,13 +61,6 @@ def test_hours_include_settling() -> None:
     assert night.hours == pytest.approx(len(night.strehl) * 2.4 / 3600)
 
 
-def test_rows_keep_what_is_not_of_blocks() -> None:
-    night = night_with()
-    part = night.rows(night.set_number == 1)
-    assert part.labels == night.labels
-    assert len(part.strehl) == (night.set_number == 1).sum()
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from tests.shared_data import shared_file
 
+from faintspot.base.statistics import slope_statistics
 from faintspot.experiments import Cell, StudySpecification, Sweep, measure_cell
-from faintspot.experiments.study.cell import realisations
+from faintspot.experiments.study.cell import Tuning, realisations
 from faintspot.experiments.study.cell_methods import CellMethods, errors_of, position_table
 
 SMALL = StudySpecification("small", [Sweep("a", flux_e=60, pixels=8)], realisations=400, fixed_k=(10, 40))
@@ -171,3 +172,67 @@ def test_reference_cases(name: str) -> None:
         low, high = expected["k_within_1pct"]
         assert low - 3 <= column + 1 <= high + 3
     assert found["brightest"] / found["tv"] == pytest.approx(case["ratio"], rel=0.03)
+
+
+TUNED = StudySpecification(
+    "s",
+    [Sweep("a", flux_e=30, pixels=8, d_over_r0=2)],
+    realisations=400,
+    estimators=["brightest", "smoothed", "ml"],
+    widths=[0.4, 1.0],
+    blurs=[0.0, 1.5],
+    model_errors=[0.3],
+    fixed_k=[20],
+    corrected=True,
+)
+TUNED_CELL = TUNED.cells()[0]
+METHODS = CellMethods(TUNED_CELL, TUNED, 30.0)
+
+
+def tuning() -> Tuning:
+    return Tuning(METHODS)
+
+
+def test_choices_are_those_of_the_smallest_error() -> None:
+    blocks = list(realisations(TUNED_CELL, 200, np.random.default_rng(1)))
+    ((images, truth),) = blocks
+    search = tuning()
+    search.add(blocks)
+    choices = search.choices()
+    for method in ("brightest", "smoothed"):
+        candidates = METHODS.candidates(method)
+        tables = [position_table(METHODS.estimator(method, c), images, 1.0)[0] for c in candidates]  # type: ignore[arg-type]
+        corrected = [
+            [slope_statistics(table[:, k, 0], table[:, k, 1], truth).corrected_rms.value for k in range(63)]
+            for table in tables
+        ]
+        errors = [np.abs(table - truth[:, None]).mean(axis=(0, 2)) for table in tables]
+        for mode, values in (("best", errors), ("corrected", corrected)):
+            row, column = np.unravel_index(np.argmin(values), np.shape(values))
+            assert choices[method, mode][1] == column, (method, mode)
+            assert choices[method, mode][0] == candidates[int(row)]
+        assert choices[method, "fixed20"][1] == 19
+    robust = METHODS.candidates("ml")
+    slopes = [METHODS.measure("ml", candidate, images) for candidate in robust]
+    found = [slope_statistics(s.x, s.y, truth) for s in slopes]
+    best = int(np.argmin([s.error.value for s in found]))
+    assert choices["ml", "best"][0] == robust[best]
+    corrected_best = int(np.argmin([s.corrected_rms.value for s in found]))
+    assert choices["ml", "corrected"][0] == robust[corrected_best]
+
+
+def test_images_may_come_in_parts() -> None:
+    whole, parts = tuning(), tuning()
+    ((images, truth),) = realisations(TUNED_CELL, 200, np.random.default_rng(2))
+    whole.add([(images, truth)])
+    parts.add([(images[:70], truth[:70])])
+    parts.add([(images[70:], truth[70:])])
+    assert whole.choices() == parts.choices()
+
+
+def test_nothing_to_choose_needs_no_images() -> None:
+    specification = StudySpecification("s", [Sweep("a")], estimators=["ml", "trained"], fixed_k=[])
+    methods = CellMethods(specification.cells()[0], specification)
+    choices = Tuning(methods).choices()
+    assert choices["ml", "best"][0] == (("blur_px", 0.0), ("model_error", 0.0))
+    assert choices["trained", "best"][0] == ()

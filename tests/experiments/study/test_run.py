@@ -2,31 +2,44 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.experiments.study_runs import N_CELLS, SPECIFICATION, assert_identical, assert_same
 
 from faintspot import InputError, experiments
-from faintspot.experiments.study.run import VARIABLES
+from faintspot.experiments import StudySpecification, WorkerPool, measure_cell, open_study
 
 pytest.importorskip("zarr")
 xarray = pytest.importorskip("xarray")
+
+from faintspot.experiments.study.run import (  # noqa: E402
+    VARIABLES,
+    dataset_of,
+    new_dataset,
+    stored_units,
+)
 
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("study") / "whole.zarr"
-    experiments.run(SPECIFICATION, path, workers=0)
+    experiments.run(SPECIFICATION, path, pool=WorkerPool(0))
     return path
+
+
+def counting(counts: list[tuple[int, ...]]) -> WorkerPool:
+    return WorkerPool(0, lambda *count: counts.append(count))
 
 
 @pytest.mark.slow
 def test_in_memory(uninterrupted: Path) -> None:
-    counts = []
-    result = experiments.run(SPECIFICATION, workers=0, progress=lambda *count: counts.append(count))
+    counts: list[tuple[int, ...]] = []
+    result = experiments.run(SPECIFICATION, pool=counting(counts))
     assert counts == [(i, N_CELLS) for i in range(N_CELLS + 1)]
     assert result["done"].all()
     assert_identical(result, experiments.open_study(uninterrupted))
@@ -41,20 +54,20 @@ def test_interrupted_and_started_again(tmp_path: Path, uninterrupted: Path) -> N
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        experiments.run(SPECIFICATION, path, progress=stop, workers=0)
+        experiments.run(SPECIFICATION, path, pool=WorkerPool(0, stop))
     assert int(experiments.open_study(path)["done"].sum()) == 4
-    counts = []
-    experiments.run(SPECIFICATION, path, workers=0, progress=lambda *count: counts.append(count))
+    counts: list[tuple[int, ...]] = []
+    experiments.run(SPECIFICATION, path, pool=counting(counts))
     assert counts == [(finished, N_CELLS) for finished in range(4, N_CELLS + 1)]
     assert_same(path, uninterrupted)
-    experiments.run(SPECIFICATION, path, workers=0, progress=lambda *count: counts.append(count))
+    experiments.run(SPECIFICATION, path, pool=counting(counts))
     assert len(counts) == N_CELLS - 4 + 1  # a complete study tells nothing
 
 
 def test_other_cells_do_not_matter(uninterrupted: Path) -> None:
     whole = experiments.open_study(uninterrupted)
     sweep = experiments.Sweep("one", flux_e=[300, 30], pixels=8)
-    part = experiments.run(replace(SPECIFICATION, sweeps=[sweep]), workers=0)
+    part = experiments.run(replace(SPECIFICATION, sweeps=[sweep]), pool=WorkerPool(0))
     for cell in range(2):
         chosen = (whole["flux_e"] == part["flux_e"][cell]) & (whole["pixels"] == 8)
         chosen &= whole["read_noise_e"] == 0.1
@@ -65,6 +78,71 @@ def test_other_cells_do_not_matter(uninterrupted: Path) -> None:
 
 def test_bad_arguments() -> None:
     with pytest.raises(InputError, match="workers = -1"):
-        experiments.run(SPECIFICATION, workers=-1)
+        experiments.run(SPECIFICATION, pool=WorkerPool(-1))
     with pytest.raises(InputError, match="expected a StudySpecification"):
-        experiments.run("mine.toml", workers=0)  # type: ignore[arg-type]
+        experiments.run("mine.toml")  # type: ignore[arg-type]
+
+
+OTHER = replace(SPECIFICATION, seed=2)
+
+
+def test_schema() -> None:
+    dataset = new_dataset(SPECIFICATION)
+    assert dict(dataset.sizes) == {"cell": N_CELLS, "estimator": 4, "estimator2": 4, "mode": 3, "k": 63}
+    assert set(dataset.data_vars) == {*VARIABLES, "done"}
+    assert dataset["gain"].dims == ("cell", "estimator", "mode")
+    assert dataset["stated_over_actual"].dims == ("cell", "estimator")
+    assert dataset["bound"].dims == ("cell",)
+    assert dataset["error_covariance"].dims == ("cell", "mode", "estimator", "estimator2")
+    assert dataset["error_at_k"].dims == ("cell", "estimator", "k")
+    for name in VARIABLES:
+        assert dataset[name].attrs["units"]
+        assert np.isnan(dataset[name]).all()
+    assert not dataset["done"].any()
+    assert dataset["flux_e"].attrs["units"] == "electron"
+    assert dataset["pixels"].dtype.kind == "i"
+    assert list(dataset["mode"].values) == ["best", "fixed10", "fixed40"]
+    assert StudySpecification.from_text(dataset.attrs["specification"]) == SPECIFICATION
+    assert (dataset.attrs["seed"], dataset.attrs["n"]) == (1, 200)
+
+
+def test_store_is_memory(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    stored, memory = stored_units(SPECIFICATION, path), dict[str, Any]()
+    assert_identical(open_study(path), dataset_of(SPECIFICATION, memory))
+    for index in (2, 0):
+        results = measure_cell(SPECIFICATION.cells()[index], SPECIFICATION)
+        stored[str(index)] = memory[str(index)] = results
+    assert_identical(open_study(path), dataset_of(SPECIFICATION, memory))
+    assert [index for index in range(N_CELLS) if str(index) in stored] == [0, 2]
+    # One chunk a cell and variable.
+    assert sorted(p.name for p in (path / "error" / "c").iterdir()) == ["0", "2"]
+    # A window of 6 x 6 pixels has no more than 35 k.
+    small = dataset_of(SPECIFICATION, memory).isel(cell=0)
+    assert int(small["pixels"]) == 6
+    assert np.isfinite(small["error_at_k"].sel(estimator="brightest", k=slice(1, 35))).all()
+    assert np.isnan(small["error_at_k"].sel(k=slice(36, None))).all()
+    opened = xarray.open_zarr(path, consolidated=False)
+    np.testing.assert_array_equal(opened["error"], dataset_of(SPECIFICATION, memory)["error"])
+
+
+def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    stored_units(SPECIFICATION, path)
+    with pytest.raises(InputError, match=r"s\.zarr: belongs to another study \('small'"):
+        stored_units(OTHER, path)
+    stored_units(OTHER, path, overwrite=True)
+    assert open_study(path).attrs["fingerprint"] == OTHER.fingerprint
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for wrong, found in ((folder, "something else"), (tmp_path / "nothing", "nothing")):
+        with pytest.raises(InputError, match=f"found {found}"):
+            open_study(wrong)
+
+
+def test_of_another_version(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    stored_units(SPECIFICATION, path)
+    shutil.rmtree(path / "gain")
+    with pytest.raises(InputError, match="has no gain: measured by another version"):
+        open_study(path)

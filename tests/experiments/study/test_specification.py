@@ -143,7 +143,7 @@ BAD = {
     'name = "x"\n[sweeps.a]\nflux_e = []': ("flux_e", "empty"),
     'name = "x"\n[sweeps.a]\nflux_e = 0': ("flux_e = 0", "above 0"),
     'name = "x"\n[sweeps.a]\nflux_e = "many"': ("flux_e", "real numbers"),
-    'name = "x"\n[sweeps.a]\nflux_e = nan': ("flux_e = nan",),
+    'name = "x"\n[sweeps.a]\nflux_e = nan': ("flux_e", "NaN"),
     'name = "x"\n[sweeps.a]\nread_noise_e = [0.1, -3]': ("'a'", "read_noise_e = -3"),
     'name = "x"\n[sweeps.a]\nelongation = 0.5': ("elongation = 0.5",),
     'name = "x"\n[sweeps.a]\npixels = 8.5': ("pixels = 8.5", "whole"),

@@ -16,8 +16,8 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import derived, write_atomically
 from faintspot.base.json_text import parse_json
 from faintspot.base.statistics import Estimate, paired_mean
+from faintspot.experiments.closed_loop.experiment import with_flux
 from faintspot.experiments.closed_loop.limits import Limit, falling, magnitude_gain, magnitude_limit
-from faintspot.experiments.closed_loop.magnitude import with_flux
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, NOISE_SCALE, MethodKind, method_kind
 from faintspot.experiments.closed_loop.question import (
     BASELINE,
@@ -169,11 +169,11 @@ class LoopAnswer:
 
     def limit(self, name: str) -> Limit:
         """Return a method's limiting magnitude."""
-        return magnitude_limit(*self._from_bright(name), self.level)
+        return magnitude_limit(self.magnitudes, self.runs(name), self.level)
 
     def gain(self, name: str, reference: str) -> Limit:
         """Return the gain in limiting magnitude over another method; NaN where one of them has no limit."""
-        return magnitude_gain(*self._from_bright(name), self._from_bright(reference)[1], self.level)
+        return magnitude_gain(self.magnitudes, self.runs(name), self.runs(reference), self.level)
 
     def coverage(self, name: str, place: str) -> Coverage | None:
         """Return what part of a place of `PLACES` a method can use; None: no radius."""
@@ -198,7 +198,7 @@ class LoopAnswer:
 
     def curve(self, name: str) -> Floats:
         """Return a method's mean Strehl ratios (F,), made to fall with magnitude; to be joined by lines."""
-        return falling(self._from_bright(name)[1].mean(axis=1))[::-1]
+        return falling(self.runs(name)[::-1].mean(axis=1))[::-1]
 
     def star(self, flux: int) -> LoopConfiguration:
         """Return the loop with the star of a measured flux."""
@@ -261,10 +261,6 @@ class LoopAnswer:
         if math.isfinite(strehl.standard_error):
             table["strehl_error"] = round(strehl.standard_error, 4)
         return table
-
-    def _from_bright(self, name: str) -> tuple[Floats, Floats]:
-        """Return rising magnitudes (F,), and the Strehl ratios (F, R) there."""
-        return self.magnitudes[::-1], self.runs(name)[::-1]
 
 
 def _simplicity(kind: MethodKind) -> tuple[Any, ...]:

@@ -16,7 +16,6 @@ from faintspot.experiments.words import with_error
 Floats = NDArray[np.float64]
 
 _HALVINGS = 50  # of the interval in which a curve crosses the level
-_NORMAL = 1.96
 
 
 @dataclass(frozen=True)
@@ -41,12 +40,7 @@ class Limit:
     @property
     def estimate(self) -> Estimate:
         """Value and interval with both kinds of error."""
-        found, wide = self.magnitude, _NORMAL * self.interpolation_error
-        if not self.is_known or math.isnan(found.low):
-            return found
-        low = found.value - math.hypot(found.value - found.low, wide)
-        high = found.value + math.hypot(found.high - found.value, wide)
-        return Estimate(found.value, self.error, low, high, found.count)
+        return self.magnitude.widened(self.interpolation_error)
 
     def in_words(self, *, sign: bool = False) -> str:
         """Return it with its error, at least 0.01 mag."""

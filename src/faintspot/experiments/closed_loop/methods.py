@@ -74,35 +74,20 @@ class Tunable:
 
 @dataclass(frozen=True)
 class Variant:
-    """Variants of a method's use in a loop."""
+    """A variant of a method's use in a loop."""
 
     label: str
-    meaning: str
     changes: Mapping[str, bool]
-    """Of the method."""
+    """Of the `Method`, which says what they mean."""
 
 
 VARIANTS = {
-    "_predicted": Variant(
-        "predicted",
-        "the estimator's prior, or where it starts, is what the loop predicts",
-        # What stays near the prediction has no gain of its own, and is measured without one.
-        {"predict_prior": True, "correct_gain": False},
-    ),
-    "_weighted": Variant(
-        "weighted reconstructor", "slopes count by their standard errors", {"weighted_reconstructor": True}
-    ),
-    "_uncorrected": Variant(
-        "gain not corrected", "slopes are not divided by the centroid gain", {"correct_gain": False}
-    ),
-    "_filter": Variant(
-        "matched filter",
-        "its weights are the linear matched filter of a laser guide star's spots",
-        {"matched_weights": True},
-    ),
-    "_followed": Variant(
-        "profile followed", "the sodium profile of a laser guide star is followed", {"follows_profile": True}
-    ),
+    # What stays near the prediction has no gain of its own, and is measured without one.
+    "_predicted": Variant("predicted", {"predict_prior": True, "correct_gain": False}),
+    "_weighted": Variant("weighted reconstructor", {"weighted_reconstructor": True}),
+    "_uncorrected": Variant("gain not corrected", {"correct_gain": False}),
+    "_filter": Variant("matched filter", {"matched_weights": True}),
+    "_followed": Variant("profile followed", {"follows_profile": True}),
 }
 """By what follows the estimator's name in that of a method: "map_predicted_weighted"."""
 _PREDICTED = "_predicted"

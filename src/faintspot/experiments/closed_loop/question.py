@@ -230,14 +230,10 @@ class LoopQuestion:
     @property
     def left_out(self) -> dict[str, str]:
         """Default candidates that do not suit, and why."""
-        if self.methods is not None:
+        if self.methods is not None or self.configuration.control.mode == CLOSED:
             return {}
-        reasons = {}
-        for name in _CANDIDATES:
-            kind = method_kind(name)
-            if kind.control == KALMAN and self.configuration.control.mode != CLOSED:
-                reasons[name] = "its control learns from a closed loop, this one is open"
-        return reasons
+        reason = "its control learns from a closed loop, this one is open"
+        return {name: reason for name in _CANDIDATES if method_kind(name).control == KALMAN}
 
     def _default(self) -> list[str]:
         return [name for name in _CANDIDATES if name not in self.left_out]
@@ -276,15 +272,10 @@ class LoopQuestion:
         """Largest useful distance of a star from the target, arcsec; None: no high turbulence."""
         if self.radius_arcsec is not None:
             return float(self.radius_arcsec)
-        if not any(self._layers_above()):
+        atmosphere = self.configuration.atmosphere
+        if not np.dot(atmosphere.altitude_m, atmosphere.fraction) > 0:
             return None
         return min(isoplanatic_angle_arcsec(self.configuration), 3600.0)
-
-    def _layers_above(self) -> list[Any]:
-        atmosphere = self.configuration.atmosphere
-        return [
-            h > 0 and part > 0 for h, part in zip(atmosphere.altitude_m, atmosphere.fraction, strict=True)
-        ]
 
 
 def magnitudes_apart(photons: Sequence[float]) -> float:

@@ -8,16 +8,16 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.npz import NpzFile
 from faintspot.base.statistics import Estimate, paired_mean
 from faintspot.experiments.closed_loop.limits import magnitude_gain
-from faintspot.loop.simulation.files import Stored
 
 Floats = NDArray[np.float64]
 _STREHL_LEVELS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 
 
 @dataclass(frozen=True, eq=False)
-class MagnitudeResult(Stored):
+class MagnitudeResult(NpzFile):
     """Strehl ratio against the star's flux: A methods, F fluxes, R realisations of the air."""
 
     WHAT: ClassVar[str] = "a magnitude experiment"
@@ -44,7 +44,7 @@ class MagnitudeResult(Stored):
 
 
 @dataclass(frozen=True, eq=False)
-class BudgetResult(Stored):
+class BudgetResult(NpzFile):
     """Error budget: A methods with T terms switched off, R realisations of the air."""
 
     WHAT: ClassVar[str] = "an error budget"

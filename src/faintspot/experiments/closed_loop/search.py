@@ -117,18 +117,15 @@ class Tuned:
     choice: Choice
     strehl: float
     """Mean of the tuning runs; the best of many, so higher than that of other runs."""
-    tried: int
-    """Settings that were looked at."""
 
 
 def tune(
     kind: MethodKind,
     configuration: LoopConfiguration,
-    search: Search | None = None,
-    advance: Advance | None = None,
-    *,
+    search: Search,
     slopes: Choice | None = None,
-) -> Tuned:
+    advance: Advance | None = None,
+) -> dict[str, NDArray[Any]]:
     """Find the settings of a method that give the highest Strehl ratio at the configuration's flux.
 
     All combinations of a few values of each option first, then steps from the best ones to
@@ -143,18 +140,26 @@ def tune(
     ----------
     kind : MethodKind
     configuration : LoopConfiguration
-    search : Search, optional
-    advance : callable, optional
-        Told the number of frames simulated, after every run.
+    search : Search
     slopes : mapping, optional
         Settings of the slopes with the integrator, of which only the loop gain is searched again, from the
         given one. Default: searched; for control that learns, first.
+    advance : callable, optional
+        Told the number of frames simulated, after every run.
+
+    Returns
+    -------
+    dict
+        What `stored` reads.
     """
-    search = Search() if search is None else search
     if slopes is None and kind.control != INTEGRATOR:
-        slopes = tune(with_integrator(kind), configuration, search, advance).choice
+        slopes = stored(tune(with_integrator(kind), configuration, search, None, advance)).choice
     search, tuned = _searched(kind, configuration, search, slopes)
-    return _sought(kind, configuration, search, tuned, advance)
+    if all(len(tunable.values) == 1 for tunable in tuned.values()):
+        best = Tuned({name: tunable.values[0] for name, tunable in tuned.items()}, math.nan)
+    else:
+        best = _Trials(kind, configuration, search, tuned, advance).best()
+    return {"choice": np.asarray(to_json(best.choice)), "strehl": np.asarray(best.strehl)}
 
 
 def _searched(
@@ -180,78 +185,9 @@ def with_integrator(kind: MethodKind) -> MethodKind:
     return replace(kind, control=INTEGRATOR)
 
 
-def _sought(
-    kind: MethodKind,
-    configuration: LoopConfiguration,
-    search: Search,
-    tuned: Mapping[str, Tunable],
-    advance: Advance | None,
-) -> Tuned:
-    """Return the best of the values that are tuned."""
-    if all(len(tunable.values) == 1 for tunable in tuned.values()):
-        return Tuned({name: tunable.values[0] for name, tunable in tuned.items()}, math.nan, 0)
-    trials = _Trials(kind, configuration, search, advance)
-    coarse = [
-        dict(zip(tuned, values, strict=True))
-        for values in itertools.product(*(tunable.first for tunable in tuned.values()))
-    ]
-    ranked = sorted(coarse, key=lambda choice: -trials.coarse(choice))
-    if search.rounds == 0:
-        return Tuned(ranked[0], trials.coarse(ranked[0]), trials.tried)
-    finalists = sorted(ranked[: search.finalists], key=trials.fine, reverse=True)
-    tops = [_climbed(start, tuned, trials, search.rounds) for start in finalists[: search.climbs]]
-    best = max(tops, key=trials.fine)
-    return Tuned(_between(best, tuned, trials), trials.fine(best), trials.tried)
-
-
-def _climbed(
-    start: dict[str, Any], tuned: Mapping[str, Tunable], trials: _Trials, rounds: int
-) -> dict[str, Any]:
-    """Return where steps to the best neighbour end."""
-    best = start
-    for _ in range(rounds):
-        better = max(_neighbours(best, tuned), key=trials.fine, default=best)
-        if trials.fine(better) <= trials.fine(best):
-            break
-        best = better
-    return best
-
-
-def _between(best: Choice, tuned: Mapping[str, Tunable], trials: _Trials) -> dict[str, Any]:
-    """Return the best choice with each positive number at the top of the parabola through its neighbours."""
-    choice = dict(best)
-    for name, tunable in tuned.items():
-        near = [best, *(choice for choice in _neighbours(best, tuned) if choice[name] != best[name])]
-        if len(near) < 3 or not _is_scale(tunable.values):
-            continue
-        strehl = [trials.fine(choice) for choice in near]
-        logarithms = np.log([choice[name] for choice in near])
-        bend, slope, _ = np.polyfit(logarithms - logarithms[0], strehl, 2)
-        if bend < 0:
-            top = np.clip(logarithms[0] - slope / (2 * bend), logarithms.min(), logarithms.max())
-            choice[name] = float(f"{math.exp(top):.3g}")
-    return choice
-
-
 def _is_scale(values: Sequence[Any]) -> bool:
     """Return whether an option's values are positive numbers, between which it may be."""
     return all(isinstance(value, float) and value > 0 for value in values)
-
-
-def tuning_unit(
-    kind: MethodKind,
-    configuration: LoopConfiguration,
-    search: Search,
-    slopes: Choice | None,
-    advance: Advance,
-) -> dict[str, NDArray[Any]]:
-    """Return what `tune` found, as arrays that can be stored."""
-    tuned = tune(kind, configuration, search, advance, slopes=slopes)
-    return {
-        "choice": np.asarray(to_json(tuned.choice)),
-        "strehl": np.asarray(tuned.strehl),
-        "tried": np.asarray(tuned.tried),
-    }
 
 
 def smoothed(
@@ -281,8 +217,8 @@ def smoothed(
 
 
 def stored(result: Mapping[str, NDArray[Any]]) -> Tuned:
-    """Return what `tuning_unit` stored."""
-    return Tuned(parse_json(str(result["choice"])), float(result["strehl"]), int(result["tried"]))
+    """Return what `tune` found."""
+    return Tuned(parse_json(str(result["choice"])), float(result["strehl"]))
 
 
 def tuning_frames(
@@ -308,54 +244,85 @@ def learning_frames(kind: MethodKind, configuration: LoopConfiguration) -> int:
 
 
 class _Trials:
-    """Strehl ratios of the settings that were looked at."""
+    """Strehl ratios of the settings that were looked at, among those that are tuned."""
 
     def __init__(
-        self, kind: MethodKind, configuration: LoopConfiguration, search: Search, advance: Advance | None
+        self,
+        kind: MethodKind,
+        configuration: LoopConfiguration,
+        search: Search,
+        tuned: Mapping[str, Tunable],
+        advance: Advance | None,
     ) -> None:
-        self._kind, self._search = kind, search
-        self._advance, self._frames = advance, 0
-        self._configuration = configuration
-        self._coarse: dict[tuple[Any, ...], float] = {}
-        self._fine: dict[tuple[Any, ...], float] = {}
+        self._kind, self._configuration, self._search = kind, configuration, search
+        self._tuned, self._advance, self._frames = tuned, advance, 0
+        self._strehl: dict[tuple[tuple[Any, ...], int, int], float] = {}
 
-    @property
-    def tried(self) -> int:
-        return len(self._coarse.keys() | self._fine.keys())
+    def best(self) -> Tuned:
+        """Return the best of the values that are tuned."""
+        search, firsts = self._search, (tunable.first for tunable in self._tuned.values())
+        coarse = [dict(zip(self._tuned, values, strict=True)) for values in itertools.product(*firsts)]
+        ranked = sorted(coarse, key=lambda choice: -self._coarse(choice))
+        best = choice = ranked[0]
+        strehl = self._coarse
+        if search.rounds:
+            finalists = sorted(ranked[: search.finalists], key=self._fine, reverse=True)
+            best = max(map(self._climbed, finalists[: search.climbs]), key=self._fine)
+            choice, strehl = self._between(best), self._fine
+        return Tuned(choice, strehl(best))
 
-    def coarse(self, choice: Choice) -> float:
+    def _coarse(self, choice: Choice) -> float:
         """Return the Strehl ratio in one short run."""
-        key = tuple(choice.values())
-        if key not in self._coarse:
-            self._coarse[key] = self._strehl(choice, self._search.coarse_frames, 1)
-        return self._coarse[key]
+        return self._mean(choice, self._search.coarse_frames, 1)
 
-    def fine(self, choice: Choice) -> float:
+    def _fine(self, choice: Choice) -> float:
         """Return the mean Strehl ratio of longer runs."""
-        key = tuple(choice.values())
-        if key not in self._fine:
-            self._fine[key] = self._strehl(choice, self._search.frames, self._search.realisations)
-        return self._fine[key]
+        return self._mean(choice, self._search.frames, self._search.realisations)
 
-    def _strehl(self, choice: Choice, frames: int, realisations: int) -> float:
-        short = self._configuration.replace("run", frames=frames, settle_frames=self._search.settle_frames)
-        method = self._kind.method(short, choice)
-        runs = range(FIRST_TUNING_REALISATION, FIRST_TUNING_REALISATION + realisations)
-        strehl = float(
-            np.mean([simulate_loop(short, [method], realisation=run).mean_strehl() for run in runs])
-        )
-        self._frames += frames * realisations
-        if self._advance is not None:
-            self._advance(self._frames)
-        return strehl
+    def _mean(self, choice: Choice, frames: int, realisations: int) -> float:
+        key = tuple(choice.values()), frames, realisations
+        if key not in self._strehl:
+            run = {"frames": frames, "settle_frames": self._search.settle_frames}
+            short = self._configuration.replace("run", **run)
+            method = self._kind.method(short, choice)
+            runs = range(FIRST_TUNING_REALISATION, FIRST_TUNING_REALISATION + realisations)
+            strehl = [simulate_loop(short, [method], realisation=run).mean_strehl() for run in runs]
+            self._strehl[key] = float(np.mean(strehl))
+            self._frames += frames * realisations
+            if self._advance is not None:
+                self._advance(self._frames)
+        return self._strehl[key]
 
+    def _neighbours(self, choice: Choice) -> list[dict[str, Any]]:
+        """Return the choices one step away in one option."""
+        neighbours = []
+        for name, tunable in self._tuned.items():
+            index = tunable.values.index(choice[name])
+            for step in (index - 1, index + 1):
+                if 0 <= step < len(tunable.values):
+                    neighbours.append({**choice, name: tunable.values[step]})
+        return neighbours
 
-def _neighbours(choice: Choice, tuned: Mapping[str, Tunable]) -> list[dict[str, Any]]:
-    """Return the choices one step away in one option."""
-    neighbours = []
-    for name, tunable in tuned.items():
-        index = tunable.values.index(choice[name])
-        for step in (index - 1, index + 1):
-            if 0 <= step < len(tunable.values):
-                neighbours.append({**choice, name: tunable.values[step]})
-    return neighbours
+    def _climbed(self, best: dict[str, Any]) -> dict[str, Any]:
+        """Return where steps to the best neighbour end."""
+        for _ in range(self._search.rounds):
+            better = max(self._neighbours(best), key=self._fine, default=best)
+            if self._fine(better) <= self._fine(best):
+                break
+            best = better
+        return best
+
+    def _between(self, best: Choice) -> dict[str, Any]:
+        """Return a choice with positive numbers at the top of the parabola through their neighbours."""
+        choice = dict(best)
+        for name, tunable in self._tuned.items():
+            near = [best, *(other for other in self._neighbours(best) if other[name] != best[name])]
+            if len(near) < 3 or not _is_scale(tunable.values):
+                continue
+            strehl = [self._fine(other) for other in near]
+            logarithms = np.log([other[name] for other in near])
+            bend, slope, _ = np.polyfit(logarithms - logarithms[0], strehl, 2)
+            if bend < 0:
+                top = np.clip(logarithms[0] - slope / (2 * bend), logarithms.min(), logarithms.max())
+                choice[name] = float(f"{math.exp(top):.3g}")
+        return choice

@@ -8,7 +8,8 @@ from pathlib import Path
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.answer import LoopAnswer
-from faintspot.experiments.closed_loop.magnitude import run_magnitude, with_flux
+from faintspot.experiments.closed_loop.experiment import with_flux
+from faintspot.experiments.closed_loop.magnitude import run_magnitude
 from faintspot.experiments.closed_loop.question import LoopQuestion
 from faintspot.experiments.closed_loop.search import Search
 from faintspot.experiments.running import WorkerPool

@@ -24,7 +24,6 @@ ALL_STRENGTHS = "TV, all strengths"
 BEST = f"TV, {BEST_STRENGTHS_E[0]:g} to {BEST_STRENGTHS_E[1]:g} e⁻"
 _FEWEST_ROWS = 3
 _FEWEST_SEEN = 10  # blocks with a measured r0
-_NORMAL = 1.96  # standard errors on each side of a 95 % interval
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +149,7 @@ def contrast(night: Night, chosen: Rows, others: Rows, seeing: Floats | None) ->
         columns += [away, away**2 - np.mean(away**2)]
     design = np.column_stack(columns)
     found = coefficient(design, night.strehl[rows], night.middle_s[rows], night.cycle[rows], 0)
-    return _with_shared(found, _shared_error(night, chosen & rows, others & rows))
+    return found.widened(_shared_error(night, chosen & rows, others & rows))
 
 
 def _shared_error(night: Night, chosen: Rows, others: Rows) -> float:
@@ -158,18 +157,6 @@ def _shared_error(night: Night, chosen: Rows, others: Rows) -> float:
     if night.shared_error is None or not (chosen.any() and others.any()):
         return 0.0
     return abs(float(night.shared_error[chosen].mean() - night.shared_error[others].mean()))
-
-
-def _with_shared(estimate: Estimate, error: float) -> Estimate:
-    """Return an estimate with one more error, which does not show in the scatter of the blocks."""
-    if not math.isfinite(estimate.standard_error):
-        return estimate
-    low, high = (
-        estimate.value + sign * math.hypot(limit - estimate.value, _NORMAL * error)
-        for sign, limit in ((-1, estimate.low), (1, estimate.high))
-    )
-    total = math.hypot(estimate.standard_error, error)
-    return Estimate(estimate.value, total, low, high, estimate.count)
 
 
 def drift_of_r0(night: Night) -> Floats | None:

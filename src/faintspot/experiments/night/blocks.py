@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors
 from faintspot.io.locations import one_line
+from faintspot.io.optional_packages import load_zarr
 
 Floats = NDArray[np.float64]
 
@@ -112,11 +113,6 @@ class Night:
         new_set = np.diff(self.set_number, prepend=self.set_number[:1] - 1) != 0
         return np.cumsum(new_set | (self.method == self.reference)) - 1
 
-    def rows(self, chosen: NDArray[np.bool_]) -> Night:
-        """Return the night with some of its blocks."""
-        columns: dict[str, Any] = {name: values[chosen] for name, values in self._columns().items()}
-        return replace(self, **columns)
-
     def save(self, path: str | Path) -> None:
         """Write the night as a Zarr store, which xarray opens with one dimension, `block`.
 
@@ -127,7 +123,7 @@ class Night:
         MissingExtraError
             When zarr is not installed.
         """
-        path, zarr = Path(path), _zarr()
+        path, zarr = Path(path), load_zarr()
         hidden = path.with_name(f".{path.name}.new")
         attributes = {
             item.name: list(value) if isinstance(value, tuple) else value
@@ -160,7 +156,7 @@ def load_night(path: str | Path) -> Night:
     MissingExtraError
         When zarr is not installed.
     """
-    zarr = _zarr()
+    zarr = load_zarr()
     try:
         group = zarr.open_group(str(path), mode="r")
         attributes = dict(group.attrs)
@@ -175,11 +171,3 @@ def load_night(path: str | Path) -> Night:
     for name in ("labels", "settings", "set_names"):
         values[name] = tuple(values[name])
     return Night(**values)
-
-
-def _zarr() -> Any:
-    try:
-        import zarr
-    except ImportError:
-        raise MissingExtraError("zarr", "io", "Reading and writing a night") from None
-    return zarr

@@ -21,7 +21,6 @@ def r0_of_slopes(
     site: SlopeTurbulence,
     outer_scale_m: float | None = None,
     *,
-    gain_error: float = 0.0,
     run: NDArray[np.int64] | None = None,
 ) -> tuple[float, float]:
     """Return r0 at 500 nm of frames and its standard error, m; NaN where it is not measured.
@@ -34,8 +33,6 @@ def r0_of_slopes(
         Geometry; its strength and winds are not used.
     outer_scale_m : float, optional
         Outer scale, where it is known.
-    gain_error : float
-        Relative standard error of the centroid gain.
     run : (frames,) array of int, optional
         Frames with the same number are consecutive. Default: all are.
     """
@@ -43,5 +40,5 @@ def r0_of_slopes(
         return math.nan, math.nan
     run = np.zeros(len(open_loop_px), np.int64) if run is None else run
     slopes = np.asarray(open_loop_px, np.float64), np.asarray(residual_px, np.float64)
-    strength = turbulence_strength(*slopes, run, site, gain_error=gain_error, outer_scale_m=outer_scale_m)
+    strength = turbulence_strength(*slopes, run, site, outer_scale_m=outer_scale_m)
     return strength.r0_m, strength.r0_error_m

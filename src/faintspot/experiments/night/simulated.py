@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.experiments.closed_loop.methods import Choice
-from faintspot.experiments.closed_loop.search import QUICK, Search, stored, tuning_frames, tuning_unit
+from faintspot.experiments.closed_loop.search import QUICK, Search, stored, tune, tuning_frames
 from faintspot.experiments.night.blocks import NIGHT_STORE, Night
 from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan, kind_of
 from faintspot.experiments.night.seeing import r0_of_slopes
 from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
-from faintspot.experiments.store import ZarrStore, fingerprint_of
+from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.control import slope_turbulence
 from faintspot.loop.simulation.files import make_folder
@@ -85,37 +85,30 @@ def run_night(
     pool, folder = pool or WorkerPool(), make_folder(folder)
     identity = fingerprint_of(configuration.to_text(), str(asdict(plan)), f"tuned: {tuned}, quick: {quick}")
 
-    def results_of(name: str, function: Any, units: list[Unit], stage: WorkerPool) -> Any:
+    def results_of(name: str, function: Any, units: list[Unit], stage: WorkerPool) -> UnitStore:
         path = make_folder(folder / "units") / f"{name}.zarr"
         keys, attributes = [unit.key for unit in units], {"name": configuration.name}
         store = ZarrStore(path, KIND, identity, keys, attributes=attributes, overwrite=overwrite)
         return run_units(function, units, store, stage)
 
     plan.made(plan.configuration(configuration, 0), 0, {})  # refuses what does not fit before any work
-    trials = _trials(configuration, plan, QUICK if quick else Search()) if tuned else []
+    search = QUICK if quick else Search()
+    trials = [
+        Unit(name, (kind, configuration, search, None), tuning_frames(kind, configuration, search))
+        for name, kind in ({name: kind_of(name) for name in plan.methods} if tuned else {}).items()
+    ]
     units = _units(configuration, plan, {}, paired)
     stages = in_stages(pool, [sum(unit.size for unit in each) for each in (trials, units)])
     choices: dict[str, Choice] = {}
     if trials:
         pool.say("tuning")
-        found = results_of("tuning", tuning_unit, trials, stages[0])
+        found = results_of("tuning", tune, trials, stages[0])
         choices = {unit.key: stored(found[unit.key]).choice for unit in trials}
     pool.say("observing")
     units = _units(configuration, plan, choices, paired)
-    observed = results_of("night", observe, units, stages[1])
-    results = {unit.key: observed[unit.key] for unit in units}
-    night = _night(configuration, plan, choices, results)
+    night = _night(configuration, plan, choices, results_of("night", observe, units, stages[1]))
     night.save(folder / NIGHT_STORE)
     return night
-
-
-def _trials(configuration: LoopConfiguration, plan: NightPlan, search: Search) -> list[Unit]:
-    """Return the units that tune the methods of a plan."""
-    kinds = {name: kind_of(name) for name in plan.methods}
-    return [
-        Unit(name, (kind, configuration, search, None), tuning_frames(kind, configuration, search))
-        for name, kind in kinds.items()
-    ]
 
 
 def _units(
@@ -199,30 +192,33 @@ def _mean(values: Floats) -> tuple[float, float]:
 
 
 def _night(
-    configuration: LoopConfiguration, plan: NightPlan, choices: dict[str, Choice], results: dict[str, Any]
+    configuration: LoopConfiguration, plan: NightPlan, choices: dict[str, Choice], results: UnitStore
 ) -> Night:
     """Put the sets together."""
     rate = configuration.control.frame_rate_hz
-    columns: dict[str, list[Any]] = {
-        name: [] for name in ("set_number", "method", "strength_e", "start_s", *_VALUES, "paired_strehl")
-    }
     methods: dict[str, Method] = {}
+    sets = []
     for number in range(plan.sets):
         entries, count = plan.entries(number), plan.blocks(number)
-        for method in plan.made(plan.configuration(configuration, number), number, choices):
+        made = plan.made(plan.configuration(configuration, number), number, choices)
+        for method in made:
             methods.setdefault(method.label, method)
-        made = [method.label for method in plan.made(configuration, number, choices)]
-        order = np.arange(count) % len(entries)
+        numbers = np.array([list(methods).index(method.label) for method in made])
+        order, observed = np.arange(count) % len(entries), results[_key(number, False)]
         first = plan.first_frame(number) + plan.settle_in_block + plan.block_frames * np.arange(count)
-        alone = results.get(_key(number, True), {}).get("strehl", np.full(count, np.nan))
-        columns["set_number"].append(np.full(count, number))
-        columns["method"].append(np.array([list(methods).index(made[entry]) for entry in order]))
-        columns["strength_e"].append(np.array([entries[entry][1] for entry in order]))
-        columns["start_s"].append(first / rate)
-        columns["paired_strehl"].append(alone[:count])
-        for name in _VALUES:
-            columns[name].append(results[_key(number, False)][name][:count])
-    values: dict[str, Any] = {name: np.concatenate(parts) for name, parts in columns.items()}
+        key = _key(number, True)
+        alone = results[key]["strehl"] if key in results else np.full(count, np.nan)
+        sets.append(
+            {
+                "set_number": np.full(count, number),
+                "method": numbers[order],
+                "strength_e": np.array([strength for _, strength in entries])[order],
+                "start_s": first / rate,
+                "paired_strehl": alone[:count],
+                **{name: observed[name][:count] for name in _VALUES},
+            }
+        )
+    values: dict[str, Any] = {name: np.concatenate([part[name] for part in sets]) for name in sets[0]}
     scored = plan.block_frames - plan.settle_in_block
     return Night(
         labels=tuple(methods),

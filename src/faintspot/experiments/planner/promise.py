@@ -227,15 +227,20 @@ def frames_to_check(layout: Layout) -> int:
     return max(_FEWEST_FRAMES, spots // len(layout))
 
 
+def images_e(frames: NDArray[Any], layout: Layout, calibration: Calibration) -> Floats:
+    """Return the images (n_frames, n, ny, nx) of frames in photo-electrons."""
+    dark, electrons_per_adu = layout.images(calibration.maps(layout.frame_shape))
+    images: Floats = (layout.images(frames) - dark) * electrons_per_adu
+    return images
+
+
 def _recorded(question: Question) -> tuple[Floats, LearntPSF]:
     """Images (n_frames, n, ny, nx) of the recording in photo-electrons, and the spots fitted to them."""
     layout, calibration = question.layout, question.calibration
     assert layout is not None
     assert calibration is not None
     assert question.recording is not None
-    frames = question.recording[: frames_to_check(layout)]
-    dark, electrons_per_adu = layout.images(calibration.maps(layout.frame_shape))
-    images: Floats = (layout.images(frames) - dark) * electrons_per_adu
+    images = images_e(question.recording[: frames_to_check(layout)], layout, calibration)
     psf = question.psf
     if psf is None:
         psf = PSF.analytic(question.profile, size=question.size, radius_px=max(question.shape))

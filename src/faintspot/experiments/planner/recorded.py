@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
-from faintspot.experiments.planner.promise import frames_to_check
+from faintspot.experiments.planner.promise import frames_to_check, images_e
 from faintspot.experiments.planner.question import (
     LARGEST_FLUX_E,
     Question,
@@ -110,7 +110,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **st
     calibration = _without_background(calibration, fitted, darks is not None, stated, facts)
     if stated.get("flux_e") is None and stated.get("magnitude") is None:
         stated |= {"flux_e": float(fitted.flux_e.mean()), "flux_is_measured": True}
-        sums = float(_electrons(used, layout, calibration).sum(axis=(-2, -1)).mean())
+        sums = float(images_e(used, layout, calibration).sum(axis=(-2, -1)).mean())
         facts.append(
             f"light measured by fitting spots and background: {stated['flux_e']:.0f} electrons per "
             f"sub-aperture and frame, on average (pixels above the background add up to {sums:.0f})"
@@ -237,18 +237,12 @@ def _some(frames: NDArray[Any], layout: Layout) -> NDArray[Any]:
     return sample
 
 
-def _electrons(stack: NDArray[Any], layout: Layout, calibration: Calibration) -> NDArray[np.float64]:
-    dark, electrons_per_adu = layout.images(calibration.maps(layout.frame_shape))
-    images: NDArray[np.float64] = (layout.images(stack) - dark) * electrons_per_adu
-    return images
-
-
 def _fitted(
     frames: NDArray[Any], layout: Layout, calibration: Calibration, stated: dict[str, Any], facts: list[str]
 ) -> tuple[LearntPSF, NDArray[Any]]:
     """Fit spots and background in some of the frames, returned as well; learn PSF and range if need be."""
     used = _some(frames, layout)
-    images = _electrons(used, layout, calibration).reshape(-1, *layout.window)
+    images = images_e(used, layout, calibration).reshape(-1, *layout.window)
     plain = replace(calibration, dark=0.0, gain_e_per_adu=1.0, em_gain=1.0)
     plain = replace(plain, read_noise_e=calibration.read_noise_photoelectrons)
     assumed, reach = _assumed_psf(layout, stated), stated.get("search_range_px")

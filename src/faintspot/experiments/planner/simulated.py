@@ -43,7 +43,7 @@ class SimulatedSpots:
     layout: Layout
     calibration: Calibration
     choosing: tuple[Floats, Floats]
-    every_k: tuple[Floats, Floats]
+    scoring: tuple[Floats, Floats]
 
     @classmethod
     def of(cls, question: Question, realisations: int, rng: np.random.Generator) -> SimulatedSpots:
@@ -69,7 +69,7 @@ class SimulatedSpots:
         """Return frames to choose on and frames to score on at a flux."""
         camera, (ny, nx) = self.question.detector, self.layout.window
         samples = []
-        for (images, truth), noise in zip((self.choosing, self.every_k), spawn(rng, 2), strict=True):
+        for (images, truth), noise in zip((self.choosing, self.scoring), spawn(rng, 2), strict=True):
             frames = camera.expose(flux_e * images, noise).reshape(-1, SPOTS_PER_FRAME * ny, nx)
             samples.append(Sample(frames, truth.reshape(-1, SPOTS_PER_FRAME, 2)))
         return samples[0], samples[1]

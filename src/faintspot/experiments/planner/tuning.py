@@ -112,7 +112,8 @@ def tune(
     spots_rng, score_rng, noise_rng, resampling_rng = spawn(
         np.random.default_rng(1) if rng is None else rng, 4
     )
-    trial = _Trial(question, number, spots_rng, score_rng, noise_rng, progress)
+    spots = SimulatedSpots.of(question, number, spots_rng)
+    trial = _Trial(question, spots, int(_TRAINING_SHARE * number), score_rng, noise_rng, progress)
     trial.add(range(-each_side, each_side + 1))
     answer = trial.answer(resampling_rng)
     while question.budget_px is not None and (further := _further(answer, trial.steps)):
@@ -151,22 +152,20 @@ class _Scored:
     """Logarithm of the gain-corrected rms of each block of spots."""
 
 
+@dataclass(eq=False)
 class _Trial:
     """All estimators at all fluxes that were tried."""
 
-    def __init__(
-        self,
-        question: Question,
-        realisations: int,
-        spots_rng: np.random.Generator,
-        score_rng: np.random.Generator,
-        noise_rng: np.random.Generator,
-        progress: Progress | None,
-    ) -> None:
-        self._question, self._realisations = question, realisations
-        self._score_rng, self._noise_rng, self._progress = score_rng, noise_rng, progress
-        self._spots = SimulatedSpots.of(question, realisations, spots_rng)
-        self._left_out = _left_out(question)
+    question: Question
+    spots: SimulatedSpots
+    training: int
+    """Spots that each class of a score is trained on."""
+    score_rng: np.random.Generator
+    noise_rng: np.random.Generator
+    progress: Progress | None
+
+    def __post_init__(self) -> None:
+        self._left_out = _left_out(self.question)
         self._kinds = {name: kind for name, kind in estimators().items() if name not in self._left_out}
         self._scored: dict[int, dict[str, _Scored]] = {}
         self._finished = self._to_do = 0
@@ -178,24 +177,22 @@ class _Trial:
 
     def add(self, steps: Sequence[int]) -> None:
         """Try more fluxes."""
-        fluxes = [_flux_of(self._question.star_flux_e, step) for step in steps]
-        scores, classes = self._kinds_that_need(Need.SCORE), 0
-        if scores:
+        fluxes = [_flux_of(self.question.star_flux_e, step) for step in steps]
+        score, classes = None, 0
+        if any(Need.SCORE in kind.needs for kind in self._kinds.values()):
             classes = 1 + 2 * round(0.5 * math.log(fluxes[-1] / fluxes[0]) / math.log(CLASS_WIDTH) - 0.5)
             classes = max(classes, 1)
         self._to_do += len(self._kinds) * len(fluxes) + classes
-        score = None
-        if scores:
+        if classes:
             middle = math.sqrt(fluxes[0] * fluxes[-1])
-            count = int(_TRAINING_SHARE * self._realisations)
-            score = _trained(self._question, middle, count, classes, self._score_rng)
-        self._advance(classes)
-        for step, flux, rng in zip(steps, fluxes, spawn(self._noise_rng, len(fluxes)), strict=True):
-            samples = self._spots.exposed(flux, rng)
+            score = _trained(self.question, middle, self.training, classes, self.score_rng)
+            self._advance(classes)
+        for step, flux, rng in zip(steps, fluxes, spawn(self.noise_rng, len(fluxes)), strict=True):
+            samples = self.spots.exposed(flux, rng)
             self._scored[step] = {}
             for name, kind in list(self._kinds.items()):
                 try:
-                    self._scored[step][name] = self._tried(kind, flux, samples, score)
+                    self._scored[step][name] = self._tried(kind, flux, *samples, score)
                 except InputError as error:
                     if name in (BrightestPixels.name, Thresholded.name):  # what all are compared with
                         raise
@@ -204,35 +201,43 @@ class _Trial:
                 self._advance(1)
 
     def _tried(
-        self, kind: type[Estimator], flux_e: float, samples: tuple[Sample, Sample], score: TrainedScore | None
+        self, kind: type[Estimator], flux_e: float, first: Sample, second: Sample, score: TrainedScore | None
     ) -> _Scored:
         """Choose an estimator's options on the first sample, and score it on the second."""
-        scene = self._question.scene(flux_e)
+        scene, spots = self.question.scene(flux_e), self.spots
         method = method_for_scene(kind, scene, psf=self._psf, score=score)
-        if method.estimator.uses_flux and self._question.flux_is_known:
+        if method.estimator.uses_flux and self.question.flux_is_known:
             method = method.with_options({"flux_e": float(f"{flux_e:.4g}")})
-        return _chosen_and_scored(method, tuned_options(method, scene), self._spots, *samples)
+
+        def badness(choice: Choice, name: str, values: Sequence[Any]) -> list[float]:
+            measured = spots.measure_each(first, method.with_options(choice), name, values)
+            return [corrected_badness(x, y, first.truth) for x, y in measured]
+
+        chosen = method.with_options(coordinate_search(tuned_options(method, scene), badness))
+        error_scale = _error_scale(spots.measure(first, chosen), first.truth)
+        chosen = chosen.with_options({"error_scale": error_scale})
+        slopes, truth = spots.measure(second, chosen), second.truth
+        errors = absolute_errors(slopes.x, slopes.y, truth).ravel()
+        statistics = slope_statistics(slopes.x, slopes.y, truth)
+        return _Scored(chosen, errors, statistics, _by_blocks(slopes, truth))
 
     @cached_property
     def _psf(self) -> PSF:
         """The user's PSF, or that of the assumed profile."""
-        question = self._question
+        question = self.question
         if question.psf is not None:
             return question.psf
         radius = math.ceil(max(question.shape) / 2 + question.search_range_px + 1)
         return PSF.analytic(question.profile, size=question.size, radius_px=radius)
 
-    def _kinds_that_need(self, need: Need) -> list[type[Estimator]]:
-        return [kind for kind in self._kinds.values() if need in kind.needs]
-
     def _advance(self, count: int) -> None:
         self._finished += count
-        if self._progress is not None and count:
-            self._progress(self._finished, self._to_do)
+        if self.progress is not None:
+            self.progress(self._finished, self._to_do)
 
     def answer(self, rng: np.random.Generator) -> Answer:
         """Return what the fluxes tried so far say."""
-        question, at_star = self._question, self._scored[0]
+        question, at_star = self.question, self._scored[0]
         flux = np.array([_flux_of(question.star_flux_e, step) for step in self.steps])
         errors = {name: np.stack([self._scored[s][name].errors for s in self.steps]) for name in self._kinds}
         curve = Curve.of_errors(flux, errors)
@@ -262,12 +267,12 @@ class _Trial:
     @cached_property
     def _promises(self) -> dict[str, Promise]:
         """The methods at the star's flux, checked on the recording."""
-        if self._question.recording is None:
+        if self.question.recording is None:
             return {}
         methods = {
             name: (scored.method, scored.statistics.error.value) for name, scored in self._scored[0].items()
         }
-        return check_promises(self._question, methods)
+        return check_promises(self.question, methods)
 
 
 def _default_realisations(question: Question) -> int:
@@ -296,32 +301,6 @@ def _trained(
         flux_e=(flux_e / reach, flux_e * reach),
         search_range_px=question.search_range_px,
         realisations=realisations,
-    )
-
-
-def _chosen_and_scored(
-    method: Method,
-    axes: Mapping[str, Sequence[Any]],
-    spots: SimulatedSpots,
-    choosing: Sample,
-    every_k: Sample,
-) -> _Scored:
-    """Choose a method's options on one sample, and score it on the other."""
-
-    def badness(choice: Choice, name: str, values: Sequence[Any]) -> list[float]:
-        measured = spots.measure_each(choosing, method.with_options(choice), name, values)
-        return [corrected_badness(x, y, choosing.truth) for x, y in measured]
-
-    chosen = method.with_options(coordinate_search(axes, badness))
-    chosen = chosen.with_options(
-        {"error_scale": _error_scale(spots.measure(choosing, chosen), choosing.truth)}
-    )
-    slopes = spots.measure(every_k, chosen)
-    return _Scored(
-        chosen,
-        absolute_errors(slopes.x, slopes.y, every_k.truth).ravel(),
-        slope_statistics(slopes.x, slopes.y, every_k.truth),
-        _by_blocks(slopes, every_k.truth),
     )
 
 

@@ -7,7 +7,6 @@ with the number of realisations.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from faintspot.experiments.study.cell_methods import (
     CellMethods,
     Floats,
     Measured,
-    detector_of,
     errors_of,
     moments_of,
     shown,
@@ -31,21 +29,15 @@ from faintspot.experiments.study.sweep import Cell
 from faintspot.slopes.simulate import subapertures
 from faintspot.slopes.spots.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency
 
-
-@dataclass(frozen=True)
-class Choice:
-    """Choice of a method in a mode."""
-
-    candidate: Candidate
-    column: int | None
-    """Number of kept pixels less one; None where every k is not measured."""
+Chosen = tuple[Candidate, int | None]
+"""Candidate and number of kept pixels less one of a method in a mode; None where every k is not measured."""
 
 
 class Tuning:
     """Errors of all candidates on the first half of a cell's images, and what follows from them."""
 
-    def __init__(self, methods: CellMethods, specification: StudySpecification) -> None:
-        self._methods = methods
+    def __init__(self, methods: CellMethods) -> None:
+        self._methods, specification = methods, methods.specification
         self._modes = specification.kept_pixels(methods.cell)
         self._candidates = {method: methods.candidates(method) for method in specification.estimators}
         self._errors: dict[str, Any] = dict.fromkeys(self._candidates, 0.0)  # sums over images
@@ -64,27 +56,27 @@ class Tuning:
                 if CORRECTED in self._modes:
                     self._moments[method] += np.stack([moments_of(xy, truth) for xy in estimates], axis=1)
 
-    def choices(self) -> dict[tuple[str, str], Choice]:
+    def choices(self) -> dict[tuple[str, str], Chosen]:
         """Return the choice of every method and mode."""
-        chosen = {}
+        chosen: dict[tuple[str, str], Chosen] = {}
         for method, candidates in self._candidates.items():
             for mode, kept in self._modes.items():
                 if np.ndim(self._errors[method]) == 0:
-                    chosen[method, mode] = Choice(candidates[0], None)
+                    chosen[method, mode] = candidates[0], None
                     continue
                 errors = _corrected_rms(self._moments[method]) if mode == CORRECTED else self._errors[method]
                 chosen[method, mode] = _smallest(candidates, errors, kept)
         return chosen
 
 
-def _smallest(candidates: Sequence[Candidate], errors: Floats, kept: int | None) -> Choice:
+def _smallest(candidates: Sequence[Candidate], errors: Floats, kept: int | None) -> Chosen:
     """Return the candidate, and where `kept` is None the k, of a table's smallest error (candidates, K)."""
     if errors.shape[1] == 1:
-        return Choice(candidates[int(np.argmin(errors))], None)
+        return candidates[int(np.argmin(errors))], None
     if kept is not None:
-        return Choice(candidates[int(np.argmin(errors[:, kept - 1]))], kept - 1)
+        return candidates[int(np.argmin(errors[:, kept - 1]))], kept - 1
     row, column = np.unravel_index(np.argmin(errors), errors.shape)
-    return Choice(candidates[int(row)], int(column))
+    return candidates[int(row)], int(column)
 
 
 def _corrected_rms(moments: Floats) -> Floats:
@@ -109,20 +101,14 @@ STATISTICS = ("gain", "rms", "corrected_rms", "outlier_fraction")
 
 def realisations(cell: Cell, count: int, rng: np.random.Generator) -> Iterator[Block]:
     """Yield blocks of noisy images (n, side, side), the mean background subtracted, and true positions."""
-    detector = detector_of(cell)
     block = _BLOCK_PIXELS // cell.pixels**2
     for start in range(0, count, block):
         images, truth = subapertures(
             min(block, count - start),
-            shape=(cell.pixels, cell.pixels),
             flux_e=cell.flux_e,
-            profile=cell.profile,
-            size=cell.size,
-            elongation=cell.elongation,
-            position_range_px=cell.position_range_px,
             d_over_r0=cell.d_over_r0,
-            detector=detector,
             rng=rng,
+            **cell.conditions,
         )
         yield images - np.float32(cell.background_e), truth
 
@@ -169,20 +155,20 @@ def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDA
         if methods is None:
             flux = np.concatenate([images.sum(axis=(1, 2), dtype=np.float64) for images, _ in stack])
             methods = CellMethods(cell, specification, float(flux.mean()))
-            tuning = Tuning(methods, specification)
+            tuning = Tuning(methods)
         tuning.add(stack)
     assert methods is not None
     scores = Scores(methods, tuning.choices())
     for stack in _stacks(realisations(cell, specification.realisations - half, rng), cell.pixels):
         scores.add(stack)
-    return _results(cell, specification, scores)
+    return _results(scores)
 
 
 class Scores:
     """Positions with the chosen settings, stack after stack."""
 
-    def __init__(self, methods: CellMethods, choices: dict[tuple[str, str], Choice]) -> None:
-        self._methods, self.choices = methods, choices
+    def __init__(self, methods: CellMethods, choices: dict[tuple[str, str], Chosen]) -> None:
+        self.methods, self.choices = methods, choices
         self._truth: list[Floats] = []
         self._positions: dict[tuple[str, str], list[Floats]] = {key: [] for key in choices}
         self._valid: dict[tuple[str, str], list[Any]] = {key: [] for key in choices}
@@ -197,19 +183,18 @@ class Scores:
     def add(self, blocks: Sequence[Block]) -> None:
         """Score images."""
         self._truth += [truth for _, truth in blocks]
-        for method, candidate in dict.fromkeys(
-            (method, c.candidate) for (method, _), c in self.choices.items()
-        ):
-            same = (method, candidate)
-            modes = [mode for (a, mode), choice in self.choices.items() if (a, choice.candidate) == same]
-            for images, truth in self._methods.parts(method, blocks):
-                self._add(method, modes, truth, self._methods.positions(method, candidate, images))
+        modes_of: dict[tuple[str, Candidate], list[str]] = {}
+        for (method, mode), (candidate, _) in self.choices.items():
+            modes_of.setdefault((method, candidate), []).append(mode)
+        for (method, candidate), modes in modes_of.items():
+            for images, truth in self.methods.parts(method, blocks):
+                self._add(method, modes, truth, self.methods.positions(method, candidate, images))
 
     def _add(self, method: str, modes: list[str], truth: Floats, measured: Measured) -> None:
         """Add positions that a method measured for the modes that chose its candidate."""
         positions, valid, stated = measured
         for mode in modes:
-            column = self.choices[method, mode].column or 0
+            column = self.choices[method, mode][1] or 0
             self._positions[method, mode].append(positions[:, column])
             self._valid[method, mode].append(valid[:, column])
         if BEST not in modes:
@@ -234,9 +219,10 @@ class Scores:
         return np.concatenate(self._stated[method]) if method in self._stated else None
 
 
-def _results(cell: Cell, specification: StudySpecification, scores: Scores) -> dict[str, NDArray[Any]]:
+def _results(scores: Scores) -> dict[str, NDArray[Any]]:
     """Arrange choices and scores as the dataset has them."""
-    methods, modes, truth = specification.estimators, specification.modes, scores.truth
+    cell, specification, truth = scores.methods.cell, scores.methods.specification, scores.truth
+    methods, modes = specification.estimators, specification.modes
     names = ["error", "error_se", "chosen_k", "chosen_candidate", "chosen_model_error", "invalid_fraction"]
     names += [name for statistic in STATISTICS for name in (statistic, f"{statistic}_se")]
     results: dict[str, NDArray[Any]] = {name: np.full((len(methods), len(modes)), np.nan) for name in names}
@@ -251,10 +237,10 @@ def _results(cell: Cell, specification: StudySpecification, scores: Scores) -> d
         results["error_se"][:, j] = np.sqrt(np.diag(covariance))
         results["error_covariance"][j] = covariance
         for i, method in enumerate(methods):
-            choice = scores.choices[method, mode]
-            results["chosen_k"][i, j] = np.nan if choice.column is None else choice.column + 1
-            results["chosen_candidate"][i, j] = shown(choice.candidate)
-            results["chosen_model_error"][i, j] = shown(choice.candidate, "model_error")
+            candidate, column = scores.choices[method, mode]
+            results["chosen_k"][i, j] = np.nan if column is None else column + 1
+            results["chosen_candidate"][i, j] = shown(candidate)
+            results["chosen_model_error"][i, j] = shown(candidate, "model_error")
             results["invalid_fraction"][i, j] = 1.0 - scores.valid(method, mode).mean()
             statistics = slope_statistics(positions[i][:, 0], positions[i][:, 1], truth)
             for name in STATISTICS:
@@ -287,18 +273,10 @@ def _against_the_bound(cell: Cell, errors: Floats) -> dict[str, NDArray[Any]]:
     """Cramer-Rao bound and photon efficiency; NaN for speckled spots, whose bound is not known."""
     bounds, efficiency = np.full(2, np.nan), np.full(errors.shape, np.nan)
     if cell.d_over_r0 == 0:
-        conditions: dict[str, Any] = {
-            "shape": (cell.pixels, cell.pixels),
-            "profile": cell.profile,
-            "size": cell.size,
-            "elongation": cell.elongation,
-            "detector": detector_of(cell),
-            "position_range_px": cell.position_range_px,
-        }
-        bound = cramer_rao(cell.flux_e, **conditions)
+        bound = cramer_rao(cell.flux_e, **cell.conditions)
         bounds = np.array([MEAN_ABSOLUTE * bound.mean(), np.sqrt(np.mean(np.square(bound)))])
         measured = errors > 0
-        efficiency[measured] = photon_efficiency(errors[measured], cell.flux_e, **conditions)
+        efficiency[measured] = photon_efficiency(errors[measured], cell.flux_e, **cell.conditions)
     return {"bound": bounds[0], "bound_rms": bounds[1], "photon_efficiency": efficiency}
 
 

@@ -22,7 +22,6 @@ from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.pipeline.images import measure_images
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slopes import Slopes
-from faintspot.slopes.simulate import Detector
 from faintspot.slopes.spots.psf import PSF, spot_psf
 from faintspot.slopes.spots.score import TrainedScore
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
@@ -57,13 +56,6 @@ def shown(candidate: Candidate, option: str | None = None) -> float:
     return next(iter(values.values()), math.nan) if option is None else values.get(option, math.nan)
 
 
-def detector_of(cell: Cell) -> Detector:
-    """Return the camera of a cell."""
-    return Detector(
-        read_noise_e=cell.read_noise_e * cell.em_gain, background_e=cell.background_e, em_gain=cell.em_gain
-    )
-
-
 class CellMethods:
     """Methods of a study in one cell: candidates, estimators, and slopes of images.
 
@@ -76,7 +68,7 @@ class CellMethods:
     """
 
     def __init__(self, cell: Cell, specification: StudySpecification, flux_e: float | None = None) -> None:
-        self.cell, self._specification = cell, specification
+        self.cell, self.specification = cell, specification
         self.flux_e = max(cell.flux_e if flux_e is None else flux_e, _LEAST_FLUX_E)
         self.search_range_px = specification.search_range_of(cell)
         self._within_px = min(self.search_range_px, cell.pixels / 2)
@@ -135,22 +127,22 @@ class CellMethods:
     def _axes(self, kind: Kind) -> dict[str, list[float]]:
         """Values of every option that a method chooses, in the units of the specification."""
         listed = {
-            name: list(self._listed(name)) for name in kind.declared() if name in self._specification.LISTED
+            name: list(self._listed(name)) for name in kind.declared() if name in self.specification.LISTED
         }
         found_by_table = {_KEPT} if keeps_every_k(kind) else set()
         estimator = kind(**{name: values[0] * self._unit(name) for name, values in listed.items()})
         automatic = {
             name: list(values)
             for name, values in estimator.tuned(self.scene).items()
-            if name not in self._specification.LISTED.keys() | found_by_table
+            if name not in self.specification.LISTED.keys() | found_by_table
         }
         return {**listed, **automatic}
 
     def _listed(self, option: str) -> tuple[float, ...]:
-        key, only_speckled = self._specification.LISTED[option]
+        key, only_speckled = self.specification.LISTED[option]
         if only_speckled and self.cell.d_over_r0 == 0:
             return (0.0,)
-        return tuple(getattr(self._specification, key))
+        return tuple(getattr(self.specification, key))
 
     def _unit(self, option: str) -> float:
         """Return what a number of the specification is multiplied with."""
@@ -192,10 +184,10 @@ class CellMethods:
     def _score(self) -> TrainedScore:
         """Trained on spots of a seed of their own."""
         cell = self.cell
-        entropy = [*cell.seed(self._specification.seed).entropy, _TRAINING]  # type: ignore[misc]
+        entropy = [*cell.seed(self.specification.seed).entropy, _TRAINING]  # type: ignore[misc]
         rng = np.random.default_rng(np.random.SeedSequence(entropy))
         scene = replace(self.scene, position_range_px=cell.position_range_px)
-        return score_for_scene(scene, detector_of(cell), rng, search_range_px=self._within_px)
+        return score_for_scene(scene, cell.detector, rng, search_range_px=self._within_px)
 
 
 def position_table(

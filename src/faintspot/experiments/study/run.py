@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +17,6 @@ from faintspot.experiments.store import (
     DONE,
     OWN_ATTRIBUTES,
     Arrays,
-    MemoryStore,
     UnitStore,
     ZarrStore,
     kind_of_store,
@@ -72,7 +70,7 @@ def new_dataset(specification: StudySpecification) -> xarray.Dataset:
         "k": ("k", np.arange(1, sizes["k"] + 1), {"units": "px", "long_name": "number of kept pixels"}),
     }
     for name in PARAMETERS:
-        units = {"units": RANGES[name].units} if name in RANGES else {}
+        units = {"units": RANGES[name].unit} if name in RANGES else {}
         coordinates[name] = ("cell", np.array([asdict(cell)[name] for cell in cells]), units)
     attributes = {
         "name": specification.name,
@@ -95,10 +93,10 @@ def open_study(path: str | Path) -> xarray.Dataset:
 
     Examples
     --------
-    >>> from faintspot.experiments import StudySpecification, Sweep, open_study, run
+    >>> from faintspot.experiments import StudySpecification, Sweep, WorkerPool, open_study, run
     >>> light = Sweep("light", flux_e=[30, 100], pixels=8)
     >>> study = StudySpecification("mine", [light], realisations=200, estimators=["brightest"], fixed_k=[])
-    >>> _ = run(study, "mine.zarr", workers=0)
+    >>> _ = run(study, "mine.zarr", pool=WorkerPool(workers=0))
     >>> results = open_study("mine.zarr")
     >>> bool(results["done"].all()), results["error"].dims
     (True, ('cell', 'estimator', 'mode'))
@@ -139,8 +137,8 @@ def dataset_of(specification: StudySpecification, units: UnitStore) -> xarray.Da
     """Return the results of cells that are in memory; a smaller window has fewer k."""
     dataset = new_dataset(specification)
     for index in range(dataset.sizes["cell"]):
-        if units.done(str(index)):
-            for name, values in units.read(str(index)).items():
+        if str(index) in units:
+            for name, values in units[str(index)].items():
                 target = dataset[name].values
                 if values.ndim:
                     target[index][..., : values.shape[-1]] = values
@@ -153,12 +151,9 @@ def dataset_of(specification: StudySpecification, units: UnitStore) -> xarray.Da
 def run(
     specification: StudySpecification,
     store: str | Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
     *,
-    workers: int | None = None,
-    scheduler: str | None = None,
+    pool: WorkerPool | None = None,
     overwrite: bool = False,
-    announce: Callable[[str], None] | None = None,
 ) -> xarray.Dataset:
     """Run a study, or what is left of it.
 
@@ -171,16 +166,11 @@ def run(
     store : path, optional
         Zarr store to write every cell to as it finishes, and to go on with when it is there. Without one,
         results are in memory only.
-    progress : callable, optional
-        Called with the number of finished cells and of all, if any are missing.
-    workers : int, optional
-        Processes on this machine; as many as there are processors by default. 0 or 1 works in this process.
-    scheduler : str, optional
-        Address of a running Dask scheduler instead; see docs/cluster.md for who may reach it.
+    pool : WorkerPool, optional
+        Where the work is done; its progress is told the number of finished cells and of all, if any are
+        missing. Default: processes on this machine.
     overwrite : bool
         Replace the store, if it is one of a study.
-    announce : callable, optional
-        Called with a line of text that says where the work is done.
 
     Returns
     -------
@@ -194,21 +184,19 @@ def run(
 
     Examples
     --------
-    >>> from faintspot.experiments import StudySpecification, Sweep, run
+    >>> from faintspot.experiments import StudySpecification, Sweep, WorkerPool, run
     >>> light = Sweep("light", flux_e=[30, 100], pixels=8)
     >>> study = StudySpecification("mine", [light], realisations=200, estimators=["brightest"], fixed_k=[])
-    >>> results = run(study, workers=0)
+    >>> results = run(study, pool=WorkerPool(workers=0))
     >>> dict(results.sizes)
     {'cell': 2, 'estimator': 1, 'mode': 1, 'estimator2': 1, 'k': 63}
     """
     if not isinstance(specification, StudySpecification):
         raise InputError(f"specification: expected a StudySpecification, got {type(specification).__name__}")
-    pool = WorkerPool(workers, progress, announce, scheduler)
+    pool = pool or WorkerPool()
     units = [Unit(str(index), (cell, specification)) for index, cell in enumerate(specification.cells())]
     if store is None:
-        memory = MemoryStore()
-        run_units(_measured, units, memory, pool)
-        return dataset_of(specification, memory)
+        return dataset_of(specification, run_units(_measured, units, {}, pool))
     run_units(_measured, units, stored_units(specification, Path(store), overwrite=overwrite), pool)
     return open_study(store)
 

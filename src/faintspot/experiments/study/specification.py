@@ -12,33 +12,24 @@ import numpy as np
 import tomlkit
 
 from faintspot.base.checks import number_between, one_of
+from faintspot.base.config.options import Option
 from faintspot.base.errors import InputError
 from faintspot.base.sizes import check_size
 from faintspot.base.toml_files import check_keys, checked_table, parse_text, read_text
 from faintspot.experiments.methods import DEFAULT_METHODS, knows_the_spot
 from faintspot.experiments.store import fingerprint_of
-from faintspot.experiments.study.sweep import (
-    PARAMETERS,
-    PROFILES,
-    RANGES,
-    Cell,
-    Range,
-    Sweep,
-    checked_numbers,
-)
+from faintspot.experiments.study.sweep import PARAMETERS, RANGES, Cell, Sweep, checked_numbers
 from faintspot.slopes.estimators.registry import estimators
-
-__all__ = ["BEST", "CORRECTED", "PROFILES", "StudySpecification", "Sweep"]
 
 BEST, CORRECTED = "best", "corrected"
 _MOST_CELLS = 100_000
 _CANDIDATE_RANGES = {
-    "strengths": Range("1", 0.0, 10.0, low_open=True),
-    "widths": Range("px", 0.0, 10.0, low_open=True),
-    "thresholds": Range("1", 0.0, 100.0),
-    "weight_widths": Range("1", 0.0, 100.0, low_open=True),
-    "blurs": Range("px", 0.0, 10.0),
-    "model_errors": Range("1", 0.0, 10.0),
+    "strengths": Option("", "1", 0.0, 10.0, low_open=True),
+    "widths": Option("", "px", 0.0, 10.0, low_open=True),
+    "thresholds": Option("", "1", 0.0, 100.0),
+    "weight_widths": Option("", "1", 0.0, 100.0, low_open=True),
+    "blurs": Option("", "px", 0.0, 10.0),
+    "model_errors": Option("", "1", 0.0, 10.0),
 }
 _RANGE_KEYS = ("from", "to", "points", "spacing")
 
@@ -151,7 +142,7 @@ class StudySpecification:
         if not len(self.fixed_k):
             return ()
         largest = max(cell.pixels for cell in self.cells()) ** 2
-        kept = checked_numbers("fixed_k", self.fixed_k, Range("px", 1, 1e9), integer=True)
+        kept = checked_numbers("fixed_k", self.fixed_k, Option("", "px", 1, 1e9, whole=True))
         for k in kept:
             if k >= largest:
                 raise InputError(

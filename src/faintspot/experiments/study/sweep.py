@@ -11,34 +11,26 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.base.checks import one_of, real_array
+from faintspot.base.checks import numbers_between, one_of
+from faintspot.base.config.options import Option
 from faintspot.base.errors import InputError
+from faintspot.slopes.camera.detector import Detector
 
 PROFILES = ("diffraction", "gaussian")
 
 
-@dataclass(frozen=True)
-class Range:
-    """Units and bounds of a physical parameter."""
-
-    units: str
-    low: float
-    high: float
-    low_open: bool = False
-
-
 RANGES = {
-    "flux_e": Range("electron", 0.0, 1e9, low_open=True),
-    "read_noise_e": Range("electron", 0.0, 1e6),
-    "size": Range("2 px", 0.05, 1e3),
-    "elongation": Range("1", 1.0, 100.0),
-    "pixels": Range("px", 4, 64),
-    "position_range_px": Range("px", 0.0, 32.0, low_open=True),
-    "background_e": Range("electron", 0.0, 1e6),
-    "em_gain": Range("1", 1.0, 1e5),
-    "d_over_r0": Range("1", 0.0, 10.0),
+    "flux_e": Option("", "electron", 0.0, 1e9, low_open=True),
+    "read_noise_e": Option("", "electron", 0.0, 1e6),
+    "size": Option("", "2 px", 0.05, 1e3),
+    "elongation": Option("", "1", 1.0, 100.0),
+    "pixels": Option("", "px", 4, 64, whole=True),
+    "position_range_px": Option("", "px", 0.0, 32.0, low_open=True),
+    "background_e": Option("", "electron", 0.0, 1e6),
+    "em_gain": Option("", "1", 1.0, 1e5),
+    "d_over_r0": Option("", "1", 0.0, 10.0),
 }
-"""The numeric parameters; `profile` is the only other one."""
+"""The numeric parameters of a `Cell`, which says what they mean; `profile` is the only other one."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +89,19 @@ class Cell:
         """Standard deviation of a mean pixel's noise: read noise and the flux's, spread over all pixels."""
         flux = self.flux_e / self.pixels**2 + self.background_e
         return float(np.sqrt(self.read_noise_e**2 + self.excess_noise * flux))
+
+    @property
+    def detector(self) -> Detector:
+        """The camera."""
+        return Detector(
+            self.read_noise_e * self.em_gain, background_e=self.background_e, em_gain=self.em_gain
+        )
+
+    @property
+    def conditions(self) -> dict[str, Any]:
+        """Window, spots and camera by the names that simulations and bounds give them."""
+        names = ("profile", "size", "elongation", "position_range_px", "detector")
+        return {"shape": (self.pixels, self.pixels), **{name: getattr(self, name) for name in names}}
 
     def seed(self, study_seed: int) -> np.random.SeedSequence:
         """Return the cell's own seed, from the study's seed and its coordinates alone."""
@@ -175,22 +180,14 @@ def _values(where: str, name: str, values: Any) -> tuple[Any, ...]:
         raise InputError(f"{where}: expected at least one value, got an empty list")
     if name == "profile":
         return tuple(dict.fromkeys(one_of(where, item, PROFILES) for item in items))
-    return tuple(dict.fromkeys(checked_numbers(where, items, RANGES[name], integer=name == "pixels")))
+    return tuple(dict.fromkeys(checked_numbers(where, items, RANGES[name])))
 
 
-def checked_numbers(where: str, items: Any, bounds: Range, *, integer: bool = False) -> list[Any]:
+def checked_numbers(where: str, items: Any, bounds: Option) -> list[Any]:
     """Return plain numbers within the bounds, or raise InputError."""
-    array = real_array(where, items)
+    kind = {"low_open": bounds.low_open, "integer": bounds.whole}
+    array = numbers_between(where, items, bounds.low, bounds.high, **kind)
     if array.ndim != 1:
         raise InputError(f"{where}: expected a list of numbers, got shape {array.shape}")
-    for value in array.tolist():
-        too_low = value <= bounds.low if bounds.low_open else value < bounds.low
-        if too_low or not value <= bounds.high:
-            start = "above" if bounds.low_open else "from"
-            raise InputError(
-                f"{where} = {value:g}: expected a number {start} {bounds.low:g} to {bounds.high:g}"
-            )
-        if integer and value != round(value):
-            raise InputError(f"{where} = {value:g}: expected a whole number")
-    kind = int if integer else float
-    return [kind(value) for value in array.tolist()]
+    numbers: list[Any] = array.tolist()
+    return numbers

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.loop.simulation.files import Stored
+from faintspot.base.npz import NpzFile
 
 
 @dataclass(frozen=True, eq=False)
-class LoopRecord(Stored):
+class LoopRecord(NpzFile):
     """One run of `simulate_loop`, n sub-apertures and m commands."""
 
     WHAT: ClassVar[str] = "a record of a loop"

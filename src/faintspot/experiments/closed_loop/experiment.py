@@ -1,0 +1,239 @@
+"""A closed-loop experiment: every method is tuned at every flux, then scored in other turbulence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.base.json_text import to_json
+from faintspot.experiments.closed_loop.methods import Choice, MethodKind, method_kind
+from faintspot.experiments.closed_loop.search import (
+    QUICK,
+    Search,
+    Tuned,
+    learning_frames,
+    smoothed,
+    stored,
+    tune,
+    tuning_frames,
+    with_integrator,
+)
+from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
+from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.files import make_folder
+from faintspot.loop.simulation.simulation import DisabledErrors, simulate_loop
+
+_QUICK_RUN = {"frames": 300, "settle_frames": 60, "realisations": 2}
+_NO_LOSS = 0.02  # of Strehl ratio: the best one of many short runs is that much too high
+
+Stars = Mapping[float, LoopConfiguration]
+"""The loop with the star of each flux."""
+Choices = dict[tuple[str, float], Choice]
+"""Tuned values by the method's name and the flux."""
+
+
+class Experiment:
+    """A closed-loop experiment in a folder, where finished units are remembered.
+
+    Parameters
+    ----------
+    name : str
+        Beginning of the names of its stores.
+    configuration, folder, quick, search, pool, overwrite
+        As for `run_magnitude`.
+    """
+
+    def __init__(
+        self,
+        configuration: LoopConfiguration,
+        folder: str | Path,
+        name: str,
+        quick: bool,
+        search: Search | None,
+        pool: WorkerPool | None,
+        overwrite: bool,
+    ) -> None:
+        self.configuration = quick_run(configuration) if quick else configuration
+        self.folder, self._name, self._overwrite = make_folder(folder), name, overwrite
+        self._search = search or (QUICK if quick else Search())
+        self._pool = pool or WorkerPool()
+
+    def measured(
+        self, kinds: Sequence[MethodKind], columns: Mapping[str, tuple[float, DisabledErrors]]
+    ) -> dict[str, NDArray[Any]]:
+        """Tune every method at every flux, then score it in every column.
+
+        Slopes are tuned first, with the integrator, also of methods whose control learns: all their options
+        at each flux alone, then the loop gain with smoothed options, which are kept where they lose nothing.
+        Then what is the control's own.
+
+        Parameters
+        ----------
+        kinds : sequence of MethodKind
+        columns : mapping
+            Flux and errors that are switched off, by name.
+
+        Returns
+        -------
+        dict
+            What `scored_runs` returns, (methods, columns, realisations), and "choices", (methods, columns):
+            JSON text of the tuned values.
+        """
+        stars = {flux: with_flux(self.configuration, flux) for flux, _ in columns.values()}
+        plain = list({kind.name: kind for kind in map(with_integrator, kinds)}.values())
+        learning = [kind for kind in kinds if kind not in plain]
+        guess: Choices = {
+            (kind.name, flux): {name: axis.first[0] for name, axis in kind.tuned(star).items()}
+            for kind in plain
+            for flux, star in stars.items()
+        }
+        expected = (
+            self._tuning(plain, stars, {}),
+            self._tuning(plain, stars, guess),
+            self._tuning(learning, stars, guess),
+            self._scoring(kinds, columns, stars, {}),
+        )
+        sizes = [sum(unit.size for unit in units.values()) for units in expected]
+        alone, again, control, scoring = in_stages(self._pool, sizes)
+        choices = self._choices(plain, stars, alone, again)
+        of_control = self._tuned("tuning of control", learning, stars, choices, control)
+        choices |= {key: tuned.choice for key, tuned in of_control.items()}
+        units = self._scoring(kinds, columns, stars, choices)
+        results = self._run("scoring", scored_runs, units, scoring)
+        scored = [[results[units[kind.name, name].key] for name in columns] for kind in kinds]
+        arrays = {
+            name: np.array([[each[name] for each in row] for row in scored])
+            for name in ("strehl", "residual_nm", "centroid_gain", "settings")
+        }
+        texts = [[to_json(choices[kind.name, flux]) for flux, _ in columns.values()] for kind in kinds]
+        return {**arrays, "choices": np.array(texts)}
+
+    def _choices(
+        self, plain: Sequence[MethodKind], stars: Stars, alone: WorkerPool, again: WorkerPool
+    ) -> Choices:
+        """Return the tuned values of the slopes, tuned now where they are not stored."""
+        first = self._tuned("tuning", plain, stars, {}, alone)
+        best = {key: tuned.choice for key, tuned in first.items()}
+        smooth: Choices = {}
+        for kind in plain:
+            choices = smoothed(kind, list(stars.values()), [best[kind.name, flux] for flux in stars])
+            smooth |= {(kind.name, flux): choice for flux, choice in zip(stars, choices, strict=True)}
+        if smooth != best:
+            second = self._tuned("tuning of the loop gain", plain, stars, smooth, again)
+            kept = {key: new for key, new in second.items() if new.strehl >= first[key].strehl - _NO_LOSS}
+            best |= {key: tuned.choice for key, tuned in kept.items()}
+        return best
+
+    def _tuned(
+        self, stage: str, kinds: Sequence[MethodKind], stars: Stars, slopes: Choices, pool: WorkerPool
+    ) -> dict[tuple[str, float], Tuned]:
+        """Return the tuned values of every method with every star, given those of its slopes."""
+        units = self._tuning(kinds, stars, slopes)
+        if not units:
+            return {}
+        results = self._run(stage, tune, units, pool, "-tuning")
+        return {key: stored(results[unit.key]) for key, unit in units.items()}
+
+    def _tuning(
+        self, kinds: Sequence[MethodKind], stars: Stars, slopes: Choices
+    ) -> dict[tuple[str, float], Unit]:
+        units = {}
+        for kind in kinds:
+            for flux, star in stars.items():
+                known = slopes.get((with_integrator(kind).name, flux))
+                arguments = kind, star, self._search, known
+                key = f"{kind.name}-{flux:g}{'' if known is None else f'-{_digest(known)}'}"
+                units[kind.name, flux] = Unit(key, arguments, tuning_frames(*arguments))
+        return units
+
+    def _scoring(
+        self,
+        kinds: Sequence[MethodKind],
+        columns: Mapping[str, tuple[float, DisabledErrors]],
+        stars: Stars,
+        choices: Choices,
+    ) -> dict[tuple[str, str], Unit]:
+        run, units = self.configuration.run, {}
+        for kind in kinds:
+            size = run.realisations * run.frames + learning_frames(kind, self.configuration)
+            for name, (flux, off) in columns.items():
+                arguments = stars[flux], choices.get((kind.name, flux)), off
+                key = f"{kind.name}-{name}-{_digest(arguments)}"
+                units[kind.name, name] = Unit(key, (kind, *arguments), size)
+        return units
+
+    def _run(
+        self, stage: str, function: Any, units: Mapping[Any, Unit], pool: WorkerPool, suffix: str = ""
+    ) -> UnitStore:
+        """Run units that are kept in a store of the folder."""
+        pool.say(stage)
+        store = ZarrStore(
+            make_folder(self.folder / "units") / f"{self._name}{suffix}.zarr",
+            "closed-loop experiment",
+            fingerprint_of(self.configuration.to_text(), str(asdict(self._search))),
+            [unit.key for unit in units.values()],
+            attributes={"name": self.configuration.name},
+            overwrite=self._overwrite,
+        )
+        return run_units(function, list(units.values()), store, pool)
+
+
+def _digest(value: object) -> str:
+    """Return a short text that differs between choices."""
+    return fingerprint_of(repr(value))[:8]
+
+
+def scored_runs(
+    kind: MethodKind, star: LoopConfiguration, choice: Choice, off: DisabledErrors, advance: Advance
+) -> dict[str, NDArray[Any]]:
+    """Run a tuned method in all realisations of the turbulence, in one process: control learns only once.
+
+    Returns
+    -------
+    dict
+        Long-exposure Strehl ratio, rms of the wavefront, centroid gain and settings as TOML, (realisations,).
+    """
+    method, frames, results = kind.method(star, choice), star.run.frames, []
+    for run in range(star.run.realisations):
+
+        def progress(done: int, total: int, before: int = run * frames) -> None:
+            advance(before + done)
+
+        record = simulate_loop(star, [method], realisation=run, progress=progress, disabled_errors=off)
+        scored = record.scored & off.settled(record.frames)
+        residual_nm = np.sqrt(np.mean(record.residual_nm[scored] ** 2))
+        gain, settings = record.centroid_gain[0], record.method_settings[0]
+        results.append((record.strehl[scored].mean(), residual_nm, gain, settings))
+    names = "strehl", "residual_nm", "centroid_gain", "settings"
+    return {name: np.array(values) for name, values in zip(names, zip(*results, strict=True), strict=True)}
+
+
+def with_flux(configuration: LoopConfiguration, photons: float) -> LoopConfiguration:
+    """Return the configuration with another star."""
+    return configuration.replace("camera", photons_per_subaperture=float(photons), magnitude=None)
+
+
+def quick_run(configuration: LoopConfiguration) -> LoopConfiguration:
+    """Return the configuration with few and short runs."""
+    run = {name: min(value, getattr(configuration.run, name)) for name, value in _QUICK_RUN.items()}
+    return configuration.replace("run", **run)
+
+
+def checked_methods(names: Sequence[str]) -> list[MethodKind]:
+    """Return methods by their names, each once.
+
+    Raises
+    ------
+    InputError
+        For an unknown one, or none.
+    """
+    if not names:
+        raise InputError("methods: expected at least one, got none")
+    return list({kind.name: kind for kind in map(method_kind, names)}.values())
