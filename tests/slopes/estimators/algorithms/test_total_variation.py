@@ -88,7 +88,7 @@ class TestAgainstOracle:
         assert result.converged.tolist() == [e.converged for e in expected]
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("width", ["4", "8", "16"])
+    @pytest.mark.parametrize("width", ["4", "16"])
     def test_any_simd_width(self, width: str, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("FAINTSPOT_SIMD_WIDTH", width)
         stack = np.random.default_rng(1).normal(size=(37, 9, 7)).astype(np.float32)
