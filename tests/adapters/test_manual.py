@@ -1,4 +1,4 @@
-"""The scripts in the manual of other tools run as they stand, but for a shorter recording, in own processes."""
+"""The scripts in the manual of other tools run as they stand, but for a shorter recording."""
 
 from __future__ import annotations
 
