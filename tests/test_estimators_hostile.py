@@ -83,7 +83,7 @@ class TestImages:
     @pytest.mark.slow
     @EVERY
     @given(seed=SEEDS)
-    @settings(max_examples=25)
+    @settings(max_examples=15)
     def test_hostile_images(self, estimator: str, seed: int) -> None:
         case = random_case(seed, estimator)
         rng = np.random.default_rng(seed)
