@@ -43,6 +43,7 @@ def test_the_vibration_is_found_and_the_learnt_filter_beats_the_best_integrator(
     )
     learnt = learn_controller(KALMAN, plant, learning, _SITE, _RATE_HZ)
     assert learnt.identified is not None
+    assert learnt.identified.noise_factor == pytest.approx(1.0, rel=0.1)
     for mode in ("tip", "tilt"):
         of_mode = [each for each in learnt.identified.oscillators if each.mode == mode]
         narrow = min(of_mode, key=lambda each: each.damping)
