@@ -1,12 +1,15 @@
-"""A script that is run on a machine as macOS is, as far as Linux can be taken away from a process.
+"""A script that is run on a machine as macOS or Windows is, as far as Linux can be taken away from a process.
 
-Gone is what Linux adds to the modules os, signal, socket, time and resource, and all of /proc and /dev/shm;
-processes are spawned, not forked, and run this script up to its last lines, too. It imports every module of
-faintspot, real time included, and then runs commands, one an argument.
+For "macos", what Linux adds to the modules os, signal, socket, time and resource is gone, and all of /proc
+and /dev/shm; processes are spawned, not forked, and run this script up to its last lines, too. For "windows",
+faintspot does not find the modules of POSIX, and functions of the module os are gone; other packages keep
+the modules. The script imports every module of faintspot that should work there, and then runs commands, one
+an argument.
 """
 
 from __future__ import annotations
 
+import builtins
 import contextlib
 import functools
 import importlib
@@ -17,8 +20,8 @@ import resource
 import signal
 import socket
 import sys
-import tempfile  # noqa: F401 - remembers what this system has
 import time
+import types
 from typing import Any
 
 LINUX_ONLY: dict[Any, str] = {
@@ -32,6 +35,15 @@ LINUX_ONLY: dict[Any, str] = {
 }
 """What names begin with that macOS lacks."""
 PLACES = ("/proc", "/dev/shm")
+
+POSIX_MODULES = {"fcntl", "grp", "pty", "pwd", "readline", "resource", "syslog", "termios", "tty"}
+POSIX_FUNCTIONS = ("pread", "pwrite", "mkfifo", "getuid", "geteuid", "sched_getaffinity", "O_CLOEXEC")
+NEED_POSIX = (
+    "faintspot.engine",
+    "faintspot.cli.realtime",
+    "faintspot.cli.shared.engine_requests",
+    "faintspot.adapters.pyrtc",
+)
 
 
 def take_linux_away() -> None:
@@ -65,26 +77,65 @@ def _opened(event: str, arguments: tuple[Any, ...]) -> None:
             raise FileNotFoundError(2, "No such file or directory", path)
 
 
-def main(commands: list[str]) -> None:
-    """Import everything, and run the commands in order; an error of either is the script's."""
+def take_posix_away() -> None:
+    """Do it, to this process, for good."""
+    original, locks = builtins.__import__, _locks_of_windows()
+
+    def visible(name: str, variables: Any = None, *arguments: Any, **options: Any) -> Any:
+        importer = str((variables or {}).get("__name__", ""))
+        if name.split(".")[0] in POSIX_MODULES and importer.startswith("faintspot"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        if name == "msvcrt" and importer.startswith("faintspot"):
+            return locks
+        return original(name, variables, *arguments, **options)
+
+    builtins.__import__ = visible  # type: ignore[assignment]
+    for name in POSIX_FUNCTIONS:
+        if hasattr(os, name):
+            delattr(os, name)
+
+
+def _locks_of_windows() -> types.ModuleType:
+    """Return a module that locks bytes of a file from its position on, as msvcrt does."""
+    fcntl: Any = importlib.import_module("fcntl")
+    module: Any = types.ModuleType("msvcrt")
+    module.LK_NBLCK = 2
+
+    def locking(descriptor: int, mode: int, count: int) -> None:
+        assert mode == module.LK_NBLCK
+        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, count, 0, os.SEEK_CUR)
+
+    module.locking = locking
+    return module  # type: ignore[no-any-return]
+
+
+def main(left_out: tuple[str, ...], commands: list[str]) -> None:
+    """Import everything but what is left out, and run the commands in order; any error is the script's."""
     import faintspot
 
-    names = [module.name for module in pkgutil.walk_packages(faintspot.__path__, "faintspot.")]
+    names = [
+        module.name for module in pkgutil.walk_packages(faintspot.__path__, "faintspot.", lambda _: None)
+    ]
+    names = [name for name in names if not name.startswith(left_out) and not name.endswith("__main__")]
     for name in names:
-        if not name.endswith("__main__"):
-            importlib.import_module(name)
+        importlib.import_module(name)
     print(len(names), "modules")
+
     from faintspot.cli import main as command_line
     from faintspot.experiments.planner import tuning
 
-    tuning.tune = functools.partial(tuning.tune, realisations=256, steps=1)  # quick
+    tune = tuning.tune
+    tuning.tune = lambda *given, **named: tune(*given, **{**named, "realisations": 256, "steps": 1})  # quick
     for command in commands:
         command_line(command.split())
 
 
+if "windows" in sys.argv[1:2]:
+    take_posix_away()
+elif "macos" in sys.argv[1:2]:
+    if __name__ == "__main__":
+        with contextlib.suppress(ImportError):
+            importlib.import_module("hcipy")  # has psutil read /proc, which is another one on macOS
+    take_linux_away()
 if __name__ == "__main__":
-    with contextlib.suppress(ImportError):
-        importlib.import_module("hcipy")  # has psutil read /proc, which is another one on macOS
-take_linux_away()
-if __name__ == "__main__":
-    main(sys.argv[1:])
+    main(NEED_POSIX if sys.argv[1] == "windows" else (), sys.argv[2:])

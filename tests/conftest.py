@@ -1,7 +1,7 @@
 """Settings of Hypothesis, Ctrl-C, and cheap pictures for the tests of pages.
 
 Hypothesis has no deadline, because the first call of a kernel compiles it;
-`pytest --hypothesis-profile=thorough` looks 25 times harder.
+`pytest --hypothesis-profile=thorough` looks 40 times harder.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 settings.register_profile(
-    "default", deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow]
+    "default", deadline=None, max_examples=25, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.register_profile("ci", settings.get_profile("default"), derandomize=True, print_blob=True)
 settings.register_profile("thorough", settings.get_profile("default"), max_examples=1000)

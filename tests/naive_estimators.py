@@ -270,16 +270,6 @@ def sandwich(i: Floats, j: Floats) -> tuple[float, float]:
     return math.sqrt(covariance[0, 0]), math.sqrt(covariance[1, 1])
 
 
-def cramer_rao_bound(
-    x: float, y: float, flux: float, shape: tuple[int, int], task: Task
-) -> tuple[float, float]:
-    """The smallest standard deviation that an unbiased estimator of x and y can have, flux unknown."""
-    assert task.spot is not None
-    f, fx, fy = task.spot.images(x, y, shape)
-    w = 1.0 / (task.variance + task.excess * np.maximum(flux * f, 0.0))
-    return sandwich(*information(flux * f, [flux * fx, flux * fy, f], w, task, "ml"))
-
-
 def grid_posterior(
     g: ArrayLike, task: Task, flux: float, xs: ArrayLike, ys: ArrayLike, cell: float | None = None
 ) -> Estimate:

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from importlib.resources import files
-
 import numpy as np
 import pytest
 
@@ -18,9 +16,3 @@ def test_the_frame_has_the_lenslets_of_its_sensor() -> None:
     layout = find_layout(frame.astype(float), bad_pixels=bad).layout
     assert 150 <= len(layout) <= 165  # some at the edge are doubtful
     assert layout.pitch_px == pytest.approx(22.08, abs=0.05)
-
-
-def test_its_licence_is_beside_it() -> None:
-    text = (files("faintspot.data") / "LICENSE_mmtwfs.rst").read_text(encoding="utf-8")
-    assert "MMT Observatory" in text
-    assert "Redistribution" in text

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import builtins
 import re
 import shutil
 import subprocess
-import symtable
 import sys
 import tomllib
 from pathlib import Path
@@ -150,28 +148,6 @@ def test_blocks_run(page: Path, names: dict[str, Any]) -> None:
             exec(compiled, names)
 
 
-@pytest.mark.parametrize("page", blocks())
-def test_blocks_name_what_they_need(page: Path) -> None:
-    """A comment of the block names every variable that neither it nor an earlier block of the page makes."""
-    made, unnamed = set(dir(builtins)), []
-    for code in BLOCK.findall(page.read_text(encoding="utf-8")):
-        needed, made_here = variables(symtable.symtable(code, page.name, "exec"))
-        comments = " ".join(re.findall("#.*", code))
-        unnamed += [name for name in needed - made - made_here if not re.search(rf"\b{name}\b", comments)]
-        made |= made_here | needed
-    assert unnamed == []
-
-
-def variables(table: symtable.SymbolTable) -> tuple[set[str], set[str]]:
-    """Return the global names that code reads, and those that it makes."""
-    symbols, top = table.get_symbols(), table.get_type() == "module"
-    read = {symbol.get_name() for symbol in symbols if symbol.is_referenced() and (top or symbol.is_global())}
-    made = {symbol.get_name() for symbol in symbols if top and (symbol.is_assigned() or symbol.is_imported())}
-    for child in table.get_children():
-        read |= variables(child)[0]
-    return read, made
-
-
 @pytest.mark.slow
 def test_names_are_there_after_the_import() -> None:
     """Blocks share a process with others that import more than they do."""
@@ -180,15 +156,6 @@ def test_names_are_there_after_the_import() -> None:
     code = "import faintspot, sys; print([name for name in sys.argv[1:] if not hasattr(faintspot, name)])"
     done = subprocess.run([sys.executable, "-c", code, *names], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_tables_have_a_head(page: Path) -> None:
-    """A blank line within a table would leave its other half as text."""
-    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
-    tables = [table.splitlines() for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)]
-    headless = [rows[0] for rows in tables if len(rows) < 2 or not re.fullmatch(r"[|\s:-]+", rows[1])]
-    assert headless == []
 
 
 def test_package_page_links_to_no_file() -> None:
@@ -203,9 +170,3 @@ def test_package_page_links_to_no_file() -> None:
     assert re.findall(r"\]\((?!https://)[^)]*\)", page) == []
     assert "A noisy frame" not in page
     assert "200 electrons a spot" not in page  # what the picture shows
-
-
-def test_what_is_not_run_is_there() -> None:
-    """A reason whose block is gone is gone, too."""
-    text = "\n".join("\n".join(BLOCK.findall(page.read_text(encoding="utf-8"))) for page in PAGES)
-    assert [mark for mark in NOT_RUN if mark not in text] == []

@@ -83,13 +83,6 @@ def test_commands_and_options_are_there(text: str) -> None:
             parse(shlex.split(called)[1:])
 
 
-@pytest.mark.parametrize("line", ["faintspot sloops", "faintspot slopes --nonsense", "$ faintspot loop shut"])
-def test_what_is_not_there_is_found(line: str) -> None:
-    (words,) = commands(line)
-    with pytest.raises((AssertionError, click.NoSuchOption)):
-        parse(words)
-
-
 @pytest.mark.parametrize("text", texts())
 def test_toml_is_toml(text: str) -> None:
     for block in blocks(text, "toml"):

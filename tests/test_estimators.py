@@ -19,11 +19,9 @@ from tests.estimator_cases import (
     assert_sane,
     one_psf,
     random_case,
-    settings_of,
     with_noise_map,
 )
 from tests.estimator_oracle import assert_equals_oracle
-from tests.naive_spots import spots_of
 
 import faintspot as fs
 from faintspot.slopes.estimators import estimators
@@ -92,11 +90,11 @@ class TestAgainstOracle:
         assert_equals_oracle(case, case.measure())
 
     @pytest.mark.slow
-    # Each is compiled anew: at 8 lanes the families, at the ends all.
+    # Each is compiled anew: at 8 lanes the families; every estimator is compared at 4 lanes elsewhere.
     @pytest.mark.parametrize(
         ("width", "estimator"),
         [
-            *product((4, 16), QUICK),
+            *product((16,), QUICK),
             *product((8,), ("tv", "window", "ml", "trained")),
         ],
     )
@@ -182,7 +180,7 @@ class TestIndependence:
             assert np.array_equal(getattr(calm, name)[::2], getattr(expected, name)[::2]), name
         assert_same(expected, case.select(slice(2, 9)).measure(), slice(2, 9))
 
-    @EVERY
+    @pytest.mark.parametrize("estimator", ["map", "trained"])
     def test_measure_is_the_pipeline(self, estimator: str) -> None:
         case = random_case(9, estimator, n=5)
         parts: dict[str, Any] = {"psf": case.psf, "score": case.score, "prior": case.prior}
@@ -200,6 +198,7 @@ class TestIndependence:
 
 
 class TestNoiseMap:
+    @pytest.mark.slow
     @EVERY
     def test_constant_map_is_the_number(self, estimator: str) -> None:
         """Of one variance, so that only the order of roundings may differ; the matched filter's weights are
@@ -216,7 +215,7 @@ class TestNoiseMap:
             np.testing.assert_allclose(getattr(found, name), values, rtol=1e-5, atol=1e-5, err_msg=name)
 
     @pytest.mark.slow
-    @EVERY
+    @pytest.mark.parametrize("estimator", ["tv", "weighted", "trained", "map"])
     def test_images_and_widths(self, estimator: str) -> None:
         """Calibrated images and other SIMD widths give what the frames give."""
         case = with_noise_map(random_case(22, estimator, n=9), 1)
@@ -229,25 +228,6 @@ class TestNoiseMap:
             for name in ("x", "y", "standard_error_x"):
                 values = getattr(expected, name)
                 np.testing.assert_allclose(getattr(found, name), values, rtol=1e-4, atol=1e-4, err_msg=name)
-
-    @pytest.mark.parametrize("estimator", ["ml", "matched"])
-    def test_noisy_pixels_count_less(self, estimator: str) -> None:
-        """A pixel of 30 e- beside the spot, whose noise is assumed to be 1 e- or is known."""
-        rng = np.random.default_rng(4)
-        noise = np.ones((60, 10, 10))
-        noise[:, 4, 6] = 30.0
-        mean = one_psf().images(np.zeros((60, 2)), (10, 10), 200.0)
-        images = rng.poisson(np.maximum(mean, 0.0)) + noise * rng.standard_normal(noise.shape)
-        chosen = settings_of(estimator, search_range_px=3.0)
-        found = {}
-        for known in (1.0, noise.reshape(-1, 10)):
-            calibration = fs.Calibration(dark=0.0, read_noise_e=known)
-            slopes = Case(images.astype(np.float32), chosen, calibration, one_psf()).measure()
-            found[np.ndim(known)] = slopes
-        rms = {kind: float(np.sqrt(np.mean(slopes.x**2))) for kind, slopes in found.items()}
-        assert rms[2] < 0.5 * rms[0]
-        # 60 slopes give their rms to 9 %; three of these.
-        assert rms[2] == pytest.approx(float(np.mean(found[2].standard_error_x)), rel=0.3)
 
     def test_automatic_settings_follow_the_mean_variance(self) -> None:
         """Of the pixels of each sub-aperture."""
@@ -262,6 +242,7 @@ class TestNoiseMap:
             own = replace(case, settings=settings, calibration=plain).pipeline().plan.settings[0]
             np.testing.assert_allclose(table[:, s], own[:, s], rtol=1e-6)
 
+    @pytest.mark.slow
     def test_hostile_maps(self) -> None:
         """Noiseless, noisier than any camera, and all pixels but one bad."""
         for estimator in estimators():
@@ -322,73 +303,6 @@ class TestPhysics:
 
     N = 4000
 
-    def simulated(self, flux: float, noise: float, psf: PSF) -> tuple[Any, Any]:
-        rng = np.random.default_rng(7)
-        places = rng.uniform(-1, 1, (self.N, 2))
-        detector = fs.slopes.simulate.Detector(noise)
-        return detector.expose(np.maximum(psf.images(places, (12, 14), flux), 0.0), rng), places
-
-    @pytest.mark.parametrize(
-        ("estimator", "flux", "noise"),
-        [
-            ("ml", 300, 0.1),
-            ("ml", 500, 3.0),
-            ("matched", 500, 3.0),
-            ("weighted", 500, 1.0),
-            ("map", 300, 1.0),
-        ],
-    )
-    def test_scatter(self, estimator: str, flux: float, noise: float) -> None:
-        """8,000 errors give their rms to 1 %; linear propagation of errors is good to 10 % at such light."""
-        psf = one_psf()
-        images, places = self.simulated(flux, noise, psf)
-        chosen = settings_of(estimator, spot_fwhm_px=1.8, flux_e=flux, prior_std_px=10.0)
-        slopes = measure_images(
-            images, chosen, calibration=fs.Calibration(dark=0.0, read_noise_e=noise), psf=psf
-        )
-        assert slopes.valid.all()
-        ratio_x = (slopes.x - places[:, 0]) / slopes.standard_error_x
-        ratio_y = (slopes.y - places[:, 1]) / slopes.standard_error_y
-        for ratio in (ratio_x, ratio_y):
-            assert np.std(ratio) == pytest.approx(1.0, abs=0.1)
-            assert abs(np.mean(ratio)) < 0.1
-
-    @pytest.mark.parametrize("estimator", ["matched", "ml", "map"])
-    def test_a_dark_that_is_off(self, estimator: str) -> None:
-        """With a constant fitted along, slopes and their errors stay as they are, for next to nothing.
-
-        4,000 spots of 100 e- under 3 e- of read noise. Images that differ by a constant give slopes equal to
-        float32 rounding, but where that turns a decision: fewer than 1 % may differ by more than 1e-3 px.
-        1 % for the price of the constant is ample: the bounds differ by less than 1e-3. Without it, a dark
-        8 e- too high makes the same spots look three times too faint.
-        """
-        psf, flux, noise = one_psf(), 100.0, 3.0
-        images, places = self.simulated(flux, noise, psf)
-
-        def run(local_background: str, off_e: float) -> fs.Slopes:
-            chosen = settings_of(
-                estimator,
-                local_background=local_background,
-                flux_e=flux,
-                prior_std_px=0.6,
-                search_range_px=3.0,
-            )
-            calibration = fs.Calibration(dark=off_e, read_noise_e=noise)
-            return measure_images(images, chosen, calibration=calibration, psf=psf)
-
-        def rms(slopes: fs.Slopes) -> float:
-            return float(np.sqrt(np.mean((np.stack([slopes.x, slopes.y], axis=1) - places) ** 2)))
-
-        known, fitted = run("off", 0.0), run("on", 0.0)
-        assert rms(fitted) == pytest.approx(rms(known), rel=0.01)
-        for off_e in (-8.0, 8.0):
-            shifted = run("on", off_e)
-            assert np.mean(np.abs(shifted.vector - fitted.vector) > 1e-3) < 0.01
-            assert np.median(shifted.flux) == pytest.approx(flux, rel=0.05)
-            ratio = (shifted.x - places[:, 0]) / shifted.standard_error_x
-            assert np.std(ratio) == pytest.approx(1.0, abs=0.1)
-        assert np.median(run("off", 8.0).flux) < flux / 3
-
     def test_bound_with_an_unknown_background(self) -> None:
         """A spot as wide as the window: the constant costs what the Cramer-Rao bound says it costs."""
         psf = PSF.analytic("gaussian", size=1.8, radius_px=26)
@@ -411,32 +325,6 @@ class TestPhysics:
         assert rms == pytest.approx(float(bound.mean()), rel=0.05)  # 1 % of it from the number of spots
         errors = np.sqrt(np.mean(slopes.standard_error_x**2))
         assert errors == pytest.approx(float(bound[0]), rel=0.05)
-
-    def test_likelihood_reaches_the_bound(self) -> None:
-        psf, flux, noise = one_psf(), 300.0, 0.5
-        images, places = self.simulated(flux, noise, psf)
-        calibration = fs.Calibration(dark=0.0, read_noise_e=noise)
-        slopes = measure_images(images, fs.Settings(estimator="ml"), calibration=calibration, psf=psf)
-        spot = spots_of(psf)[0]
-        task = oracle.Task(spot, variance=noise**2)
-        bound = np.mean([oracle.cramer_rao_bound(x, y, flux, (12, 14), task) for x, y in places[:50]])
-        rms = np.sqrt(np.mean((np.stack([slopes.x, slopes.y], axis=1) - places) ** 2))
-        assert rms == pytest.approx(float(bound), rel=0.05)  # 1 % of it from the number of spots
-
-    def test_error_scale(self) -> None:
-        case = random_case(12, "ml", n=8)
-        one = replace(case, settings=case.settings.replace(error_scale=1.0)).measure()
-        two = replace(case, settings=case.settings.replace(error_scale=2.0)).measure()
-        np.testing.assert_allclose(two.standard_error_x, 2 * one.standard_error_x, rtol=1e-6)
-        assert np.array_equal(one.x, two.x)
-
-    def test_prior_pulls(self) -> None:
-        case = random_case(13, "map", n=8)
-        narrow = replace(
-            case, settings=case.settings.replace(prior_std_px=1e-3), prior=np.full((8, 2), 0.25)
-        ).measure()
-        valid = narrow.valid
-        assert np.allclose(narrow.vector.reshape(2, -1)[:, valid], 0.25, atol=0.02)
 
 
 def test_unknown_read_noise_gives_infinite_errors() -> None:

@@ -76,18 +76,6 @@ def test_sums(tmp_path: Path, weights: fs.FixedWeights | None) -> None:
     np.testing.assert_allclose(found.T, [slopes.x, slopes.y], atol=2e-5)
 
 
-def test_given_weights_of_one_centre_of_gravity(tmp_path: Path) -> None:
-    settings = fs.Settings("window", normalisation="frame", spot_fwhm_px=2.0)
-    path = written(tmp_path, settings, LAYOUT)
-    configuration.save(path, CELL)
-    export_fits(path, tmp_path / "weights.fits", reference=REFERENCE)
-    slopes = fs.SlopePipeline(LAYOUT, settings, CALIBRATION, REFERENCE, score=CELL)(frames(1)[0])
-    with fits.open(tmp_path / "weights.fits") as file:
-        weights, gain, home = (file[name].data for name in ("WEIGHTS", "GAIN", "REFERENCE"))
-        found = gain * (centre_of_gravity(electrons(frames(1)[0]), weights) - home)
-    np.testing.assert_allclose(found.T, [slopes.x, slopes.y], atol=2e-5)
-
-
 @pytest.mark.parametrize("name", ["brightest", "window"])
 def test_matrices(tmp_path: Path, name: str) -> None:
     """An integrator in three lines of NumPy sends the commands of ours."""

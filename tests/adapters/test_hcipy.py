@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import importlib
-import re
 import sys
 import warnings
 from typing import Any
@@ -9,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.refusals import refused
-from tests.shared_data import ROOT
 
 import faintspot as fs
 from faintspot import InputError, MissingExtraError, Settings
@@ -236,18 +234,6 @@ def test_images_that_do_not_fit(optics: Any) -> None:
     ):
         with pytest.raises(InputError, match=message):
             estimator.estimate(images)
-
-
-def test_the_loop_of_the_manual_closes(capsys: pytest.CaptureFixture[str]) -> None:
-    text = (ROOT / "docs" / "adapters" / "hcipy.md").read_text(encoding="utf-8")
-    script = re.search(r"```python\n(.*?)```", text, re.DOTALL)
-    assert script is not None
-    np.random.seed(1)  # noqa: NPY002 - HCIPy's detectors draw from this one
-    names: dict[str, Any] = {}
-    exec(script[1], names)
-    # It reaches 0.5 to 0.6, and 0.01 to 0.05 without a mirror.
-    assert names["strehl"] > 0.3
-    assert "36 valid slopes" in capsys.readouterr().out
 
 
 def test_a_missing_hcipy_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

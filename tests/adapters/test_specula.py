@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import subprocess
 import sys
 from typing import Any
 
@@ -173,15 +172,3 @@ class TestRealTool:
             self.slopes(self.made(subapertures, sn=broken), frame)
         with refused("filtmat: expected finite numbers", "got 36 NaN or infinite of 36"):
             self.made(subapertures, filtmat=np.full((2, 2, 2 * N), np.nan))
-
-
-@pytest.mark.slow
-@needs("specula", "specula")
-def test_a_parameter_file_finds_the_class() -> None:
-    code = (
-        "import specula; specula.init(-1, precision=1)\n"
-        "from specula.lib.utils import import_class\n"
-        "print(import_class('FaintspotSlopec', ['faintspot.adapters.specula']).input_names().keys())"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "in_predicted" in run.stdout

@@ -150,7 +150,7 @@ exit $code
 """
 """In a mount namespace of its own, so that nobody else sees it, and it goes with the process."""
 UNSHARE = ["unshare", "--user", "--map-root-user", "--mount"]
-LARGEST_FILE, PAUSE_S = 120_000, 0.01
+LARGEST_FILE, PAUSE_S = 60_000, 0.01
 REASONS = {"disk": "the disk is full", "file": "File too large"}
 
 
@@ -170,7 +170,7 @@ def small_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("full", ["disk", "file"])
 def test_no_space_for_a_recording(sky: Sky, files: tuple[Path, Control], full: str, tmp_path: Path) -> None:
-    """A file system of 300 kB is full, or files may not be larger than 120 kB.
+    """A file system of 300 kB is full, or files may not be larger than 60 kB.
 
     The recorder says so in a line, what it had written before is whole, and the loop goes on.
     """

@@ -17,7 +17,7 @@ from faintspot.io.stored.slopes_format import VARIABLES
 pytest.importorskip("astropy")
 pytest.importorskip("zarr")
 
-NAMES = ["slopes.zarr", "slopes.npz", "slopes.fits", "slopes.fits.gz", "slopes.csv"]
+NAMES = ["slopes.zarr", "slopes.npz", "slopes.fits", "slopes.csv"]
 ATTRIBUTES = {
     "fingerprint": "abc",
     "configuration": 'title = "é"\n[sensor]\npixels = 16\n',

@@ -12,9 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tests.io.frame_files import cube, fits, save, zarr
+from tests.io.frame_files import cube, save, zarr
 from tests.refusals import refused
-from tests.shared_data import shared_file
 
 from faintspot.io import open_frames, read_array, read_slopes
 from faintspot.io.references import read_reference
@@ -134,19 +133,3 @@ class TestReadArray:
         np.save(tmp_path / "a.npy", array)
         with refused("a.npy", "expected"):
             read_array(tmp_path / "a.npy")
-
-
-class TestRealFiles:
-    @pytest.mark.parametrize("name", ["mmirs_wfs_0150", "auto_wfs_0037_ave", "test_newf9"])
-    def test_sky_frames(self, name: str) -> None:
-        path = shared_file(f"data/{name}.fits.gz")
-        with open_frames([path]) as source, fits.open(path) as units:
-            expected = next(unit.data for unit in units if unit.data is not None)
-            np.testing.assert_array_equal(source.block(0, source.n_frames)[0], expected)
-
-    @pytest.mark.parametrize("name", ["ciao_bench_60x224x224", "ciao_bench_edge_60x56x224"])
-    def test_bench_frames(self, name: str) -> None:
-        path = shared_file(f"data/{name}.npz")
-        with open_frames([path]) as source, np.load(path) as archive:
-            whole = np.concatenate([block for _, block in source.blocks(0, 60, 7)])
-            np.testing.assert_array_equal(whole, archive["frames"])

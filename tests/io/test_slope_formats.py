@@ -55,10 +55,12 @@ def test_xarray_reads_the_store(tmp_path: Path) -> None:
             np.testing.assert_array_equal(dataset[name].values, whole[name])
 
 
-def test_astropy_reads_the_fits_file(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["slopes.fits", "slopes.fits.gz"])
+def test_astropy_reads_the_fits_file(tmp_path: Path, name: str) -> None:
     whole = result()
-    write(tmp_path / "slopes.fits", whole)
-    with fits.open(tmp_path / "slopes.fits", checksum=True) as units:  # a warning is an error
+    write(tmp_path / name, whole)
+    assert_alone(tmp_path / name, whole)
+    with fits.open(tmp_path / name, checksum=True) as units:  # a warning is an error
         units.verify("exception")
         for unit in units:
             assert unit.verify_checksum() == unit.verify_datasum() == 1
@@ -83,12 +85,12 @@ def test_csv_is_a_plain_table(tmp_path: Path) -> None:
 
 
 def test_csv_is_written_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As texts the whole table of 30,000 lines takes more than 10 MB, a piece of 256 lines 0.2 MB."""
-    monkeypatch.setattr(csv_files, "_LINES", 256)
+    """As texts the whole table of 6,000 lines takes more than 2 MB, a piece of 128 lines 0.1 MB."""
+    monkeypatch.setattr(csv_files, "_LINES", 128)
     tracemalloc.start()
     try:
-        write(tmp_path / "slopes.csv", result(300, 100), 10)
-        assert tracemalloc.get_traced_memory()[1] < 4_000_000
+        write(tmp_path / "slopes.csv", result(60, 100), 10)
+        assert tracemalloc.get_traced_memory()[1] < 1_500_000
     finally:
         tracemalloc.stop()
 
@@ -99,7 +101,7 @@ def test_slopes_are_read_as_frames_by_name(tmp_path: Path) -> None:
         assert source.shape == (50, 7)
 
 
-@pytest.mark.parametrize("name", ["x", "flags", "valid", "centre_x"])
+@pytest.mark.parametrize("name", ["flags", "centre_x"])
 @pytest.mark.parametrize("damage", ["lost", "empty", "short", "bit"])
 def test_damaged_chunk_of_a_store(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, damage: str

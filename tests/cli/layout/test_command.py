@@ -299,7 +299,6 @@ def test_places_that_cannot_be_written(folder: Path, run: Commands) -> None:
     [
         ("data/ciao_bench_60x224x224.npz", "square", None, 49, 49),
         ("data/auto_wfs_0037_ave.fits.gz", "square", (14, 14), 144, 152),
-        ("data/mmirs_wfs_0150.fits.gz", "square", (14, 14), 150, 158),
         ("data/test_newf9.fits.gz", "hexagonal", None, 141, 149),
     ],
 )

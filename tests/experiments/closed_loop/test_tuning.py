@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.experiments.experiment_cases import HERE, small
+from tests.experiments.experiment_cases import HERE, StopsAfter, small
 from tests.experiments.loop_answer_cases import configuration, made_up
 
 from faintspot.base.errors import InputError
@@ -15,6 +15,7 @@ from faintspot.experiments.closed_loop.methods import LOOP_GAIN, method_kind
 from faintspot.experiments.closed_loop.question import LoopQuestion
 from faintspot.experiments.closed_loop.search import Search
 from faintspot.experiments.closed_loop.tuning import LoopPlan, tune_loop
+from faintspot.experiments.running import WorkerPool
 
 pytest.importorskip("hcipy")
 SEARCH = Search(
@@ -23,10 +24,10 @@ SEARCH = Search(
 PLAN = LoopPlan(fluxes=3, frames=30, settle_frames=10, realisations=2, search=SEARCH)
 
 
-def tuned(folder: Path, *methods: str) -> LoopAnswer:
+def tuned(folder: Path, *methods: str, pool: WorkerPool = HERE) -> LoopAnswer:
     loop = small().replace("control", telemetry_frames=700)
     question = LoopQuestion(loop, magnitudes=(9.0, 11.0), methods=methods)
-    return tune_loop(question, folder, plan=PLAN, pool=HERE)
+    return tune_loop(question, folder, plan=PLAN, pool=pool)
 
 
 @pytest.mark.slow
@@ -47,12 +48,16 @@ def test_answer(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_another_loop_in_the_folder_is_refused_or_replaced(tmp_path: Path) -> None:
-    tuned(tmp_path)
+    soon = WorkerPool(0, progress=StopsAfter(1))
+    with pytest.raises(KeyboardInterrupt):
+        tuned(tmp_path, pool=soon)
     other = LoopQuestion(small().replace("camera", read_noise_e=5.0), magnitudes=(9.0, 11.0), methods=())
     with pytest.raises(InputError, match=r"magnitude-tuning\.zarr"):
         tune_loop(other, tmp_path, plan=PLAN, pool=HERE)
-    answer = tune_loop(other, tmp_path, plan=PLAN, pool=HERE, overwrite=True)
-    assert answer.question is other
+    with pytest.raises(KeyboardInterrupt):
+        tune_loop(other, tmp_path, plan=PLAN, pool=soon, overwrite=True)
+    with pytest.raises(InputError, match=r"magnitude-tuning\.zarr"):
+        tuned(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -110,10 +110,8 @@ def test_standard_errors_are_right() -> None:
 
 CASES = (
     "noise_rn0.1_f10",
-    "spot_sinc2_s1.5_f80",
     "spot_gauss_s2_f80",
     "nx8_f80",
-    "noise_rn3_f200",
     "lgs_rn3_f300",
     "bobcat_s1.5_f800",
     "range4_rn0.1_f80",

@@ -5,7 +5,9 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections.abc import Callable
+from functools import reduce
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -233,8 +235,18 @@ def test_quad_cells_of_others_without_a_configuration(tmp_path: Path, run: Comma
     run.ok("slopes", path, "-c", toml, "-o", tmp_path / "s.npz")
 
 
-def no_pixels(system: Any) -> None:
-    system.wavefront_sensors[0].detector = None
+def changed(place: str, value: Any) -> Callable[[Any], None]:
+    """Return what sets an attribute of the first sensor with sub-apertures, or of its loop."""
+
+    def change(system: Any) -> None:
+        with_subapertures(system)
+        *names, last = place.split(".")
+        owner = reduce(
+            getattr, names, SimpleNamespace(sensor=system.wavefront_sensors[0], loop=system.loops[0])
+        )
+        setattr(owner, last, value)
+
+    return change
 
 
 def pyramid(system: Any) -> None:
@@ -243,50 +255,38 @@ def pyramid(system: Any) -> None:
     system.loops = []
 
 
-def wrong_mask(system: Any) -> None:
-    with_subapertures(system)
-    system.wavefront_sensors[0].subaperture_mask.data[0, 0] = 7
-
-
-def wrong_reference(system: Any) -> None:
-    with_subapertures(system)
-    system.wavefront_sensors[0].ref_measurements.data = np.zeros((4, 2))
-
-
-def wrong_slopes(system: Any) -> None:
-    system.wavefront_sensors[0].measurements.data = np.ones((50, 4, 2))
-
-
-def wrong_matrix(system: Any) -> None:
-    with_subapertures(system)
-    system.loops[0].interaction_matrix.data = np.ones((3, 2, 4))
-
-
-def outside(system: Any) -> None:
-    with_subapertures(system)
-    system.wavefront_sensors[0].mask_offsets = [aotpy.Coordinates(5.0, 1.0)]
-
-
-def two_offsets(system: Any) -> None:
-    with_subapertures(system)
-    system.wavefront_sensors[0].mask_offsets *= 2
-
-
-def frames_of_lines(system: Any) -> None:
-    system.wavefront_sensors[0].detector.pixel_intensities.data = np.ones(20)
+MASK = np.array([[7, 2, -1], [0, -1, 1], [-1, 3, -1]])
 
 
 @pytest.mark.parametrize(
     ("change", "naming"),
     [
-        (no_pixels, "expected one Shack-Hartmann sensor with pixels, it has: WFS1, WFS2"),
+        (
+            changed("sensor.detector", None),
+            "one Shack-Hartmann sensor with pixels, it has: WFS1, WFS2",
+        ),
         (pyramid, "it has: none"),
-        (wrong_mask, "subaperture_mask: expected the numbers 0 to 3"),
-        (wrong_reference, r"ref_measurements: expected shape \(2, 4\), got \(4, 2\)"),
-        (wrong_slopes, r"measurements: expected shape \(t, 2, 4\)"),
-        (wrong_matrix, r"interaction_matrix: expected shape \(4, 2, commands\), got \(3, 2, 4\)"),
-        (two_offsets, "mask_offsets: expected one, got 2"),
-        (frames_of_lines, r"pixel_intensities: expected \(frames, height, width\)"),
+        (changed("sensor.subaperture_mask.data", MASK), "subaperture_mask: expected the numbers 0 to 3"),
+        (
+            changed("sensor.ref_measurements.data", np.zeros((4, 2))),
+            r"ref_measurements: expected shape \(2, 4\), got \(4, 2\)",
+        ),
+        (
+            changed("sensor.measurements.data", np.ones((50, 4, 2))),
+            r"measurements: expected shape \(t, 2, 4\)",
+        ),
+        (
+            changed("loop.interaction_matrix.data", np.ones((3, 2, 4))),
+            r"interaction_matrix: expected shape \(4, 2, commands\), got \(3, 2, 4\)",
+        ),
+        (
+            changed("sensor.mask_offsets", 2 * [aotpy.Coordinates(2.0, 1.0)]),
+            "mask_offsets: expected one, got 2",
+        ),
+        (
+            changed("sensor.detector.pixel_intensities.data", np.ones(20)),
+            r"pixel_intensities: expected \(frames, height, width\)",
+        ),
     ],
 )
 def test_refused(tmp_path: Path, change: Callable[[Any], None], naming: str) -> None:
@@ -296,18 +296,14 @@ def test_refused(tmp_path: Path, change: Callable[[Any], None], naming: str) -> 
 
 def test_subapertures_outside_the_frame_are_refused(tmp_path: Path) -> None:
     fs.Settings("centroid").save(tmp_path / "faintspot.toml")
+    path = example(tmp_path / "e.fits", changed("sensor.mask_offsets", [aotpy.Coordinates(5.0, 1.0)]))
     with pytest.raises(fs.InputError, match=r"'WFS1': layout: sub-aperture 1 .* leaves the frame"):
-        measure_recorded(
-            [example(tmp_path / "e.fits", outside)], tmp_path / "faintspot.toml", tmp_path / "s.npz"
-        )
+        measure_recorded([path], tmp_path / "faintspot.toml", tmp_path / "s.npz")
 
 
 def test_references_in_another_unit_are_not_taken(tmp_path: Path) -> None:
-    def in_metres(system: Any) -> None:
-        with_subapertures(system)
-        system.wavefront_sensors[0].ref_measurements.unit = "m"
-
-    assert read_aot(example(tmp_path / "e.fits", in_metres)).reference is None
+    path = example(tmp_path / "e.fits", changed("sensor.ref_measurements.unit", "m"))
+    assert read_aot(path).reference is None
 
 
 def test_images_elsewhere_are_not_fetched(tmp_path: Path) -> None:

@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.loop.control.control_cases import ERRORS, INTERACTION
 
@@ -19,16 +17,6 @@ def _integrator(
 ) -> tuple[Integrator, CommandDelayLine]:
     line = CommandDelayLine(1, delay)
     return Integrator(line, ONE, make_reconstructor(ONE), gain, leak, sees_mirror=sees_mirror), line
-
-
-@given(delay=st.integers(1, 5), gain=st.floats(0.1, 1.0))
-def test_a_command_acts_delay_frames_after_its_frame(delay: int, gain: float) -> None:
-    integrator, line = _integrator(delay, gain)
-    held = []
-    for frame in range(10):
-        held.append(float(line.acting[0]))
-        integrator.follow(np.array([1.0 if frame == 3 else 0.0]))
-    np.testing.assert_allclose(held, [-gain if frame >= 3 + delay else 0.0 for frame in range(10)])
 
 
 def test_closed_loop_recursion() -> None:

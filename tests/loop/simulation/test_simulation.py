@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.loop.simulation.loop_cases import PLAIN, expected_variance, faint, plain, quiet
+from tests.loop.simulation.loop_cases import PLAIN, faint, plain, quiet
 
 import faintspot as fs
 from faintspot.base.errors import InputError
@@ -115,23 +115,6 @@ def test_noise_free_loop_lies_between_fitting_error_and_its_budget() -> None:
     assert record.mean_strehl() == pytest.approx(marechal, abs=0.02)
 
 
-def test_without_correction_the_strehl_is_that_of_theory() -> None:
-    """Weak turbulence, r0 1.2 m: exp(-variance), the variance from the von Karman structure function.
-
-    Three realisations of 150 independent wavefronts: the variance scatters by 15 %.
-    """
-    loop = quiet().replace("atmosphere", r0_m=1.2).replace("control", gain=0.0, frame_rate_hz=5.0)
-    loop = loop.replace("run", frames=150, settle_frames=0)
-    optics = prepare(loop)
-    method = Method("none", PLAIN, true_slopes=True)
-    records = [simulate_loop(loop, [method], realisation=number) for number in range(3)]
-    variance = np.mean([record.residual_nm**2 for record in records]) * (2 * np.pi / 500) ** 2
-    expected = expected_variance(optics.pupil.amplitude, optics.pupil.spacing_m, 1.2, 25.0)
-    assert variance == pytest.approx(expected, rel=0.2)
-    strehl = np.mean([record.mean_strehl() for record in records])
-    assert strehl == pytest.approx(np.exp(-expected * (500 / 1650) ** 2), abs=0.04)
-
-
 def test_open_loop_control() -> None:
     loop = load_loop("open_loop").replace("run", frames=160, settle_frames=40)
     settings = fs.Settings("brightest", keep_brightest=150)
@@ -167,24 +150,10 @@ def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
     assert corrected.mean_strehl() > not_corrected.mean_strehl()
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        Method(
-            "ml", fs.Settings(estimator="ml", search_range_px=4, model_error=0.3), weighted_reconstructor=True
-        ),
-        Method("map", fs.Settings(estimator="map", prior_std_px=1.0, model_error=0.3), predict_prior=True),
-        Method("weighted", fs.Settings(estimator="weighted", search_range_px=4)),
-        Method("smoothed", fs.Settings(estimator="smoothed", keep_brightest=80)),
-        Method("window", fs.Settings("brightest", keep_brightest=50), window_pixels=10),
-        Method("auto", fs.Settings(noise_std="auto", keep_brightest="auto")),
-    ],
-    ids=lambda method: method.label,
-)
-def test_every_kind_of_method_closes_the_loop(method: Method) -> None:
+def test_smaller_windows_close_the_loop() -> None:
     loop = load_loop("diffraction_limit").replace("run", frames=100, settle_frames=40)
-    record = simulate_loop(loop.replace("camera", photons_per_subaperture=400.0), [method])
-    assert record.mean_strehl() > 0.3
+    method = Method("window", fs.Settings("brightest", keep_brightest=50), window_pixels=10)
+    assert simulate_loop(loop.replace("camera", photons_per_subaperture=400.0), [method]).mean_strehl() > 0.3
 
 
 def test_invalid_sub_apertures_do_no_harm() -> None:

@@ -33,11 +33,11 @@ def opened(frames: int) -> Recording:
 @pytest.mark.slow
 def test_pieces_of_an_open_loop() -> None:
     """r0 of each piece within three errors, also of one that lost half of its frames."""
-    loop = opened(2400)
+    loop = opened(1600)
     progress: list[tuple[int, int]] = []
     pieces = turbulence_over_time(loop, 400 * 1.99 / RATE_HZ, lambda *counts: progress.append(counts))
-    assert progress == [(1, 3), (2, 3), (3, 3)]
-    assert [piece.start_s for piece in pieces] == pytest.approx([0.0, 796 / RATE_HZ, 1592 / RATE_HZ])
+    assert progress == [(1, 2), (2, 2)]
+    assert [piece.start_s for piece in pieces] == pytest.approx([0.0, 796 / RATE_HZ])
     for piece in pieces:
         r0 = piece.values["r0 at 500 nm"]
         assert abs(r0.value - AIR.r0_m) < 3 * r0.error < 0.15
@@ -46,8 +46,8 @@ def test_pieces_of_an_open_loop() -> None:
     assert [float(row["start_s"]) for row in rows] == pytest.approx(
         [piece.start_s for piece in pieces], rel=1e-4
     )
-    assert float(rows[2]["r0 at 500 nm (m)"]) == pytest.approx(
-        pieces[2].values["r0 at 500 nm"].value, rel=1e-4
+    assert float(rows[1]["r0 at 500 nm (m)"]) == pytest.approx(
+        pieces[1].values["r0 at 500 nm"].value, rel=1e-4
     )
     page = page_of_loop(report_of_loop(loop, compare=False), pieces)
     assert "Against time" in page

@@ -222,31 +222,3 @@ def test_a_single_sub_aperture() -> None:
     left = {each.name: each.residual for each in found.choices}
     assert left[FILTER].value + left[FILTER].error < left[BEST].value
     assert "with fitting and aliasing" not in page_of_loop(found)
-
-
-@pytest.mark.slow
-def test_the_unit_of_the_slopes_does_not_matter(report: LoopReport) -> None:
-    """All numbers but those in the slopes' unit are the same, in 2**-20 of it, which rounds nothing."""
-    unit = 2.0**-20
-    kept = np.delete(np.arange(2550), slice(1000, 1020))
-    loop = recorded()
-    assert loop.pixel_scale_arcsec is not None
-    other = report_of_loop(
-        replace(
-            loop,
-            slopes=unit * loop.slopes[kept],
-            frame=loop.frame[kept],
-            commands=loop.commands[kept],
-            interaction_matrix=unit * loop.interaction_matrix,
-            pixel_scale_arcsec=loop.pixel_scale_arcsec / unit,
-            slope_unit="other",
-        )
-    )
-    one, two = (list(numbers(each.as_values())) for each in (report, other))
-    assert [each["name"] for each in one] == [each["name"] for each in two]
-    for first, second in zip(one, two, strict=True):
-        factor = unit if second["unit"] == "other" else 1.0
-        for value in ("value", "low", "high"):
-            if first[value] is not None:
-                assert second[value] == pytest.approx(factor * first[value], rel=1e-6), first["name"]
-    assert other.advice == report.advice

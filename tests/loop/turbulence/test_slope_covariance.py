@@ -10,7 +10,7 @@ from tests.loop.control.control_cases import COVARIANCES, TURBULENCE
 from faintspot.loop.simulation import LoopConfiguration
 from faintspot.loop.simulation.control import slope_turbulence
 from faintspot.loop.simulation.telescope.atmosphere import make_atmosphere
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence, phase_covariance_rad2
+from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 from faintspot.slopes.spots.von_karman import SPECTRUM
 
 
@@ -107,13 +107,3 @@ def test_layers_add_up() -> None:
     np.testing.assert_allclose(
         sum(each.covariance_px2(0.01) for each in layers), TURBULENCE.covariance_px2(0.01), rtol=1e-9
     )
-
-
-def test_slopes_are_differences_of_the_phase() -> None:
-    """The variance of a mean gradient, from the phase along two edges: 60 points each, to 1 %."""
-    side, line = 0.6, (np.arange(60) + 0.5) / 60 * 0.6
-    edges = np.concatenate([np.column_stack([np.full(60, x), line]) for x in (0.0, side)])
-    phase = phase_covariance_rad2(edges, 0.15, 25.0)
-    weight = np.repeat([-1.0, 1.0], 60) / 60 / side
-    slope = weight @ phase @ weight * (500e-9 / (2 * math.pi) / 9e-7) ** 2
-    assert slope == pytest.approx(TURBULENCE.covariance_px2()[0, 0], rel=0.01)

@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from tests.refusals import assert_each_refused, refused
 
 from faintspot.base.errors import InputError
@@ -41,7 +39,8 @@ def check_mean_and_variance(detector: Detector, level: float, seed: int = 1) -> 
 @pytest.mark.parametrize("em_gain", [1.0, 500.0])
 @pytest.mark.parametrize("level", [0.0, 0.2, 25.0])
 def test_mean_and_variance(read_noise_e: float, em_gain: float, level: float) -> None:
-    check_mean_and_variance(Detector(read_noise_e, em_gain=em_gain), level)
+    detector = Detector(read_noise_e, em_gain=em_gain, dark_e=0.3, background_e=0.4)
+    check_mean_and_variance(detector, level)
 
 
 @pytest.mark.parametrize("em_gain", [1.0, 500.0])
@@ -50,37 +49,6 @@ def test_mean_and_variance_quantised(em_gain: float, gain_e_per_adu: float) -> N
     # Read noise of at least 0.6 ADU, where the rounding error is uniform to 1e-3 of itself.
     detector = Detector(3.0, em_gain=em_gain, gain_e_per_adu=gain_e_per_adu, offset_adu=100, bits=20)
     check_mean_and_variance(detector, 12.0)
-
-
-@settings(max_examples=15, deadline=None, derandomize=True)
-@given(
-    level=st.floats(0.5, 50),
-    read_noise_e=st.floats(0, 20),
-    dark_e=st.floats(0, 3),
-    background_e=st.floats(0, 3),
-    em_gain=st.sampled_from([1.0, 1.5, 30.0, 1000.0]),
-    gain_e_per_adu=st.floats(0.1, 10),
-    seed=st.integers(0, 2**32),
-)
-def test_variance_agrees_with_samples(
-    level: float,
-    read_noise_e: float,
-    dark_e: float,
-    background_e: float,
-    em_gain: float,
-    gain_e_per_adu: float,
-    seed: int,
-) -> None:
-    # Fainter than half an electron the squared output of the register is too skewed for standard errors.
-    detector = Detector(
-        read_noise_e,
-        dark_e=dark_e,
-        background_e=background_e,
-        em_gain=em_gain,
-        gain_e_per_adu=gain_e_per_adu,
-        offset_adu=10.0,
-    )
-    check_mean_and_variance(detector, level, seed)
 
 
 def test_excess_noise_factor() -> None:
@@ -99,18 +67,6 @@ def test_register_output_of_one_electron_is_exponential() -> None:
     expected = np.exp(-1)
     assert abs(share - expected) <= STANDARD_ERRORS * np.sqrt(expected * (1 - expected) / n)
     assert detector.expose(np.zeros((3, 3)), np.random.default_rng(4)).max() == 0
-
-
-def test_without_noise_sources_the_output_is_whole_electrons() -> None:
-    out = Detector(0.0).expose(np.full((20, 20), 3.3), np.random.default_rng(0))
-    np.testing.assert_array_equal(out, np.rint(out))
-    assert np.all(Detector(0.0).expose(np.zeros((2, 4, 4))) == 0)
-
-
-def test_small_read_noise_is_not_rounded() -> None:
-    out = Detector(0.037).expose(np.zeros(SHAPE), np.random.default_rng(0)).astype(np.float64)
-    n = out.size
-    assert abs(out.std() - 0.037) <= STANDARD_ERRORS * 0.037 / np.sqrt(2 * n)
 
 
 @pytest.mark.parametrize(

@@ -292,10 +292,7 @@ def estimator(text: str) -> str:
         ("estimator.threshold_e: an option of 'thresholded', not of 'tv'", estimator("threshold_e = 1")),
         ("estimator.flux_e: expected in the table [settings]", estimator("noise_std = 1\nflux_e = 9")),
         ("settings.noise_std: unknown key; known: search_range_px", estimator("[settings]\nnoise_std = 1")),
-        ("settings.flux_e = -1", estimator("noise_std = 1\n[settings]\nflux_e = -1")),
-        ("estimator.noise_std: expected a number (electrons)", estimator("")),
         ("estimator.noise_std = -1: expected a number of at least 0", estimator("noise_std = -1")),
-        ("estimator.noise_std", estimator("noise_std = 2026-01-01")),
         ("estimator.noise_std.first", estimator("noise_std = { default = 1.0, first = 2.0 }")),
         (
             "settings: expected arrays of one length",
@@ -399,10 +396,7 @@ def test_spots_of_a_laser_guide_star(tmp_path: Path) -> None:
     ("old", "new"),
     [
         ("launch_m = [-5.0, 0.0]", "launch_m = [-5.0]"),
-        ("spot_fwhm_arcsec = 1.2", ""),
         ("spot_fwhm_arcsec = 1.2", "spot_fwhm_arcsec = 1.2\nfollow_every_s = -1"),
-        ("spot_fwhm_arcsec = 1.2", 'spot_fwhm_arcsec = 1.2\nprofile = "none.npz"'),
-        ("spot_fwhm_arcsec = 1.2", "spot_fwhm_arcsec = 1.2\nzenith_distance_deg = 90"),
         ("matched_filter = true", "matched_filter = 1"),
         ("flux_e = 200.0", ""),
         ("read_noise_e = 1.0", ""),
@@ -411,5 +405,5 @@ def test_spots_of_a_laser_guide_star(tmp_path: Path) -> None:
 )
 def test_a_laser_guide_star_that_is_refused(tmp_path: Path, old: str, new: str) -> None:
     path = written(tmp_path, (SENSOR + WINDOW + LASER).replace(old, new))
-    with refused("none.npz" if "none.npz" in new else f"{path}"):
+    with refused(f"{path}"):
         configuration.load_all(path)

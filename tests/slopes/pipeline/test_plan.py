@@ -31,38 +31,24 @@ def score() -> fs.TrainedScore:
 
 
 class TestWhatIsMissing:
-    @pytest.mark.parametrize("estimator", ["matched", "ml", "map"])
-    def test_psf(self, estimator: str) -> None:
-        with pytest.raises(fs.InputError, match=r"psf: expected a PSF .*learn_psf"):
-            fs.SlopePipeline(LAYOUT, fs.Settings(estimator=estimator), NOISE)
-
-    def test_read_noise(self) -> None:
-        with pytest.raises(fs.InputError, match=r"calibration\.read_noise_e"):
-            fs.SlopePipeline(LAYOUT, fs.Settings(estimator="ml"), psf=fs.PSF.analytic())
-
-    def test_score(self) -> None:
-        with pytest.raises(fs.InputError, match=r"score: expected a TrainedScore .*train_estimator"):
-            fs.SlopePipeline(LAYOUT, fs.Settings(estimator="trained"), NOISE)
-
-    def test_width(self) -> None:
-        with pytest.raises(fs.InputError, match=r"settings\.spot_fwhm_px"):
-            fs.SlopePipeline(LAYOUT, fs.Settings(estimator="weighted"), NOISE)
-        with pytest.raises(fs.InputError, match=r"settings\.spot_fwhm_px"):
-            fs.SlopePipeline(LAYOUT, fs.Settings(noise_std="auto"), NOISE)
-
-    def test_level(self) -> None:
-        with pytest.raises(fs.InputError, match=r"estimator\.threshold_e"):
-            fs.SlopePipeline(LAYOUT, fs.Settings(estimator="thresholded"), NOISE)
-
-    def test_index_of_another_sensor(self) -> None:
-        psf = fs.PSF.analytic(size=[1.0, 1.5], index=[0, 1, 1])
-        with pytest.raises(fs.InputError, match=r"psf.index: expected 12 numbers"):
-            fs.SlopePipeline(LAYOUT, fs.Settings(estimator="ml"), NOISE, psf=psf)
-
-    def test_prior_of_another_shape(self) -> None:
-        pipeline = fs.SlopePipeline(LAYOUT, fs.Settings(estimator="map"), NOISE, psf=fs.PSF.analytic())
-        with pytest.raises(fs.InputError, match=r"prior: expected shape \(12, 2\)"):
-            pipeline(np.zeros(LAYOUT.frame_shape), prior=np.zeros((11, 2)))
+    @pytest.mark.parametrize(
+        ("settings", "parts", "message"),
+        [
+            (fs.Settings("matched"), {}, r"psf: expected a PSF .*learn_psf"),
+            (
+                fs.Settings("ml"),
+                {"calibration": None, "psf": fs.PSF.analytic()},
+                r"calibration\.read_noise_e",
+            ),
+            (fs.Settings("trained"), {}, r"score: expected a TrainedScore .*train_estimator"),
+            (fs.Settings("weighted"), {}, r"settings\.spot_fwhm_px"),
+            (fs.Settings(noise_std="auto"), {}, r"settings\.spot_fwhm_px"),
+            (fs.Settings("thresholded"), {}, r"estimator\.threshold_e"),
+        ],
+    )
+    def test_is_named(self, settings: fs.Settings, parts: dict[str, Any], message: str) -> None:
+        with pytest.raises(fs.InputError, match=message):
+            fs.SlopePipeline(LAYOUT, settings, **{"calibration": NOISE, **parts})
 
 
 class TestMeasuredFlux:

@@ -89,15 +89,6 @@ def test_nothing_valid_gives_nan_without_warnings() -> None:
     assert not statistics.jitter(method.x, method.y, method.valid).measured.any()
 
 
-def test_slope_error_is_the_projects_metric() -> None:
-    method = make_method(40, 5)
-    truth = np.random.default_rng(9).uniform(-1, 1, (40, 5, 2))
-    kept = method.valid
-    error, _ = statistics.slope_error(method, truth, kept)
-    dx, dy = np.abs(method.x - truth[..., 0])[kept], np.abs(method.y - truth[..., 1])[kept]
-    assert error.value == pytest.approx(np.mean((dx + dy) / 2), rel=1e-6)
-
-
 def test_gain_is_that_of_a_shrinking_estimator() -> None:
     truth = np.random.default_rng(1).uniform(-1, 1, (50, 4, 2))
     zero = np.zeros((50, 4), np.uint8)

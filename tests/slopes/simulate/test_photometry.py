@@ -23,11 +23,6 @@ def test_electrons_are_those_of_the_formula() -> None:
     assert float(FLUX.electrons(10.0)) == pytest.approx(expected)
 
 
-def test_five_magnitudes_are_a_factor_of_a_hundred() -> None:
-    bright, faint = FLUX.electrons([7.0, 12.0])
-    assert bright / faint == pytest.approx(100)
-
-
 def test_zero_point_of_v_is_the_textbook_one() -> None:
     """About 1000 photons / s / cm^2 / angstrom over 880 angstrom: 8.8e9 / s / m^2; 3 % for its rounding."""
     assert ZERO_POINTS["V"] == pytest.approx(8.8e9, rel=0.03)

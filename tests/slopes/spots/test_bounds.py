@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError
-from faintspot.slopes.simulate import Detector, spots, subapertures
+from faintspot.slopes.simulate import Detector, spots
 from faintspot.slopes.spots.bounds import MEAN_ABSOLUTE, cramer_rao, cramer_rao_covariance, photon_efficiency
 from faintspot.slopes.spots.psf import PSF
 
@@ -52,30 +52,6 @@ def test_flux_and_background_cost_nothing_for_a_spot_in_the_middle() -> None:
     np.testing.assert_allclose(centred[0], centred[1], rtol=1e-9)
 
 
-def test_derivatives_equal_the_differences_at_pixel_edges() -> None:
-    """Fisher information of a sinc^2 spot from the density at the edges of pixels."""
-    x, y, flux, size = 0.37, -0.81, 200.0, 1.3
-    width, edges = 2 * size, np.arange(17) - 8.0
-    image = spots([[x, y]], size=size)[0]
-    image *= flux / spots([[0.0, 0.0]], size=size)[0].sum()
-    along_x = image.sum(axis=0) / image.sum()
-    slope = -np.diff(np.sinc((edges - x) / width) ** 2) / width
-    fractions = spots([[x, y]], size=size, shape=(1001, 16))[0].sum(axis=0)
-    derivative = image * (slope / fractions)
-    information = np.sum(derivative**2 / image)
-    bound = cramer_rao(
-        flux, size=size, positions=(x, y), detector=Detector(0.0), unknown_flux=False, noise="gaussian"
-    )
-    along_y = -np.diff(np.sinc((edges - y) / width) ** 2) / width
-    fractions_y = spots([[x, y]], size=size, shape=(16, 1001))[0].sum(axis=1)
-    derivative_y = image * (along_y / fractions_y)[:, None]
-    cross = np.sum(derivative * derivative_y / image)
-    expected = math.sqrt(1 / (information - cross**2 / np.sum(derivative_y**2 / image)))
-    assert along_x.sum() == pytest.approx(1)
-    # The 1001 px stand for an infinite column: 1e-3 of the flux is beyond, the same in every column.
-    np.testing.assert_allclose(bound[0], expected, rtol=2e-3)
-
-
 def test_exact_and_gaussian_noise_agree_with_much_flux_only() -> None:
     detector = Detector(1.0)
     ratio = [
@@ -85,43 +61,6 @@ def test_exact_and_gaussian_noise_agree_with_much_flux_only() -> None:
     assert ratio[0] > 1.03
     # Dark wings hold a few thousandths of the information even then.
     assert ratio[1] == pytest.approx(1, abs=5e-3)
-
-
-def fitted(images: NDArray[np.float64], size: float, read_noise: float) -> NDArray[np.float64]:
-    """Maximum likelihood fit of x, y and flux: Fisher scoring from the middle, Gaussian noise model."""
-    step = 0.01
-    where, flux = np.zeros((len(images), 2)), images.sum(axis=(1, 2))
-    for _ in range(8):
-        shape = spots(where, size=size)
-        derivatives = [
-            (spots(where + d, size=size) - spots(where - d, size=size)) / (2 * step) * flux[:, None, None]
-            for d in np.eye(2) * step
-        ]
-        stack = np.stack([*derivatives, shape], axis=1)
-        model = flux[:, None, None] * shape
-        weight = 1 / (model + read_noise**2)
-        information = np.einsum("naij,nbij,nij->nab", stack, stack, weight)
-        score = np.einsum("naij,nij,nij->na", stack, images - model, weight)
-        move = np.linalg.solve(information, score[:, :, None])[:, :, 0]
-        where = where + np.clip(move[:, :2], -0.5, 0.5)
-        flux = np.maximum(flux + move[:, 2], 1.0)
-    return where
-
-
-@pytest.mark.parametrize(("flux", "read_noise"), [(3000.0, 1.0), (2000.0, 8.0)])
-def test_a_maximum_likelihood_fit_reaches_the_bound(flux: float, read_noise: float) -> None:
-    detector = Detector(read_noise)
-    images, truth = subapertures(
-        1500, flux_e=flux, position_range_px=0.5, detector=detector, rng=np.random.default_rng(1)
-    )
-    error = fitted(images.astype(np.float64), 1.0, read_noise) - truth
-    bound = cramer_rao(flux, detector=detector, position_range_px=0.5)
-    # 3,000 errors: 1.3 % on their spread, times 3, and 1 % for what is left of the bias of a finite flux.
-    assert np.sqrt(np.mean(error**2)) == pytest.approx(bound.mean(), rel=0.05)
-    efficiency = photon_efficiency(
-        np.abs(error).mean(), flux, detector=detector, position_range_px=0.5, noise="gaussian"
-    )
-    assert 0.9 < efficiency < 1.1
 
 
 def test_a_multiplication_register_costs_half_the_flux() -> None:

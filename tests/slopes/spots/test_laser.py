@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -45,18 +44,6 @@ def test_elongation_is_baseline_times_depth_over_squared_height(zenith_deg: floa
     np.testing.assert_allclose(found, (PLACES - LAUNCH) * depth / ARCSEC / 0.5, rtol=1e-3, atol=1e-12)
 
 
-def test_images_are_the_profile_along_a_line_convolved_with_the_spot() -> None:
-    sky = star()
-    profile = sky.focused(PROFILE)
-    mean, covariance = moments(sky.images(profile, (44, 44)))
-    np.testing.assert_allclose(mean, 0.0, atol=1e-3)
-    _, own = moments(SPOT.images([[0.0, 0.0]], (44, 44)))
-    std = sky.elongation_px(profile) / 2.3548
-    expected = own + std[:, :, None] * std[:, None, :]
-    # The distance is not quite linear in the altitude.
-    np.testing.assert_allclose(covariance, expected, atol=0.01 * expected.max())
-
-
 def test_an_image_by_adding_spots_one_by_one() -> None:
     sky = star(zenith_distance_deg=30.0, range_gate_m=[84e3, 97e3])
     altitudes = np.linspace(70e3, 105e3, 4001)
@@ -84,11 +71,6 @@ def test_responses_images_and_psf_agree() -> None:
 def test_a_launch_within_a_subaperture_leaves_its_spot_round() -> None:
     images = star().images(PROFILE, (12, 12))
     np.testing.assert_allclose(images[3], SPOT.images([[0.0, 0.0]], (12, 12))[0], atol=1e-9)
-
-
-def test_windows_truncate() -> None:
-    flux = star(pixel_arcsec=0.3).images(PROFILE, (8, 8)).sum(axis=(1, 2))
-    assert flux[1] < 0.9 < 0.99 < flux[3]
 
 
 def test_a_mean_altitude_off_focus_is_a_displacement_along_the_elongation() -> None:
@@ -174,27 +156,3 @@ def test_kernels_are_those_of_specula() -> None:
     # Such a beam is brighter, the nearer it is.
     nearer = fs.SodiumProfile(LAYERS, NARROW.density / LAYERS**2)
     same_kernels(np.asarray(theirs, np.float64), grid([5.0, 1.0], 1.2 / FINE_ARCSEC, FINE_ARCSEC), nearer)
-
-
-def test_kernels_are_those_of_oopao() -> None:
-    sensor = pytest.importorskip("OOPAO.ShackHartmann")
-    table = np.stack([LAYERS, NARROW.density])
-    source = SimpleNamespace(laser_coordinates=[1.0, 5.0], Na_profile=table, fwhm_spot_up=1.2)
-    pixels = dict.fromkeys(("n_pix_lenslet", "n_pix_lenslet_init", "n_pix_subap", "n_pix_subap_init"), SIDE)
-    itself = SimpleNamespace(
-        **pixels,
-        telescope=SimpleNamespace(D=8.0),
-        nSubap=5,
-        binning_pixel_scale=1,
-        pixel_scale_init=FINE_ARCSEC,
-        rad2arcsec=1 / ARCSEC,
-        threshold_convolution=1e-6,
-        src=source,
-    )
-    valid = SimpleNamespace(valid_subapertures_1D=np.ones(25, bool))
-    *_, theirs = sensor.ShackHartmann.get_convolution_spot(itself, source, valid)
-    # Its Gaussians are wider than the number that it calls their width, and its grid has one interval less.
-    round_spot = sensor.gaussian_2D(resolution=SIDE, fwhm=1.2 / FINE_ARCSEC, position=[0.0, 0.0])
-    fwhm_px = 2.3548 * float(np.sqrt(moments(round_spot[None])[1][0, 0, 0]))
-    sky = grid([-5.0, 1.0], fwhm_px, FINE_ARCSEC * SIDE / (SIDE - 1))
-    same_kernels(theirs.swapaxes(1, 2)[:, ::-1, ::-1], sky, NARROW)  # transposed, and opposite

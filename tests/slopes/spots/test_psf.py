@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError
@@ -41,17 +39,6 @@ def test_images_are_those_of_the_simulation(options: dict[str, Any]) -> None:
     assert scale == pytest.approx(1.0, abs=0.05)
     # Cubic splines on eight nodes per pixel.
     assert np.abs(images / scale - expected).max() < 2e-3 * expected.max()
-
-
-@given(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.5, 1e4))
-@settings(max_examples=25, deadline=None)
-def test_flux_and_position(x: float, y: float, flux: float) -> None:
-    psf = PSF.analytic("gaussian", radius_px=8)
-    image = psf.images(np.array([[x, y]]), (24, 24), flux)[0]
-    u = np.arange(24) - 11.5
-    assert image.sum() == pytest.approx(flux, rel=1e-3)
-    assert (image.sum(axis=0) @ u) / flux == pytest.approx(x, abs=2e-3)
-    assert (image.sum(axis=1) @ u) / flux == pytest.approx(y, abs=2e-3)
 
 
 def test_samples_are_normalised_and_not_mine() -> None:
@@ -144,7 +131,3 @@ def test_images_refuse_what_does_not_fit() -> None:
     for positions, options in (([[np.nan, 0]], {}), ([1.0, 2.0, 3.0], {}), ([[0, 0]], {"which": 1})):
         with pytest.raises(InputError):
             psf.images(positions, (8, 8), **options)
-
-
-def test_its_text_is_short() -> None:
-    assert repr(PSF.analytic(radius_px=10.0)) == "PSF(1 of 20.1 x 20.1 px, oversampling 8)"

@@ -93,13 +93,6 @@ def test_dark_images_stay_at_the_rounded_start() -> None:
     np.testing.assert_array_equal(found[0], [0.25, -1.0])
 
 
-def test_inputs_are_not_changed() -> None:
-    images, start = np.ones((5, 8, 8)), np.full((5, 2), 0.4)
-    random_score().apply(images, 10.0, start)
-    assert np.all(images == 1)
-    assert np.all(start == 0.4)
-
-
 def test_starts_at_the_peak() -> None:
     images = np.zeros((5, 8, 8))
     images[:, 2, 5] = 1.0

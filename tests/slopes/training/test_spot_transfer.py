@@ -23,9 +23,7 @@ def images_of(movement_px: float, gain: float, flux_e: float, n: int = 800) -> n
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("movement_px", "gain", "flux_e"), [(0.15, 0.5, 2000.0), (0.3, 2.0, 500.0), (1.0, 1.0, 500.0)]
-)
+@pytest.mark.parametrize(("movement_px", "gain", "flux_e"), [(0.15, 0.5, 2000.0), (1.0, 2.0, 500.0)])
 def test_movement_does_not_bias_the_gain(movement_px: float, gain: float, flux_e: float) -> None:
     found = measure_on_spots(images_of(movement_px, gain, flux_e), rng=np.random.default_rng(1))
     assert found.problem is None

@@ -88,47 +88,6 @@ def test_a_tilt_in_nanometres() -> None:
     np.testing.assert_allclose(by_size.coefficients, found.coefficients)
 
 
-def screens(n: int, edge_points: int = 6) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Draw phases, D = r0, on the edges of LAYOUT's lenslets, and return mean gradients and true modes.
-
-    The phases at all points come from their exact covariance by the structure function of Kolmogorov; a
-    lenslet's mean gradient is the difference of the means along opposite edges. The true modes 2 to 11 are
-    projections of the same screens at points that fill the disk.
-    """
-    corners = (lenslet_outlines(LAYOUT) - pupil_of(LAYOUT).centre_px) / pupil_of(LAYOUT).radius_px
-    nodes, weights = np.polynomial.legendre.leggauss(edge_points)
-    along = 0.5 * (nodes + 1)
-    points = corners[:, :, None] + (np.roll(corners, -1, 1) - corners)[:, :, None] * along[:, None]
-    line = np.linspace(-1, 1, 27)
-    disk = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
-    disk = disk[np.hypot(*disk.T) <= 1]
-    every = np.concatenate([points.reshape(-1, 2), disk])
-    structure = 6.88 * (np.hypot(*(every[:, None] - every).T) / 2) ** (5 / 3)
-    of_one = structure[-1]  # phases relative to the last point's
-    covariance = 0.5 * (of_one[:, None] + of_one - structure)
-    variance, directions = np.linalg.eigh(covariance)
-    root = directions * np.sqrt(np.maximum(variance, 0))
-    phase = np.random.default_rng(5).standard_normal((n, len(every))) @ root.T
-    edges = phase[:, : -len(disk)].reshape(n, len(LAYOUT), 4, edge_points) @ (weights / 2)
-    side = 2 / 7  # in radii; edge 0 is the upper one, 1 the left, 2 the lower, 3 the right
-    gradients = np.stack([edges[..., 3] - edges[..., 1], edges[..., 0] - edges[..., 2]], axis=1) / side
-    modes = np.array([zernike(j, *disk.T) for j in range(1, 12)])
-    true = np.linalg.lstsq(modes.T, phase[:, -len(disk) :].T, rcond=None)[0][1:].T
-    return gradients, true
-
-
-def test_screens_of_turbulence() -> None:
-    gradients, true = screens(2000)
-    found = fit_wavefront(slopes_of(gradients), LAYOUT)
-    fitted = found.coefficients[:, :10] / found.pupil.radius_subapertures
-    # Noll (1976), table IV: variances for D = r0, rad^2. 2000 screens leave 3.2 % of error, one standard
-    # deviation; modes that are not fitted leak in, 6 % of the variance of Z11.
-    noll = [0.448, 0.448, 0.0232, 0.0232, 0.0232, 0.00619, 0.00619, 0.00619, 0.00619, 0.00245]
-    np.testing.assert_allclose(fitted.var(axis=0), noll, rtol=0.15)
-    left = (fitted - true).var(axis=0) / true.var(axis=0)  # screen by screen
-    assert left.max() < 0.08
-
-
 def test_standard_errors_are_those_of_the_scatter() -> None:
     rng = np.random.default_rng(2)
     noise = rng.normal(scale=0.1, size=(4000, 2, len(LAYOUT)))

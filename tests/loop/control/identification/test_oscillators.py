@@ -13,7 +13,6 @@ from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn_controller
 from faintspot.loop.control.identification.loop_delay import DelayFits
 from faintspot.loop.control.identification.open_loop import site_of_loop
-from faintspot.loop.control.identification.oscillators import fitted_oscillators
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
@@ -36,19 +35,7 @@ def _seen(seed: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.slow
-def test_oscillators_and_noise_are_found() -> None:
-    found, noise = fitted_oscillators(_seen(1), _RATE_HZ, 2)
-    assert noise == pytest.approx(np.full(2, _NOISE**2), rel=0.1)
-    for mode in ("tip", "tilt"):
-        of_mode = [each for each in found if each.mode == mode]
-        narrow = min(of_mode, key=lambda each: each.damping)
-        # Its phase is lost within 3 s, which makes 0.1 Hz in 16 s.
-        assert narrow.frequency_hz == pytest.approx(20.0, abs=0.3)
-        assert narrow.rms_px == pytest.approx(_VIBRATION.rms_px, rel=0.4)
-
-
-@pytest.mark.slow
-def test_the_learnt_filter_beats_the_best_integrator() -> None:
+def test_the_vibration_is_found_and_the_learnt_filter_beats_the_best_integrator() -> None:
     plant = LoopPlant(np.eye(2), make_reconstructor(np.eye(2)), 2, 0.01)
     learning, scoring = (
         OpenLoopTelemetry(slopes, np.full(slopes.shape, _NOISE**2), np.ones(slopes.shape))
@@ -56,7 +43,13 @@ def test_the_learnt_filter_beats_the_best_integrator() -> None:
     )
     learnt = learn_controller(KALMAN, plant, learning, _SITE, _RATE_HZ)
     assert learnt.identified is not None
-    assert learnt.identified.oscillators
+    assert learnt.identified.noise_factor == pytest.approx(1.0, rel=0.1)
+    for mode in ("tip", "tilt"):
+        of_mode = [each for each in learnt.identified.oscillators if each.mode == mode]
+        narrow = min(of_mode, key=lambda each: each.damping)
+        # Its phase is lost within 3 s, which makes 0.1 Hz in 16 s.
+        assert narrow.frequency_hz == pytest.approx(20.0, abs=0.3)
+        assert narrow.rms_px == pytest.approx(_VIBRATION.rms_px, rel=0.4)
     gain, plain = plant.best_gain(GAINS, scoring, np.eye(2))
     left = plant.residual(partial(learnt.controller, plant), scoring, np.eye(2))
     # Noise is 0.5 of either, whatever the control; of the rest, the filter leaves at most three quarters.

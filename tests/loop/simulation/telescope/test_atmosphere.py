@@ -4,12 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.loop.simulation.loop_cases import expected_variance, quiet
+from tests.loop.simulation.loop_cases import quiet
 
 from faintspot.base.errors import InputError
 from faintspot.loop.simulation import LoopConfiguration, load_loop
 from faintspot.loop.simulation.telescope.atmosphere import make_atmosphere
-from faintspot.loop.simulation.telescope.pupil import make_pupil
 
 hcipy = pytest.importorskip("hcipy")
 NM_TO_RAD = 2 * np.pi / 500
@@ -37,18 +36,6 @@ def test_structure_function_is_von_karmans() -> None:
     grid = hcipy.CartesianGrid(hcipy.UnstructuredCoords((separations * 0.05, np.zeros(6))))
     expected = np.array(hcipy.phase_structure_function_von_karman(0.15, 25.0)(grid))
     np.testing.assert_allclose(np.mean(measured, axis=0), expected, rtol=0.05)
-
-
-@pytest.mark.slow
-def test_variance_over_the_pupil_is_nolls_with_an_outer_scale() -> None:
-    """The mean of 8 realisations, 12 places in each: within 20 %, as large structures are few."""
-    pupil = make_pupil(quiet())
-    variances = []
-    for realisation in range(8):
-        atmosphere = make_atmosphere(quiet(), 6, realisation)
-        variances += [(pupil.rms(atmosphere.wavefront_nm(t)) * NM_TO_RAD) ** 2 for t in range(0, 60, 5)]
-    expected = expected_variance(pupil.amplitude, pupil.spacing_m, 0.15, 25.0)
-    assert np.mean(variances) == pytest.approx(expected, rel=0.2)
 
 
 def test_small_structures_survive_the_interpolation() -> None:

@@ -41,25 +41,6 @@ def test_strehl_is_the_peak_of_a_fraunhofer_propagation(random_wavefront: np.nda
     assert pupil.strehl(field) == pytest.approx(padded[0, 0] / flat[0, 0], rel=1e-4)
 
 
-def test_strehl_agrees_with_hcipy(random_wavefront: np.ndarray) -> None:
-    import hcipy
-
-    pupil = make_pupil(quiet())
-    grid = hcipy.make_pupil_grid(84, 4.2)
-    focal = hcipy.make_focal_grid(4, 4, spatial_resolution=WAVELENGTH_M / 4.2)
-    propagator = hcipy.FraunhoferPropagator(grid, focal)
-    phase = random_wavefront.ravel() * (2e-9 * np.pi / WAVELENGTH_M)
-
-    def power(field: np.ndarray) -> np.ndarray:
-        return np.asarray(propagator(hcipy.Wavefront(hcipy.Field(field, grid), WAVELENGTH_M)).power)
-
-    amplitude = pupil.amplitude.ravel().astype(complex)
-    aberrated, flat = power(amplitude * np.exp(1j * phase)), power(amplitude)
-    axis = int(np.argmax(flat))
-    field = pupil.field(random_wavefront, WAVELENGTH_M)
-    assert pupil.strehl(field) == pytest.approx(aberrated[axis] / flat[axis], rel=1e-3)
-
-
 def test_marechal() -> None:
     pupil = make_pupil(quiet())
     rng = np.random.default_rng(2)

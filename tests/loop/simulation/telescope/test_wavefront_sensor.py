@@ -80,12 +80,6 @@ def test_noise_free_slopes_are_mean_gradients(sensor: ShackHartmann) -> None:
     assert np.std(seen - gain * true) < 0.02 * true.std()
 
 
-def test_turbulence_speckles_the_spots(sensor: ShackHartmann) -> None:
-    wavefront = make_atmosphere(quiet(), 1).wavefront_nm(0.0)
-    brightest, flat = (sensor.spots(each).max(axis=(1, 2)) for each in (wavefront, FLAT))
-    assert brightest.mean() < 0.7 * flat.mean()
-
-
 def test_spots_are_as_long_as_asked() -> None:
     """Three times the 0.886 lambda / d of a lenslet, within 8 %: widths add in quadrature but roughly."""
     configuration = load_loop("elongated_3e")

@@ -96,22 +96,6 @@ def test_near_the_best_of_a_search(cell: Cell) -> None:
         assert found < 1.10 * plain.min(), method
 
 
-def test_strength_grows_with_read_noise_and_with_flux_in_the_wings() -> None:
-    common: dict[str, Any] = {"pixels": 256, "spot_fwhm_px": 1.772}
-    noise = automatic_strength(1000.0, [0.1, 0.3, 1.0, 3.0, 10.0], **common)
-    assert (np.diff(noise) > 0).all()
-    flux = automatic_strength([30.0, 100.0, 1000.0, 1e4], 0.1, **common)
-    assert (np.diff(flux) > 0).all()
-    without_wings = automatic_strength([30.0, 100.0, 1000.0, 1e4], 0.1, profile="gaussian", **common)
-    assert (without_wings < flux).all()
-
-
-def test_strength_is_below_the_noise_of_a_mean_pixel_where_flux_is_plenty() -> None:
-    for profile in PROFILES:
-        strength = automatic_strength(2000.0, 3.0, pixels=256, spot_fwhm_px=2.0, profile=profile)
-        assert 1.0 < strength < np.sqrt(9.0 + 2000.0 / 256)
-
-
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("method", METHODS)
 def test_kept_pixels_grow_with_contrast_and_with_the_spot(profile: str, method: str) -> None:
@@ -121,13 +105,6 @@ def test_kept_pixels_grow_with_contrast_and_with_the_spot(profile: str, method: 
     assert brighter[-1] > brighter[0]
     larger = automatic_kept_pixels(1e4, 3.0, spot_fwhm_px=[1.5, 2.0, 3.0, 4.0], **common)
     assert (np.diff(larger) > 0).all()
-
-
-def test_more_pixels_after_denoising_than_without_where_noise_is_large() -> None:
-    arguments: dict[str, Any] = {"pixels": 256, "spot_fwhm_px": 1.772}
-    kept = {method: automatic_kept_pixels(400.0, 10.0, method=method, **arguments) for method in METHODS}
-    assert kept["none"] < kept["tv"]
-    assert kept["none"] < kept["smoothed"]
 
 
 def test_without_flux_nothing_is_denoised_and_nearly_all_pixels_are_kept() -> None:
@@ -164,38 +141,23 @@ def test_every_argument_broadcasts() -> None:
             assert function(**good | {name: [value, value, value]}).shape == (3,)
 
 
-@given(
-    flux=st.floats(0, 1e6),
-    read_noise=st.floats(0, 100),
-    side=st.integers(2, 64),
-    fwhm=st.floats(0.05, 30),
-    elongation=st.floats(1, 10),
-    excess=st.sampled_from([1.0, 2.0]),
-    background=st.floats(0, 1e4),
-    position_range=st.floats(0.01, 32),
-    profile=st.sampled_from(PROFILES),
-)
-def test_bounds_over_the_whole_space(
-    flux: float,
-    read_noise: float,
-    side: int,
-    fwhm: float,
-    elongation: float,
-    excess: float,
-    background: float,
-    position_range: float,
-    profile: str,
-) -> None:
-    about: dict[str, Any] = {
-        "pixels": side**2,
-        "spot_fwhm_px": fwhm,
-        "elongation": elongation,
-        "excess_noise": excess,
-        "background_e": background,
-        "position_range_px": position_range,
-        "profile": profile,
+ABOUT = st.fixed_dictionaries(
+    {
+        "pixels": st.integers(2, 64).map(lambda side: side**2),
+        "spot_fwhm_px": st.floats(0.05, 30),
+        "elongation": st.floats(1, 10),
+        "excess_noise": st.sampled_from([1.0, 2.0]),
+        "background_e": st.floats(0, 1e4),
+        "position_range_px": st.floats(0.01, 32),
+        "profile": st.sampled_from(PROFILES),
     }
-    noise = np.sqrt(read_noise**2 + excess * (background + flux / side**2) + 1e-4)
+)
+
+
+@given(st.floats(0, 1e6), st.floats(0, 100), ABOUT)
+def test_bounds_over_the_whole_space(flux: float, read_noise: float, about: dict[str, Any]) -> None:
+    photons = about["background_e"] + flux / about["pixels"]
+    noise = np.sqrt(read_noise**2 + about["excess_noise"] * photons + 1e-4)
     strength = automatic_strength(flux, read_noise, **about)
     assert np.isfinite(strength)
     assert 0 <= strength <= 2 * noise
@@ -205,7 +167,7 @@ def test_bounds_over_the_whole_space(
     for method in METHODS:
         kept = automatic_kept_pixels(flux, read_noise, method=method, **about)
         assert kept.dtype == np.int64
-        assert 1 <= kept <= side**2 - 1
+        assert 1 <= kept <= about["pixels"] - 1
 
 
 @pytest.mark.parametrize(

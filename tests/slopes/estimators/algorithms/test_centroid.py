@@ -26,15 +26,6 @@ def test_equals_oracle(dtype: Any, stack: Any) -> None:
     assert np.allclose(result, expected, rtol=0, atol=30 * np.finfo(dtype).eps * max(stack.shape[1:]))
 
 
-def test_single_pixels() -> None:
-    g = np.zeros((20, 4, 5))
-    places = [(y, x) for y in range(4) for x in range(5)]
-    for i, (y, x) in enumerate(places):
-        g[i, y, x] = 7.0
-    expected = [(x - 2.0, y - 1.5) for y, x in places]
-    assert np.allclose(fs.centre_of_gravity(g), expected, rtol=1e-15)
-
-
 @every_dtype
 @pytest.mark.parametrize("value", [0.0, -1.0, -1e-44])
 def test_without_flux(dtype: Any, value: float) -> None:
@@ -78,13 +69,6 @@ def test_leading_shapes(leading: tuple[int, ...]) -> None:
     assert np.array_equal(g, copy)
     for index in np.ndindex(leading):
         assert np.array_equal(result[index], fs.centre_of_gravity(g[index]))
-
-
-def test_company() -> None:
-    g = np.random.default_rng(2).random((1000, 3, 7)).astype(np.float32)
-    whole = fs.centre_of_gravity(g)
-    order = np.random.default_rng(3).permutation(1000)[:77]
-    assert np.array_equal(fs.centre_of_gravity(g[order]), whole[order])
 
 
 def test_lists_and_integers() -> None:

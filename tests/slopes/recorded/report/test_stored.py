@@ -176,7 +176,7 @@ def measured(folder: Path, name: str, **options: Any) -> Path:
     configured = folder / f"{name}.toml"
     for item in (layout, Settings(estimator=name, **options), Calibration(read_noise_e=0.3)):
         configuration.save(configured, item)
-    if name in ("matched", "ml", "map"):
+    if name == "ml":
         psf = PSF.analytic("diffraction", size=1.0)
         configuration.save(configured, PSF(psf.samples, psf.oversampling))
     if name == "trained":
@@ -194,12 +194,8 @@ def small_score() -> TrainedScore:
     ("name", "options"),
     [
         ("brightest", {}),
-        ("smoothed", {}),
         ("thresholded", {"threshold_e": 0.5}),
-        ("weighted", {"spot_fwhm_px": 2.0}),
-        ("matched", {}),
         ("ml", {}),
-        ("map", {}),
         ("trained", {}),
     ],
 )
