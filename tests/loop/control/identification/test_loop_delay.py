@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.loop.control.control_cases import FRAME_S, INTERACTION, LAYERS, PLANT, TURBULENCE, telemetry
+from tests.loop.control.frozen_flow import frozen_slopes
 from tests.loop.telemetry.loop_cases import AIR, RATE_HZ, recorded
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.loop_delay import DelayFits, LoopDelay, with_axes
+from faintspot.loop.control.reconstructor import make_reconstructor
 
 
 def found(delay: int, gain: float, given: float | None = None, frames: int | None = None) -> LoopDelay:
@@ -61,3 +65,28 @@ def test_gains_of_x_and_y(of_x: float, of_y: float) -> None:
     assert abs(seen.measured_x_to_y - of_x / of_y) < 3 * seen.x_to_y_error < 0.5
     np.testing.assert_allclose(seen.gains(9), gains, rtol=0.15)
     assert (seen.x_to_y == 1.0) == (of_x == of_y)
+
+
+@pytest.mark.slow
+def test_gain_of_a_large_sensor() -> None:
+    """156 sub-apertures at 500 frames/s, within three errors. The mirror corrects large modes only; with 40
+    sub-apertures apart from each other, what is between them looked like those, and the gain was 0.2.
+    """
+    rate_hz, gain, frames, rng = 500.0, 0.7, 2000, np.random.default_rng(7)
+    rows, columns = np.mgrid[:14, :14] - 6.5
+    cells = np.argwhere(np.hypot(rows, columns) < 7) - 6.5
+    air = replace(AIR, positions_m=cells[:, ::-1] * AIR.subaperture_m)
+    turbulence = frozen_slopes(air, frames, rate_hz, rng)
+    noise = rng.normal(0, turbulence.std(), turbulence.shape)
+    corners = np.unique((cells[:, None] + np.argwhere(np.ones((2, 2))) - 0.5).reshape(-1, 2), axis=0)
+    apart = corners - cells[:, None]
+    beside = (np.abs(apart) < 1).all(axis=2)
+    matrix = np.vstack([beside * np.sign(apart[..., axis]) / 2 for axis in (1, 0)])
+    inverse = make_reconstructor(matrix).matrix
+    slopes, commands = np.zeros_like(turbulence), np.zeros((frames, matrix.shape[1]))
+    for frame in range(2, frames):
+        slopes[frame] = gain * (turbulence[frame] + matrix @ commands[frame - 2]) + noise[frame]
+        commands[frame] = 0.99 * commands[frame - 1] - 0.3 * inverse @ slopes[frame]
+    context = slopes[100:], commands[100:] @ matrix.T, np.zeros(frames - 100, np.int64), air, rate_hz
+    seen = DelayFits(*context).of(2.0)
+    assert abs(seen.gain - gain) < 3 * seen.gain_error

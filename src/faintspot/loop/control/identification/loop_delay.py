@@ -20,8 +20,8 @@ from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 
-_WINDOW = 128  # frames
-_FEWEST_PIECES = 8
+_WINDOW, _WINDOW_S = 128, 0.52  # frames; a longer window if the frame rate is so high that these last longer
+_FEWEST_PIECES, _FEWEST_LONG_PIECES = 8, 12
 _MOST_DELAY = 5
 _STEP = 0.1  # of fractional delays
 GAINS = 0.1, 1.6
@@ -33,7 +33,8 @@ _AXES_ERROR = 0.09  # of the gain of x relative to y, likewise: rms in loops of 
 _SURE = 3.0  # standard errors
 _SPEEDS_M_PER_S = (1.0, 3.0, 6.0, 10.0, 15.0, 22.0, 32.0)
 _DIRECTIONS = 4  # of half a turn: opposite winds have the same spectrum
-_MOST_SUBAPERTURES, _MOST_MODES = 40, 36
+_MOST_SUBAPERTURES, _MOST_MODES = 160, 36
+"""Side by side: in sparse ones structure between them is taken for large modes."""
 _UPDATES, _FEW_UPDATES, _POWER = 60, 15, 0.9
 _BATCH = 64  # pieces at a time
 _INDEPENDENT = 0.55  # part of half-overlapping pieces
@@ -113,10 +114,11 @@ class DelayFits:
                 f"recording: expected {FEWEST_SUBAPERTURES} sub-apertures or more, as vibrations hide it in "
                 f"tip and tilt, got {n}"
             )
-        kept = np.arange(n)[:: math.ceil(n / _MOST_SUBAPERTURES)]
+        apart = np.hypot(*(site.positions_m - site.positions_m.mean(axis=0)).T)
+        kept = np.sort(np.argsort(apart, kind="stable")[:_MOST_SUBAPERTURES])
         columns = np.concatenate([kept, kept + n])
         site = replace(site, positions_m=site.positions_m[kept])
-        window = np.hanning(_WINDOW + 2)[1:-1]
+        window = np.hanning(_window_length(run, rate_hz) + 2)[1:-1]
         window /= np.linalg.norm(window)
         basis = _modes(site, axis)
         slopes, sent = ((values - values.mean(axis=0))[:, columns] @ basis for values in (slopes_px, sent_px))
@@ -238,6 +240,14 @@ def _modes(site: SlopeTurbulence, axis: int | None) -> Floats:
     vectors = np.linalg.eigh(without @ covariance @ without)[1][:, ::-1][:, :modes]
     most = _MOST_MODES * modes // (2 * n - 2)
     return np.asarray(vectors[:, np.unique(np.geomspace(1, modes, most).astype(int)) - 1])
+
+
+def _window_length(run: NDArray[np.int64], rate_hz: float) -> int:
+    """Return the number of frames of a piece: more at high frame rates, as turbulence is slow then."""
+    length, longest = _WINDOW, int(np.bincount(run - run.min()).max())
+    while 2 * length <= _WINDOW_S * rate_hz and (_FEWEST_LONG_PIECES + 1) * length <= longest:
+        length *= 2
+    return length
 
 
 def _products(slopes: Floats, sent: Floats, run: NDArray[np.int64], window: Floats) -> tuple[Floats, int]:
