@@ -71,6 +71,13 @@ class WorkerPool:
         For a number of workers that is no whole number from 0.
     MissingExtraError
         For a scheduler where Dask is not installed.
+
+    Examples
+    --------
+    >>> from faintspot.experiments import WorkerPool
+    >>> pool = WorkerPool(workers=2, announce=print)
+    >>> pool.say("scoring")
+    scoring
     """
 
     workers: int | None = None
