@@ -32,7 +32,7 @@ def slopes_of(frame: int) -> Slopes:
 
 def write(ring: TelemetryRing, frame: int) -> None:
     """Write the record of a frame."""
-    ring.write(frame, frame % 2, frame // 10, 1000 * frame + 7, 1000 * frame + 507, slopes_of(frame))
+    ring.write(frame, frame % 2, frame // 10, 10**6 * frame + 7, 10**6 * frame + 507, slopes_of(frame))
 
 
 def write_images(ring: TelemetryRing, frame: int) -> None:
@@ -45,7 +45,7 @@ def as_written(items: Any) -> bool:
     """Whether records (structured, or `Telemetry`) hold what `write` writes; none is torn."""
     frames = [int(frame) for frame in items["frame"]]
     right = [items["method"], items["change"], items["last_row_time_ns"], items["published_time_ns"]]
-    expected = [[f % 2, f // 10, 1000 * f + 7, 1000 * f + 507] for f in frames]
+    expected = [[f % 2, f // 10, 10**6 * f + 7, 10**6 * f + 507] for f in frames]
     scalars = np.array_equal(np.stack(right, axis=-1), np.array(expected).reshape(-1, 4))
     names = [name for name in FIELDS if name != "bad_pixels"]
     return scalars and all(
