@@ -74,7 +74,7 @@ def test_gain_of_a_large_sensor() -> None:
     """
     rate_hz, gain, frames, rng = 500.0, 0.7, 2000, np.random.default_rng(7)
     rows, columns = np.mgrid[:14, :14] - 6.5
-    cells = np.argwhere(np.hypot(rows, columns) < 7) - 6.5
+    cells = np.argwhere(np.hypot(rows, columns) < 7).astype(np.float64) - 6.5
     air = replace(AIR, positions_m=cells[:, ::-1] * AIR.subaperture_m)
     turbulence = frozen_slopes(air, frames, rate_hz, rng)
     noise = rng.normal(0, turbulence.std(), turbulence.shape)

@@ -29,7 +29,7 @@ class Denoised(NamedTuple):
     >>> images, _ = fs.slopes.simulate.subapertures(100, flux_e=60.0, rng=np.random.default_rng(1))
     >>> result = fs.tv_denoise(images, 0.4, full_output=True)
     >>> result.images.shape, int(result.iterations.max()), int(result.infeasible.sum())
-    ((100, 16, 16), 24, 0)
+    ((100, 16, 16), 168, 0)
     """
 
     images: NDArray[Any]
