@@ -106,7 +106,7 @@ def engine_and_telescope(
                 break
             time.sleep(0.2)
         first = ["chrt", "-f", str(priority)] if priority else []
-        run = [*first, *_COMMAND, "telescope", "run", str(loop), "--name", name, *telescope]
+        run = [*first, *_COMMAND, "telescope", str(loop), "--name", name, *telescope]
         started.append(subprocess.Popen(run, **quiet))
         yield Processes(name, *started), started[1]
     finally:

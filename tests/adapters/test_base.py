@@ -194,10 +194,10 @@ def test_what_a_tools_file_says(tmp_path: Path) -> None:
         "calibration": {"dark": 3.0},
     }
     for source in (path, str(path), tables):
-        settings, calibration, psf, score = parts_of(source)
-        assert (settings.estimator.name, settings.flux_e, calibration.dark) == ("window", 40.0, 3.0)
-        assert psf is None
-        assert score is None
+        parts = parts_of(source)
+        assert parts.settings == Settings("window", flux_e=40.0, spot_fwhm_px=2.0)
+        assert parts.calibration.dark == 3.0
+        assert parts.spot == {"psf": None, "score": None}
     with pytest.raises(InputError, match="layuot"):
         parts_of({**tables, "layuot": {}})
     with pytest.raises(InputError, match="faintspot: calibration"):

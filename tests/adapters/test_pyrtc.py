@@ -88,7 +88,7 @@ def test_predicted_slopes_come_by_a_stream() -> None:
     errors = []
     for stream in (Stream(true.ravel(), 0), Stream(true.ravel(), 1)):
         own = measuring("map", input_streams={"predicted": "name"})
-        own.parts = own.parts._replace(settings=own.parts.settings.replace(flux_e=5.0, prior_std_px=0.1))
+        own.parts.settings = own.parts.settings.replace(flux_e=5.0, prior_std_px=0.1)
         errors.append(np.std(own.maps(process(), frame, lambda name, stream=stream: stream) - true))
     assert errors[1] < 0.3 * errors[0]
     own = measuring("map", input_streams={"predicted": "name"})

@@ -106,16 +106,3 @@ def test_bad_reference(folder: Path, run: Commands, reference: Any) -> None:
     np.save("r.npy", reference)
     run.refused("slopes", "a.npy", "--reference", "r.npy", naming=("r.npy", "reference"))
     run.refused("slopes", "a.npy", "--reference", "nix.npy", naming=("nix.npy", "no such file"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "naming"),
-    [
-        ([], ("FRAMES", "--help")),
-        (["a.npy", "--nix"], ("--nix",)),
-        (["a.npy", "--threads", "0"], ("--threads", "0")),
-        (["a.npy", "--block", "many"], ("--block", "many")),
-    ],
-)
-def test_usage(folder: Path, run: Commands, arguments: list[str], naming: tuple[str, ...]) -> None:
-    run.refused("slopes", *arguments, naming=naming)

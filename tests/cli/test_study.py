@@ -47,28 +47,26 @@ def test_estimators(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
 
 def test_run(folder: Path, run: Commands) -> None:
     Path("my-study.toml").write_text(SMALL)
-    first = run.ok("study", "run", "my-study.toml", "--workers", 0)
+    first = run.ok("study", "my-study.toml", "--workers", 0)
     assert "2 of them in this run" in first.out
     assert "faintspot report my-study.zarr" in first.out
     assert "400/400" in first.err
     assert open_study("my-study.zarr")["done"].all()
-    again = run.ok("study", "run", "my-study.toml", "-o", "my-study.zarr", "--workers", 0)
+    again = run.ok("study", "my-study.toml", "-o", "my-study.zarr", "--workers", 0)
     assert "complete already" in again.out
     Path("my-study.toml").write_text(SMALL.replace("200", "300"))
-    refused = run.refused(
-        "study", "run", "my-study.toml", "--workers", 0, naming=("another study", "--overwrite")
-    )
+    refused = run.refused("study", "my-study.toml", "--workers", 0, naming=("another study", "--overwrite"))
     assert "'small'" in refused.error
-    run.ok("study", "run", "my-study.toml", "--workers", 0, "--overwrite")
+    run.ok("study", "my-study.toml", "--workers", 0, "--overwrite")
     assert open_study("my-study.zarr").attrs["n"] == 300
 
 
 def test_bad_input(folder: Path, run: Commands) -> None:
-    run.refused("study", "run", "nothing.toml", naming=("nothing.toml", "no such file"))
+    run.refused("study", "nothing.toml", naming=("nothing.toml", "no such file"))
     Path("bad.toml").write_text(SMALL + "read_noise_e = -1\n")
-    run.refused("study", "run", "bad.toml", naming=("bad.toml", "read_noise_e = -1"))
+    run.refused("study", "bad.toml", naming=("bad.toml", "read_noise_e = -1"))
     Path("bad.toml").write_text(SMALL + "sizes = 1\n")
-    run.refused("study", "run", "bad.toml", naming=("did you mean size",))
+    run.refused("study", "bad.toml", naming=("did you mean size",))
     run.refused("study", "paper", "--figure", "fig99", naming=("fig99",))
     run.refused("study", "paper", "--workers", -1, naming=("--workers",))
     assert not list(folder.glob("*.zarr"))
@@ -77,7 +75,7 @@ def test_bad_input(folder: Path, run: Commands) -> None:
 def test_killed_and_started_again(folder: Path, run: Commands) -> None:
     Path("slow.toml").write_text(SLOW)
     store = folder / "slow.zarr"
-    process = command_line("study", "run", "slow.toml", "--workers", 0, cwd=folder)
+    process = command_line("study", "slow.toml", "--workers", 0, cwd=folder)
     try:
         end = time.monotonic() + 60
         while len(list(store.glob("done/c/*"))) < 2 and process.poll() is None and time.monotonic() < end:
@@ -88,7 +86,7 @@ def test_killed_and_started_again(folder: Path, run: Commands) -> None:
         process.kill()
         raise
     assert 2 <= int(open_study(store)["done"].sum()) < 12
-    run.ok("study", "run", "slow.toml", "--workers", 0)
+    run.ok("study", "slow.toml", "--workers", 0)
     whole = folder / "whole.zarr"
     uninterrupted(whole)
     found, expected = (
@@ -105,7 +103,7 @@ def test_report_of_a_study(folder: Path, run: Commands) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("jinja2")
     Path("my-study.toml").write_text(SMALL)
-    run.ok("study", "run", "my-study.toml", "--workers", 0)
+    run.ok("study", "my-study.toml", "--workers", 0)
     assert "my-study.html" in run.ok("report", "my-study.zarr").out
     page = (folder / "my-study.html").read_text(encoding="utf-8")
     assert "small" in page

@@ -154,7 +154,7 @@ def test_for_a_loop(run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     )
     question = asked["question"]
     assert isinstance(question, LoopQuestion)
-    assert (question.magnitudes, question.methods) == ((9.0, 13.0), ["tv", "map+kalman"])
+    assert (question.magnitudes, question.methods) == ((9.0, 13.0), ("tv", "map+kalman"))
     assert (question.strehl, question.radius_arcsec) == (0.3, 20.0)
     assert question.configuration.run.seed == 7
     assert question.configuration.camera.magnitude == 12.0

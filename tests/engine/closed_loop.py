@@ -48,14 +48,19 @@ def configured(
 def make_engine(
     name: str, path: Path, control: Control | None, settings: fs.Settings | None = None, **options: Any
 ) -> Engine:
-    layout, written, calibration, psf, score = configuration_file.load_all(path)
+    described = configuration_file.Configuration(path)
     reference = None if control is None else control.reference
 
     def make(each: fs.Settings) -> fs.SlopePipeline:
-        return fs.SlopePipeline(layout, each, calibration, reference, psf=psf, score=score)
+        return fs.SlopePipeline(described.layout, each, described.calibration, reference, **described.spot)
 
     return Engine(
-        name, make, written if settings is None else settings, control=control, images_every=0, **options
+        name,
+        make,
+        described.settings if settings is None else settings,
+        control=control,
+        images_every=0,
+        **options,
     )
 
 

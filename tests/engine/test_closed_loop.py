@@ -41,7 +41,7 @@ def test_the_loop_is_the_simulated_one(sky: Sky, files: tuple[Path, Control]) ->
     drawn otherwise, and the loops part: by 0.005 in the mean Strehl ratio of the rest.
     """
     path, control = files
-    settings = configuration_file.load_all(path).settings
+    settings = configuration_file.Configuration(path).settings
     run = CONFIGURATION.replace("run", frames=FRAMES, settle_frames=10)
     record = simulate_loop(run, [Method("-", settings, gain=control.options.gain)])
     sky.start(make_engine(sky.name, path, control))

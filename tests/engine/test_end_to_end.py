@@ -91,7 +91,7 @@ def test_three_processes(name: str, processes: list[subprocess.Popen[bytes]], tm
     for frame, slopes in captured(name, 30).values():
         assert np.array_equal(slopes, pipeline(frame).vector)
 
-    assert "in effect from frame" in ask(name, "set", "noise_std=2.5", "keep_brightest=5")
+    assert "in effect from frame" in ask(name, "send", "noise_std=2.5", "keep_brightest=5")
     changed = fs.SlopePipeline(
         pipeline.layout, pipeline.settings.replace(noise_std=2.5, keep_brightest=5), pipeline.calibration
     )

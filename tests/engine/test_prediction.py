@@ -92,10 +92,11 @@ def test_predictions_from_a_stream(sky: Sky, files: tuple[Path, Control]) -> Non
         width = np.full(n, 0.2 * np.sqrt(number) if taken else 1.0)
         width[:3] = 1.0  # as the settings say
         widths.append(width)
-    layout, settings, calibration, psf, _ = configuration_file.load_all(path)
+    described = configuration_file.Configuration(path)
     for record, frame, prior, width in zip(sky.records, frames, priors, widths, strict=True):
-        wide = settings.replace(prior_std_px=width)
-        pipeline = fs.SlopePipeline(layout, wide, calibration, control.reference, psf=psf)
+        wide = described.settings.replace(prior_std_px=width)
+        parts = described.layout, wide, described.calibration, control.reference
+        pipeline = fs.SlopePipeline(*parts, psf=described.psf)
         expected = pipeline(frame, prior.astype(np.float32))
         np.testing.assert_array_equal(np.concatenate([record["x"], record["y"]]), expected.vector)
     counters = engine.status()["prediction"]

@@ -83,11 +83,7 @@ def _read_slopes(path: Path) -> None:
 
 def _read_configuration(path: Path) -> None:
     configuration.has(path, "settings")
-    fs.SlopePipeline(**_parts(configuration.load_all(path)))
-
-
-def _parts(parts: configuration.Configuration) -> dict[str, Any]:
-    return parts._asdict()
+    fs.SlopePipeline.from_file(path)
 
 
 def _read_telemetry(path: Path) -> None:

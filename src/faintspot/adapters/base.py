@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, number_between
-from faintspot.base.config.tables import read_tables
 from faintspot.base.errors import InputError
-from faintspot.base.toml_files import check_keys, checked_table
+from faintspot.base.toml_files import check_keys
 from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.pipeline.configuration import Parts
+from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
@@ -98,7 +97,7 @@ def layout_around(centres: ArrayLike, frame_shape: tuple[int, int], side: int) -
     return Layout(frame_shape, (side, side), corners, finite_array("lenslet centres", centres))
 
 
-def parts_of(source: str | Path | Mapping[str, Any]) -> Parts:
+def parts_of(source: str | Path | Mapping[str, Any]) -> Configuration:
     """Return the pipeline's parts from a tool's configuration.
 
     Parameters
@@ -113,14 +112,11 @@ def parts_of(source: str | Path | Mapping[str, Any]) -> Parts:
         When a table or key is unknown, a value is invalid, or a file cannot be read.
     """
     if isinstance(source, str | Path):
-        path, document = Path(source), read_tables(source)
-    elif isinstance(source, Mapping):
+        return Configuration(source)
+    if isinstance(source, Mapping):
         check_keys("faintspot: ", source, _PARTS, what="table")
-        path = Path("faintspot")
-        document = {name: checked_table(f"faintspot: {name}", values) for name, values in source.items()}
-    else:
-        raise InputError(f"faintspot: expected a file or tables of settings, got {type(source).__name__}")
-    return Parts.from_tables(path, document)
+        return Configuration("faintspot", source)
+    raise InputError(f"faintspot: expected a file or tables of settings, got {type(source).__name__}")
 
 
 class AdapterOptions(TypedDict, total=False):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, errors_within
 from faintspot.io.arrays.fits_units import write_images
 from faintspot.io.optional_packages import load_fits
 from faintspot.io.references import read_reference
@@ -71,8 +71,9 @@ def export_fits(
     if path.suffix.lower() != ".fits":
         raise InputError(f"{path}: expected a name ending in .fits")
     load_fits()
-    control = load_control(configuration_file)
-    pipeline = _pipeline(configuration_file, reference, control)
+    described = configuration.Configuration(configuration_file)
+    control = load_control(described)
+    pipeline = _pipeline(described, reference, control)
     images: Images = {"CORNERS": pipeline.layout.corners.astype(np.int32)}
     if control is None or isinstance(pipeline.settings.estimator, Window):
         images |= _weights(pipeline)
@@ -90,19 +91,19 @@ def export_fits(
 
 
 def _pipeline(
-    path: str | Path, reference: ArrayLike | str | Path | None, control: Control | None
+    described: configuration.Configuration,
+    reference: ArrayLike | str | Path | None,
+    control: Control | None,
 ) -> SlopePipeline:
     """Return the pipeline of a configuration file, with the given reference slopes or those of [control]."""
-    layout, settings, calibration, psf, score = configuration.load_all(path)
+    layout, path = described.layout, described.path
     if layout.bin > 1:
         raise InputError(f"{path}: layout.bin = {layout.bin}: expected 1, weights are of the camera's pixels")
     slopes: Any = read_reference(reference) if isinstance(reference, str | Path) else reference
     if slopes is None and control is not None:
         slopes = control.reference
-    try:
-        return SlopePipeline(layout, settings, calibration, slopes, psf=psf, score=score)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    with errors_within(path):
+        return SlopePipeline(layout, described.settings, described.calibration, slopes, **described.spot)
 
 
 def _weights(pipeline: SlopePipeline) -> Images:

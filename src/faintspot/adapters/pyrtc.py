@@ -270,13 +270,13 @@ class _Measuring:
                 f"{width}, got {np.count_nonzero(outside)} that leave it, first row {where // n}, column "
                 f"{where % n}; leave them out, or change sub_ap_offset_x and _y"
             )
-        settings, calibration, psf, score = self.parts
+        parts = self.parts
         return ToolSlopes(
             layout_around(corners + 0.5 * (side - 1), (height, width), side),
-            settings,
-            calibration,
-            psf=psf,
-            score=score,
+            parts.settings,
+            parts.calibration,
+            psf=parts.psf,
+            score=parts.score,
             calibration_flux_e=self.flux_e,
             flux_frames=self.flux_frames,
         )

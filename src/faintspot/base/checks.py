@@ -33,19 +33,18 @@ def real_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray
     try:
         array = _masked_as_nan(value) if np.ma.is_masked(value) else np.asarray(value)
     except (ValueError, TypeError) as error:
-        raise InputError(
-            f"{name}: expected an array of real numbers, got {type(value).__name__} ({error})"
-        ) from None
+        got = f"{type(value).__name__} ({error})"
+        raise InputError(f"expected an array of real numbers, got {got}", name=name) from None
     if array.dtype == np.bool_:
         array = array.astype(np.uint8)
     if array.dtype.kind not in "iuf":
-        raise InputError(f"{name}: expected real numbers, got dtype {array.dtype}")
+        raise InputError(f"expected real numbers, got dtype {array.dtype}", name=name)
     if array.ndim < minimum_dimensions:
         raise InputError(
-            f"{name}: expected at least {minimum_dimensions} dimensions, got shape {array.shape}"
+            f"expected at least {minimum_dimensions} dimensions, got shape {array.shape}", name=name
         )
     if array.size == 0:
-        raise InputError(f"{name}: expected at least one value, got an empty array of shape {array.shape}")
+        raise InputError(f"expected at least one value, got an empty array of shape {array.shape}", name=name)
     return array
 
 
@@ -62,7 +61,8 @@ def finite_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArr
     if array.dtype.kind == "f":
         bad = array.size - int(np.count_nonzero(np.isfinite(array)))
         if bad:
-            raise InputError(f"{name}: expected finite numbers, got {bad} NaN or infinite of {array.size}")
+            got = f"{bad} NaN or infinite of {array.size}"
+            raise InputError(f"expected finite numbers, got {got}", name=name)
     return array
 
 
@@ -76,7 +76,8 @@ def image_stack(name: str, value: Any) -> NDArray[np.floating[Any]]:
     limit = LARGEST_FLOAT32 if dtype == np.float32 else LARGEST_FLOAT64
     largest = float(np.max(np.abs(array)))
     if largest > limit:
-        raise InputError(f"{name}: expected magnitudes up to {limit:g} in {np.dtype(dtype)}, got {largest:g}")
+        kind = np.dtype(dtype)
+        raise InputError(f"expected magnitudes up to {limit:g} in {kind}, got {largest:g}", name=name)
     return np.ascontiguousarray(array, dtype=dtype)
 
 
@@ -101,16 +102,18 @@ def numbers_between(
     With `low_open`, `low` itself is not allowed. True and False are no numbers.
     """
     if _has_truth_values(value):
-        raise InputError(f"{name} = {value!r}: expected a number, got true or false")
+        raise InputError("expected a number, got true or false", name=name, value=value)
     array = finite_array(name, value)
     wrong = (array <= low) if low_open else (array < low)
     wrong = wrong | (array > high)
     if np.any(wrong):
-        raise InputError(f"{name} = {array[wrong].flat[0]:g}: expected {_range_text(low, high, low_open)}")
+        bad = float(array[wrong].flat[0])
+        raise InputError(f"expected {_range_text(low, high, low_open)}", name=name, value=bad)
     if integer:
         rounded: NDArray[Any] = np.rint(array)
         if np.any(rounded != array):
-            raise InputError(f"{name} = {array[rounded != array].flat[0]:g}: expected a whole number")
+            bad = float(array[rounded != array].flat[0])
+            raise InputError("expected a whole number", name=name, value=bad)
         return rounded.astype(np.int64)
     numbers: NDArray[Any] = array.astype(np.float64)
     return numbers
@@ -131,7 +134,7 @@ def number_between(
     """Return one number within the range, like `numbers_between`; as float (exact for whole numbers)."""
     array = numbers_between(name, value, low, high, **kind)
     if array.ndim:
-        raise InputError(f"{name}: expected one number, got an array of shape {array.shape}")
+        raise InputError(f"expected one number, got an array of shape {array.shape}", name=name)
     return float(array)
 
 
@@ -140,16 +143,14 @@ def increasing(name: str, value: Any, count: int, *, integer: bool = False) -> N
     array = numbers_between(name, value, *(_WHOLE if integer else ()), integer=integer)
     is_column = array.size == count == max(array.shape, default=0)
     if not is_column or (np.diff(array.ravel()) <= 0).any():
-        raise InputError(f"{name}: expected {count} increasing numbers, got shape {array.shape}")
+        raise InputError(f"expected {count} increasing numbers, got shape {array.shape}", name=name)
     return array.ravel()
 
 
 def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
     """Return `value` if it is one of the names in `choices`."""
     if not isinstance(value, str) or value not in choices:
-        raise InputError(
-            f"{name} = {value!r}: expected one of {', '.join(repr(choice) for choice in choices)}"
-        )
+        raise InputError(f"expected one of {', '.join(map(repr, choices))}", name=name, value=value)
     return value
 
 
@@ -166,7 +167,7 @@ def strings_of(name: str, value: Any) -> tuple[str, ...]:
         or not isinstance(value, Sequence)
         or not all(isinstance(v, str) for v in value)
     ):
-        raise InputError(f"{name} = {value!r}: expected a list of texts")
+        raise InputError("expected a list of texts", name=name, value=value)
     return tuple(value)
 
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import check_regular, write_atomically
 from faintspot.base.sizes import check_bytes
 
@@ -118,10 +118,8 @@ class NpzFile:
         version = values.pop("format", None)
         if cls.FORMAT is not None and (version != cls.FORMAT or set(values) != set(cls._names())):
             raise InputError(f"{path}: expected {cls.WHAT} of format {cls.FORMAT}, got something else")
-        try:
+        with errors_within(path):
             return cls(**{name: _restored(value) for name, value in values.items()})
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
 
     @classmethod
     def _names(cls) -> tuple[str, ...]:

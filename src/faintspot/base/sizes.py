@@ -39,10 +39,8 @@ def check_size(
         If it is larger.
     """
     if math.prod(sides) > most:
-        shape = " x ".join(str(side) for side in sides)
-        raise InputError(
-            f"{name} = {shape}: expected at most {most:,} {what or 'numbers'}{hint and f'; {hint}'}"
-        )
+        name = f"{name} = {' x '.join(map(str, sides))}"
+        raise InputError(f"expected at most {most:,} {what or 'numbers'}{hint and f'; {hint}'}", name=name)
 
 
 def check_bytes(name: object, total: int, most: int, what: str) -> None:

@@ -87,7 +87,7 @@ def check_keys(
         check_known(prefix, key, known, what)
     for key in required:
         if key not in table:
-            raise InputError(f"{prefix}{key}: expected a value, found none")
+            raise InputError("expected a value, found none", name=f"{prefix}{key}")
 
 
 def check_known(prefix: str, name: str, known: Iterable[str], what: str = "key") -> None:
@@ -102,7 +102,7 @@ def check_known(prefix: str, name: str, known: Iterable[str], what: str = "key")
     if name not in names:
         close = difflib.get_close_matches(name, names, 1)
         hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(names)}"
-        raise InputError(f"{prefix}{name}: unknown {what}; {hint}")
+        raise InputError(f"unknown {what}; {hint}", name=f"{prefix}{name}")
 
 
 def checked_table(where: str, value: Any) -> dict[str, Any]:

@@ -13,13 +13,12 @@ import click
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.version import __version__
-from faintspot.cli.shared.commands import Group
 
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
     "doctor": "Show versions, extras and processor, and how to add what is missing.",
     "estimators": "List the estimators, or the options of one.",
-    "export": "Write weights and matrices as FITS for other controllers.",
+    "export": "Write weights and matrices, or telemetry, as FITS for other software.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
     "live": "Show a running engine, or a recording, as a web page.",
     "loop": "Compare methods in a simulated closed loop, and recommend one.",
@@ -52,16 +51,12 @@ class _Interrupted(Exception):
     """Ctrl-C, under a name that click does not print anything for."""
 
 
-class _LazyGroup(Group):
+class _LazyGroup(click.Group):
     """Imports a command's module only when it is used, so that --help answers at once."""
-
-    def list_commands(self, context: click.Context) -> list[str]:
-        """Return the names of all commands."""
-        return list(_COMMANDS)
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
         """Import one command."""
-        if name not in _COMMANDS:
+        if name not in self.commands:
             return None
         try:
             command: click.Command = import_module(module_of(name)).command
@@ -79,13 +74,15 @@ class _LazyGroup(Group):
         except KeyboardInterrupt:
             raise _Interrupted from None
 
-    def summary(self, context: click.Context, name: str) -> str:
-        """Return a command's line without importing it."""
-        return _COMMANDS[name]
+    def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, listed.short_help or "") for name, listed in self.commands.items()])
 
 
 @click.group(
     cls=_LazyGroup,
+    commands={name: click.Command(name, short_help=text) for name, text in _COMMANDS.items()},
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )

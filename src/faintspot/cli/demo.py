@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from faintspot.slopes.recorded.statistics import MeasuredSlopes
 
 
-@click.command(short_help="Simulate a faint star, measure it with and without denoising, and write a report.")
+@click.command()
 @option("--output", "-o", default="faintspot-demo", help="Folder for what it makes.")
 @option("--frames", type=click.IntRange(20), default=600, help="Frames at each flux.")
 @option("--seed", type=click.IntRange(0), default=2015, help="Seed of the simulation.")

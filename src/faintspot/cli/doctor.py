@@ -32,7 +32,7 @@ class Finding:
     """Advice, in one line; None where nothing is missing."""
 
 
-@click.command(short_help="Show versions, extras and processor, and how to add what is missing.")
+@click.command()
 @option("--json", "as_json", is_flag=True, help="As JSON: name, value and advice of each finding.")
 def command(as_json: bool) -> None:
     """Show versions, extras and processor, and how to add what is missing.

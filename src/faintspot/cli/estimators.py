@@ -8,7 +8,7 @@ from faintspot.slopes.estimators.documentation import allowed_in_words, needs_in
 from faintspot.slopes.estimators.registry import estimator_named, estimators
 
 
-@click.command(short_help="List the estimators, or the options of one.")
+@click.command()
 @click.argument("name", required=False)
 def command(name: str | None) -> None:
     """List all estimators, those of installed packages included, or the options of the named one.

@@ -17,7 +17,7 @@ from faintspot.loop.simulation.files import holds_loop_results
 
 
 @needs("report", "matplotlib", "jinja2")
-@click.command(short_help="Make a web page of pictures and tables from slopes, a study, a loop or telemetry.")
+@click.command()
 @click.argument("slopes", nargs=-1, required=True, metavar="SLOPES [OTHER]")
 @option(
     "--output", "-o", metavar="HTML", help="Page to write.", show_default="the first file's name with .html"

@@ -12,7 +12,7 @@ from faintspot.base.config.presets import PRESETS
 from faintspot.base.config.written_changes import parse_changes
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.flags import SubapertureFlag
-from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.commands import NAMES, option
 from faintspot.cli.shared.options import KEY, REFERENCE, configuration_option
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.io.formats.registry import slope_format
@@ -22,7 +22,7 @@ from faintspot.io.stored.slopes_format import UNITS
 from faintspot.slopes.recorded import Summary, measure_recorded
 
 
-@click.command(short_help="Turn recorded frames into slopes.")
+@click.command()
 @click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
 @configuration_option("Layout, settings, calibration.")
 @option(
@@ -58,8 +58,9 @@ from faintspot.slopes.recorded import Summary, measure_recorded
 )
 @option(
     "--keep",
+    type=NAMES,
     metavar="limited,unlike",
-    default="",
+    default=(),
     help="Doubtful slopes that stay valid: limited (at search_range_px, or cut by their window), unlike (all "
     "neighbours).",
     show_default="none",
@@ -83,7 +84,6 @@ def command(
     estimator: str | None,
     changes: tuple[str, ...],
     no_denoise: bool,
-    keep: str,
     **options: Any,
 ) -> None:
     """Turn recorded frames into slopes.
@@ -114,11 +114,9 @@ def command(
         split_location(name)  # refuses what is not there
     changed = {} if estimator is None else {"estimator": estimator}
     changed |= parse_changes(changes) if changes else {}
-    options |= {"keep": [name.strip() for name in keep.split(",") if name.strip()], "changes": changed}
+    options |= {"changes": changed, "denoise": not no_denoise}
     with progress_bar("slopes") as advance:
-        summary = measure_recorded(
-            frames, config, output, denoise=not no_denoise, progress=advance, **options
-        )
+        summary = measure_recorded(frames, config, output, progress=advance, **options)
     for line in describe(summary, output):
         click.echo(line)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from faintspot.base.config.tables import read_tables, save_tables
+from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
 from faintspot.cli.shared.commands import option
@@ -16,15 +16,13 @@ from faintspot.cli.shared.options import KEY, configuration_option
 from faintspot.cli.shared.output import picture_file, write_picture
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.io.frames import open_frames
-from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.recorded.sodium import MOST_FRAMES, sodium_of_frames
-from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.spots.laser_spots import LaserSpots, laser_of
 
 _SAME_PX = 0.05  # nearer centres stay
 
 
-@click.command(short_help="Learn the sodium profile of a laser guide star from frames.")
+@click.command()
 @click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
 @configuration_option("Configuration with [layout] and [laser].")
 @option("--launch-m", type=(float, float), metavar="X Y", help="Launch telescope, for a new [laser].")
@@ -61,14 +59,14 @@ def command(
       faintspot layout frames.fits --pixel-scale-arcsec 0.5 --diameter-m 8
       faintspot sodium frames.fits --launch-m -5 0
     """
-    document = read_tables(config)
-    laser = laser_of(config, document)
+    described = Configuration(config)
+    tables = described.tables
     if launch_m is not None:
-        document["laser"] = {"spot_fwhm_arcsec": 1.0, **document.get("laser", {}), "launch_m": list(launch_m)}
-        laser = LaserSpots.from_table(config, document["laser"])
+        tables["laser"] = {"spot_fwhm_arcsec": 1.0, **tables.get("laser", {}), "launch_m": list(launch_m)}
+    laser = described.laser
     if laser is None:
         raise InputError(f"{config}: expected a table [laser], or --launch-m")
-    layout, calibration = Layout.from_tables(config, document), Calibration.from_tables(config, document)
+    layout, calibration = described.layout, described.calibration
     drawing = picture_file(Path(config), picture, ".sodium.png")
     with open_frames(frames, key=key, time_axis=time_axis) as source, progress_bar("sodium", "steps") as show:
         found = sodium_of_frames(source, layout, calibration, laser, most_frames=most, progress=show)
@@ -76,7 +74,7 @@ def command(
     profile = known.fit.profile
     profile.save(path)
     learnt = {"profile": path.name, "spot_fwhm_arcsec": float(f"{known.spot_fwhm_arcsec:.4g}")}
-    save_tables(config, {"laser": {**document["laser"], **learnt}})
+    save_tables(config, {"laser": {**tables["laser"], **learnt}})
     longest = np.hypot(*known.star.elongation_px(profile).T)
     click.echo(
         f"{path}: mean {profile.mean_m / 1e3:.1f} km, standard deviation {profile.std_m / 1e3:.1f} km; spots "
@@ -86,7 +84,7 @@ def command(
     if found.left_out:
         click.echo(f"  {found.left_out}")
     click.echo(f"  {config}: profile and spot_fwhm_arcsec of [laser] written")
-    if "centres" in document["layout"]:
+    if "centres" in tables["layout"]:
         lattice = found.lattice_of(layout)
         moved = np.abs(lattice.centres - layout.centres).max()
         if moved > _SAME_PX:

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.extras import require, require_linux
 from faintspot.base.files import derived, write_atomically
 from faintspot.base.json_text import to_json
 from faintspot.cli.realtime.record import record_engine, summary
-from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.commands import declared, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import DIAMETER, PIXEL_SCALE, SUBAPERTURE
 from faintspot.cli.shared.progress import progress_bar
+from faintspot.slopes.sensor.layout import OPTICS, Layout
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.recording import Recording
@@ -27,7 +27,7 @@ _SECONDS = 20.0
 
 
 @needs("report", "matplotlib", "jinja2")
-@click.command(short_help="Report noise, turbulence, vibrations and control of a recorded or running loop.")
+@click.command()
 @click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[FILE]")
 @option("--engine", metavar="NAME", help="Record this running engine first; FILE keeps the recording.")
 @option(
@@ -60,9 +60,7 @@ _SECONDS = 20.0
 @option("--one-loop", is_flag=True, help="Report the loop as a whole, although methods alternated.")
 @option("--every", type=float, metavar="SECONDS", help="Turbulence against time as well, in such pieces.")
 @option("--frame-rate-hz", type=float, metavar="HZ", help="Frame rate, of slopes from frames.")
-@PIXEL_SCALE
-@SUBAPERTURE
-@DIAMETER
+@declared(Layout, *OPTICS, sections="Telescope")
 @option("--controller", metavar="NPZ", help="Learn a predictive controller as well, and write it to a file.")
 @option("--output", "-o", metavar="HTML", help="Page to write.", show_default="FILE's or NAME's, with .html")
 def command(
@@ -151,10 +149,8 @@ def command(
     click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
     if controller is not None:
         click.echo("controller ...", err=True)
-        try:
+        with errors_within(f"{controller}: not written, keep the integrator"):
             control = learn(loop) if report.observed is None else learn_observed(report.observed)
-        except InputError as error:
-            raise InputError(f"{controller}: not written, keep the integrator: {error}") from None
         control.save(controller)
         click.echo(f"{controller}: {control.summary()}")
 

@@ -16,87 +16,34 @@ from rich.console import Console
 from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
 from faintspot.cli.layout.options import grid_shape
-from faintspot.cli.shared.commands import SectionedCommand, option
+from faintspot.cli.shared.commands import SectionedCommand, declared, flag_of, option
 from faintspot.cli.shared.needs import suggested_slopes
 from faintspot.cli.shared.options import which_frames
 from faintspot.cli.shared.output import check_target, picture_file, results_table, wrapped, write_picture
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.experiments.planner import text as answer_text
-from faintspot.experiments.planner.question import PROFILES, TABLES, read_camera
+from faintspot.experiments.planner.question import Question, read_camera
 from faintspot.io.frames import open_frames
 from faintspot.slopes.camera.binning import binned, binned_calibration, camera_calibration
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.simulate.photometry import (
-    DEFAULT_BAND,
-    DEFAULT_QUANTUM_EFFICIENCY,
-    DEFAULT_THROUGHPUT,
-    ZERO_POINTS,
-)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rich.table import Table
 
     from faintspot.experiments.planner.answer import Answer
-    from faintspot.experiments.planner.question import Question
 
 _MOST_FRAMES, _MOST_PIXELS = 200, 1 << 26
 _GIVEN = "Sources"
 _MOST_NAMES = 3  # of files that are repeated in the suggested command
 
-# Section; name, type, metavar, help and default of every option that is also a key of the camera file.
-_VALUES: dict[str, tuple[tuple[str, Any, str | None, str, str], ...]] = {
-    "Camera": (
-        ("read_noise_e", float, "E", "Read noise at the camera's output, before the EM gain.", ""),
-        ("gain_e_per_adu", float, "E/ADU", "Electrons per ADU.", "1, or measured in the frames"),
-        ("em_gain", float, "G", "Gain of the multiplication register of an EMCCD.", "1, none"),
-        ("background_e", float, "E", "Electrons of sky and dark current per pixel and frame.", "0"),
-        ("pixels", int, "N", "Side of a sub-aperture's window.", ""),
-        ("pixel_scale_arcsec", float, "ARCSEC", "Side of a pixel on the sky.", ""),
-        ("quantum_efficiency", float, "Q", "Quantum efficiency.", f"{DEFAULT_QUANTUM_EFFICIENCY:g}"),
-    ),
-    "Spots": (
-        ("fwhm_px", float, "PX", "Width (FWHM) of the optical spot.", ""),
-        ("profile", click.Choice(PROFILES), None, "Shape of the spot.", "diffraction (sinc^2)"),
-        ("search_range_px", float, "PX", "Largest slope.", "from the frames, or FWHM / 2"),
-        ("subaperture_m", float, "M", "Side of a sub-aperture in the telescope's pupil.", ""),
-        ("wavelength_nm", float, "NM", "Wavelength of the sensor.", ""),
-        ("r0_m", float, "M", "Fried parameter at 500 nm: decides whether spots are speckled.", ""),
-    ),
-    "Guide star": (
-        ("magnitude", float, "MAG", "Magnitude; needs --subaperture-m and --frame-rate-hz.", ""),
-        ("flux_e", float, "E", "Flux instead: photo-electrons per sub-aperture and frame.", ""),
-        ("band", click.Choice(list(ZERO_POINTS)), None, "Band of the magnitude.", DEFAULT_BAND),
-        ("zero_point", float, "PHOTONS", "Photons/s/m^2 of magnitude 0 in the band.", "that of --band"),
-        ("frame_rate_hz", float, "HZ", "Frame rate.", ""),
-        ("throughput", float, "T", "Of atmosphere, telescope and optics.", f"{DEFAULT_THROUGHPUT:g}"),
-        (
-            "budget",
-            str,
-            "R",
-            "Slope error allowed, such as 0.1 (px), 0.05arcsec: asks for the limiting magnitude.",
-            "",
-        ),
-    ),
-}
+_SECTIONS = {"camera": "Camera", "spot": "Spots", "star": "Guide star", "tune": "Search"}
 
 
-def _values(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of `_VALUES`."""
-    for section, values in reversed(_VALUES.items()):
-        for name, kind, metavar, text, default in reversed(values):
-            shown = {"show_default": default} if default else {}
-            flag = f"--{name.replace('_', '-')}"
-            command = option(flag, name, type=kind, metavar=metavar, help=text, section=section, **shown)(
-                command
-            )
-    return command
-
-
-@click.command(cls=SectionedCommand, short_help="Recommend an estimator and settings.")
+@click.command(cls=SectionedCommand)
 @option("--camera", metavar="TOML", help="File of the values below; options take precedence.", section=_GIVEN)
 @option(
     "--recording", multiple=True, metavar="FILE", help="Recorded frames, to measure the rest.", section=_GIVEN
@@ -117,7 +64,7 @@ def _values(command: Callable[..., Any]) -> Callable[..., Any]:
     help="Rows and columns of lenslets instead of a layout, such as 7x7.",
     section=_GIVEN,
 )
-@_values
+@declared(Question, sections=_SECTIONS)
 @option("--output", "-o", metavar="TOML", default="faintspot.toml", help="Configuration to write.")
 @option("--picture", metavar="PNG", help="Plot to write.", show_default="beside the output, with -tune.png")
 @option("--seed", type=click.IntRange(0), default=1, help="Seed of the simulation.")
@@ -254,10 +201,11 @@ def _sensor(grid: str | None, config: str | None, target: Path, given: dict[str,
     found: dict[str, Any] = {}
     source = config or (str(target) if target.exists() else None)
     if source is not None:
-        calibration: Calibration = configuration.load(source, "calibration")
+        described = configuration.Configuration(source)
+        calibration = described.calibration
         # The target may have no layout yet; a file that was named for its layout must.
-        if config is not None or "[layout" in target.read_text(encoding="utf-8"):
-            found["layout"] = Layout.load(source)
+        if config is not None or "layout" in described:
+            found["layout"] = described.layout
         found["calibration"] = calibration
         default = Calibration()
         if calibration.read_noise_e is not None:
@@ -285,7 +233,6 @@ def _question(
     read: Callable[..., NDArray[Any]],
 ) -> Question:
     """Check what is given, and measure the rest in the frames."""
-    from faintspot.experiments.planner.question import Question
     from faintspot.experiments.planner.recorded import question_from_frames
 
     if dark and not frames:
@@ -297,16 +244,10 @@ def _question(
         darks = read(dark, None) if dark else None
         return question_from_frames(read(frames, key), darks, **given)
     except InputError as error:
-        raise InputError(f"{error}{_where(str(error))}") from None
-
-
-def _where(text: str) -> str:
-    """Return how to give the value that an error begins with."""
-    name = text.replace("=", ":").partition(":")[0].strip()
-    for table, keys in TABLES.items():
-        if name in keys:
-            return f" (--{name.replace('_', '-')}, or {name} in [{table}] of the --camera file)"
-    return ""
+        if (what := Question.declared().get(error.name)) is None:
+            raise
+        hint = f"({flag_of(error.name)}, or {error.name} in [{what.group}] of the --camera file)"
+        raise InputError(f"{error.expected} {hint}", name=error.name, value=error.value) from None
 
 
 def _read(paths: tuple[str, ...], key: str | None, *, time_axis: int | None, factor: int) -> NDArray[Any]:

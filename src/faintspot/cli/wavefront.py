@@ -8,19 +8,19 @@ from typing import Any
 
 import click
 
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.extras import require
-from faintspot.cli.shared.commands import SectionedCommand, option
-from faintspot.cli.shared.options import DIAMETER, PIXEL_SCALE, SUBAPERTURE
+from faintspot.cli.shared.commands import SectionedCommand, declared, option
 from faintspot.cli.shared.output import picture_file, write_picture
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.stored_run import open_run
+from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.wavefront import Wavefront, fit_wavefront, save_wavefront
 from faintspot.slopes.wavefront.files import check_ending
 from faintspot.slopes.wavefront.words import mode_table, remarks, rms_table
 
 
-@click.command(cls=SectionedCommand, short_help="Fit Zernike modes to slopes, and draw the wavefront.")
+@click.command(cls=SectionedCommand)
 @click.argument("slopes", metavar="SLOPES")
 @option(
     "--output",
@@ -37,9 +37,7 @@ from faintspot.slopes.wavefront.words import mode_table, remarks, rms_table
     help="Number of modes, from tip and tilt on.",
     show_default="by the sensor",
 )
-@PIXEL_SCALE
-@SUBAPERTURE
-@DIAMETER
+@declared(Layout, *OPTICS, sections="Telescope")
 def command(
     slopes: str, output: tuple[str, ...], picture: str | None, modes: int | None, **scales: float | None
 ) -> None:
@@ -64,11 +62,9 @@ def command(
         raise InputError(f"{slopes}: expected slopes with their layout ({' '.join(run.notes)})")
     given: dict[str, Any] = {name: value for name, value in scales.items() if value is not None}
     layout = replace(run.layout, **given)
-    try:
+    with errors_within(slopes):
         measured = Slopes.from_variables(run.stored.variables, keep=run.keep)
         wavefront = fit_wavefront(measured, layout, modes=modes)
-    except InputError as error:
-        raise InputError(f"{slopes}: {error}") from None
     _print(wavefront)
     for note in run.notes:
         click.echo(note)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, number_between, one_of
-from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError, errors_within
 from faintspot.base.files import check_regular, output_errors
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.formats.registry import slope_endings, slope_format
@@ -163,10 +163,8 @@ def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
     before = str(stored.attributes.get("unit", "px"))
     if unit == before:
         return stored
-    try:
+    with errors_within(path):
         factor = pixels_in(unit, stored.attributes) / pixels_in(before, stored.attributes)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     variables = scaled_positions(stored.variables, factor)
     return replace(stored, variables=variables, attributes={**stored.attributes, "unit": unit})
 

@@ -32,7 +32,7 @@ def test_reflection_does_not_spoil_settings_and_slopes(
     np.save("a.npy", pixels)
     out = run.ok("layout", "a.npy", "-o", "new.toml").out
     assert ("a map" in out) == (reflection_e > 0)
-    known = configuration.load_all("new.toml")
+    known = configuration.Configuration("new.toml")
     assert float(out.split("flux of a spot ")[1].split()[0]) == pytest.approx(1000.0, rel=0.05)
     assert known.settings.spot_fwhm_px == pytest.approx(4.7, rel=0.05)
     slopes = SlopePipeline(known.layout, known.settings, known.calibration)(pixels)
@@ -50,7 +50,7 @@ def test_defaults_are_as_good_as_a_narrow_centroid_in_eyes(folder: Path, run: Co
     pixels, spots = eye_frame(seed)
     np.save("a.npy", pixels)
     run.ok("layout", "a.npy", "-o", "new.toml")
-    known = configuration.load_all("new.toml")
+    known = configuration.Configuration("new.toml")
     layout = known.layout
     assert known.settings.spot_fwhm_px == pytest.approx(5.0, rel=0.25)
     slopes = SlopePipeline(layout, known.settings, known.calibration)(pixels)
@@ -73,7 +73,7 @@ def test_background_beyond_a_stated_dark_is_reported(folder: Path, run: Commands
     np.save("a.npy", flat_frame(500.0).pixels)
     out = run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "20").out
     assert "ADU beyond the dark" in out
-    known = configuration.load_all("new.toml")
+    known = configuration.Configuration("new.toml")
     assert known.calibration.dark == 20.0
     assert known.settings.spot_fwhm_px == pytest.approx(4.7, rel=0.15)
 

@@ -1,4 +1,4 @@
-"""faintspot realtime control, and what status says of a loop, with an engine in the process of the test."""
+"""faintspot realtime send and status, with an engine in the process of the test."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from faintspot.cli.realtime.control import control
+from faintspot.cli.realtime.control import send, status
 from faintspot.cli.realtime.run import run
-from faintspot.cli.shared.engine_requests import summary
 from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import ControlServer
@@ -29,8 +29,8 @@ pytestmark = pytest.mark.machine_time("starts other processes")
 MATRIX = np.random.default_rng(1).standard_normal((2 * len(LAYOUT), 10))
 
 
-def said(*arguments: str) -> str:
-    result = CliRunner().invoke(control, arguments, standalone_mode=False)
+def said(command: click.Command, *arguments: str) -> str:
+    result = CliRunner().invoke(command, arguments, standalone_mode=False)
     return result.output if result.exception is None else str(result.exception)
 
 
@@ -45,26 +45,40 @@ def bench() -> Iterator[Bench]:
 
 def test_the_loop_by_the_command_line(bench: Bench) -> None:
     name = ["--name", bench.name]
-    assert said("status", *name) == "loop open: integrator, gain 0.4; not closed since the engine began\n"
-    assert said("close", *name).startswith("loop closed: integrator, gain 0.4, slopes of")
-    assert "gain 0.25" in said("gain", *name, "0.25")
-    assert "gain = 2.5: expected a number from 0 to 2" in said("gain", *name, "2.5")
+    began = "loop open: integrator, gain 0.4; not closed since the engine began"
+    assert began in said(status, *name)
+    assert said(send, *name, "loop=close").startswith("loop closed: integrator, gain 0.4, slopes of")
+    assert "gain 0.25" in said(send, *name, "gain=0.25")
+    assert "gain = 2.5: expected a number from 0 to 2" in said(send, *name, "gain=2.5")
     bench.measure(simulated(3))
-    assert "expected it open to flatten the mirror" in said("flat", *name)
-    assert said("open", *name) == "loop open: integrator, gain 0.25; asked to\n"
-    assert said("flat", *name) == said("status", *name)
-    everything = json.loads(said("status", *name, "--json"))
+    assert "expected it open to flatten the mirror" in said(send, *name, "loop=flat")
+    assert said(send, *name, "loop=open") == "loop open: integrator, gain 0.25; asked to\n"
+    assert said(send, *name, "loop=flat").strip() in said(status, *name)
+    everything = json.loads(said(status, *name, "--json"))["loop"]
     assert (everything["state"], everything["commands"]) == ("open", 10)
     assert everything["latency"]["count"] == 3
-    assert "loop open: integrator" in summary(bench.engine.status())
     assert bench.records["commands"].any()
+    assert said(status, *name, "max_bad_fraction") == "max_bad_fraction = 0.25\n"
+    assert "keep_brightest = " in said(status, *name, "all")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (["loop=shut"], "action = 'shut': expected one of"),
+        (["loop=open", "noise_std=1"], "noise_std: unknown name beside loop; known: loop"),
+        (["methods=none,tv", "evry=3"], "evry: unknown name beside methods; did you mean every?"),
+        (["gain=x"], "gain"),
+    ],
+)
+def test_what_send_refuses(bench: Bench, changes: list[str], message: str) -> None:
+    assert message in said(send, "--name", bench.name, *changes)
 
 
 def test_an_engine_without_control() -> None:
     with Bench() as bench, ControlServer(socket_path(bench.name), commands_of(bench.engine)):
-        assert said("status", "--name", bench.name) == "no loop: the engine makes no commands\n"
-        assert "add [control] to its configuration" in said("close", "--name", bench.name)
-        assert "loop" not in summary(bench.engine.status())
+        assert "loop" not in said(status, "--name", bench.name)
+        assert "add [control] to its configuration" in said(send, "--name", bench.name, "loop=close")
 
 
 @pytest.mark.parametrize(

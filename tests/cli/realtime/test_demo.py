@@ -131,7 +131,7 @@ def test_refusals(folder: Path, run: Commands, name: str, monkeypatch: pytest.Mo
         assert naming in refused.error
     with ControlServer(socket_path(name), {"status": lambda fields: {"counters": {}}}):
         run.refused("realtime", "demo", "--name", name, naming=("expected an unused name",))
-    monkeypatch.setattr("faintspot.cli.realtime.demo.present", lambda package: package == "zarr")
+    monkeypatch.setattr("faintspot.base.extras.present", lambda package: package == "zarr")
     wanted = "needs pyshmem and tornado and hcipy: install it with pip install 'faintspot[realtime,loop]'"
     run.refused("realtime", "demo", naming=(wanted,))
     assert [path.name for path in folder.iterdir()] == ["faintspot.toml"]

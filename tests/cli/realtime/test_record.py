@@ -15,7 +15,8 @@ pytest.importorskip("zarr")
 from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written
 
 from faintspot.base.errors import InputError
-from faintspot.cli.realtime.record import export, record
+from faintspot.cli.export import command as export
+from faintspot.cli.realtime.record import record
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
@@ -57,7 +58,9 @@ def test_record_and_export(engine: Engine, tmp_path: Path) -> None:
     telemetry = read_telemetry(store)
     assert as_written(vars(telemetry))
     images = len(telemetry.image_frame)
-    assert f"{file}: 50 frames, {images} images" in said(export, str(store), str(file), "--ao-mode", "GLAO")
+    assert f"{file}: 50 frames, {images} images" in said(
+        export, str(store), "-o", str(file), "--ao-mode", "GLAO"
+    )
     assert aotpy.AOSystem.read_from_file(file).ao_mode == "GLAO"
 
 
@@ -77,5 +80,5 @@ def test_what_cannot_be_done_is_said(engine: Engine, tmp_path: Path) -> None:
     )
     (tmp_path / "there.fits").touch()
     assert "already exists" in refused(record, str(tmp_path / "there.fits"), "--name", name)
-    assert "ends in .fits" in refused(export, str(tmp_path / "a.zarr"), str(tmp_path / "b"))
-    assert "no such file" in refused(export, str(tmp_path / "a.zarr"), str(tmp_path / "b.fits"))
+    assert "ends in .fits" in refused(export, str(tmp_path / "a.zarr"), "-o", str(tmp_path / "b"))
+    assert "no such file" in refused(export, str(tmp_path / "a.zarr"))

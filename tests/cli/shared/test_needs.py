@@ -21,7 +21,7 @@ pytestmark = pytest.mark.machine_time("starts other processes")
 OPTIONAL = sorted({package for packages in EXTRAS.values() for package in packages})
 NEEDING = {
     "report slopes.npz": "report",
-    "study run study.toml": "loop",
+    "study study.toml": "loop",
     "study paper --quick": "loop",
     "study estimators --quick": "loop",
     "loop magnitude --quick": "loop",
@@ -29,7 +29,7 @@ NEEDING = {
     "realtime run": "realtime",
     "realtime bridge stream": "realtime",
     "realtime record night.zarr": "realtime",
-    "realtime export night.zarr night.fits": "realtime",
+    "export night.zarr -o night.fits": "io",
     "slopes frames.npy": "io",
     "slopes frames.npy -o slopes.fits": "io",
     "tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100 -o new.toml --picture tune.png": "report",
@@ -94,7 +94,7 @@ def test_the_rest_is_done_and_what_is_left_out_is_said(tmp_path: Path) -> None:
         "slopes faintspot-demo/frames.npy --config found.toml -o slopes.npz",
         "wavefront slopes.npz -o wavefront.csv",
         "tune --read-noise-e 3 --pixels 8 --fwhm-px 2 --flux-e 1000 -o tuned.toml",
-        "loop list",
+        "loop show",
         "estimators",
     ]
     done = subprocess.run(

@@ -29,7 +29,8 @@ import faintspot
 import faintspot as fs
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
-from faintspot.cli.realtime.telescope import telescope_set, telescope_status
+from faintspot.cli.realtime.control import send
+from faintspot.cli.realtime.control import status as show_status
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
@@ -303,18 +304,19 @@ def test_commands_over_the_socket(watched: Watched, name: str, monkeypatch: pyte
         assert reply["conditions"] == {"photons": 50, "r0_m": [0.1, 0.2], "wind_factor": 1}
         with pytest.raises(InputError, match="changes: expected values by name"):
             request(path, "set", changes=[])
-        said = CliRunner().invoke(telescope_set, ["wind_factor=2", "--name", name])
+        asked = ["--telescope", "--name", name]
+        said = CliRunner().invoke(send, ["--telescope", "wind_factor=2", "--name", name])
         assert "50 photons, r0 0.1 to 0.2 m, winds x 2" in said.output
         wait_for(lambda: request(path, "status")["truth"] is not None)
-        said = CliRunner().invoke(telescope_status, ["--name", name])
+        said = CliRunner().invoke(show_status, asked)
         for text in ("canary", "1000 a second", "is not there", "Strehl ratio 0."):
             assert text in said.output
-        status = json.loads(CliRunner().invoke(telescope_status, ["--name", name, "--json"]).output)
+        status = json.loads(CliRunner().invoke(show_status, [*asked, "--json"]).output)
         assert tuple(status["truth"]) == TRUTH
-    for command, options in ((telescope_set, ["photons=1"]), (telescope_status, [])):
-        refused = CliRunner().invoke(command, [*options, "--name", name])
+    for command, options in ((send, ["photons=1"]), (show_status, [])):
+        refused = CliRunner().invoke(command, [*options, "--telescope", "--name", name])
         assert isinstance(refused.exception, InputError)
-        assert "faintspot realtime telescope run starts one" in str(refused.exception)
+        assert "faintspot realtime telescope starts one" in str(refused.exception)
 
 
 # ---- pace, ends and restarts
@@ -356,7 +358,7 @@ def test_two_of_one_name_and_nothing_left_behind(watched: Watched, name: str) ->
 
 def started(name: str, *options: str) -> subprocess.Popen[str]:
     """Start the command; returns when it has published frames."""
-    code = "from faintspot.cli.realtime.telescope import run; run()"
+    code = "from faintspot.cli.realtime.telescope import telescope; telescope()"
     process = start(code, "canary", "--name", name, "--frame-rate-hz", "100", *options)
     end = time.monotonic() + PATIENCE_S
     while True:
@@ -401,7 +403,7 @@ def test_files_keep_what_else_there_is(tmp_path: Path) -> None:
     path = tmp_path / "faintspot.toml"
     path.write_text('# mine\n[estimator]\nname = "centroid"\n')
     assert write_engine_files(CONFIGURATION, tmp_path) == path
-    known = configuration_file.load_all(path)
+    known = configuration_file.Configuration(path)
     assert known.settings.estimator.name == "centroid"
     assert "# mine" in path.read_text()
     assert known.psf is not None

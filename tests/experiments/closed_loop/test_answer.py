@@ -23,7 +23,7 @@ from faintspot.experiments.closed_loop.answer import LoopAnswer
 from faintspot.experiments.closed_loop.question import MODEL_ERROR, sky_coverage
 from faintspot.experiments.planner.figures import loop_figure
 from faintspot.loop.simulation.configuration.configuration import load_loop
-from faintspot.slopes.pipeline import configuration as configuration_file
+from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.settings import Settings
 
 PAIR = ("brightest", "window")
@@ -166,7 +166,7 @@ def test_saved_settings_and_loop_can_be_loaded(tmp_path: Path) -> None:
     loop = answer.save(target)
     settings = Settings.load(target)
     assert (settings.estimator.name, settings.window_fwhm_px, settings.flux_e) == ("window", 3.0, 100.0)
-    assert configuration_file.load(target, "calibration").read_noise_e == 3.0
+    assert Calibration.load(target).read_noise_e == 3.0
     table = tomllib.loads(target.read_text())["loop"]
     assert (table["method"], table["control"], table["gain"]) == ("window+kalman", "kalman", 0.4)
     assert table["centroid_gain"] == 0.9

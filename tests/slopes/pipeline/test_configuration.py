@@ -190,7 +190,7 @@ def test_the_file_is_not_taken_for_a_table(tmp_path: Path) -> None:
     path = tmp_path / "layout.est.toml"
     path.write_text(SETTINGS)
     with pytest.raises(fs.InputError) as error:
-        configuration.load_all(path)
+        _ = configuration.Configuration(path).layout
     assert str(error.value) == f"{path}: expected a table [layout], found estimator"
 
 
@@ -199,7 +199,8 @@ def test_all_together_and_again(tmp_path: Path) -> None:
     parts = fs.Layout.grid((2, 3), pixels=4), fs.Settings(noise_std=1.0), fs.Calibration(em_gain=500.0)
     for part in (*parts, *parts):
         part.save(path)
-    assert configuration.load_all(path)[:3] == parts
+    described = configuration.Configuration(path)
+    assert (described.layout, described.settings, described.calibration) == parts
     assert path.read_text().count("[estimator]") == 1
     assert "[settings]" not in path.read_text()  # nothing that all estimators share was set
 
@@ -222,7 +223,8 @@ def test_comments_and_other_tables_stay(tmp_path: Path) -> None:
 def test_to_text(tmp_path: Path) -> None:
     parts = fs.Layout.grid((2, 3), pixels=4), fs.Settings(noise_std=1.0)
     path = written(tmp_path, configuration.to_text(*parts))
-    assert configuration.load_all(path)[:2] == parts
+    described = configuration.Configuration(path)
+    assert (described.layout, described.settings) == parts
     assert "map of (3, 4)" in configuration.to_text(fs.Calibration(flat=np.ones((3, 4))))
 
 
@@ -263,14 +265,14 @@ def test_some_subapertures(tmp_path: Path) -> None:
 def test_no_calibration_means_electrons(tmp_path: Path) -> None:
     path = written(tmp_path, LAYOUT + SETTINGS)
     assert fs.Calibration.load(path) == fs.Calibration()
-    assert configuration.load_all(path)[2] == fs.Calibration()
+    assert configuration.Configuration(path).calibration == fs.Calibration()
 
 
 def test_an_estimator_alone_is_enough(tmp_path: Path) -> None:
     path = written(tmp_path, f'{LAYOUT}[estimator]\nname = "brightest"\n')
     assert configuration.has(path, "settings")
     assert not configuration.has(path, "calibration")
-    assert configuration.load_all(path).settings == fs.Settings("brightest")
+    assert configuration.Configuration(path).settings == fs.Settings("brightest")
 
 
 def estimator(text: str) -> str:
@@ -376,7 +378,8 @@ LASER = "[laser]\nlaunch_m = [-5.0, 0.0]\nspot_fwhm_arcsec = 1.2\nmatched_filter
 def test_spots_of_a_laser_guide_star(tmp_path: Path) -> None:
     """Places are from the middle of the pupil; a PSF or weights of their own go before."""
     path = written(tmp_path, SENSOR + WINDOW + LASER)
-    _, _, _, psf, weights = configuration.load_all(path)
+    described = configuration.Configuration(path)
+    psf, weights = described.psf, described.score
     x, y = np.meshgrid(1.3 * (np.arange(4) - 1.5), 1.3 * (np.arange(3) - 1.0))
     places = np.stack([x.ravel(), y.ravel()], axis=1)
     star = fs.LaserGuideStar(places, [-5.0, 0.0], 0.5, fs.PSF.analytic("gaussian", size=1.2))
@@ -387,7 +390,7 @@ def test_spots_of_a_laser_guide_star(tmp_path: Path) -> None:
     assert isinstance(weights, fs.FixedWeights)
     np.testing.assert_allclose(weights.x, matched.x)
     own = written(tmp_path, SENSOR + WINDOW + LASER + '[psf]\nprofile = "gaussian"\n')
-    psf = configuration.load_all(own).psf
+    psf = configuration.Configuration(own).psf
     assert psf is not None
     assert len(psf.samples) == 1
 
@@ -406,4 +409,4 @@ def test_spots_of_a_laser_guide_star(tmp_path: Path) -> None:
 def test_a_laser_guide_star_that_is_refused(tmp_path: Path, old: str, new: str) -> None:
     path = written(tmp_path, (SENSOR + WINDOW + LASER).replace(old, new))
     with refused(f"{path}"):
-        configuration.load_all(path)
+        _ = configuration.Configuration(path).score

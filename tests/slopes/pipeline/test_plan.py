@@ -91,7 +91,7 @@ class TestConfiguration:
         psf = fs.PSF.analytic(elongation=2.0, angle_deg=30.0, radius_px=8.0)
         for item in (LAYOUT, fs.Settings(estimator="ml"), NOISE, psf, score()):
             configuration.save(path, item)
-        again = configuration.load_all(path)
+        again = configuration.Configuration(path)
         assert again.psf is not None
         assert np.allclose(again.psf.samples, psf.samples)
         assert again.score == score()
@@ -105,7 +105,7 @@ class TestConfiguration:
             configuration.save(path, item)
         with path.open("a") as file:
             file.write('\n[psf]\nprofile = "gaussian"\nsize = 1.2\n')
-        psf = configuration.load_all(path).psf
+        psf = configuration.Configuration(path).psf
         assert psf is not None
         assert np.allclose(psf.samples, fs.PSF.analytic("gaussian", size=1.2).samples)
 
@@ -126,7 +126,7 @@ class TestConfiguration:
         with path.open("a") as file:
             file.write("\n" + table)
         with refused(message):
-            configuration.load_all(path)
+            _ = configuration.Configuration(path).spot
 
 
 class TestTables:

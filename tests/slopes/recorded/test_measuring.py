@@ -163,8 +163,9 @@ def test_mean_flux_of_the_recording(files: tuple[Path, Path, Path]) -> None:
     with pytest.raises(Stopped):
         measure_recorded([frames], configuration, output, **told, block_frames=8, progress=stop_after(8))
     assert measure_recorded([frames], configuration, output, **told).resumed_at == 8
-    layout, settings, calibration, _, _ = faintspot.slopes.pipeline.configuration.load_all(configuration)
-    pipeline = faintspot.SlopePipeline(layout, settings.replace(**changes), calibration)
+    described = faintspot.slopes.pipeline.configuration.Configuration(configuration)
+    settings = described.settings.replace(**changes)
+    pipeline = faintspot.SlopePipeline(described.layout, settings, described.calibration)
     flux = faintspot.MeanFlux(pipeline(simulated()).flux)
     expected_slopes = pipeline.with_flux(flux)(simulated())
     np.testing.assert_array_equal(read_slopes(output).variables["x"], expected_slopes.x)

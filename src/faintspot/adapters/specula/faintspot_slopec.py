@@ -78,10 +78,11 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
             target_device_idx=target_device_idx,
             precision=precision,
         )
-        self._settings, self._calibration, psf, score = parts_of(faintspot)
+        parts = parts_of(faintspot)
+        self._settings, self._calibration = parts.settings, parts.calibration
         self._options: AdapterOptions = {
-            "psf": psf,
-            "score": score,
+            "psf": parts.psf,
+            "score": parts.score,
             "calibration_flux_e": calibration_flux_e,
             "flux_frames": flux_frames if flux_frames > 0 else None,
         }

@@ -7,19 +7,23 @@ options and the tables of the documentation.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import numbers_between, one_of
+from faintspot.base.checks import numbers_between, one_of, strings_of
 from faintspot.base.errors import InputError
 
 AUTO = "auto"
-_MIXED = '{}: expected "auto" for the whole sensor or numbers for all sub-apertures, got both'
+REQUIRED: Any = MISSING
+"""Default of an option that must be given."""
+FLAG, TEXT, TEXTS = "true or false", "a text", "a list of texts"
+LIST, NUMBER_OR_LIST = "a list of numbers", "a number or a list of numbers"
+_MIXED = 'expected "auto" for the whole sensor or numbers for all sub-apertures, got both'
 
 
 @dataclass(frozen=True)
@@ -46,9 +50,15 @@ class Option:
         Whether it may be "auto": chosen from flux, camera and spot.
     optional : bool
         Whether it may be None: not used, or chosen automatically.
+    group : str
+        Table of a file in which the option stands, where a class describes several.
+    kind : str
+        FLAG, TEXT, TEXTS, LIST or NUMBER_OR_LIST, instead of a number or a name.
+    check : callable, optional
+        Function of name and value that returns the checked value, or raises InputError.
     """
 
-    meaning: str
+    meaning: str = ""
     unit: str = ""
     low: float = -math.inf
     high: float = math.inf
@@ -58,6 +68,9 @@ class Option:
     per_subaperture: bool = True
     automatic: bool = False
     optional: bool = False
+    group: str = ""
+    kind: str = ""
+    check: Callable[[str, Any], Any] | None = None
 
     def checked(self, name: str, value: Any) -> Any:
         """Return the checked value; scalars become plain Python values, sequences read-only arrays.
@@ -73,6 +86,10 @@ class Option:
             return None
         if self.automatic and isinstance(value, str) and value == AUTO:
             return AUTO
+        if self.check is not None:
+            return self.check(name, value)
+        if self.kind:
+            return self._checked_kind(name, value)
         if self.choices:
             return self._checked_names(name, value)
         array = self._checked_numbers(name, value)
@@ -80,15 +97,29 @@ class Option:
             return array.item()
         if array.ndim > 1 or not self.per_subaperture:
             several = " or one per sub-aperture" if self.per_subaperture else ""
-            raise InputError(f"{name}: expected a number{several}, got shape {array.shape}")
+            raise InputError(f"expected a number{several}, got shape {array.shape}", name=name)
         return _locked(array.copy())
+
+    def _checked_kind(self, name: str, value: Any) -> Any:
+        """Return a flag or a text, or several texts or numbers as a tuple."""
+        if self.kind == TEXTS:
+            return tuple(one_of(name, text, self.choices or (text,)) for text in strings_of(name, value))
+        if self.kind in (FLAG, TEXT):
+            if not isinstance(value, bool if self.kind == FLAG else str) or value == "":
+                raise InputError(f"expected {self.kind}", name=name, value=value)
+            return value
+        if self.kind == NUMBER_OR_LIST and np.ndim(value) != 1:
+            return self._checked_numbers(name, value).item()
+        if np.ndim(value) != 1:
+            raise InputError(f"expected {LIST}, got {value!r}", name=name)
+        return tuple(self._checked_numbers(name, value).tolist()) if len(value) else ()
 
     def _checked_each(self, name: str, value: PerSubaperture) -> PerSubaperture:
         if None in value.others.values():
-            raise InputError(f"{name}: expected a value for each sub-aperture listed, got none")
+            raise InputError("expected a value for each sub-aperture listed, got none", name=name)
         others = {int(index): self.checked(name, item) for index, item in value.others.items()}
         if AUTO in others.values() or (others and value.default == AUTO):
-            raise InputError(_MIXED.format(name))
+            raise InputError(_MIXED, name=name)
         return PerSubaperture(self.checked(name, value.default), MappingProxyType(others))
 
     def _checked_names(self, name: str, value: Any) -> Any:
@@ -97,7 +128,7 @@ class Option:
         try:
             names = [one_of(name, item, self.choices) for item in value]
         except TypeError:
-            raise InputError(f"{name} = {value!r}: expected one value or one per sub-aperture") from None
+            raise InputError("expected one value or one per sub-aperture", name=name, value=value) from None
         return _locked(np.array(names))
 
     def _checked_numbers(self, name: str, value: Any) -> NDArray[Any]:
@@ -107,9 +138,9 @@ class Option:
             )
         except InputError as error:
             if self.automatic and isinstance(value, str):
-                raise InputError(f'{name} = {value!r}: expected a number or "auto"') from None
+                raise InputError('expected a number or "auto"', name=name, value=value) from None
             if self.automatic and isinstance(value, list | tuple) and AUTO in value:
-                raise InputError(_MIXED.format(name)) from None
+                raise InputError(_MIXED, name=name) from None
             raise error from None
 
 
@@ -131,6 +162,16 @@ def option(default: Any, meaning: str, **bounds: Any) -> Any:
     """
     bounds.setdefault("optional", default is None)
     return field(default=default, metadata={"option": Option(meaning, **bounds)})
+
+
+def setting(default: Any, meaning: str = "", **bounds: Any) -> Any:
+    """Declare an option that has one value for the whole sensor; see `option`."""
+    return option(default, meaning, per_subaperture=False, **bounds)
+
+
+def number(default: Any, low: float, high: float, meaning: str = "", **bounds: Any) -> Any:
+    """Declare a number from `low` to `high`, or None if that is its default; see `option`."""
+    return setting(default, meaning, low=low, high=high, **bounds)
 
 
 @dataclass(frozen=True)
@@ -158,9 +199,17 @@ class Options:
         If a value is out of range, NaN or of the wrong type, or arrays have different lengths.
     """
 
+    table: ClassVar[str] = ""
+    """Table of a configuration file that holds the options; messages begin with it."""
+
+    def __init_subclass__(cls, table: str = "", **named: Any) -> None:
+        super().__init_subclass__(**named)
+        cls.table = table or cls.table
+
     def __post_init__(self) -> None:
+        prefix = self.table and f"{self.table}."
         for name, declared in self.declared().items():
-            object.__setattr__(self, name, declared.checked(name, getattr(self, name)))
+            object.__setattr__(self, name, declared.checked(f"{prefix}{name}", getattr(self, name)))
         check_lengths(self)
 
     def __eq__(self, other: object) -> bool:
@@ -205,7 +254,7 @@ class Options:
         if isinstance(value, np.ndarray):
             if len(value) != n_subapertures:
                 raise InputError(
-                    f"{name}: expected {n_subapertures} values, one per sub-aperture, got {len(value)}"
+                    f"expected {n_subapertures} values, one per sub-aperture, got {len(value)}", name=name
                 )
             return value
         if isinstance(value, PerSubaperture):
@@ -267,8 +316,8 @@ def check_lengths(*parts: Options) -> None:
     lengths = {
         name: len(value)
         for part in parts
-        for name in part.declared()
-        if isinstance(value := getattr(part, name), np.ndarray)
+        for name, declared in part.declared().items()
+        if declared.per_subaperture and isinstance(value := getattr(part, name), np.ndarray)
     }
     if len(set(lengths.values())) > 1:
         sizes = ", ".join(f"{name} {length}" for name, length in lengths.items())

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, fields
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from faintspot.base.config.options import PerSubaperture
-from faintspot.base.errors import InputError
+from faintspot.base.config.options import Options, PerSubaperture
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import write_atomically
 from faintspot.base.toml_files import check_keys, checked_table, parse_file, read_text
 
@@ -29,66 +28,89 @@ TABLES = (
 )
 
 
-def read_tables(path: str | Path) -> dict[str, dict[str, Any]]:
-    """Read the tables of a configuration file as plain dictionaries.
+class Tables:
+    """Tables of a configuration file, read once.
+
+    Parameters
+    ----------
+    path : path
+        The file; messages name it, and files that its tables name are beside it.
+    tables : mapping, optional
+        Its content, if the file is not to be read.
 
     Raises
     ------
     InputError
         If the file cannot be read, is not TOML, or has an unknown table.
     """
-    path = Path(path)
-    maker = f"`faintspot layout FRAME -o {path.name}` makes one"
-    document = parse_file(path, if_missing=maker)
-    check_keys(f"{path}: ", document, TABLES, what="table")
-    return {name: checked_table(f"{path}: {name}", values) for name, values in document.items()}
+
+    def __init__(self, path: str | Path, tables: Mapping[str, Any] | None = None) -> None:
+        self.path = path = Path(path)
+        if tables is None:
+            tables = parse_file(path, if_missing=f"`faintspot layout FRAME -o {path.name}` makes one")
+        check_keys(f"{path}: ", tables, TABLES, what="table")
+        self.tables = {name: checked_table(f"{path}: {name}", values) for name, values in tables.items()}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.tables
+
+    def __getitem__(self, name: str) -> dict[str, Any]:
+        """Return a required table.
+
+        Raises
+        ------
+        InputError
+            If it is missing.
+        """
+        if name not in self.tables:
+            raise InputError(
+                f"{self.path}: expected a table [{name}], found {', '.join(self.tables) or 'none'}"
+            )
+        return self.tables[name]
+
+    def part(self, kind: type[Part]) -> Part:
+        """Return the object that a required table describes."""
+        return kind.from_table(self[kind.table], self.path)
 
 
-def table_of(path: str | Path, document: Mapping[str, dict[str, Any]], name: str) -> dict[str, Any]:
-    """Return a required table.
+@dataclass(frozen=True, eq=False)
+class Table(Options):
+    """Options that are a table of a configuration file."""
 
-    Raises
-    ------
-    InputError
-        If it is missing.
-    """
-    if name not in document:
-        raise InputError(f"{path}: expected a table [{name}], found {', '.join(document) or 'none'}")
-    return document[name]
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read the table of a configuration file (TOML)."""
+        return Tables(path).part(cls)
+
+    @classmethod
+    def from_table(cls, values: Mapping[str, Any], path: Path | None = None) -> Self:
+        """Make the object that a table describes; messages name `path`, if there is one.
+
+        Raises
+        ------
+        InputError
+            If a key is unknown, or a value is missing or invalid.
+        """
+        required = [item.name for item in fields(cls) if MISSING is item.default is item.default_factory]
+        with errors_within(path):
+            check_keys(f"{cls.table}.", values, [item.name for item in fields(cls)], required=required)
+            return cls(**values)
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the table: the fields whose values are not the defaults."""
+        return {
+            item.name: value
+            for item in fields(self)
+            if (value := getattr(self, item.name)) is not None
+            and (isinstance(value, np.ndarray) or item.default is MISSING or value != item.default)
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write the table of a configuration file (TOML); preserve other tables."""
+        save_tables(path, {self.table: self.to_table()})
 
 
-@contextlib.contextmanager
-def errors_of_table(path: str | Path, name: str) -> Iterator[None]:
-    """Prefix errors with the file and the table in which they occur."""
-    try:
-        yield
-    except InputError as error:
-        text = str(error)
-        names_table = text.startswith(tuple(f"{table}{mark}" for table in TABLES for mark in ".: "))
-        raise InputError(f"{path}: {'' if names_table else f'{name}.'}{text}") from None
-
-
-def check_fields(name: str, kind: type, values: Mapping[str, Any]) -> None:
-    """Raise an error for keys that are not fields of a dataclass, and for missing required fields.
-
-    Raises
-    ------
-    InputError
-        If there are any.
-    """
-    required = [f.name for f in fields(kind) if f.default is MISSING]
-    check_keys(f"{name}.", values, [f.name for f in fields(kind)], required=required)
-
-
-def chosen_fields(item: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass whose values are not the defaults."""
-    values = {}
-    for f in fields(item):
-        value = getattr(item, f.name)
-        at_default = f.default is not MISSING and not isinstance(value, np.ndarray) and value == f.default
-        if value is not None and not at_default:
-            values[f.name] = value
-    return values
+Part = TypeVar("Part", bound=Table)
 
 
 def save_tables(path: str | Path, tables: Mapping[str, Mapping[str, Any] | None]) -> None:
@@ -115,13 +137,13 @@ def save_tables(path: str | Path, tables: Mapping[str, Mapping[str, Any] | None]
     write_atomically(path, tomlkit.dumps(document))
 
 
-def tables_as_text(tables: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return tables as TOML text."""
+def tables_as_text(tables: Mapping[str, Any]) -> str:
+    """Return tables, and values outside of them, as TOML text."""
     import tomlkit
 
     document = tomlkit.document()
     for name, values in tables.items():
-        document[name] = _toml_table(values)
+        document[name] = _toml_table(values) if isinstance(values, Mapping) else values
     return tomlkit.dumps(document)
 
 
@@ -140,7 +162,7 @@ def per_subaperture(where: str, value: Any) -> Any:
         if index == "default":
             continue
         if not index.isdecimal():
-            raise InputError(f"{where}.{index}: expected default or the number of a sub-aperture")
+            raise InputError("expected default or the number of a sub-aperture", name=f"{where}.{index}")
         others[int(index)] = item
     return PerSubaperture(value.get("default"), others)
 
@@ -177,4 +199,4 @@ def _toml_value(value: Any) -> Any:
         array = tomlkit.array()
         array.extend(rows)
         return array.multiline(value.ndim == 2)
-    return list(value) if isinstance(value, tuple) else value
+    return np.array(value).tolist() if isinstance(value, tuple) else value

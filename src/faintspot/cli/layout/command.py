@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 import warnings
 from dataclasses import replace
@@ -21,9 +20,17 @@ from faintspot.cli.layout.completing import completed
 from faintspot.cli.layout.darks import clearer_frame, measured_darks, with_measured_pixels
 from faintspot.cli.layout.describing import describe, describe_settings, doubts_of
 from faintspot.cli.layout.options import plain
-from faintspot.cli.shared.commands import SectionedCommand, option
+from faintspot.cli.shared.commands import (
+    NAMES,
+    RANGES,
+    Listed,
+    SectionedCommand,
+    declared,
+    errors_of_options,
+    option,
+)
 from faintspot.cli.shared.needs import suggested_slopes
-from faintspot.cli.shared.options import DIAMETER, KEY, PIXEL_SCALE, SUBAPERTURE
+from faintspot.cli.shared.options import KEY
 from faintspot.cli.shared.output import picture_file
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.slopes.camera.binning import binned
@@ -33,10 +40,11 @@ from faintspot.slopes.camera.hot_pixels import find_hot_pixels
 from faintspot.slopes.camera.mean_frame import MeanFrame
 from faintspot.slopes.camera.saturation import LargestValues
 from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, first_settings
 from faintspot.slopes.sensor.found_layout import FoundLayout, find_layout
 from faintspot.slopes.sensor.known_grid import KnownGrid
-from faintspot.slopes.sensor.layout import GEOMETRIES, LARGEST_BIN, Layout
+from faintspot.slopes.sensor.layout import GEOMETRIES, LARGEST_BIN, OPTICS, Layout
 
 _MOST_FRAMES = 200  # averaged to find the spots
 _FIRST_FRAMES = 20  # measured for the settings
@@ -45,21 +53,9 @@ _array = partial(option, section="Lenslet array")
 _windows = partial(option, section="Windows")
 _camera = partial(option, section="Camera")
 _CALIBRATION = ("dark", "flat", "bad_pixels", "gain_e_per_adu", "read_noise_e")
-_OPTICS = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
-# What the finder calls what these options give.
-_OPTIONS = {
-    "pitch_px": "--pitch-px",
-    "angle_deg": "--angle-deg",
-    "centre": "--centre",
-    "fit": "--fit",
-    "illuminated_fraction": "--illuminated-fraction",
-    "bad_pixels": "--bad-pixels",
-}
 
 
-@click.command(
-    cls=SectionedCommand, short_help="Find the sub-apertures in a frame and write a configuration."
-)
+@click.command(cls=SectionedCommand)
 @click.argument("frames", nargs=-1, metavar="FRAME...")
 @_array("--geometry", type=click.Choice(["auto", *GEOMETRIES]), default="auto", help="Packing.")
 @_array("--pitch-px", type=float, metavar="PX", help="Distance of neighbouring lenslets, used as stated.")
@@ -68,11 +64,14 @@ _OPTIONS = {
 )
 @_array(
     "--centre",
+    type=Listed(float, (2,), "X,Y in pixels"),
     metavar="X,Y",
     help="Point of the lattice [px], used as stated: the middle of a lenslet, of an edge, or a corner.",
 )
 @_array(
     "--fit",
+    type=NAMES,
+    default=(),
     metavar="LIST",
     help="Which of pitch, angle, centre to fit to the frame although stated, such as pitch,angle.",
     show_default="those not stated",
@@ -85,6 +84,7 @@ _OPTIONS = {
 )
 @_array(
     "--roi",
+    type=Listed(float, (4,), "X0,Y0,X1,Y1 in pixels"),
     metavar="X0,Y0,X1,Y1",
     help="Look only at columns X0 to X1 - 1 and rows Y0 to Y1 - 1 of the frame.",
 )
@@ -97,16 +97,19 @@ _OPTIONS = {
 )
 @_array(
     "--pupil",
+    type=Listed(float, (3, 4), "X,Y,R or X,Y,R,INNER in pixels"),
     metavar="X,Y,R[,INNER]",
     help="Centre and radius [px] of the disk, or annulus, whose lenslets are taken, illuminated or not.",
 )
 @_array(
     "--exclude",
+    type=RANGES,
     metavar="LIST",
     help="Sub-apertures to leave out, such as 3,17,40-45: their numbers in the picture drawn without this.",
 )
 @_windows(
     "--pixels",
+    type=Listed(float, (1, 2), "a number of pixels, or height and width, such as 12,16"),
     metavar="N|NY,NX",
     help="Side of a window, or its height and width [px].",
     show_default="the largest without overlap",
@@ -140,19 +143,11 @@ _OPTIONS = {
     is_flag=True,
     help="Enter isolated bright pixels and pairs as bad pixels. Not for spots sharper than Nyquist sampling.",
 )
-@_camera(
-    "--gain-e-per-adu",
-    type=float,
-    metavar="E/ADU",
-    help="Electrons per ADU.",
-    show_default="1, frames in electrons",
-)
+@declared(Calibration, "gain_e_per_adu", sections="Camera", show_default="1, frames in electrons")
 @_camera(
     "--read-noise-e", metavar="E|FILE", help="Read noise, a number or a map of each pixel as FILE[:ARRAY]."
 )
-@PIXEL_SCALE
-@SUBAPERTURE
-@DIAMETER
+@declared(Layout, *OPTICS, sections="Telescope")
 @KEY
 @option("--accept", is_flag=True, help="Settle the doubts of the layout that --output has; without FRAME.")
 @option("--output", "-o", metavar="TOML", default="faintspot.toml", help="Configuration to write.")
@@ -169,7 +164,7 @@ def command(
     output: str,
     picture: str | None,
     grid: str | None,
-    exclude: str | None,
+    exclude: list[int] | None,
     factor: int | None,
     mask_hot_pixels: bool,
     key: str | None,
@@ -208,17 +203,9 @@ def command(
     keeps_settings = configuration.has(target, "settings") and not configuration.has(target, "layout")
     if target.exists() and not overwrite and not keeps_settings:
         raise InputError(f"{output}: already exists; --overwrite replaces its layout and settings")
-    for name, counts, expected in (
-        ("pupil", (3, 4), "X,Y,R or X,Y,R,INNER in pixels"),
-        ("roi", (4,), "X0,Y0,X1,Y1 in pixels"),
-        ("centre", (2,), "X,Y in pixels"),
-        ("pixels", (1, 2), "a number of pixels, or height and width, such as 12,16"),
-    ):
-        options[name] = layout_options.numbers(f"--{name}", options[name], counts, expected)
-    options["fit"] = tuple(part.strip() for part in (options["fit"] or "").split(",") if part.strip())
     if options["pixels"] is not None and len(options["pixels"]) == 1:
         (options["pixels"],) = options["pixels"]
-    optics = layout_options.optics(target, {name: options.pop(name) for name in _OPTICS})
+    optics = layout_options.optics(target, {name: options.pop(name) for name in OPTICS})
     of_camera = {name: options.pop(name) for name in _CALIBRATION}
     drawing = picture_file(target, picture, ".png")
     with open_frames(frames, key=key, time_axis=time_axis) as source:
@@ -266,7 +253,7 @@ def command(
         keeps_noise = of_camera["read_noise_e"] is not None
         calibration, lines = with_measured_pixels(calibration, measured, keeps_noise=keeps_noise)
         notes += lines
-    settings = configuration.load(target, "settings") if keeps_settings else seen.settings
+    settings = Settings.load(target) if keeps_settings else seen.settings
     if keeps_settings:
         notes.append(f"  the settings that {output} has are kept")
     marks: dict[str, Any] = {}
@@ -303,7 +290,7 @@ def _accept(target: Path, accept: bool, frames: tuple[str, ...]) -> None:
         raise InputError("FRAME, --accept: expected frames to find the sub-apertures in, or --accept without")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtWarning)
-        layout: Layout = configuration.load(target, "layout")
+        layout = Layout.load(target)
     configuration.save(target, replace(layout, doubts=()))
     click.echo(f"{target}: {'accepted: ' + '; '.join(layout.doubts) if layout.doubts else 'no doubts'}")
 
@@ -311,15 +298,8 @@ def _accept(target: Path, accept: bool, frames: tuple[str, ...]) -> None:
 def _found(description: str, mean: NDArray[np.float64], options: dict[str, Any]) -> FoundLayout:
     """Find the layout, and say in an error where, and which option changes it."""
     bad = np.isnan(mean)
-    try:
+    with errors_of_options(description):
         found = find_layout(np.where(bad, 0, mean), bad_pixels=bad, **options)
-    except InputError as error:
-        text = str(error)
-        for name, option in _OPTIONS.items():
-            text = re.sub(rf"\b{name}\b", option, text)
-        if "found no" in text:
-            text += "; --grid is for an array that is known, such as quad cells"
-        raise InputError(f"{description}: {text}") from None
     grid = found.lenslets
     if (contrast := mosaic_contrast(mean, grid.spots, grid.pitch_px, grid.spot_px)) > 1:
         raise InputError(

@@ -9,36 +9,26 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.cli.layout import options as layout_options
+from faintspot.cli.shared.commands import errors_of_options, flag_of
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.sensor.known_grid import KnownGrid, find_illuminated
 from faintspot.slopes.sensor.layout import Layout
 
 _QUAD_CELL = 2  # pixels on a side
-_ONLY_WITHOUT = {
-    "geometry": "--geometry",
-    "pitch_px": "--pitch-px",
-    "angle_deg": "--angle-deg",
-    "centre": "--centre",
-    "fit": "--fit",
-    "move_windows": "--move-windows",
-}
+_ONLY_WITHOUT = ("geometry", "pitch_px", "angle_deg", "centre", "fit", "move_windows")
 
 
 def illuminated(
     description: str, mean: NDArray[np.float64], grid: str, calibration: Calibration, options: dict[str, Any]
 ) -> KnownGrid:
     """Return the illuminated sub-apertures of the grid; name the frame in an error."""
-    wrong = [flag for name, flag in _ONLY_WITHOUT.items() if options[name] not in (None, False, "auto", ())]
+    wrong = [flag_of(name) for name in _ONLY_WITHOUT if options[name] not in (None, False, "auto", ())]
     if wrong:
         raise InputError(f"--grid, {', '.join(wrong)}: expected one of them; a grid fills the frame or --roi")
     shape = layout_options.grid_shape(grid)
     kept = {name: value for name, value in options.items() if name not in _ONLY_WITHOUT}
-    try:
+    with errors_of_options(description):
         return find_illuminated(mean, shape, has_dark=calibration.dark is not None, **kept)
-    except InputError as error:
-        raise InputError(
-            f"{description}: {str(error).replace('illuminated_fraction', '--illuminated-fraction')}"
-        ) from None
 
 
 def is_quad_cell(layout: Layout) -> bool:

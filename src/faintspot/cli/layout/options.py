@@ -11,26 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.tables import chosen_fields, read_tables
+from faintspot.base.config.tables import Tables, is_map
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration, read_map
-from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.sensor.binning import scaled_points
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.window_size import LARGEST_WINDOW
-
-
-def numbers(option: str, text: str | None, counts: tuple[int, ...], expected: str) -> list[float] | None:
-    """Return the numbers of a text such as 1,2.5,3; InputError when they are not so many."""
-    if text is None:
-        return None
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in counts or not np.isfinite(values).all():
-        raise InputError(f"{option} {text}: expected {expected}")
-    return values
 
 
 def binned(options: dict[str, Any], factor: int) -> dict[str, Any]:
@@ -63,23 +49,13 @@ def grid_shape(text: str) -> tuple[int, int]:
     return int(rows), int(columns)
 
 
-def kept(count: int, text: str | None) -> NDArray[np.bool_]:
-    """Return which of so many sub-apertures a text such as 3,17,40-45 does not exclude."""
-    kept = np.ones(count, dtype=bool)
-    if text is None:
-        return kept
-    for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
-        if not first.isdecimal() or not (last.isdecimal() or not dash):
-            raise InputError(
-                f"--exclude {text}: expected numbers and ranges of sub-apertures, such as 3,17,40-45"
-            )
-        low, high = int(first), int(last or first)
-        if not low <= high < count:
-            raise InputError(f"--exclude {part.strip()}: expected sub-apertures from 0 to {count - 1}")
-        kept[low : high + 1] = False
+def kept(count: int, excluded: list[int] | None) -> NDArray[np.bool_]:
+    """Return which of so many sub-apertures are not excluded."""
+    if excluded and max(excluded) >= count:
+        raise InputError(f"--exclude {max(excluded)}: expected sub-apertures from 0 to {count - 1}")
+    kept = ~np.isin(np.arange(count), excluded or [])
     if not kept.any():
-        raise InputError(f"--exclude {text}: no sub-aperture is left of {count}")
+        raise InputError(f"--exclude: no sub-aperture is left of {count}")
     return kept
 
 
@@ -88,7 +64,7 @@ def calibration(target: Path, given: Mapping[str, Any]) -> Calibration:
 
     What an earlier `faintspot layout` estimated from its frames is left out, to be estimated again.
     """
-    known: Calibration = configuration.load(target, "calibration") if target.exists() else Calibration()
+    known = Calibration.load(target) if target.exists() else Calibration()
     defaults = Calibration()
     forgotten = {name: getattr(defaults, name) for name in known.estimated}
     known = replace(known, **forgotten, estimated=())
@@ -109,8 +85,8 @@ def calibration(target: Path, given: Mapping[str, Any]) -> Calibration:
 def kept_calibration(calibration: Calibration, given: Mapping[str, Any]) -> list[str]:
     """Return a line on what an existing configuration states and was not given now."""
     kept = [
-        f"{name} {plain(value) if not isinstance(value, np.ndarray) else 'map'}"
-        for name, value in chosen_fields(calibration).items()
+        f"{name} {plain(value) if not is_map(getattr(calibration, name)) else 'map'}"
+        for name, value in calibration.to_table().items()
         if given.get(name) is None
     ]
     return [f"  kept as the configuration states: {', '.join(kept)}"] if kept else []
@@ -118,7 +94,7 @@ def kept_calibration(calibration: Calibration, given: Mapping[str, Any]) -> list
 
 def optics(target: Path, given: Mapping[str, float | None]) -> dict[str, Any]:
     """Return the scales of a layout that were given, or else those that the configuration has already."""
-    known = read_tables(target).get("layout", {}) if target.exists() else {}
+    known = Tables(target).tables.get("layout", {}) if target.exists() else {}
     return {name: known.get(name) if value is None else value for name, value in given.items()}
 
 

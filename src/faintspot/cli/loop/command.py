@@ -4,38 +4,37 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
-from faintspot.cli.loop.night import night
 from faintspot.cli.loop.tune import tune
-from faintspot.cli.shared.commands import Group, option
+from faintspot.cli.shared.commands import NAMES, NUMBERS, option
+from faintspot.cli.shared.experiments import (
+    CONFIGURATION,
+    QUICK,
+    experiment_options,
+    simulate_night,
+    worker_pool,
+)
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import SCHEDULER, WORKERS
-from faintspot.cli.shared.progress import progress_bar
+
+Names = tuple[str, ...]
 
 _needs_loop = needs("loop", "hcipy", "joblib", "zarr", "matplotlib", "jinja2")
+_output = option(
+    "--output", "-o", metavar="FOLDER", help="Where results go.", show_default="CONFIG, CONFIG-quick ..."
+)
 
 
-def _experiment_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of every experiment."""
-    for each in (
-        option("--overwrite", is_flag=True, help="Replace another experiment in the folder."),
-        SCHEDULER,
-        WORKERS,
-        option("--quick", is_flag=True, help="Fewer and shorter runs: a few minutes."),
-        option(
-            "--output", "-o", metavar="FOLDER", help="Where results go.", show_default="NAME, or NAME-quick"
-        ),
-        click.argument("configuration", metavar="[CONFIG]", default="canary"),
-    ):
-        command = each(command)
-    return command
+def _compared(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of every comparison."""
+    return CONFIGURATION(QUICK(_output(experiment_options(command))))
 
 
-@click.group(name="loop", cls=Group, short_help="Compare methods in a simulated closed loop.")
+@click.group("loop")
 def command() -> None:
     """Compare methods in a simulated closed loop, and recommend one.
 
@@ -52,14 +51,17 @@ def command() -> None:
 
 
 command.add_command(tune)
-command.add_command(night)
 
 
-@command.command(name="list", short_help="List the shipped configurations.")
-def list_shipped() -> None:
-    """List the shipped configurations."""
+@command.command()
+@click.argument("name", metavar="[CONFIG]", required=False)
+def show(name: str | None) -> None:
+    """Print a configuration as TOML with every value written out, or list the shipped ones."""
     from faintspot.loop.simulation.configuration.configuration import load_loop, shipped_loops
 
+    if name is not None:
+        click.echo(load_loop(name).to_text(), nl=False)
+        return
     for name in shipped_loops():
         loop = load_loop(name)
         camera, sensor = loop.camera, loop.sensor
@@ -71,26 +73,26 @@ def list_shipped() -> None:
         )
 
 
-@command.command(short_help="Print a configuration as TOML.")
-@click.argument("name", metavar="CONFIG")
-def show(name: str) -> None:
-    """Print a configuration, shipped or of a file, as TOML with every value written out."""
-    from faintspot.loop.simulation.configuration.configuration import load_loop
-
-    click.echo(load_loop(name).to_text(), nl=False)
-
-
 @_needs_loop
 @command.command(short_help="Measure the Strehl ratio against the star's magnitude.")
-@_experiment_options
-@option("--methods", metavar="NAMES", help="Methods to compare, with commas.", show_default="all that suit")
+@_compared
+@option(
+    "--methods",
+    type=NAMES,
+    metavar="NAMES",
+    help="Methods to compare, with commas.",
+    show_default="all that suit",
+)
 @option(
     "--flux-e",
+    type=NUMBERS,
     metavar="NUMBERS",
     help="Fluxes with commas, photo-electrons per sub-aperture and frame.",
     show_default="four times to an eighth of the configuration's",
 )
-def magnitude(configuration: str, methods: str | None, flux_e: str | None, **options: Any) -> None:
+def magnitude(
+    configuration: str, methods: Names | None, flux_e: tuple[float, ...] | None, **options: Any
+) -> None:
     """Measure the Strehl ratio of any list of methods against the star's magnitude.
 
     Each method is tuned at each flux, its settings and the loop gain together, on other turbulence. Methods:
@@ -108,15 +110,20 @@ def magnitude(configuration: str, methods: str | None, flux_e: str | None, **opt
     """
     from faintspot.experiments.closed_loop.magnitude import run_magnitude
 
-    fluxes = None if flux_e is None else [_number(text) for text in _listed(flux_e)]
-    _measure(configuration, "magnitude", run_magnitude, _methods(methods), fluxes, **options)
+    _measure(configuration, "magnitude", run_magnitude, _methods(methods), flux_e, **options)
 
 
 @_needs_loop
 @command.command(short_help="Measure what limits the Strehl ratio.")
-@_experiment_options
-@option("--methods", metavar="NAMES", help="Methods, with commas.", show_default="brightest,smoothed,tv")
-def budget(configuration: str, methods: str | None, **options: Any) -> None:
+@_compared
+@option(
+    "--methods",
+    type=NAMES,
+    metavar="NAMES",
+    help="Methods, with commas.",
+    show_default="brightest,smoothed,tv",
+)
+def budget(configuration: str, methods: Names | None, **options: Any) -> None:
     """Measure what limits the Strehl ratio, by switching off one term of the error after another.
 
     At the configuration's own flux, each method is tuned and then runs without photon and read noise, without
@@ -132,9 +139,76 @@ def budget(configuration: str, methods: str | None, **options: Any) -> None:
     _measure(configuration, "budget", run_budget, _methods(methods), **options)
 
 
+@_needs_loop
+@command.command(short_help="Alternate with and without TV, as on the telescope.")
+@_compared
+@option(
+    "--methods",
+    type=NAMES,
+    metavar="NAMES",
+    default="none,tv",
+    help="Methods of a cycle, with commas; the first is the reference. none: brightest pixels; tv: every "
+    "strength; others as for `loop magnitude`, with the integrator.",
+)
+@option(
+    "--strengths",
+    type=NUMBERS,
+    metavar="NUMBERS",
+    help="Strengths of TV [e-], with commas.",
+    show_default="8 or 20 from 0 to 2",
+)
+@option(
+    "--strength-factors",
+    metavar="FILE",
+    help="Factor on the strength in each sub-aperture (.npy, .csv).",
+    show_default="1",
+)
+@option(
+    "--tuned",
+    is_flag=True,
+    help="Tune pixels kept, loop gain and options of each method on other turbulence.",
+)
+def night(
+    configuration: str,
+    methods: Names,
+    strengths: tuple[float, ...],
+    strength_factors: str | None,
+    output: str | None,
+    quick: bool,
+    **options: Any,
+) -> None:
+    """Alternate with and without TV in a simulated loop, as on the telescope.
+
+    The protocol of the observations of Basden et al. 2015: four sets of cycles, each a block without TV, then
+    8 or 20 strengths that rise from 0 to 2; the multiplication gain is full in the first two sets and at 75 %
+    in the last two; one atmosphere, whose r0 drifts. The page compares Strehl ratios against time, r0 and
+    strength, judges the paper's statements with their significance, and states how many hours of observing
+    would show each difference. A run without TV in the same turbulence tells the true difference. An
+    interrupted command continues with the sets that are missing.
+
+    \b
+    Examples:
+      faintspot loop night
+      faintspot loop night canary --tuned -o tuned
+      faintspot loop night emccd --methods none,tv,smoothed,window --strengths 0.4,0.8
+    """
+    from faintspot.experiments.night.page import PAGE_FILE, night_summary_text
+    from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan
+    from faintspot.io.frames import read_array
+    from faintspot.loop.simulation.configuration.configuration import load_loop
+
+    factors = () if strength_factors is None else tuple(read_array(strength_factors).ravel().tolist())
+    plan = QUICK_PLAN if quick else NightPlan()
+    plan = replace(plan, methods=methods, strengths_e=strengths or (), strength_factors=factors)
+    loop = load_loop(configuration)
+    folder = Path(output or f"{loop.name}-night{'-quick' if quick else ''}")
+    click.echo(night_summary_text(simulate_night(loop, folder, plan=plan, quick=quick, **options)))
+    click.echo(f"{shlex.quote(str(folder / PAGE_FILE))}: open it in a browser")
+
+
 @needs("loop", "hcipy")
 @command.command(short_help="Write what a real-time engine needs, [control] included.")
-@click.argument("configuration", metavar="[CONFIG]", default="canary")
+@CONFIGURATION
 @option("--output", "-o", default=".", metavar="FOLDER", help="Folder for faintspot.toml and matrices.")
 @option(
     "--control",
@@ -179,13 +253,11 @@ def _measure(
     """Run an experiment with a progress bar, print the summary of its result and write its page."""
     from faintspot.experiments.closed_loop.page import write_loop_report
     from faintspot.experiments.closed_loop.verdict import LoopResults, loop_summary
-    from faintspot.experiments.running import WorkerPool
     from faintspot.loop.simulation.configuration.configuration import load_loop
 
     loop = load_loop(configuration)
     folder = output or (f"{loop.name}-quick" if quick else loop.name)
-    with progress_bar("loop") as advance:
-        pool = WorkerPool(workers, advance, lambda text: click.echo(text, err=True), scheduler)
+    with worker_pool("loop", workers, scheduler) as pool:
         result = run(loop, folder, *what, quick=quick, pool=pool, overwrite=overwrite)
     click.echo(loop_summary(LoopResults(**{name: result})))
     page = Path(folder) / "report.html"
@@ -193,30 +265,14 @@ def _measure(
     click.echo(f"{shlex.quote(str(page))}: open it in a browser")
 
 
-def _listed(text: str) -> list[str]:
-    return [part.strip() for part in text.split(",") if part.strip()]
-
-
-def _methods(text: str | None) -> list[str] | None:
+def _methods(names: Names | None) -> Names | None:
     """Return the methods that are asked for; name those that could use the loop's prediction but do not."""
     from faintspot.experiments.closed_loop.methods import method_kind
 
-    if text is None:
-        return None
-    names = _listed(text)
-    for name in names:
+    for name in names or ():
         kind = method_kind(name)
         if kind.estimator.takes_prior and not kind.is_predicted:
             own = kind.estimator.name
             rest = kind.name.removeprefix(own)
             click.echo(f"{name}: without the loop's prediction; {own}_predicted{rest} uses it", err=True)
     return names
-
-
-def _number(text: str) -> float:
-    from faintspot.base.errors import InputError
-
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"--flux-e: expected numbers with commas, got {text!r}") from None

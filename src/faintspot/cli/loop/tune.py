@@ -10,11 +10,10 @@ import click
 from rich.console import Console
 
 from faintspot.base.errors import InputError
-from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.commands import NAMES, Listed, option
+from faintspot.cli.shared.experiments import experiment_options, worker_pool
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import SCHEDULER, WORKERS
 from faintspot.cli.shared.output import check_target, picture_file, results_table, wrapped, write_picture
-from faintspot.cli.shared.progress import progress_bar
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -35,12 +34,14 @@ if TYPE_CHECKING:
 )
 @option(
     "--magnitudes",
+    type=Listed(float, (2,), "the first and the last, such as 8,14"),
     metavar="FIRST,LAST",
     help="Range of stars to simulate.",
     show_default="four times to an eighth of the star's flux",
 )
 @option(
     "--methods",
+    type=NAMES,
     metavar="NAMES",
     help="Candidates, with commas, as for `loop magnitude`.",
     show_default="all that suit",
@@ -60,16 +61,21 @@ if TYPE_CHECKING:
     show_default="the isoplanatic angle",
 )
 @option("--seed", type=click.IntRange(0), help="Seed of turbulence and noise.", show_default="CONFIG")
-@WORKERS
-@SCHEDULER
 @option(
     "--results", metavar="FOLDER", help="Folder of finished work, to continue from.", show_default="NAME-tune"
 )
 @option("--output", "-o", metavar="TOML", default="faintspot.toml", help="Configuration to write.")
 @option("--picture", metavar="PNG", help="Plot to write.", show_default="beside the output, with -tune.png")
-@option("--overwrite", is_flag=True, help="Replace the settings of an existing configuration.")
+@experiment_options
 def tune(
-    configuration: str, results: str | None, output: str, picture: str | None, overwrite: bool, **options: Any
+    configuration: str,
+    results: str | None,
+    output: str,
+    picture: str | None,
+    overwrite: bool,
+    workers: int | None,
+    scheduler: str | None,
+    **options: Any,
 ) -> None:
     """Recommend an estimator and a control for a closed loop.
 
@@ -87,13 +93,11 @@ def tune(
     drawing = picture_file(target, picture, "-tune.png")
     question = _question(configuration, options)
     from faintspot.experiments.closed_loop.tuning import tune_loop
-    from faintspot.experiments.running import WorkerPool
     from faintspot.loop.simulation.engine_files import CONFIGURATION as ENGINE_FILE
 
     folder = results or f"{question.configuration.name}-tune"
-    with progress_bar("loop") as advance:
-        place = WorkerPool(options["workers"], advance, scheduler=options["scheduler"])
-        answer = tune_loop(question, folder, pool=place, overwrite=overwrite)
+    with worker_pool("loop", workers, scheduler) as pool:
+        answer = tune_loop(question, folder, pool=pool, overwrite=overwrite)
     show(answer)
     loop = answer.save(target)
     click.echo(f"{target}: written, and {loop}, the loop with this star and gain")
@@ -193,21 +197,5 @@ def _question(config: str, options: dict[str, Any]) -> LoopQuestion:
         loop = loop.replace("camera", photons_per_subaperture=options["flux_e"], magnitude=None)
     if options["seed"] is not None:
         loop = loop.replace("run", seed=options["seed"])
-    methods = options["methods"]
-    return LoopQuestion(
-        loop,
-        magnitudes=_range(options["magnitudes"]),
-        methods=None if methods is None else [name.strip() for name in methods.split(",") if name.strip()],
-        strehl=options["strehl"],
-        radius_arcsec=options["radius_arcsec"],
-    )
-
-
-def _range(text: str | None) -> tuple[float, float] | None:
-    if text is None:
-        return None
-    try:
-        first, last = (float(part) for part in text.split(","))
-    except ValueError:
-        raise InputError(f"--magnitudes {text}: expected the first and the last, such as 8,14") from None
-    return first, last
+    kept = {name: options[name] for name in ("magnitudes", "methods", "strehl", "radius_arcsec")}
+    return LoopQuestion(loop, **kept)

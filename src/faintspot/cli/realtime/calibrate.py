@@ -67,9 +67,10 @@ def calibrate(
     from faintspot.loop.control.calibration_files import save_calibration, save_picture
     from faintspot.loop.control.configuration import load_control
     from faintspot.loop.control.mirror_calibration import calibrate_mirror, centroid_gain
-    from faintspot.slopes.sensor.layout import Layout
+    from faintspot.slopes.pipeline.configuration import Configuration
 
-    layout, former = Layout.load(config), load_control(config)
+    described = Configuration(config)
+    layout, former = described.layout, load_control(described)
     if keep_reference and (former is None or former.reference is None):
         raise InputError(f"--keep-reference: expected reference_slopes in [control] of {config}")
     stroke = None if former is None else former.options.largest_command

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from faintspot.cli.shared.commands import SectionedCommand, option
+from faintspot.cli.shared.commands import SectionedCommand, declared, option
 from faintspot.cli.shared.options import FRAMES, READOUT_FRACTION, SLOTS, configuration_option, name_option
+from faintspot.slopes.camera.detector import Detector
 
 if TYPE_CHECKING:
     from faintspot.engine.pixels.camera import CameraReport
 
-_KNOWN = "the configuration's"
+_KNOWN = "read_noise_e", "em_gain", "gain_e_per_adu", "offset_adu"
 _spots = partial(option, section="Spots", type=float)
-_detector = partial(option, section="Detector", type=float)
 
 
 @click.command(
@@ -39,20 +39,8 @@ _detector = partial(option, section="Detector", type=float)
 @_spots("--size", default=1.0, metavar="SIZE", help="Width of the spots; 1 is Nyquist sampling.")
 @_spots("--motion-px", default=0.3, metavar="PX", help="Rms motion per axis.")
 @_spots("--motion-time-s", default=0.01, metavar="S", help="Correlation time of the motion.")
-@_detector(
-    "--read-noise-e",
-    metavar="E",
-    help="Read noise at the output.",
-    show_default="the configuration's, else 1",
-)
-@_detector("--background-e", default=0.0, metavar="E", help="Sky per pixel and frame.")
-@_detector("--dark-e", default=0.0, metavar="E", help="Dark current per pixel and frame.")
-@_detector("--em-gain", metavar="G", help="EM gain; 1: none.", show_default=_KNOWN)
-@_detector("--gain-e-per-adu", metavar="E/ADU", help="Electrons per ADU.", show_default=_KNOWN)
-@_detector(
-    "--offset-adu", metavar="ADU", help="Level of every pixel.", show_default="the configuration's dark"
-)
-@_detector("--bits", type=int, help="Bits of the converter, for whole ADU.", show_default="continuous values")
+@declared(Detector, *_KNOWN, sections="Detector", show_default="the configuration's")
+@declared(Detector, "background_e", "dark_e", "bits", sections="Detector")
 @READOUT_FRACTION
 @option("--rows-per-block", type=int, default=4, help="Rows published together.")
 @SLOTS
@@ -74,11 +62,10 @@ def camera(config: str, name: str, frames: int | None, slots: int, seed: int | N
 
     from faintspot.engine.pixels.camera import Camera, SpotMotion, readout_type
     from faintspot.engine.pixels.pixel_ring import PixelRing
-    from faintspot.slopes.camera.calibration import Calibration
-    from faintspot.slopes.sensor.layout import Layout
-    from faintspot.slopes.simulate import Detector
+    from faintspot.slopes.pipeline.configuration import Configuration
 
-    layout, known = Layout.load(config), Calibration.load(config)
+    described = Configuration(config)
+    layout, known = described.layout, described.calibration
     values: dict[str, Any] = {
         "read_noise_e": 1.0 if known.read_noise_e is None else known.read_noise_e,
         "em_gain": known.em_gain,

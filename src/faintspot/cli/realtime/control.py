@@ -1,4 +1,4 @@
-"""faintspot realtime status, top, get, set, interleave, control and stop: requests to a running engine."""
+"""faintspot realtime status, send, stop, load, swap and unload: requests to a running engine or telescope."""
 
 from __future__ import annotations
 
@@ -6,98 +6,57 @@ from typing import Any
 
 import click
 
+from faintspot.base.config.written_changes import parse_changes
+from faintspot.base.errors import InputError
 from faintspot.base.json_text import to_json
+from faintspot.base.toml_files import check_keys
 from faintspot.cli.realtime.camera import stop_on_signal
-from faintspot.cli.shared.commands import Group, option
-from faintspot.cli.shared.engine_requests import (
-    asked,
-    asked_at_length,
-    loop_in_words,
-    notes,
-    summary,
-)
-from faintspot.cli.shared.options import AS_JSON, ENGINE_NAME
+from faintspot.cli.shared.commands import RANGES, option
+from faintspot.cli.shared.engine_requests import asked, asked_at_length, loop_in_words, notes, summary
+from faintspot.cli.shared.options import ENGINE_NAME
+from faintspot.engine.requests.private_socket import ENGINE, TELESCOPE
 from faintspot.engine.requests.requests import since
 
 _REFRESH_S = 0.5
-_LOOP_ACTIONS = {
-    "open": "Open the loop: the mirror keeps its commands.",
-    "close": "Close the loop, starting from the mirror's present commands.",
-    "flat": "Flatten the mirror while the loop is open.",
-}
+_ALONE = {"methods": ("methods", "every"), "loop": ("loop",), "gain": ("gain",)}
+"""Names that `send` does not take together with settings, and what may stand beside them."""
+_OF_TELESCOPE = option("--telescope", is_flag=True, help="Ask the simulated telescope of that name instead.")
 
 
-@click.command("status")
+@click.command("status", short_help="Show counters, latencies, loop or settings of a running engine.")
 @ENGINE_NAME
-@AS_JSON
-def status(name: str, as_json: bool) -> None:
-    """Show counters, latencies and the loop of a running engine."""
-    reply = asked(name, "status")
-    click.echo(to_json(reply, indent=1) if as_json else summary(reply))
+@option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+@option("--watch", is_flag=True, help="Show them until Ctrl-C.")
+@_OF_TELESCOPE
+@click.argument("settings", nargs=-1, metavar="[SETTING]...")
+def status(name: str, as_json: bool, watch: bool, telescope: bool, settings: tuple[str, ...]) -> None:
+    """Show counters, latencies and the loop of a running engine, or the values of settings.
 
-
-@click.command("get")
-@ENGINE_NAME
-@click.argument("settings", nargs=-1)
-def get(name: str, settings: tuple[str, ...]) -> None:
-    """Show settings of a running engine: all, or those named.
-
-    Defaults are filled in; null is what is not used, or found from the PSF or each frame.
-    """
-    for key, value in asked(name, "get", names=list(settings) or None)["settings"].items():
-        click.echo(f"{key} = {to_json(value)}")
-
-
-@click.command("set", short_help="Change settings of a running engine, between two frames.")
-@ENGINE_NAME
-@option(
-    "--subapertures", metavar="LIST", help="Sub-apertures to change, such as 4,5,10-20.", show_default="all"
-)
-@click.argument("changes", nargs=-1, required=True, metavar="NAME=VALUE...")
-def set_settings(name: str, subapertures: str | None, changes: tuple[str, ...]) -> None:
-    """Change settings of a running engine between two frames, all at once or not at all.
-
-    The answer comes when they are in effect. Kernels that this machine has not used yet are compiled first,
-    which takes up to half a minute, once; frames are measured as before meanwhile, and status says so.
+    SETTING is the name of a setting, or "all". Defaults are filled in; null is what is not used, or found
+    from the PSF or each frame.
 
     \b
-    Example:
-      faintspot realtime set noise_std=2.5 keep_brightest=20 --subapertures 4,5,10-20
+    Examples:
+      faintspot realtime status
+      faintspot realtime status keep_brightest noise_std
     """
-    from faintspot.base.config.written_changes import parse_changes, parse_subapertures
-
-    where = None if subapertures is None else parse_subapertures(subapertures)
-    wanted = {"changes": parse_changes(changes), "where": where}
-    reply = asked_at_length(name, "set", **wanted)
-    click.echo(since(reply["frame"]))
-
-
-@click.command("interleave", short_help="Alternate between settings in a running engine.")
-@ENGINE_NAME
-@click.argument("methods")
-@option("--every", type=click.IntRange(1), default=50, help="Frames for each in turn.")
-def interleave(name: str, methods: str, every: int) -> None:
-    """Alternate between settings in a running engine: METHODS as of run --interleave; "set" ends it.
-
-    \b
-    Example:
-      faintspot realtime interleave none,tv --every 100
-    """
-    reply = asked_at_length(name, "interleave", methods=methods, every=every)
-    click.echo(since(reply["frame"]))
+    if settings:
+        names = None if "all" in settings else list(settings)
+        for key, value in asked(name, "get", names=names)["settings"].items():
+            click.echo(f"{key} = {to_json(value)}")
+        return
+    if watch:
+        _watch(name)
+        return
+    reply = asked(name, "status", TELESCOPE if telescope else ENGINE)
+    if as_json:
+        click.echo(to_json(reply, indent=1))
+    else:
+        click.echo(_telescope_in_words(name, reply) if telescope else summary(reply))
 
 
-@click.command("stop")
-@ENGINE_NAME
-def stop_engine(name: str) -> None:
-    """End a running engine."""
-    asked(name, "stop")
-
-
-@click.command("top", short_help="Watch a running engine in the terminal.")
-@ENGINE_NAME
-def top(name: str) -> None:
-    """Watch a running engine in the terminal; Ctrl-C ends watching."""
+def _watch(name: str) -> None:
+    """Show the table of an engine in the terminal until Ctrl-C."""
     from rich.live import Live
 
     with Live(_table(name), refresh_per_second=1 / _REFRESH_S) as live, stop_on_signal() as stop:
@@ -136,45 +95,140 @@ def _table(name: str) -> Any:
     return grid
 
 
-@click.group("control", cls=Group, short_help="Open or close the loop of a running engine.")
-def control() -> None:
-    """Open or close the loop of a running engine, whose configuration has [control].
+@click.command("send", short_help="Change settings, methods or the loop of a running engine.")
+@ENGINE_NAME
+@option(
+    "--subapertures",
+    type=RANGES,
+    metavar="LIST",
+    help="Sub-apertures to change, such as 4,5,10-20.",
+    show_default="all",
+)
+@_OF_TELESCOPE
+@click.argument("changes", nargs=-1, required=True, metavar="NAME=VALUE...")
+def send(name: str, subapertures: list[int] | None, telescope: bool, changes: tuple[str, ...]) -> None:
+    """Change a running engine between two frames, or a simulated telescope from the next exposure on.
 
-    While it is open, the mirror keeps its commands. A guard opens it when the slopes diverge or too many are
-    not valid; status says why.
+    All changes are made at once or not at all; the answer comes when they are in effect. NAME is that of a
+    setting. Kernels that this machine has not used yet are compiled first, which takes up to half a minute,
+    once; frames are measured as before meanwhile, and status says so. Or NAME is, alone:
+
+    \b
+    methods  settings that alternate, as of run --interleave, each for `every` frames [default: 50]; "set"
+             ends it
+    loop     open: the mirror keeps its commands; close: start from its present commands; flat: flatten the
+             mirror of an open loop. A guard opens the loop when the slopes diverge or too many are not
+             valid; status says why
+    gain     loop gain
+
+    \b
+    With --telescope:
+    photons        photo-electrons of a fully lit sub-aperture in a frame, or
+    magnitude      of the star, in the configuration's band
+    r0_m           Fried parameter at 500 nm; two values: the ends of its drift, or
+    seeing_arcsec  0.976 x 500 nm / r0
+    wind_factor    all winds, as a multiple of the configuration's
 
     \b
     Examples:
-      faintspot realtime control close
-      faintspot realtime control gain 0.3
+      faintspot realtime send noise_std=2.5 keep_brightest=20 --subapertures 4,5,10-20
+      faintspot realtime send methods=none,tv every=100
+      faintspot realtime send loop=close
+      faintspot realtime send --telescope magnitude=11 seeing_arcsec=1.2 wind_factor=1.5
     """
+    wanted = parse_changes(changes, texts=("methods", "loop"))
+    for alone, beside in _ALONE.items():
+        if alone in wanted and not telescope:
+            check_keys("", wanted, beside, what=f"name beside {alone}")
+    if telescope:
+        reply = asked(name, "set", TELESCOPE, changes=wanted)
+        click.echo(f"{since(reply['frame'])}: {_conditions_in_words(reply['conditions'])}")
+    elif "loop" in wanted:
+        click.echo(loop_in_words(asked(name, "loop", action=wanted["loop"])["loop"]))
+    elif "gain" in wanted:
+        click.echo(loop_in_words(asked(name, "loop", action="gain", **wanted)["loop"]))
+    elif "methods" in wanted:
+        click.echo(since(asked_at_length(name, "interleave", **wanted)["frame"]))
+    else:
+        click.echo(since(asked_at_length(name, "set", changes=wanted, where=subapertures)["frame"]))
 
 
-@control.command("status")
+@click.command("stop")
 @ENGINE_NAME
-@AS_JSON
-def loop_status(name: str, as_json: bool) -> None:
-    """Show whether the loop is closed, and if not, why."""
-    loop = asked(name, "loop", action="status")["loop"]
-    click.echo(to_json(loop, indent=1) if as_json else loop_in_words(loop))
+def stop_engine(name: str) -> None:
+    """End a running engine."""
+    asked(name, "stop")
 
 
-@control.command("gain")
+_FILE = click.argument("file", metavar="FILE", type=click.Path(dir_okay=False, resolve_path=True))
+_USE = option("--use", is_flag=True, help="Measure with it from now on, as send estimator=NAME does.")
+
+
+@click.command("load", short_help="Load an estimator from a Python file into a running engine.")
 @ENGINE_NAME
-@click.argument("gain", type=float)
-def gain(name: str, gain: float) -> None:
-    """Change the loop gain from the next frame on."""
-    click.echo(loop_in_words(asked(name, "loop", action="gain", gain=gain)["loop"]))
+@_FILE
+@_USE
+def load(**given: Any) -> None:
+    """Load the estimators that a Python file registers into a running engine.
+
+    They are tried in a process of their own first, and refused where they fail, crash, return what they must
+    not, or do not return. The file runs with all rights of the engine.
+
+    \b
+    Example:
+      faintspot realtime load examples/own_estimator.py
+      faintspot realtime send estimator=power power=2
+    """
+    _load("load", **given)
 
 
-def _add_action(action: str, text: str) -> None:
-    """Add a command that needs nothing but the engine's name."""
+@click.command("swap", short_help="Read the edited file of a loaded estimator again.")
+@ENGINE_NAME
+@_FILE
+@_USE
+def swap(**given: Any) -> None:
+    """Load the estimators of a file in place of those of the same names, between two frames."""
+    _load("swap", **given)
 
-    @control.command(action, help=text)
-    @ENGINE_NAME
-    def act(name: str) -> None:
-        click.echo(loop_in_words(asked(name, "loop", action=action)["loop"]))
+
+def _load(command: str, name: str, file: str, use: bool) -> None:
+    reply = asked_at_length(name, command, source=file)
+    names, frame = reply["estimators"], reply["frame"]
+    if use:
+        if len(names) != 1:
+            raise InputError(f"--use: expected one estimator in {file}, got {', '.join(names)}")
+        frame = asked_at_length(name, "set", changes={"estimator": names[0]}, where=None)["frame"]
+    click.echo(f"{', '.join(names)}: loaded from {file}{'' if frame is None else f', {since(frame)}'}")
 
 
-for _action, _text in _LOOP_ACTIONS.items():
-    _add_action(_action, _text)
+@click.command("unload", short_help="Unload an estimator from a running engine.")
+@ENGINE_NAME
+@click.argument("estimator")
+def unload(name: str, estimator: str) -> None:
+    """Unload an estimator; where it is in use, the built-in estimator before takes over."""
+    frame = asked_at_length(name, "unload", estimator=estimator)["frame"]
+    click.echo(f"{estimator}: unloaded{'' if frame is None else f', {since(frame)}'}")
+
+
+def _telescope_in_words(name: str, reply: dict[str, Any]) -> str:
+    """Summarise the state of a simulated telescope."""
+    commands, truth = reply["commands"], reply["truth"]
+    state = commands["obstacle"] or f"{commands['taken']} taken, {commands['refused']} refused"
+    lines = [
+        f"{name}: {reply['configuration']}, {reply['frames']} frames at {reply['frame_rate_hz']:g} a second, "
+        f"{reply['late']} late, {reply['overruns']} frame times without a frame",
+        _conditions_in_words(reply["conditions"]),
+        f"{commands['stream']}: {state}",
+    ]
+    if truth is not None:
+        lines.append(
+            f"frame {truth['frame']:.0f}: Strehl ratio {truth['strehl']:.3f}, {truth['rms_nm']:.0f} nm"
+        )
+    return "\n  ".join(lines)
+
+
+def _conditions_in_words(conditions: dict[str, Any]) -> str:
+    low, high = sorted(conditions["r0_m"])
+    r0 = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+    photons, winds = conditions["photons"], conditions["wind_factor"]
+    return f"{photons:g} photons, r0 {r0} m, winds x {winds:g}"

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 import click
 from rich.console import Console
 
-from faintspot.base.errors import MissingExtraError
-from faintspot.base.extras import present
 from faintspot.cli.realtime.camera import stop_on_signal
 from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.options import PORT, name_option
 from faintspot.cli.shared.output import results_table
 
@@ -22,9 +21,8 @@ if TYPE_CHECKING:
     from faintspot.base.statistics import Estimate
     from faintspot.engine.page.demonstration import MethodShown, Shown
 
-_NEEDED = {"realtime": ("pyshmem", "tornado", "zarr"), "loop": ("hcipy",)}
 
-
+@needs("realtime,loop", "pyshmem", "tornado", "zarr", "hcipy")
 @click.command("demo", short_help="Run a simulated telescope, the engine and its page together.")
 @name_option("Name of the engine and its streams.")
 @option("--output", "-o", metavar="FOLDER", default="faintspot-demo", help="Folder for what it makes.")
@@ -49,7 +47,6 @@ def demo(
     The loop is closed on a faint star, methods alternate, and a table at the end gives the Strehl ratio of
     each. Needs the extras `realtime` and `loop`.
     """
-    _check_extras()
     from faintspot.engine.page.demonstration import LiveDemonstration
 
     plan = LiveDemonstration(Path(output), flux_e, frame_rate_hz, name, port, seed)
@@ -78,18 +75,6 @@ def methods_table(methods: list[MethodShown]) -> Table:
         )
     table.caption = "Standard errors from blocks of turns; p50, p99 from the last row to the slopes, us."
     return table
-
-
-def _check_extras() -> None:
-    """Make sure that all that is needed is installed; one line says all that is not."""
-    missing = {
-        extra: [package for package in packages if not present(package)]
-        for extra, packages in _NEEDED.items()
-    }
-    missing = {extra: packages for extra, packages in missing.items() if packages}
-    if missing:
-        packages = " and ".join(package for each in missing.values() for package in each)
-        raise MissingExtraError(packages, ",".join(missing), "faintspot realtime demo")
 
 
 def in_words(shown: Shown) -> list[str]:

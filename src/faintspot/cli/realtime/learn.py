@@ -101,14 +101,14 @@ def _learn_from(
     from faintspot.loop.control.identification.learning import learn_controller
     from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
     from faintspot.loop.telemetry.recording import recorded_loop, site_of
-    from faintspot.slopes.pipeline.settings import Settings
-    from faintspot.slopes.sensor.layout import Layout
+    from faintspot.slopes.pipeline.configuration import Configuration
 
-    control = load_control(config)
+    described = Configuration(config)
+    control = load_control(described)
     if control is None:
         raise InputError(f"{config}: expected a table [control], which calibrate writes")
-    layout, night = Layout.load(config), read_telemetry(store, images=False)
-    prior = prior_std_px(Settings.load(config), layout)
+    layout, night = described.layout, read_telemetry(store, images=False)
+    prior = prior_std_px(described.settings, layout)
     loop = recorded_loop(night, control, layout, prior)
     _, delay, unknown = known_delay(loop)
     telemetry, rate_hz = open_loop_of(loop, delay).telemetry, loop.frame_rate_hz

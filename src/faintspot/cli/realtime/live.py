@@ -24,7 +24,7 @@ _NICENESS = 5  # the engine comes first
 
 
 @needs("realtime", "tornado", "pyshmem", "zarr")
-@click.command(short_help="Show a running engine, or a recording, as a web page.")
+@click.command()
 @click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[RECORDING]")
 @ENGINE_NAME
 @option("--bind", default="127.0.0.1", metavar="ADDRESS", help="Address of this machine to listen on.")

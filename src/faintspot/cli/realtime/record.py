@@ -1,4 +1,4 @@
-"""faintspot realtime record, export: telemetry of a running engine to files."""
+"""faintspot realtime record: telemetry of a running engine to files."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ from faintspot.base.errors import InputError
 from faintspot.base.extras import require
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import ENGINE_NAME
+from faintspot.cli.shared.options import AO_MODE, ENGINE_NAME
+from faintspot.cli.shared.output import write_aot_file
 
 if TYPE_CHECKING:
     from faintspot.engine.telemetry.recorder import RecordingReport
-
-_MODES = click.Choice(["SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO"])
-_AO_MODE = option("--ao-mode", type=_MODES, default="SCAO", help="What an AOT file says the sensor serves.")
 
 
 @needs("realtime", "zarr")
@@ -26,7 +24,7 @@ _AO_MODE = option("--ao-mode", type=_MODES, default="SCAO", help="What an AOT fi
 @ENGINE_NAME
 @option("--frames", type=click.IntRange(1), help="Stop after so many.")
 @option("--seconds", type=click.FloatRange(0, min_open=True), help="Stop after so long.")
-@_AO_MODE
+@AO_MODE
 def record(out: Path, name: str, frames: int | None, seconds: float | None, ao_mode: str) -> None:
     """Record slopes, fluxes, times, images and changes of settings of a running engine until Ctrl-C.
 
@@ -48,33 +46,7 @@ def record(out: Path, name: str, frames: int | None, seconds: float | None, ao_m
     report = record_engine(name, store, frames, seconds)
     click.echo(f"{store}: {summary(report)}")
     if out.suffix == ".fits" and report.frames:
-        _export(store, out, ao_mode)
-
-
-@needs("realtime", "zarr", "aotpy")
-@click.command("export", short_help="Turn recorded telemetry into an AOT file.")
-@click.argument("store", type=click.Path(path_type=Path), metavar="STORE")
-@click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
-@_AO_MODE
-def export(store: Path, out: Path, ao_mode: str) -> None:
-    """Turn a Zarr store of telemetry into a file of the Adaptive Optics Telemetry standard (AOT, FITS).
-
-    \b
-    Example:
-      faintspot realtime export night.zarr night.fits
-    """
-    if out.suffix != ".fits":
-        raise InputError(f"{out}: expected a name that ends in .fits")
-    _export(store, out, ao_mode)
-
-
-def _export(store: Path, out: Path, ao_mode: str) -> None:
-    """Write the AOT file."""
-    from faintspot.io import read_telemetry, write_aot
-
-    telemetry = read_telemetry(store)
-    write_aot(out, telemetry, ao_mode=ao_mode)
-    click.echo(f"{out}: {len(telemetry.frame)} frames, {len(telemetry.image_frame)} images")
+        write_aot_file(store, out, ao_mode)
 
 
 def record_engine(name: str, store: Path, frames: int | None, seconds: float | None) -> RecordingReport:

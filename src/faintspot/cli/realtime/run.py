@@ -6,17 +6,20 @@ import os
 import threading
 from contextlib import nullcontext
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from faintspot.cli.realtime.camera import stop_on_signal
 from faintspot.cli.realtime.live import page_beside
-from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.commands import RANGES, option
 from faintspot.cli.shared.engine_requests import summary
 from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.options import FRAMES, configuration_option, name_option
 from faintspot.engine.requests.private_socket import socket_path
+
+if TYPE_CHECKING:
+    from faintspot.slopes.pipeline.configuration import Configuration
 
 
 @needs("realtime", "pyshmem")
@@ -25,7 +28,7 @@ from faintspot.engine.requests.private_socket import socket_path
 @name_option("Name of the pixel ring, the streams and the engine.")
 @option("--stream", metavar="NAME", help="Take whole frames from a stream: pyshmem's, or isio:NAME.")
 @option("--threads", type=click.IntRange(1), default=1, help="Worker threads.")
-@option("--cpus", metavar="LIST", help="Processors to run on, such as 2,3 or 4-7.")
+@option("--cpus", type=RANGES, metavar="LIST", help="Processors to run on, such as 2,3 or 4-7.")
 @option(
     "--priority",
     type=click.IntRange(0, 99),
@@ -59,7 +62,7 @@ from faintspot.engine.requests.private_socket import socket_path
     default=100,
     help="Telemetry keeps the images of every N-th frame; 0: of none.",
 )
-@option("--close-loop", is_flag=True, help="Close the loop with the first frame; see control.")
+@option("--close-loop", is_flag=True, help="Close the loop with the first frame.")
 @option("--no-control", is_flag=True, help="Compute no commands, although the configuration has [control].")
 @option(
     "--flux-frames",
@@ -74,7 +77,7 @@ def run(
     config: str,
     name: str,
     stream: str | None,
-    cpus: str | None,
+    cpus: list[int] | None,
     priority: int,
     interleave: str | None,
     every: int,
@@ -98,7 +101,6 @@ def run(
       faintspot realtime run --close-loop --interleave none,tv:0.6,tv:0.8 --every 50
       faintspot realtime run --close-loop --interleave integrator,kalman --every 250
     """
-    from faintspot.base.config.written_changes import parse_subapertures
     from faintspot.base.errors import InputError
     from faintspot.engine.engine import Engine
     from faintspot.engine.path.pipeline_maker import PipelineMaker
@@ -107,18 +109,24 @@ def run(
     from faintspot.engine.requests.scheduling import real_time
     from faintspot.engine.settings.interleaving import Interleaving
     from faintspot.loop.control.configuration import load_control
-    from faintspot.slopes.pipeline import configuration
+    from faintspot.slopes.pipeline.configuration import Configuration
 
-    layout, settings, calibration, psf, score = configuration.load_all(config)
-    control = None if no_control else load_control(config)
+    described = Configuration(config)
+    layout, settings = described.layout, described.settings
+    control = None if no_control else load_control(described)
     if close_loop and control is None:
         raise InputError(f"--close-loop: expected [control] in {config}, which says what makes commands")
-    processors = parse_subapertures(cpus) if cpus else None
     engine = Engine(
         name,
-        PipelineMaker(layout, calibration, psf, score, None if control is None else control.reference),
+        PipelineMaker(
+            layout,
+            described.calibration,
+            described.psf,
+            described.score,
+            None if control is None else control.reference,
+        ),
         settings,
-        cpus=processors,
+        cpus=cpus,
         source=None if stream is None else _followed(stream, name),
         interleaving=None if interleave is None else Interleaving.parse(interleave, every),
         deadline_s=deadline_us * 1e-6,
@@ -135,9 +143,9 @@ def run(
         server,
         stop_on_signal() as stop,
         learns,
-        _following(engine, config),
+        _following(engine, described),
         page,
-        real_time(processors, priority) as refused,
+        real_time(cpus, priority) as refused,
     ):
         engine.refused = refused
         for line in refused:
@@ -162,15 +170,14 @@ def _learning(engine: Any, config: str) -> Any:
     return background_learning(engine, config, options.learn_every_s, partial(click.echo, err=True))
 
 
-def _following(engine: Any, config: str) -> Any:
+def _following(engine: Any, described: Configuration) -> Any:
     """The process that follows a laser guide star's profile, as a context, if the configuration wants it."""
     from faintspot.engine.background.sodium import background_sodium
-    from faintspot.slopes.spots.laser_spots import load_laser
 
-    laser = load_laser(config)
+    laser = described.laser
     if laser is None or not laser.follow_every_s:
         return nullcontext()
-    return background_sodium(engine, config, partial(click.echo, err=True))
+    return background_sodium(engine, str(described.path), partial(click.echo, err=True))
 
 
 def _followed(stream: str, name: str) -> Any:

@@ -1,4 +1,4 @@
-"""faintspot realtime telescope run, set, status: a simulated telescope."""
+"""faintspot realtime telescope: a simulated telescope."""
 
 from __future__ import annotations
 
@@ -10,22 +10,13 @@ from typing import Any, Self
 import click
 
 from faintspot.base.files import output_errors
-from faintspot.base.json_text import to_json
 from faintspot.cli.realtime.camera import published, stop_on_signal
-from faintspot.cli.shared.commands import Group, option
-from faintspot.cli.shared.options import AS_JSON, FRAMES, READOUT_FRACTION, SLOTS, name_option
+from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.options import FRAMES, READOUT_FRACTION, SLOTS, name_option
 from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
-from faintspot.engine.requests.requests import request, since
-
-_NAME = name_option("Name of the telescope.")
 
 
-@click.group("telescope", cls=Group, short_help="Simulate a telescope whose mirror follows a command stream.")
-def telescope() -> None:
-    """Simulate a telescope whose mirror follows a command stream."""
-
-
-@telescope.command("run", short_help="Run the simulated telescope until Ctrl-C.")
+@click.command("telescope", short_help="Simulate a telescope whose mirror follows a command stream.")
 @click.argument("configuration", metavar="[CONFIG]", default="canary")
 @name_option("Name of the pixel ring and the streams.")
 @option(
@@ -68,7 +59,7 @@ def telescope() -> None:
     metavar="CSV",
     help="Write the true Strehl ratio of every frame, for faintspot telemetry --strehl.",
 )
-def run(
+def telescope(
     configuration: str,
     name: str,
     frame_rate_hz: float | None,
@@ -87,9 +78,9 @@ def run(
 
     \b
     In three terminals:
-      faintspot realtime telescope run canary --frame-rate-hz 250 --write-config bench
+      faintspot realtime telescope canary --frame-rate-hz 250 --write-config bench
       faintspot realtime run --config bench/faintspot.toml
-      faintspot realtime telescope set photons=50 seeing_arcsec=1.2
+      faintspot realtime send --telescope photons=50 seeing_arcsec=1.2
     """
     from faintspot.engine.requests.requests import ControlServer
     from faintspot.engine.requests.scheduling import real_time
@@ -149,56 +140,3 @@ class _StrehlFile:
         time_s = begun_s + self._exposure_s / 2 + time.time() - time.monotonic()
         with output_errors(self._path):
             self._stream.write(f"{time_s:.4f},{strehl:.5f},{self._exposure_s:.6g}\n")
-
-
-@telescope.command("set", short_help="Change the star or the turbulence.")
-@_NAME
-@click.argument("changes", nargs=-1, required=True, metavar="NAME=VALUE...")
-def telescope_set(name: str, changes: tuple[str, ...]) -> None:
-    """Change the star or the turbulence from the next exposure on.
-
-    \b
-    photons        photo-electrons of a fully lit sub-aperture in a frame, or
-    magnitude      of the star, in the configuration's band
-    r0_m           Fried parameter at 500 nm; two values: the ends of its drift, or
-    seeing_arcsec  0.976 x 500 nm / r0
-    wind_factor    all winds, as a multiple of the configuration's
-
-    \b
-    Example:
-      faintspot realtime telescope set magnitude=11 seeing_arcsec=1.2 wind_factor=1.5
-    """
-    from faintspot.base.config.written_changes import parse_changes
-
-    reply = request(socket_path(name, TELESCOPE), "set", changes=parse_changes(changes))
-    click.echo(f"{since(reply['frame'])}: {_in_words(reply['conditions'])}")
-
-
-@telescope.command("status", short_help="Show what the telescope sees, and whether it keeps its pace.")
-@_NAME
-@AS_JSON
-def telescope_status(name: str, as_json: bool) -> None:
-    """Show what the telescope sees, and whether it keeps its pace."""
-    reply = request(socket_path(name, TELESCOPE), "status")
-    if as_json:
-        click.echo(to_json(reply, indent=1))
-        return
-    commands, truth = reply["commands"], reply["truth"]
-    click.echo(
-        f"{name}: {reply['configuration']}, {reply['frames']} frames at {reply['frame_rate_hz']:g} a second, "
-        f"{reply['late']} late, {reply['overruns']} frame times without a frame"
-    )
-    click.echo(f"  {_in_words(reply['conditions'])}")
-    state = commands["obstacle"] or f"{commands['taken']} taken, {commands['refused']} refused"
-    click.echo(f"  {commands['stream']}: {state}")
-    if truth is not None:
-        click.echo(
-            f"  frame {truth['frame']:.0f}: Strehl ratio {truth['strehl']:.3f}, {truth['rms_nm']:.0f} nm"
-        )
-
-
-def _in_words(conditions: dict[str, Any]) -> str:
-    low, high = sorted(conditions["r0_m"])
-    r0 = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-    photons, winds = conditions["photons"], conditions["wind_factor"]
-    return f"{photons:g} photons, r0 {r0} m, winds x {winds:g}"

@@ -1,12 +1,17 @@
-"""Options, commands and groups whose help is alike everywhere: units, defaults, sections, near misses."""
+"""Options and commands whose help is alike everywhere: units, defaults, sections."""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
 
 import click
+
+from faintspot.base.config.options import REQUIRED, TEXT, Options
+from faintspot.base.config.written_changes import parse_ranges
+from faintspot.base.errors import InputError
 
 _GENERAL = "Options"
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
@@ -29,6 +34,51 @@ class _Option(click.Option):
         return extra
 
 
+class Listed(click.ParamType[Any]):
+    """A list with commas.
+
+    Parameters
+    ----------
+    kind : type
+        str or float.
+    counts : tuple of int
+        Allowed numbers of items; none: any.
+    expected : str
+        What messages expect.
+    """
+
+    name = "list"
+
+    def __init__(self, kind: type = str, counts: tuple[int, ...] = (), expected: str = "") -> None:
+        self.kind, self.counts, self.expected = kind, counts, expected or "numbers with commas"
+
+    def convert(self, value: Any, parameter: Any, context: click.Context | None) -> Any:
+        """Return the items of a text as a tuple."""
+        if not isinstance(value, str):
+            return value
+        try:
+            items = tuple(self.kind(part.strip()) for part in value.split(",") if part.strip())
+        except ValueError:
+            items = ()
+        wrong = self.kind is float and not (items and all(map(math.isfinite, items)))
+        if wrong or (self.counts and len(items) not in self.counts):
+            raise InputError(f"{parameter.opts[0]} {value}: expected {self.expected}")
+        return items
+
+
+class _Ranges(click.ParamType[Any]):
+    """Numbers and ranges of numbers, such as 4,5,10-20."""
+
+    name = "ranges"
+
+    def convert(self, value: Any, parameter: Any, context: click.Context | None) -> Any:
+        """Return the numbers."""
+        return parse_ranges(value, parameter.opts[0]) if isinstance(value, str) else value
+
+
+NAMES, NUMBERS, RANGES = Listed(), Listed(float), _Ranges()
+
+
 class SectionedCommand(click.Command):
     """A command whose options are listed by section, in the order of their first appearance."""
 
@@ -43,41 +93,6 @@ class SectionedCommand(click.Command):
         for heading, records in sections.items():
             with formatter.section(heading):
                 formatter.write_dl(records)
-
-
-class Group(click.Group):
-    """A group that suggests the nearest command for an unknown one, and may list its commands by section."""
-
-    sections: ClassVar[Mapping[str, Sequence[str]]] = {}
-    """Names of commands by heading; those that are not named come first."""
-
-    def resolve_command(
-        self, context: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find a command."""
-        name = args[0] if args else ""
-        if name and not name.startswith("-") and self.get_command(context, name) is None:
-            near = difflib.get_close_matches(name, self.list_commands(context), n=1)
-            also = (
-                f"did you mean {near[0]!r}?" if near else f"expected {', '.join(self.list_commands(context))}"
-            )
-            raise click.UsageError(f"no command {name!r}: {also}", context)
-        return super().resolve_command(context, args)
-
-    def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the commands."""
-        named = {name for names in self.sections.values() for name in names}
-        rest = [name for name in self.list_commands(context) if name not in named]
-        for heading, names in {"Commands": rest, **self.sections}.items():
-            rows = [(name, self.summary(context, name)) for name in names]
-            if rows:
-                with formatter.section(heading):
-                    formatter.write_dl(rows)
-
-    def summary(self, context: click.Context, name: str) -> str:
-        """Return the line that describes a command."""
-        found = self.get_command(context, name)
-        return "" if found is None else found.get_short_help_str(limit=100)
 
 
 def _range_in_words(kind: Any) -> str:
@@ -103,3 +118,58 @@ def option(*names: str, **attributes: Any) -> Decorator:
     if kind in (int, float) or isinstance(kind, click.IntRange | click.FloatRange):
         attributes.setdefault("metavar", "N" if kind is int or isinstance(kind, click.IntRange) else "X")
     return click.option(*names, cls=_Option, **attributes)
+
+
+def flag_of(name: str) -> str:
+    """Return the option that gives a value of this name."""
+    return f"--{name.replace('_', '-')}"
+
+
+@contextmanager
+def errors_of_options(where: object) -> Iterator[None]:
+    """Say in errors where they occur, and name values that the command's options give by their options."""
+    try:
+        yield
+    except InputError as error:
+        given = error.name in click.get_current_context().params
+        name = flag_of(error.name) if given else error.name
+        raise InputError(error.expected, name=name, value=error.value).within(where) from None
+
+
+def declared(
+    kind: type[Options],
+    *names: str,
+    sections: Mapping[str, str] | str = _GENERAL,
+    show_default: str | None = None,
+) -> Decorator:
+    """Return the options that a class declares, all or those named; what is not given is None.
+
+    Parameters
+    ----------
+    kind : type
+    *names : str
+    sections : str or mapping
+        Heading in the help of a `SectionedCommand`, or headings by the group of an option.
+    show_default : str, optional
+        Default in words, if it is not that of the class.
+    """
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        defaults = kind.defaults()
+        for name, what in reversed(kind.declared().items()):
+            if name not in (names or (name,)) or not what.meaning:
+                continue
+            attributes: dict[str, Any] = {"help": what.meaning, "type": int if what.whole else float}
+            if what.choices:
+                attributes["type"] = click.Choice(what.choices)
+            elif what.kind == TEXT:
+                attributes["type"] = str
+            if what.unit:
+                attributes["metavar"] = what.unit.upper().replace("E-", "E")
+            if show_default or defaults[name] not in (None, REQUIRED):
+                attributes["show_default"] = show_default or f"{defaults[name]}".removesuffix(".0")
+            section = sections if isinstance(sections, str) else sections[what.group]
+            command = option(flag_of(name), name, section=section, **attributes)(command)
+        return command
+
+    return add

@@ -8,16 +8,16 @@ from typing import Any
 
 import click
 
-from faintspot.engine.requests.private_socket import socket_path
+from faintspot.engine.requests.private_socket import ENGINE, socket_path
 from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
 
 PATIENCE_S = 2.0
 """Delay before the reason for waiting is printed."""
 
 
-def asked(name: str, command: str, **fields: Any) -> dict[str, Any]:
-    """Ask the engine of that name; see `faintspot.engine.requests.requests.request`."""
-    return request(socket_path(name), command, **fields)
+def asked(name: str, command: str, kind: str = ENGINE, /, **fields: Any) -> dict[str, Any]:
+    """Ask the engine or telescope of that name; see `faintspot.engine.requests.requests.request`."""
+    return request(socket_path(name, kind), command, **fields)
 
 
 def asked_at_length(name: str, command: str, **fields: Any) -> dict[str, Any]:

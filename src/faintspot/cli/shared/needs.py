@@ -27,9 +27,8 @@ def needs(extra: str, *packages: str) -> Callable[[click.Command], click.Command
 
 
 def needs_linux(command: click.Command) -> click.Command:
-    """Declare that a command, or every command of a group, does its work in real time: on Linux only."""
-    for each in command.commands.values() if isinstance(command, click.Group) else [command]:
-        _check_first(each, require_linux)
+    """Declare that a command does its work in real time: on Linux only."""
+    _check_first(command, require_linux)
     return command
 
 

@@ -23,7 +23,6 @@ def name_option(what: str) -> Option:
 
 
 ENGINE_NAME = name_option("Name of the engine.")
-AS_JSON = option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
 
 
 def which_frames(**options: Any) -> Option:
@@ -55,32 +54,14 @@ READOUT_FRACTION = option(
 PORT = option(
     "--port", type=click.IntRange(0, 65535), default=8642, help="Port of the page; 0: any that is free."
 )
-WORKERS = option(
-    "--workers",
-    type=click.IntRange(0),
-    help="Processes on this machine; 0 or 1: this process alone.",
-    show_default="all processors",
-)
-SCHEDULER = option("--scheduler", metavar="ADDRESS", help="Dask scheduler to use instead: tls://host:8786.")
-PIXEL_SCALE = option(
-    "--pixel-scale-arcsec",
-    type=float,
-    metavar="ARCSEC",
-    help="Side of a pixel on the sky: for slopes in arcsec and wavefronts.",
-    section="Telescope",
-)
-SUBAPERTURE = option(
-    "--subaperture-m",
-    type=float,
-    metavar="M",
-    help="Side of a sub-aperture in the telescope's pupil.",
-    section="Telescope",
-)
-DIAMETER = option(
-    "--diameter-m", type=float, metavar="M", help="Diameter of the telescope's pupil.", section="Telescope"
-)
 REFERENCE = option(
     "--reference",
     metavar="FILE",
     help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE[:ARRAY].",
+)
+AO_MODE = option(
+    "--ao-mode",
+    type=click.Choice(["SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO"]),
+    default="SCAO",
+    help="What an AOT file says the sensor serves.",
 )

@@ -25,8 +25,8 @@ from faintspot.loop.control.identification.model import KALMAN
 from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
 from faintspot.loop.control.identification.relearning import FEWEST_FRAMES, RelearntControl, relearn
 from faintspot.loop.telemetry.recording import CLOSED, recorded_loop, site_of
+from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.settings import Settings
-from faintspot.slopes.sensor.layout import Layout
 
 _FROM_NOTHING_EVERY = 6  # learnings, as a search from known layers finds no new one
 
@@ -54,12 +54,12 @@ class BackgroundLearning(BackgroundProcess):
     failed = "not learnt"
 
     def __init__(self, name: str, config: str | Path, every_s: float) -> None:
-        control = load_control(config)
+        described = Configuration(config)
+        control = load_control(described)
         if control is None or control.options.controller != KALMAN:
             raise InputError(f'{config}: expected controller = "kalman" in [control], to learn it again')
-        layout = Layout.load(config)
         self._control: Control = control
-        self._site, self._layout = site_of(layout), layout
+        self._site, self._layout = site_of(described.layout), described.layout
         super().__init__(name)
         self._every_s = every_s
         self._cursor, self._records = self._reader.records.written, list[NDArray[Any]]()

@@ -22,8 +22,8 @@ from faintspot.base.validity import are_valid
 from faintspot.engine.background.background_process import BackgroundProcess, background_process
 from faintspot.engine.engine import Engine
 from faintspot.loop.control.configuration import load_control
-from faintspot.slopes.pipeline import configuration
-from faintspot.slopes.spots.laser_spots import load_laser, matched_filter
+from faintspot.slopes.pipeline.configuration import Configuration
+from faintspot.slopes.spots.laser_spots import matched_filter
 from faintspot.slopes.spots.sodium import SodiumProfile
 from faintspot.slopes.training.known_sodium import KnownSodium, calibrated_images, dark_variance_e2
 from faintspot.slopes.training.sodium import MeanImages
@@ -58,15 +58,16 @@ class SodiumFollower(BackgroundProcess):
     failed = "not followed"
 
     def __init__(self, name: str, config: str | Path) -> None:
-        laser = load_laser(config)
+        described = Configuration(config)
+        laser = described.laser
         if laser is None or not laser.follow_every_s:
             raise InputError(f"{config}: expected [laser] with follow_every_s > 0, to follow its profile")
         self._laser = laser
-        self._layout, _, self._calibration, _, _ = configuration.load_all(config)
+        self._layout, self._calibration = described.layout, described.calibration
         self._star = laser.star_of(self._layout)
         self._dark = dark_variance_e2(self._layout, self._calibration)
         self._profile: SodiumProfile = self._star.focused(laser.profile)
-        control = load_control(config)
+        control = load_control(described)
         reference = np.zeros((2, len(self._layout)))
         if control is not None and control.reference is not None:
             reference = np.reshape(control.reference, reference.shape)

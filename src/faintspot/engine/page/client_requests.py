@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from faintspot.base.config.written_changes import parse_changes, parse_subapertures
+from faintspot.base.config.written_changes import parse_changes, parse_ranges
 from faintspot.base.errors import InputError
 from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request, since
@@ -80,12 +80,12 @@ class EngineRequests:
                 f"changes: expected at most {_MOST_CHANGES}, and sub-apertures such as 4,5,10-20"
             )
         changes = parse_changes(texts)
-        indices = parse_subapertures(where) if where.strip() else None
+        indices = parse_ranges(where) if where.strip() else None
         reply = self._ask("set", changes=changes, where=indices)
         return {"text": since(reply["frame"])}
 
     def _interleave(self, request: dict[str, Any]) -> Mapping[str, Any]:
-        """Interleave configurations as `faintspot realtime interleave`."""
+        """Interleave configurations as `faintspot realtime send methods=METHODS`."""
         reply = self._ask("interleave", methods=request.get("methods"), every=request.get("every"))
         return {"text": since(reply.get("frame"))}
 

@@ -92,7 +92,7 @@ class LiveDemonstration:
 
     @cached_property
     def methods(self) -> dict[str, str]:
-        """Methods that take turns, by name, in the format of `faintspot realtime interleave`.
+        """Methods that take turns, by name, in the format of `faintspot realtime run --interleave`.
 
         The window uses its centroid gain for speckled spots, as a system would have measured it. "map" uses
         the Kalman filter's prediction. Brightest pixels do better without a correction of their very low
@@ -161,7 +161,7 @@ class LiveDemonstration:
             seed = ["--seed", str(self.seed)]
             turns = ["--interleave", ",".join(self.methods.values()), "--every", str(self.turn_frames)]
             images = ["--images-every", str(_IMAGES_EVERY)]
-            processes.start(_TELESCOPE, ["realtime", "telescope", "run", str(loop), *name, *seed])
+            processes.start(_TELESCOPE, ["realtime", "telescope", str(loop), *name, *seed])
             processes.start(_ENGINE, ["realtime", "run", "--config", str(engine), *name, *turns, *images])
             say("starting telescope and engine; on first use the engine compiles for about a minute")
 

@@ -87,7 +87,7 @@ def settings_rows(values: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _as_text(value: Any) -> str:
-    """Format a value as for `faintspot realtime set`; long lists are abbreviated to both ends."""
+    """Format a value as for `faintspot realtime send`; long lists are abbreviated to both ends."""
     if value is None:
         return "none"
     if isinstance(value, bool):

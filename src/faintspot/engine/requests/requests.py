@@ -62,7 +62,7 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
         When no engine listens there, the engine refuses, or it does not answer in time.
     """
     kind, name = server_of(Path(path))
-    starts = "run" if kind == ENGINE else f"{kind} run"
+    starts = "run" if kind == ENGINE else kind
     try:
         line = _encoded({"command": command, **fields}, exact=True)
     except (TypeError, ValueError) as error:

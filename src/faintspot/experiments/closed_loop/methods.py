@@ -212,8 +212,8 @@ def method_kind(name: str) -> MethodKind:
     try:
         estimator = _estimators().get(base) or estimator_named(base)
     except InputError as error:
-        text = str(error).removeprefix("estimator")
-        raise InputError(f"method{text}; after it may follow {', '.join(VARIANTS)}") from None
+        expected = f"{error.expected}; after it may follow {', '.join(VARIANTS)}"
+        raise InputError(expected, name="method", value=error.value) from None
     if _PREDICTED in variants and not estimator.takes_prior:
         raise InputError(f"method = {name!r}: expected an estimator that takes a prior, {base!r} takes none")
     if _FILTER in variants and estimator is not Window:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between, one_of
+from faintspot.base.config.options import LIST, Options, number
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.methods import MethodKind, method_kind
 from faintspot.loop.control.identification.learning import INTEGRATOR, KALMAN
@@ -160,7 +161,7 @@ _LEAST_PHOTONS = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class LoopQuestion:
+class LoopQuestion(Options):
     """A closed loop, and the stars to answer for.
 
     Parameters
@@ -194,26 +195,22 @@ class LoopQuestion:
     """
 
     configuration: LoopConfiguration
-    magnitudes: Sequence[float] | None = None
+    magnitudes: Sequence[float] | None = number(None, -30.0, 60.0, kind=LIST)
     methods: Sequence[str] | None = None
-    strehl: float | None = None
-    radius_arcsec: float | None = None
+    strehl: float | None = number(None, 0.0, 1.0, low_open=True)
+    radius_arcsec: float | None = number(None, 0.0, 3600.0, low_open=True)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         loop: Any = self.configuration
         if not isinstance(loop, LoopConfiguration):
             got = type(loop).__name__
             raise InputError(
                 f"configuration: expected a faintspot.loop.simulation.LoopConfiguration, got {got}"
             )
-        if self.magnitudes is not None:
-            ends = numbers_between("magnitudes", self.magnitudes, -30.0, 60.0)
-            if ends.shape != (2,) or ends[0] == ends[1]:
-                raise InputError(f"magnitudes: expected a first and another last one, got {ends.tolist()}")
-        if self.strehl is not None:
-            number_between("strehl", self.strehl, 0.0, 1.0, low_open=True)
-        if self.radius_arcsec is not None:
-            number_between("radius_arcsec", self.radius_arcsec, 0.0, 3600.0, low_open=True)
+        ends = self.magnitudes
+        if ends is not None and (len(ends) != 2 or ends[0] == ends[1]):
+            raise InputError(f"expected a first and another last one, got {list(ends)}", name="magnitudes")
         for kind in self.kinds:
             if kind.control != INTEGRATOR and self.configuration.control.mode != CLOSED:
                 raise InputError(f"methods: {kind.name!r} learns from a closed loop, this one is open")

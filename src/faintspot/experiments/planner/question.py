@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import number_between, one_of
+from faintspot.base.config.options import TEXT, Options, number, setting
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys, checked_table, parse_file
 from faintspot.slopes.camera.calibration import Calibration
@@ -41,15 +41,6 @@ SEEING_WAVELENGTH_NM = 500.0
 
 _ARCSEC = math.pi / 180 / 3600
 _SMALLEST_RANGE_PX = 1.0
-_POSITIVE: tuple[str, ...] = (
-    "gain_e_per_adu",
-    "fwhm_px",
-    "subaperture_m",
-    "wavelength_nm",
-    "pixel_scale_arcsec",
-    "r0_m",
-)
-_POSITIVE += ("flux_e", "frame_rate_hz", "zero_point", "search_range_px")
 _BUDGET = re.compile(r"\s*([-+0-9.eE]+)\s*(px|arcsec|mas)?\s*")
 
 
@@ -67,8 +58,12 @@ def default_search_range_px(fwhm_px: float) -> float:
     return max(_SMALLEST_RANGE_PX, fwhm_px / 2)
 
 
+_positive = {"low": 0.0, "low_open": True}
+_part = {"low": 0.0, "high": 1.0, "low_open": True}
+
+
 @dataclass(frozen=True, eq=False)
-class Question:
+class Question(Options):
     """Camera, spots and star; unknown optional values may be left out.
 
     Parameters
@@ -139,28 +134,79 @@ class Question:
     368
     """
 
-    read_noise_e: Any = None
-    pixels: Any = None
-    gain_e_per_adu: float = 1.0
-    em_gain: float = 1.0
-    background_e: float = 0.0
-    fwhm_px: Any = None
-    profile: str = "diffraction"
-    subaperture_m: Any = None
-    wavelength_nm: Any = None
-    pixel_scale_arcsec: Any = None
-    r0_m: Any = None
+    read_noise_e: Any = number(
+        None, 0.0, 1e6, "Read noise at the camera's output, before the EM gain.", unit="e-", group="camera"
+    )
+    pixels: Any = number(
+        None, SMALLEST_WINDOW, LARGEST_WINDOW, "Side of a window [px].", whole=True, group="camera"
+    )
+    gain_e_per_adu: float = setting(
+        1.0, "Electrons per ADU, unless measured in the frames.", unit="e-/ADU", group="camera", **_positive
+    )
+    em_gain: float = setting(1.0, "Gain of the multiplication register of an EMCCD.", low=1.0, group="camera")
+    background_e: float = number(
+        0.0, 0.0, 1e9, "Electrons of sky and dark current per pixel and frame.", unit="e-", group="camera"
+    )
+    fwhm_px: Any = setting(None, "Width (FWHM) of the optical spot.", unit="px", group="spot", **_positive)
+    profile: str = setting(
+        "diffraction", "Shape of the spot; diffraction is sinc^2.", choices=PROFILES, group="spot"
+    )
+    subaperture_m: Any = setting(
+        None, "Side of a sub-aperture in the telescope's pupil.", unit="m", group="spot", **_positive
+    )
+    wavelength_nm: Any = setting(None, "Wavelength of the sensor.", unit="nm", group="spot", **_positive)
+    pixel_scale_arcsec: Any = setting(
+        None, "Side of a pixel on the sky.", unit="arcsec", group="spot", **_positive
+    )
+    r0_m: Any = setting(
+        None,
+        "Fried parameter at 500 nm: decides whether spots are speckled.",
+        unit="m",
+        group="spot",
+        **_positive,
+    )
     psf: PSF | None = None
     laser: LaserSpots | None = None
-    flux_e: Any = None
-    magnitude: Any = None
-    band: str = DEFAULT_BAND
-    zero_point: Any = None
-    frame_rate_hz: Any = None
-    throughput: float = DEFAULT_THROUGHPUT
-    quantum_efficiency: float = DEFAULT_QUANTUM_EFFICIENCY
-    search_range_px: Any = None
-    budget: Any = None
+    magnitude: Any = number(
+        None, -30, 40, "Magnitude; needs --subaperture-m and --frame-rate-hz.", unit="mag", group="star"
+    )
+    flux_e: Any = setting(
+        None,
+        "Flux instead: photo-electrons per sub-aperture and frame.",
+        unit="e-",
+        group="star",
+        **_positive,
+    )
+    band: str = setting(DEFAULT_BAND, "Band of the magnitude.", choices=tuple(ZERO_POINTS), group="star")
+    zero_point: Any = setting(
+        None,
+        "Photons/s/m^2 of magnitude 0 in the band. Default: that of --band.",
+        unit="photons",
+        group="star",
+        **_positive,
+    )
+    frame_rate_hz: Any = setting(None, "Frame rate.", unit="Hz", group="star", **_positive)
+    throughput: float = setting(
+        DEFAULT_THROUGHPUT, "Of atmosphere, telescope and optics.", group="star", **_part
+    )
+    quantum_efficiency: float = setting(
+        DEFAULT_QUANTUM_EFFICIENCY, "Quantum efficiency.", group="star", **_part
+    )
+    search_range_px: Any = setting(
+        None,
+        "Largest slope. Default: from the frames, or FWHM / 2.",
+        unit="px",
+        group="tune",
+        **_positive,
+    )
+    budget: Any = setting(
+        None,
+        "Slope error allowed, such as 0.1 (px), 0.05arcsec: asks for the limiting magnitude.",
+        unit="error",
+        group="tune",
+        kind=TEXT,
+        check=lambda name, value: str(value),
+    )
     relative_flux: NDArray[np.float64] | None = None
     recording: NDArray[Any] | None = None
     layout: Layout | None = None
@@ -170,14 +216,8 @@ class Question:
     flux_is_measured: bool = False
 
     def __post_init__(self) -> None:
-        for name in _POSITIVE:
-            if getattr(self, name) is not None:
-                self._put(name, number_between(name, getattr(self, name), 0.0, low_open=True))
-        self._put("read_noise_e", self._needed("read_noise_e", "the camera's read noise (electrons)"))
-        number_between("read_noise_e", self.read_noise_e, 0.0, 1e6)
-        number_between("em_gain", self.em_gain, 1.0)
-        number_between("background_e", self.background_e, 0.0, 1e9)
-        one_of("profile", self.profile, PROFILES)
+        super().__post_init__()
+        self._needed("read_noise_e", "the camera's read noise (electrons)")
         self._check_window()
         self._check_spot()
         self._check_star()
@@ -279,13 +319,17 @@ class Question:
             value = math.nan
         if match is None or not 0 < value < math.inf:
             raise InputError(
-                f"budget = {self.budget!r}: expected a slope error such as 0.1 (px), 0.05arcsec or 50mas"
+                "expected a slope error such as 0.1 (px), 0.05arcsec or 50mas",
+                name="budget",
+                value=self.budget,
             )
         if match[2] in (None, "px"):
             return value
         if self.pixel_scale_arcsec is None:
             raise InputError(
-                f"budget = {self.budget!r}: in {match[2]} it needs the pixel scale; give pixel_scale_arcsec"
+                f"in {match[2]} it needs the pixel scale; give pixel_scale_arcsec",
+                name="budget",
+                value=self.budget,
             )
         return value * (1e-3 if match[2] == "mas" else 1.0) / float(self.pixel_scale_arcsec)
 
@@ -297,18 +341,16 @@ class Question:
     def _needed(self, name: str, meaning: str) -> Any:
         value = getattr(self, name)
         if value is None:
-            raise InputError(f"{name}: expected {meaning}, got none")
+            raise InputError(f"expected {meaning}, got none", name=name)
         return value
 
     def _check_window(self) -> None:
         if self.layout is not None:
             if self.pixels is not None and self.layout.window != (self.pixels, self.pixels):
                 ny, nx = self.layout.window
-                raise InputError(f"pixels = {self.pixels}: the layout's windows have {ny} x {nx}")
+                raise InputError(f"the layout's windows have {ny} x {nx}", name="pixels", value=self.pixels)
             self._put("pixels", max(self.layout.window))
-        side = self._needed("pixels", "the side of a sub-aperture (px)")
-        side = number_between("pixels", side, SMALLEST_WINDOW, LARGEST_WINDOW, integer=True)
-        self._put("pixels", int(side))
+        self._needed("pixels", "the side of a sub-aperture (px)")
         check_not_quad_cells(self.shape)
 
     def _check_spot(self) -> None:
@@ -337,23 +379,27 @@ class Question:
         low, high = 0.3, float(min(self.shape))
         if not low <= self.fwhm_px <= high:
             raise InputError(
-                f"fwhm_px = {self.fwhm_px:.4g}: expected {low:g} to {high:g} px, the side of a window; "
-                "check subaperture_m, wavelength_nm and pixel_scale_arcsec, or pixels"
+                f"expected {low:g} to {high:g} px, the side of a window; check subaperture_m, wavelength_nm "
+                "and pixel_scale_arcsec, or pixels",
+                name="fwhm_px",
+                value=float(f"{self.fwhm_px:.4g}"),
             )
         if self.r0_m is None:
             return
         if self.subaperture_m is None or self.wavelength_nm is None:
-            raise InputError("r0_m: with it, expected subaperture_m and wavelength_nm as well")
+            raise InputError("with it, expected subaperture_m and wavelength_nm as well", name="r0_m")
         ratio = self.d_over_r0
         if ratio > LARGEST_D_OVER_R0:
             raise InputError(
-                f"r0_m = {self.r0_m:g}: expected sub-apertures of at most {LARGEST_D_OVER_R0:g} r0, "
-                f"got {ratio:.3g}"
+                f"expected sub-apertures of at most {LARGEST_D_OVER_R0:g} r0, got {ratio:.3g}",
+                name="r0_m",
+                value=self.r0_m,
             )
         if ratio and self.profile != "diffraction":
             raise InputError(
-                f"profile = {self.profile!r}: expected 'diffraction', as spots are speckled "
-                f"(d / r0 = {ratio:.2g})"
+                f"expected 'diffraction', as spots are speckled (d / r0 = {ratio:.2g})",
+                name="profile",
+                value=self.profile,
             )
 
     def _check_star(self) -> None:
@@ -364,16 +410,12 @@ class Question:
                 "star: expected its magnitude, or flux_e (detected photons per sub-aperture and frame)"
             )
         if self.magnitude is not None:
-            number_between("magnitude", self.magnitude, -30, 40)
             for name, meaning in (
                 ("subaperture_m", "the side of a sub-aperture (m)"),
                 ("frame_rate_hz", "frames per s"),
             ):
                 if getattr(self, name) is None:
-                    raise InputError(f"magnitude: with it, expected {name}, {meaning}, got none")
-        one_of("band", self.band, list(ZERO_POINTS))
-        for name in ("throughput", "quantum_efficiency"):
-            number_between(name, getattr(self, name), 0.0, 1.0, low_open=True)
+                    raise InputError(f"with it, expected {name}, {meaning}, got none", name="magnitude")
         flux = self.star_flux_e
         if not 0.1 <= flux <= LARGEST_FLUX_E:
             raise InputError(
@@ -387,27 +429,12 @@ class Question:
         value = float(default if self.search_range_px is None else self.search_range_px)
         limit = min(self.shape) / 2
         if value > limit:
-            raise InputError(f"search_range_px = {value:g}: expected at most half a window, {limit:g} px")
+            expected = f"expected at most half a window, {limit:g} px"
+            raise InputError(expected, name="search_range_px", value=value)
         return value
 
 
 _LAYOUT, _LASER = "layout", "laser"
-
-TABLES = {
-    "camera": ("read_noise_e", "gain_e_per_adu", "em_gain", "background_e", "pixels"),
-    "spot": ("fwhm_px", "profile", "subaperture_m", "wavelength_nm", "pixel_scale_arcsec", "r0_m"),
-    "star": (
-        "magnitude",
-        "flux_e",
-        "band",
-        "zero_point",
-        "frame_rate_hz",
-        "throughput",
-        "quantum_efficiency",
-    ),
-    "tune": ("search_range_px", "budget"),
-}
-"""Keys of each table: the names of `Question`."""
 
 
 def read_camera(path: str | Path) -> dict[str, Any]:
@@ -421,7 +448,8 @@ def read_camera(path: str | Path) -> dict[str, Any]:
         When the file cannot be read or is not TOML, or has an unknown table or key.
     """
     document = parse_file(path)
-    check_keys(f"{path}: ", document, [*TABLES, _LAYOUT, _LASER], what="table")
+    groups = {name: declared.group for name, declared in Question.declared().items()}
+    check_keys(f"{path}: ", document, [*groups.values(), _LAYOUT, _LASER], what="table")
     values: dict[str, Any] = {}
     for table, content in document.items():
         entries = checked_table(f"{path}: {table}", content)
@@ -429,9 +457,9 @@ def read_camera(path: str | Path) -> dict[str, Any]:
             values[_LAYOUT] = _layout(path, entries)
             continue
         if table == _LASER:
-            values[_LASER] = LaserSpots.from_table(path, entries)
+            values[_LASER] = LaserSpots.from_table(entries, Path(path))
             continue
-        check_keys(f"{path}: {table}.", entries, TABLES[table])
+        check_keys(f"{path}: {table}.", entries, [name for name in groups if groups[name] == table])
         values |= entries
     return values
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array
-from faintspot.base.config.options import Options, option
-from faintspot.base.config.tables import errors_of_table, read_tables, save_tables
-from faintspot.base.errors import InputError
+from faintspot.base.config.options import Options, setting
+from faintspot.base.config.tables import Tables, save_tables
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.toml_files import check_keys
 from faintspot.io.frames import read_array
 from faintspot.loop.control.base import Controller
@@ -32,6 +32,7 @@ from faintspot.loop.control.identification.model import (
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.loop.control.removed_modes import REMOVED_MODES, TIP_TILT_FOCUS, RemovedModes
 from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
 
@@ -46,28 +47,27 @@ NONE, CONTROLLER, STREAM = "none", "controller", "stream"
 PRIOR = "prior_std_px"
 _LARGEST_SLOPE_PX = 1e4
 _BEYOND_ALL = 1e30  # of commands without a limit: finite in float32, too
-_setting = partial(option, per_subaperture=False)
 
 
 @dataclass(frozen=True, eq=False)
-class ControlOptions(Options):
+class ControlOptions(Options, table=TABLE):
     """Options of the table [control]."""
 
-    controller: str = _setting(
+    controller: str = setting(
         INTEGRATOR,
         "Controller that turns slopes into commands; all but the integrator need a `model`.",
         choices=tuple(CONTROLS),
     )
-    gain: float = _setting(0.4, "Loop gain of the integrator.", low=0, high=2)
-    leak: float = _setting(0.01, "Fraction by which commands decay in each frame.", low=0, high=1)
-    delay_frames: int = _setting(
+    gain: float = setting(0.4, "Loop gain of the integrator.", low=0, high=2)
+    leak: float = setting(0.01, "Fraction by which commands decay in each frame.", low=0, high=1)
+    delay_frames: int = setting(
         2,
         "Delay: the command computed from frame k first acts during the exposure of frame k + delay_frames.",
         low=1,
         high=100,
         whole=True,
     )
-    largest_command: float | None = _setting(
+    largest_command: float | None = setting(
         None,
         "Stroke limit, in the unit of the interaction matrix; clipped commands do not accumulate "
         "(anti-windup). Default: no limit.",
@@ -75,33 +75,33 @@ class ControlOptions(Options):
         high=_BEYOND_ALL,
         low_open=True,
     )
-    largest_condition: float = _setting(
+    largest_condition: float = setting(
         30.0,
         "Largest condition number of the reconstructor: modes of the mirror with smaller singular values are "
         "not controlled.",
         low=1,
         high=1e6,
     )
-    centroid_gain: float = _setting(
+    centroid_gain: float = setting(
         1.0,
         "Centroid gain relative to the interaction matrix; slopes are divided by it. 1 for a matrix measured "
         "with the same estimator at the same flux.",
         low=0.01,
         high=100,
     )
-    removed_modes: str = _setting(
+    removed_modes: str = setting(
         REMOVED_MODES[0],
         'Modes that slopes of a laser guide star do not show: "tip_tilt" or "tip_tilt_focus". They are '
         "removed before reconstruction and are not controlled; for integrators.",
         choices=REMOVED_MODES,
     )
-    prediction: str | None = _setting(
+    prediction: str | None = setting(
         None,
         'Source of the predicted slopes for estimators with a prior: "controller"; "stream", another program '
         'by the stream NAME_prediction; or "none". Default: "controller" for a Kalman filter, else "none".',
         choices=(NONE, CONTROLLER, STREAM),
     )
-    learn_every_s: float = _setting(
+    learn_every_s: float = setting(
         10.0,
         "Time between two learnings of a Kalman filter while the engine runs, each from the telemetry since "
         "the one before; 0: never.",
@@ -109,20 +109,20 @@ class ControlOptions(Options):
         low=0,
         high=3600,
     )
-    guard_frames: int = _setting(
+    guard_frames: int = setting(
         50,
         "Number of frames over which the guard averages.",
         low=1,
         high=1_000_000,
         whole=True,
     )
-    most_invalid: float = _setting(
+    most_invalid: float = setting(
         0.5,
         "Fraction of invalid slopes above which the guard opens the loop; 1: never.",
         low=0,
         high=1,
     )
-    largest_residual_px: float | None = _setting(
+    largest_residual_px: float | None = setting(
         None,
         "Rms of the slopes above which the guard opens the loop. Default: 1.25 times the open-loop rms, if "
         "the loop was open for `guard_frames` before; else a quarter of a window's side.",
@@ -131,13 +131,13 @@ class ControlOptions(Options):
         high=_BEYOND_ALL,
         low_open=True,
     )
-    most_at_limit: float = _setting(
+    most_at_limit: float = setting(
         0.5,
         "Fraction of commands at `largest_command` above which the guard opens the loop; 1: never.",
         low=0,
         high=1,
     )
-    proven_frames: int = _setting(
+    proven_frames: int = setting(
         1000,
         "Number of frames after which a closed loop counts as proven. If the guard opens a proven loop, it "
         "closes it again after `guard_frames`, with a learnt controller's integrator; 0: never.",
@@ -179,10 +179,11 @@ class Control:
     def __post_init__(self) -> None:
         matrix = finite_array(INTERACTION, self.interaction).astype(np.float64)
         if matrix.ndim != 2 or len(matrix) % 2:
-            raise InputError(f"{INTERACTION}: expected shape (2 n, commands), got {matrix.shape}")
+            raise InputError(f"expected shape (2 n, commands), got {matrix.shape}", name=INTERACTION)
         if matrix.shape[1] > len(matrix):
             raise InputError(
-                f"{INTERACTION}: expected (2 n, commands), no more commands than slopes, got {matrix.shape}"
+                f"expected (2 n, commands), no more commands than slopes, got {matrix.shape}",
+                name=INTERACTION,
             )
         reference = self.reference
         if reference is not None:
@@ -190,9 +191,9 @@ class Control:
             if reference.shape == (len(matrix) // 2, 2):
                 reference = reference.T.reshape(-1)
             if reference.shape != (len(matrix),):
-                raise InputError(f"{REFERENCE}: expected shape ({len(matrix)},), got {reference.shape}")
+                raise InputError(f"expected shape ({len(matrix)},), got {reference.shape}", name=REFERENCE)
             if np.abs(reference).max() > _LARGEST_SLOPE_PX:
-                raise InputError(f"{REFERENCE}: expected positions up to {_LARGEST_SLOPE_PX:g} px")
+                raise InputError(f"expected positions up to {_LARGEST_SLOPE_PX:g} px", name=REFERENCE)
         object.__setattr__(self, "interaction", matrix)
         object.__setattr__(self, "reference", reference)
         assert self.reconstructor  # refuses a matrix that cannot be inverted
@@ -202,22 +203,24 @@ class Control:
         kind = self.options.controller
         if self.removed_modes and kind not in (INTEGRATOR, MODAL):
             raise InputError(
-                f"removed_modes = {self.removed_modes.name!r}: expected an integrator, as the model of "
-                f"{kind!r} has all modes"
+                f"expected an integrator, as the model of {kind!r} has all modes",
+                name="removed_modes",
+                value=self.removed_modes.name,
             )
         if kind == KALMAN and self.options.prediction == STREAM:
             raise InputError(
-                'prediction = "stream": expected "controller", as a Kalman filter predicts itself'
+                'expected "controller", as a Kalman filter predicts itself', name="prediction", value=STREAM
             )
         if kind == INTEGRATOR:
             return self.model  # kept for `with_controller`
         if self.model is None:
-            raise InputError(f"{MODEL}: expected a file with the learnt model of {CONTROLS[kind]}, got none")
+            raise InputError(f"expected a file with the model of {CONTROLS[kind]}, got none", name=MODEL)
         model = self.model
         if not isinstance(model, ControlModel):
             model = ControlModel.load(model, self.plant)
         if model.kind != kind:
-            raise InputError(f"{MODEL}: expected a model of controller {kind!r}, got one of {model.kind!r}")
+            got = repr(model.kind)
+            raise InputError(f"expected a model of controller {kind!r}, got one of {got}", name=MODEL)
         model.check(self.plant)
         return model
 
@@ -369,7 +372,7 @@ def prior_std_px(settings: Settings, layout: Layout) -> Floats | None:
     return np.tile(std_px, 2) if np.isfinite(std_px).all() else None
 
 
-def load_control(path: str | Path) -> Control | None:
+def load_control(configuration: str | Path | Configuration) -> Control | None:
     """Read [control] of a configuration file and the files that it names; None without such a table.
 
     Raises
@@ -377,35 +380,34 @@ def load_control(path: str | Path) -> Control | None:
     InputError
         When something cannot be read, is unknown or does not fit.
     """
-    path = Path(path)
-    document = read_tables(path)
-    if TABLE not in document:
+    if not isinstance(configuration, Configuration):
+        configuration = Configuration(configuration)
+    if TABLE not in configuration:
         return None
-    with errors_of_table(path, TABLE):
-        return _of_table(path, document[TABLE])
+    with errors_within(configuration.path):
+        return _of_table(configuration, configuration[TABLE])
 
 
-def _of_table(path: Path, values: Mapping[str, Any]) -> Control:
-    declared = ControlOptions.declared()
+def _of_table(configuration: Configuration, values: Mapping[str, Any]) -> Control:
+    declared, path = ControlOptions.declared(), configuration.path
     check_keys(f"{TABLE}.", values, [*FILES, *declared], required=[INTERACTION])
     arrays = {name: _read(path, name, values[name]) for name in FILES[:2] if name in values}
     model = values.get(MODEL)
     if model is not None and not isinstance(model, str):
-        raise InputError(f"{MODEL}: expected the name of a file, found {model!r:.80}")
+        raise InputError(f"expected the name of a file, found {model!r:.80}", name=f"{TABLE}.{MODEL}")
     options = ControlOptions(**{name: value for name, value in values.items() if name in declared})
-    centres = Layout.load(path).centres if options.removed_modes == TIP_TILT_FOCUS else None
+    centres = configuration.layout.centres if options.removed_modes == TIP_TILT_FOCUS else None
     file = None if model is None else path.parent / model
-    return Control(arrays[INTERACTION], arrays.get(REFERENCE), options, file, centres)
+    with errors_within("", f"{TABLE}."):
+        return Control(arrays[INTERACTION], arrays.get(REFERENCE), options, file, centres)
 
 
 def _read(path: Path, name: str, location: Any) -> NDArray[Any]:
     """Read an array from the file that the table names, relative to the configuration."""
     if not isinstance(location, str):
-        raise InputError(f"{name}: expected the name of a file, found {location!r:.80}")
-    try:
+        raise InputError(f"expected the name of a file, found {location!r:.80}", name=f"{TABLE}.{name}")
+    with errors_within(f"{TABLE}.{name}"):
         return read_array(f"{path.parent / location}")
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
 
 
 def save_control(path: str | Path, **values: Any) -> None:
@@ -417,5 +419,5 @@ def save_control(path: str | Path, **values: Any) -> None:
         When the file exists and cannot be understood, or cannot be written.
     """
     path = Path(path)
-    before = read_tables(path).get(TABLE, {}) if path.exists() else {}
+    before = Tables(path).tables.get(TABLE, {}) if path.exists() else {}
     save_tables(path, {TABLE: {**before, **values}})

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.base.config.tables import read_tables
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
 from faintspot.loop.control.configuration import TABLE, save_control
@@ -83,12 +82,12 @@ def write_engine_files(
     configuration_file.save(path, psf)
     if not configuration_file.has(path, "settings"):
         configuration_file.save(path, fixed_window(configuration))
-    stored = configuration_file.load_all(path)
+    stored = configuration_file.Configuration(path)
     method = _method(stored.settings, psf, stored.score, control)
     reference = reference_slopes(configuration, optics.sensor, method)
     write_atomically(folder / INTERACTION, lambda stream: np.save(stream, optics.interaction))
     write_atomically(folder / REFERENCE, lambda stream: np.save(stream, reference))
-    loop, before = configuration.control, read_tables(path).get(TABLE, {})
+    loop, before = configuration.control, stored.tables.get(TABLE, {})
     usual = {"gain": loop.gain, "leak": loop.leak, "delay_frames": loop.delay_frames}
     measured = {"interaction_matrix": INTERACTION, "reference_slopes": REFERENCE, "centroid_gain": 1.0}
     seed = configuration.run.seed

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, increasing, one_of, real_array
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.npz import read_arrays
 from faintspot.base.toml_files import check_keys, parse_file
 from faintspot.base.validity import leave_out
@@ -89,10 +89,8 @@ def read_recorded_loop(
     if system is not None:
         values |= _system_values(Path(system))
     values |= stated or {}
-    try:
+    with errors_within(path):
         return _loop(path.name, values)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def _system_values(path: Path) -> dict[str, Any]:

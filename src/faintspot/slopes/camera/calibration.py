@@ -11,16 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import number_between, numbers_between, one_of, real_array, strings_of
-from faintspot.base.config.tables import (
-    check_fields,
-    chosen_fields,
-    errors_of_table,
-    is_map,
-    read_tables,
-    save_tables,
-)
-from faintspot.base.errors import InputError
+from faintspot.base.checks import number_between, numbers_between, real_array
+from faintspot.base.config.options import TEXTS, number, setting
+from faintspot.base.config.tables import Table, Tables, is_map, save_tables
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import derived
 from faintspot.base.npz import save_arrays
 from faintspot.io.frames import open_frames, read_array
@@ -33,8 +27,57 @@ _GAINS = 1e-9, 1e9
 _LARGEST_READ_NOISE_E, _LARGEST_BACKGROUND_E, _LARGEST_ADU = 1e6, 1e9, 1e30
 
 
+def _map(name: str, value: Any) -> NDArray[np.float64]:
+    """Return a private, read-only copy of a map, which may contain NaN."""
+    array = real_array(name, value).astype(np.float64)
+    if array.ndim != 2:
+        raise InputError(f"expected shape (h, w), got {array.shape}", name=name)
+    array.flags.writeable = False
+    return array
+
+
+def _scalar_or_map(name: str, value: Any) -> Any:
+    if real_array(name, value).ndim == 0:
+        return number_between(name, value, -_LARGEST_ADU, _LARGEST_ADU)
+    return _map(name, value)
+
+
+def _read_noise(name: str, value: Any) -> Any:
+    """Return a number, or a map whose values are in range or NaN, not all of them NaN."""
+    if real_array(name, value).ndim == 0:
+        return number_between(name, value, 0.0, _LARGEST_READ_NOISE_E)
+    noise = _map(name, value)
+    finite = noise[~np.isnan(noise)]
+    if finite.size == 0:
+        raise InputError("expected the noise of at least one pixel, every value is NaN", name=name)
+    numbers_between(name, finite, 0.0, _LARGEST_READ_NOISE_E)
+    return noise
+
+
+def _mask_or_list(name: str, value: Any) -> NDArray[Any]:
+    """Return a boolean mask, or rows and columns as (n, 2) int64."""
+    try:
+        array = np.array(value)
+    except ValueError:
+        raise InputError("expected [row, column] in every row of the list", name=name) from None
+    if array.dtype != np.bool_:
+        if array.size == 0:
+            array = np.empty((0, 2), np.int64)
+        if array.size:
+            array = numbers_between(name, array, 0, 2**31, integer=True)
+        if array.ndim != 2 or array.shape[1] != 2:
+            got = f"{array.dtype} of shape {array.shape}"
+            raise InputError(
+                f"expected a boolean map (h, w) or a list of [row, column], got {got}", name=name
+            )
+    elif array.ndim != 2:
+        raise InputError(f"expected shape (h, w), got {array.shape}", name=name)
+    array.flags.writeable = False
+    return array
+
+
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(Table, table="calibration"):
     """Conversion of raw frames to electrons: (raw - dark) * gain_e_per_adu / (em_gain * flat); immutable.
 
     Parameters
@@ -77,38 +120,18 @@ class Calibration:
     (0.1, 2.0)
     """
 
-    dark: Any = None
-    flat: Any = None
-    gain_e_per_adu: float = 1.0
-    em_gain: float = 1.0
-    bad_pixels: Any = None
-    saturation_adu: float | None = None
-    read_noise_e: Any = None
-    background_e: float = 0.0
-    estimated: tuple[str, ...] = ()
+    dark: Any = setting(None, unit="ADU", check=_scalar_or_map)
+    flat: Any = setting(None, check=_map)
+    gain_e_per_adu: float = number(1.0, *_GAINS, "Electrons per ADU.", unit="e-/ADU")
+    em_gain: float = number(1.0, *_GAINS, "EM gain; 1: none.")
+    bad_pixels: Any = setting(None, check=_mask_or_list)
+    saturation_adu: float | None = number(None, 0.0, _LARGEST_ADU, unit="ADU", low_open=True)
+    read_noise_e: Any = setting(None, "Read noise at the output.", unit="e-", check=_read_noise)
+    background_e: float = number(0.0, 0.0, _LARGEST_BACKGROUND_E, unit="e-")
+    estimated: tuple[str, ...] = setting((), kind=TEXTS, choices=_ESTIMATED)
 
     def __post_init__(self) -> None:
-        put = object.__setattr__
-        if self.dark is not None:
-            put(self, "dark", _scalar_or_map("calibration.dark", self.dark))
-        put(self, "estimated", strings_of("calibration.estimated", self.estimated))
-        for name in self.estimated:
-            one_of("calibration.estimated", name, _ESTIMATED)
-        if self.flat is not None:
-            put(self, "flat", _map("calibration.flat", self.flat))
-        for name in ("gain_e_per_adu", "em_gain"):
-            put(self, name, number_between(f"calibration.{name}", getattr(self, name), *_GAINS))
-        if self.read_noise_e is not None:
-            put(self, "read_noise_e", _read_noise(self.read_noise_e))
-        background = number_between("calibration.background_e", self.background_e, 0.0, _LARGEST_BACKGROUND_E)
-        put(self, "background_e", background)
-        if self.saturation_adu is not None:
-            level = number_between(
-                "calibration.saturation_adu", self.saturation_adu, 0.0, _LARGEST_ADU, low_open=True
-            )
-            put(self, "saturation_adu", level)
-        if self.bad_pixels is not None:
-            put(self, "bad_pixels", _mask_or_list(self.bad_pixels))
+        super().__post_init__()
         shapes = {name: array.shape for name, array in self._arrays().items()}
         if len(set(shapes.values())) > 1:
             text = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
@@ -174,21 +197,20 @@ class Calibration:
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
-        """Read the table [calibration] of a configuration file (TOML)."""
-        return cls.from_tables(path, read_tables(path))
+        """Read the table [calibration] of a configuration file (TOML); the default if there is none."""
+        return cls.from_table(Tables(path).tables.get(cls.table, {}), Path(path))
 
     @classmethod
-    def from_tables(cls, path: str | Path, document: Mapping[str, dict[str, Any]]) -> Calibration:
-        """Return the calibration in the tables of a configuration file, or the default if there is none."""
-        values = document.get("calibration", {})
-        with errors_of_table(path, "calibration"):
-            check_fields("calibration", cls, values)
-            return cls(**{key: _map_or_value(Path(path), key, value) for key, value in values.items()})
+    def from_table(cls, values: Mapping[str, Any], path: Path | None = None) -> Calibration:
+        """Return the calibration in a table, with the maps in the files that it names."""
+        with errors_within(path):
+            read = {key: _map_or_value(path or Path(), key, value) for key, value in values.items()}
+        return super().from_table(read, path)
 
     def save(self, path: str | Path) -> None:
         """Write the table [calibration] of a configuration file (TOML); other tables stay as they are."""
         path = Path(path)
-        values = chosen_fields(self)
+        values = super().to_table()
         maps = {key: value for key, value in values.items() if is_map(value)}
         store = derived(path, ".calibration.npz")
         if maps:
@@ -197,7 +219,7 @@ class Calibration:
 
     def to_table(self) -> dict[str, Any]:
         """Return the table of a configuration file, in which maps are represented by their shapes."""
-        values = chosen_fields(self)
+        values = super().to_table()
         return {key: f"map of {value.shape}" if is_map(value) else value for key, value in values.items()}
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
@@ -259,56 +281,6 @@ class Calibration:
         return mask
 
 
-def _map(name: str, value: Any) -> NDArray[np.float64]:
-    """Return a private, read-only copy of a map, which may contain NaN."""
-    array = real_array(name, value).astype(np.float64)
-    if array.ndim != 2:
-        raise InputError(f"{name}: expected shape (h, w), got {array.shape}")
-    array.flags.writeable = False
-    return array
-
-
-def _scalar_or_map(name: str, value: Any) -> Any:
-    if real_array(name, value).ndim == 0:
-        return number_between(name, value, -_LARGEST_ADU, _LARGEST_ADU)
-    return _map(name, value)
-
-
-def _read_noise(value: Any) -> Any:
-    """Return a number, or a map whose values are in range or NaN, not all of them NaN."""
-    name = "calibration.read_noise_e"
-    if real_array(name, value).ndim == 0:
-        return number_between(name, value, 0.0, _LARGEST_READ_NOISE_E)
-    noise = _map(name, value)
-    finite = noise[~np.isnan(noise)]
-    if finite.size == 0:
-        raise InputError(f"{name}: expected the noise of at least one pixel, every value is NaN")
-    numbers_between(name, finite, 0.0, _LARGEST_READ_NOISE_E)
-    return noise
-
-
-def _mask_or_list(value: Any) -> NDArray[Any]:
-    """Return a boolean mask, or rows and columns as (n, 2) int64."""
-    try:
-        array = np.array(value)
-    except ValueError:
-        raise InputError("calibration.bad_pixels: expected [row, column] in every row of the list") from None
-    if array.dtype != np.bool_:
-        if array.size == 0:
-            array = np.empty((0, 2), np.int64)
-        if array.size:
-            array = numbers_between("calibration.bad_pixels", array, 0, 2**31, integer=True)
-        if array.ndim != 2 or array.shape[1] != 2:
-            raise InputError(
-                "calibration.bad_pixels: expected a boolean map (h, w) or a list of [row, column], "
-                f"got {array.dtype} of shape {array.shape}"
-            )
-    elif array.ndim != 2:
-        raise InputError(f"calibration.bad_pixels: expected shape (h, w), got {array.shape}")
-    array.flags.writeable = False
-    return array
-
-
 def read_map(key: str, location: str | Path) -> NDArray[Any]:
     """Read `dark` or `flat` (the mean of several frames), `read_noise_e` (one map), or `bad_pixels`.
 
@@ -335,4 +307,7 @@ def read_map(key: str, location: str | Path) -> NDArray[Any]:
 
 def _map_or_value(path: Path, key: str, value: Any) -> Any:
     """Read the map named in a configuration file, relative to that file."""
-    return read_map(key, str(path.parent / value)) if key in _MAPS and isinstance(value, str) else value
+    if key not in _MAPS or not isinstance(value, str):
+        return value
+    with errors_within(f"calibration.{key}"):
+        return read_map(key, str(path.parent / value))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.config.options import Options, number, setting
 from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
 
@@ -19,8 +20,35 @@ LARGEST_MEAN_E = 1e12
 _LEVELS = ("read_noise_e", "dark_e", "background_e", "relative_gain")  # numbers or maps
 
 
+def _number_or_map(name: str, value: Any) -> float | NDArray[np.float64]:
+    """Return a level >= 0: a number, or a read-only map of shape (ny, nx)."""
+    level: NDArray[np.float64] = numbers_between(name, value, 0, LARGEST_MEAN_E)
+    if level.ndim == 0:
+        return float(level)
+    if level.ndim != 2:
+        raise InputError(f"{name}: expected one number or a map (rows, columns), got shape {level.shape}")
+    level.flags.writeable = False
+    return level
+
+
+def _single_pixels(name: str, value: Any) -> tuple[tuple[int, int, float], ...]:
+    """Return hot or blinking pixels as (row, column, electrons)."""
+    if not isinstance(value, Sequence | np.ndarray):
+        raise InputError(f"{name}: expected a list of (row, column, electrons), got {value!r}")
+    if len(value) == 0:
+        return ()
+    table = finite_array(name, value)
+    if table.ndim != 2 or table.shape[1] != 3:
+        raise InputError(f"{name}: expected (row, column, electrons) for each, got shape {table.shape}")
+    where = numbers_between(f"{name} row or column", table[:, :2], 0, 2**31, integer=True)
+    levels = numbers_between(f"{name} electrons", table[:, 2], 0, LARGEST_MEAN_E)
+    return tuple(
+        (int(row), int(column), float(level)) for (row, column), level in zip(where, levels, strict=True)
+    )
+
+
 @dataclass(frozen=True, eq=False)
-class Detector:
+class Detector(Options):
     """A CCD, CMOS or electron-multiplying CCD with its noise.
 
     The effects are applied in this order: photo-electrons of the star, background and dark current (each
@@ -81,34 +109,29 @@ class Detector:
     uint16: mean 3.0, variance 5.9 e-
     """
 
-    read_noise_e: float | NDArray[np.float64] = 0.1
+    read_noise_e: float | NDArray[np.float64] = setting(
+        0.1, "Read noise at the output.", unit="e-", check=_number_or_map
+    )
     _: KW_ONLY
-    dark_e: float | NDArray[np.float64] = 0.0
-    background_e: float | NDArray[np.float64] = 0.0
-    em_gain: float = 1.0
-    gain_e_per_adu: float = 1.0
-    offset_adu: float = 0.0
-    bits: int | None = None
-    full_well_e: float | None = None
-    hot_pixels: Sequence[tuple[int, int, float]] = ()
-    blinking_pixels: Sequence[tuple[int, int, float]] = ()
-    relative_gain: float | NDArray[np.float64] = 1.0
+    dark_e: float | NDArray[np.float64] = setting(
+        0.0, "Dark current per pixel and frame.", unit="e-", check=_number_or_map
+    )
+    background_e: float | NDArray[np.float64] = setting(
+        0.0, "Sky per pixel and frame.", unit="e-", check=_number_or_map
+    )
+    em_gain: float = number(1.0, 1, np.inf, "EM gain; 1: none.")
+    gain_e_per_adu: float = number(1.0, 0, np.inf, "Electrons per ADU.", unit="e-/ADU", low_open=True)
+    offset_adu: float = number(0.0, -np.inf, np.inf, "Level of every pixel.", unit="ADU")
+    bits: int | None = number(None, 1, 32, "Bits of the converter, for whole ADU.", whole=True)
+    full_well_e: float | None = number(None, 0, np.inf, low_open=True)
+    hot_pixels: Sequence[tuple[int, int, float]] = setting((), check=_single_pixels)
+    blinking_pixels: Sequence[tuple[int, int, float]] = setting((), check=_single_pixels)
+    relative_gain: float | NDArray[np.float64] = setting(1.0, check=_number_or_map)
 
     def __post_init__(self) -> None:
-        checked: dict[str, Any] = {name: _number_or_map(name, getattr(self, name)) for name in _LEVELS}
-        checked["em_gain"] = number_between("em_gain", self.em_gain, 1)
-        checked["gain_e_per_adu"] = number_between("gain_e_per_adu", self.gain_e_per_adu, 0, low_open=True)
-        checked["offset_adu"] = number_between("offset_adu", self.offset_adu)
-        if self.bits is not None:
-            checked["bits"] = int(number_between("bits", self.bits, 1, 32, integer=True))
-        if self.full_well_e is not None:
-            checked["full_well_e"] = number_between("full_well_e", self.full_well_e, 0, low_open=True)
-        for name in ("hot_pixels", "blinking_pixels"):
-            checked[name] = _single_pixels(name, getattr(self, name))
-        if not np.all(np.asarray(checked["relative_gain"]) > 0):
+        super().__post_init__()
+        if not np.all(np.asarray(self.relative_gain) > 0):
             raise InputError("relative_gain: expected numbers above 0, got 0")
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
 
     @classmethod
     def cmos(
@@ -316,30 +339,3 @@ class Detector:
             return adu.astype(np.float32)
         counts = np.clip(np.rint(adu), 0, 2**self.bits - 1)
         return counts.astype(np.uint16) if self.bits <= 16 else counts.astype(np.uint32)
-
-
-def _number_or_map(name: str, value: Any) -> float | NDArray[np.float64]:
-    """Return a level >= 0: a number, or a read-only map of shape (ny, nx)."""
-    level: NDArray[np.float64] = numbers_between(name, value, 0, LARGEST_MEAN_E)
-    if level.ndim == 0:
-        return float(level)
-    if level.ndim != 2:
-        raise InputError(f"{name}: expected one number or a map (rows, columns), got shape {level.shape}")
-    level.flags.writeable = False
-    return level
-
-
-def _single_pixels(name: str, value: Any) -> tuple[tuple[int, int, float], ...]:
-    """Return hot or blinking pixels as (row, column, electrons)."""
-    if not isinstance(value, Sequence | np.ndarray):
-        raise InputError(f"{name}: expected a list of (row, column, electrons), got {value!r}")
-    if len(value) == 0:
-        return ()
-    table = finite_array(name, value)
-    if table.ndim != 2 or table.shape[1] != 3:
-        raise InputError(f"{name}: expected (row, column, electrons) for each, got shape {table.shape}")
-    where = numbers_between(f"{name} row or column", table[:, :2], 0, 2**31, integer=True)
-    levels = numbers_between(f"{name} electrons", table[:, 2], 0, LARGEST_MEAN_E)
-    return tuple(
-        (int(row), int(column), float(level)) for (row, column), level in zip(where, levels, strict=True)
-    )

@@ -107,7 +107,7 @@ def estimator_named(name: str) -> type[Estimator]:
     """
     _load()
     if not isinstance(name, str) or name not in _kinds:
-        raise InputError(f"estimator = {name!r}: expected one of {', '.join(map(repr, _kinds))}")
+        raise InputError(f"expected one of {', '.join(map(repr, _kinds))}", name="estimator", value=name)
     return _kinds[name]
 
 

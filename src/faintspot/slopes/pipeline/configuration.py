@@ -7,81 +7,124 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
-from faintspot.base.config.tables import errors_of_table, read_tables, save_tables, tables_as_text
-from faintspot.base.errors import InputError
+from faintspot.base.config.tables import Tables, save_tables, tables_as_text
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import derived
 from faintspot.base.toml_files import check_keys
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.spots.laser_spots import laser_of, matched_filter
+from faintspot.slopes.spots.laser_spots import LaserSpots, matched_filter
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.score import Score, load_score
 
 _PACKED, _MOST_PACKED_BYTES = "faintspot.toml", 1 << 20
+_FILTER = "laser.matched_filter"
 _ANALYTIC_KEYS = ("profile", "size", "elongation", "angle_deg", "radius_px")
 
 Item = Layout | Calibration | Settings | PSF | Score
 
 
-class Parts(NamedTuple):
-    """Parts of a pipeline except the layout."""
-
-    settings: Settings
-    calibration: Calibration
-    psf: PSF | None
-    score: Score | None
-
-    @classmethod
-    def from_tables(cls, path: Path, document: Mapping[str, dict[str, Any]]) -> Parts:
-        """Read the parts from the tables of a configuration file; PSF and score may be absent."""
-        settings = Settings.from_tables(path, document)
-        calibration, psf = Calibration.from_tables(path, document), psf_of(path, document)
-        return cls(settings, calibration, psf, score_of(path, document, psf))
-
-
-class Configuration(NamedTuple):
-    """Contents of a configuration file."""
-
-    layout: Layout
-    settings: Settings
-    calibration: Calibration
-    psf: PSF | None
-    score: Score | None
-
-
-def load(path: str | Path, table: str) -> Any:
-    """Read one part of a configuration file.
+class Configuration(Tables):
+    """Contents of a configuration file, read once; each part is made when it is first asked for.
 
     Parameters
     ----------
-    path : path
-    table : {"layout", "calibration", "settings"}
-
-    Returns
-    -------
-    Layout, Calibration or Settings
-        A file without a calibration table gives `Calibration()`.
+    path, tables
+        As for `Tables`.
+    **parts
+        Parts that replace those of the tables, by their names.
 
     Raises
     ------
     InputError
-        If the file cannot be read, is not TOML, lacks the table, or has an unknown key or an invalid value.
+        As for `Tables`; parts also if their table is missing, or has an unknown key or an invalid value.
     """
-    kinds: dict[str, Any] = {"layout": Layout, "calibration": Calibration, "settings": Settings}
-    return kinds[table].load(path)
 
+    def __init__(self, path: str | Path, tables: Mapping[str, Any] | None = None, **parts: Any) -> None:
+        super().__init__(path, tables)
+        vars(self).update(parts)
 
-def load_all(path: str | Path) -> Configuration:
-    """Read all parts of a configuration file; PSF and score may be absent."""
-    path = Path(path)
-    document = read_tables(path)
-    return Configuration(Layout.from_tables(path, document), *Parts.from_tables(path, document))
+    @cached_property
+    def layout(self) -> Layout:
+        """Sub-apertures on the detector."""
+        return self.part(Layout)
+
+    @cached_property
+    def settings(self) -> Settings:
+        """Estimator and its options."""
+        return Settings.from_tables(self)
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """Calibration; the default without a table."""
+        return Calibration.from_table(self.tables.get(Calibration.table, {}), self.path)
+
+    @cached_property
+    def laser(self) -> LaserSpots | None:
+        """Laser guide star, or None."""
+        return self.part(LaserSpots) if LaserSpots.table in self else None
+
+    @cached_property
+    def psf(self) -> PSF | None:
+        """PSF that is described or named, else those of the laser guide star's sub-apertures, or None."""
+        values = self.tables.get("psf")
+        if values is None:
+            return self._laser_psf()
+        with errors_within(self.path, "psf."):
+            if "profile" in values:
+                check_keys("", values, _ANALYTIC_KEYS, what="key beside profile")
+                return PSF.analytic(**values)
+            return PSF.load(self._named_file(values, ("file", "profile")))
+
+    @cached_property
+    def score(self) -> Score | None:
+        """Score that is named, else the linear matched filter of a laser guide star, if wanted, or None."""
+        values = self.tables.get("score")
+        if values is None:
+            return self._laser_score()
+        with errors_within(self.path, "score."):
+            return load_score(self._named_file(values, ("file",)))
+
+    @property
+    def spot(self) -> dict[str, Any]:
+        """PSF and score, as a pipeline takes them."""
+        return {"psf": self.psf, "score": self.score}
+
+    def _laser_psf(self) -> PSF | None:
+        """Return the PSF of each sub-aperture that sees the laser guide star, or None."""
+        if self.laser is None or ("layout" not in vars(self) and Layout.table not in self):
+            return None
+        layout = binned_layout(self.layout)
+        with errors_within(self.path):
+            return self.laser.psf(self.laser.star_of(layout), layout.window)
+
+    def _laser_score(self) -> Score | None:
+        """Return the linear matched filter of the laser guide star, if the configuration wants it."""
+        if self.laser is None or not self.laser.matched_filter or self.psf is None:
+            return None
+        layout, settings = self.layout, self.settings
+        with errors_within(self.path):
+            if layout.bin > 1:
+                raise InputError(f"expected layout.bin = 1, got {layout.bin}", name=_FILTER)
+            if settings.flux_e is None:
+                raise InputError("expected flux_e in [settings], got none", name=_FILTER)
+            flux = settings.values("flux_e", len(layout), layout.pixels)
+            return matched_filter(self.psf, layout, self.calibration, flux)
+
+    def _named_file(self, values: Mapping[str, Any], known: tuple[str, ...]) -> Path:
+        """Return the file that a table names, relative to the configuration file."""
+        check_keys("", values, known)
+        name = values.get("file")
+        if not isinstance(name, str):
+            raise InputError(f"expected the name of a file, found {name!r}", name="file")
+        return self.path.parent / name
 
 
 def has(path: str | Path, table: str) -> bool:
@@ -94,8 +137,8 @@ def has(path: str | Path, table: str) -> bool:
     """
     if not Path(path).exists():
         return False
-    document = read_tables(path)
-    return table in document or (table == "settings" and "estimator" in document)
+    tables = Tables(path)
+    return table in tables or (table == "settings" and "estimator" in tables)
 
 
 def save(path: str | Path, item: Item) -> None:
@@ -142,9 +185,8 @@ def unpacked(files: Mapping[str, str]) -> tuple[Calibration, PSF | None, Score |
                 (Path(folder) / Path(name).name).write_bytes(base64.b64decode(text, validate=True))
         except (OSError, ValueError, TypeError, AttributeError):
             raise InputError("configuration: expected files in base64") from None
-        document = read_tables(path)
-        calibration, psf = Calibration.from_tables(path, document), psf_of(path, document)
-        return calibration, psf, score_of(path, document, psf)
+        stored = Configuration(path)
+        return stored.calibration, stored.psf, stored.score
 
 
 def to_text(*items: Layout | Calibration | Settings) -> str:
@@ -156,67 +198,3 @@ def to_text(*items: Layout | Calibration | Settings) -> str:
         else:
             tables["layout" if isinstance(item, Layout) else "calibration"] = item.to_table()
     return tables_as_text(tables)
-
-
-def psf_of(path: Path, document: Mapping[str, dict[str, Any]]) -> PSF | None:
-    """Return the PSF that a configuration file describes or names, or None.
-
-    Without a table [psf] it is that of the laser guide star, one for each sub-aperture.
-    """
-    if "psf" not in document:
-        return _laser_psf(path, document)
-    values = document["psf"]
-    with errors_of_table(path, "psf"):
-        if "profile" in values:
-            check_keys("psf.", values, _ANALYTIC_KEYS, what="key beside profile")
-            return PSF.analytic(**values)
-        return PSF.load(_named_file(path, "psf", values, ("file", "profile")))
-
-
-def _laser_psf(path: Path, document: Mapping[str, dict[str, Any]]) -> PSF | None:
-    """Return the PSF of each sub-aperture that sees the laser guide star of a configuration, or None."""
-    laser = laser_of(path, document)
-    if laser is None or "layout" not in document:
-        return None
-    layout = binned_layout(Layout.from_tables(path, document))
-    with errors_of_table(path, "laser"):
-        return laser.psf(laser.star_of(layout), layout.window)
-
-
-def _laser_score(path: Path, document: Mapping[str, dict[str, Any]], psf: PSF | None) -> Score | None:
-    """Return the linear matched filter of a laser guide star, if the configuration wants it."""
-    laser = laser_of(path, document)
-    if laser is None or not laser.matched_filter:
-        return None
-    psf = psf_of(path, document) if psf is None else psf
-    if psf is None:
-        return None
-    layout, settings = Layout.from_tables(path, document), Settings.from_tables(path, document)
-    if layout.bin > 1:
-        raise InputError(f"{path}: laser.matched_filter: expected layout.bin = 1, got {layout.bin}")
-    if settings.flux_e is None:
-        raise InputError(f"{path}: laser.matched_filter: expected flux_e in [settings], got none")
-    flux = settings.values("flux_e", len(layout), layout.pixels)
-    with errors_of_table(path, "laser"):
-        return matched_filter(psf, layout, Calibration.from_tables(path, document), flux)
-
-
-def score_of(path: Path, document: Mapping[str, dict[str, Any]], psf: PSF | None = None) -> Score | None:
-    """Return the score that a configuration file names, or None.
-
-    Without a table [score] it is the linear matched filter of a laser guide star, if [laser] wants it, for
-    the PSF of `psf_of`, which is made here if it is not given.
-    """
-    if "score" not in document:
-        return _laser_score(path, document, psf)
-    with errors_of_table(path, "score"):
-        return load_score(_named_file(path, "score", document["score"], ("file",)))
-
-
-def _named_file(path: Path, table: str, values: Mapping[str, Any], known: tuple[str, ...]) -> Path:
-    """Return the file that a table names, relative to the configuration file."""
-    check_keys(f"{table}.", values, known)
-    name = values.get("file")
-    if not isinstance(name, str):
-        raise InputError(f"{table}.file: expected the name of a file, found {name!r}")
-    return path.parent / name

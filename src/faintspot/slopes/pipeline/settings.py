@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.config.options import Option, Options, PerSubaperture, check_lengths, option
-from faintspot.base.config.tables import errors_of_table, per_subaperture, read_tables, save_tables, table_of
-from faintspot.base.errors import InputError
+from faintspot.base.config.tables import Tables, per_subaperture, save_tables
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.toml_files import check_known
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.registry import estimator_named, estimators
@@ -149,10 +149,10 @@ class Settings:
     @classmethod
     def load(cls, path: str | Path) -> Settings:
         """Read the tables [estimator] and [settings] of a configuration file (TOML)."""
-        return cls.from_tables(path, read_tables(path))
+        return cls.from_tables(Tables(path))
 
     @classmethod
-    def from_tables(cls, path: str | Path, document: Mapping[str, dict[str, Any]]) -> Settings:
+    def from_tables(cls, tables: Tables) -> Settings:
         """Make settings from the tables of a configuration file.
 
         Raises
@@ -160,20 +160,22 @@ class Settings:
         InputError
             If a key is unknown or belongs to another estimator, or a value is invalid.
         """
-        specific, shared = dict(table_of(path, document, "estimator")), document.get("settings", {})
-        with errors_of_table(path, "estimator"):
-            name = specific.pop("name", None)
-            if name is None:
-                raise InputError(f"estimator.name: expected one of {', '.join(estimators())}, found none")
+        specific, shared = dict(tables["estimator"]), tables.tables.get("settings", {})
+        with errors_within(tables.path):
+            if "name" not in specific:
+                known = ", ".join(estimators())
+                raise InputError(f"expected one of {known}, found none", name="estimator.name")
+            kind = estimator_named(specific.pop("name"))
+        with errors_within(tables.path, "estimator."):
             for key in specific:
-                check_option(key, estimator_named(name), "estimator.")
-        with errors_of_table(path, "settings"):
+                check_option(key, kind)
+        with errors_within(tables.path, "settings."):
             for key in shared:
-                check_known("settings.", key, cls.SHARED)
-        with errors_of_table(path, "estimator"):
-            kind = estimator_named(name)(**_plain_values("estimator", specific))
-        with errors_of_table(path, "settings"):
-            return cls(kind, **_plain_values("settings", shared))
+                check_known("", key, cls.SHARED)
+        with errors_within(tables.path, "estimator."):
+            estimator = kind(**_plain_values(specific))
+        with errors_within(tables.path, "settings."):
+            return cls(estimator, **_plain_values(shared))
 
     def to_tables(self) -> dict[str, dict[str, Any]]:
         """Return the tables [estimator] and [settings] of a configuration file."""
@@ -249,7 +251,7 @@ class Settings:
         return part.values(name, n_subapertures, pixels)
 
 
-def check_option(name: str, kind: type[Estimator], prefix: str = "") -> None:
+def check_option(name: str, kind: type[Estimator]) -> None:
     """Raise an error if the estimator does not have an option; name the estimators that do.
 
     Raises
@@ -261,12 +263,10 @@ def check_option(name: str, kind: type[Estimator], prefix: str = "") -> None:
         return
     others = [owner for owner, owner_kind in estimators().items() if name in owner_kind.declared()]
     if name in Settings.SHARED:
-        raise InputError(f"{prefix}{name}: expected in the table [settings], where all estimators look")
+        raise InputError("expected in the table [settings], where all estimators look", name=name)
     if others:
-        raise InputError(
-            f"{prefix}{name}: an option of {' and '.join(map(repr, others))}, not of {kind.name!r}"
-        )
-    check_known(prefix, name, [*kind.declared(), *Settings.SHARED], f"option of {kind.name!r}")
+        raise InputError(f"an option of {' and '.join(map(repr, others))}, not of {kind.name!r}", name=name)
+    check_known("", name, [*kind.declared(), *Settings.SHARED], f"option of {kind.name!r}")
 
 
 def _times(value: Any, scale: float, *, whole: bool) -> Any:
@@ -280,8 +280,8 @@ def _times(value: Any, scale: float, *, whole: bool) -> Any:
     return (np.maximum(np.rint(scaled), 1).astype(int) if whole else scaled).tolist()
 
 
-def _plain_values(where: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: per_subaperture(f"{where}.{key}", value) for key, value in values.items()}
+def _plain_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: per_subaperture(key, value) for key, value in values.items()}
 
 
 def _without_none(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -114,8 +114,9 @@ class SlopePipeline:
     @classmethod
     def from_file(cls, path: str | Path, **options: Any) -> SlopePipeline:
         """Make the pipeline described by a configuration file (faintspot.toml)."""
-        layout, settings, calibration, psf, score = configuration.load_all(path)
-        return cls(layout, settings, calibration, psf=psf, score=score, **options)
+        described = configuration.Configuration(path)
+        options |= described.spot
+        return cls(described.layout, described.settings, described.calibration, **options)
 
     def _prepare(self) -> None:
         """Compute the tables for the current SIMD width; forget what was prepared for small frames."""
@@ -449,7 +450,7 @@ def _reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -
     if array.shape == (2 * n,):
         return np.stack([array[:n], array[n:]], axis=1)
     if array.shape != (n, 2):
-        raise InputError(f"reference: expected shape ({n}, 2) or ({2 * n},), got {array.shape}")
+        raise InputError(f"expected shape ({n}, 2) or ({2 * n},), got {array.shape}", name="reference")
     return array
 
 

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import one_of
-from faintspot.base.config.tables import read_tables
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.flags import SubapertureFlag, kept_flags
 from faintspot.base.version import __version__
 from faintspot.io.frames import FrameSource, open_frames
@@ -24,9 +23,10 @@ from faintspot.io.slopes import create_writer
 from faintspot.io.stored.slopes_format import UNITS, pixels_in, scaled_positions
 from faintspot.io.telemetry.aot_reading import is_aot, read_aot
 from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.labelled import layout_coordinates
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
-from faintspot.slopes.pipeline.settings import Settings, with_preset, without_denoising
+from faintspot.slopes.pipeline.settings import with_preset, without_denoising
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.survey import survey
@@ -146,8 +146,8 @@ def measure_recorded(
         When a file cannot be read or written, or frames and configuration do not fit together.
     """
     kept = kept_flags(keep)
-    parts, origin, stored_reference = _configured(configuration_file, frames, key)
-    layout, settings, calibration, psf, score = parts
+    described, origin, stored_reference = _configured(configuration_file, frames, key)
+    layout, settings, calibration = described.layout, described.settings, described.calibration
     if changes:
         settings = settings.replace(**changes)
     if not denoise:
@@ -157,13 +157,13 @@ def measure_recorded(
     positions = read_reference(reference) if isinstance(reference, str | Path) else reference
     if positions is None:
         positions = stored_reference
-    options: dict[str, Any] = {"psf": psf, "score": score, "threads": threads}
+    options: dict[str, Any] = {**described.spot, "threads": threads}
     try:
         pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
     except InputError as error:
-        about_reference = positions is not None and str(error).startswith("reference")
+        about_reference = positions is not None and error.name == "reference"
         file = reference if about_reference and isinstance(reference, str | Path) else configuration_file
-        raise InputError(f"{file}: {error}") from None
+        raise error.within(file) from None
     with open_frames(frames, key=key, time_axis=time_axis) as source:
         _check_output(output, frames)
         if source.shape != layout.frame_shape:
@@ -178,7 +178,7 @@ def measure_recorded(
             pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
         if mean_flux:
             pipeline = _with_mean_flux(pipeline, source)
-        attributes = _attributes(pipeline, source, frames, configuration_file, key, unit, keep)
+        attributes = _attributes(pipeline, source, frames, described, key, unit, keep)
         if time_axis is not None:
             attributes["source_time_axis"] = time_axis
         factor = pixels_in(one_of("unit", unit, UNITS), attributes)
@@ -214,44 +214,45 @@ def measure_recorded(
 
 def _configured(
     path: str | Path, frames: Sequence[str | Path], key: str | None
-) -> tuple[configuration.Configuration, str, NDArray[Any] | None]:
+) -> tuple[Configuration, str, NDArray[Any] | None]:
     """Return the configuration, what of it is that of an AOT file, in words, and that file's references."""
-    if isinstance(frames, str | Path) or not frames or configuration.has(path, "layout"):
-        return configuration.load_all(path), "", None
-    try:
-        first, key_in_name = split_location(frames[0])
-    except InputError:  # whoever opens it says so, after what is wrong with the configuration
-        return configuration.load_all(path), "", None
-    if not is_aot(first):
-        return configuration.load_all(path), "", None
-    sensor = read_aot(first, key_in_name or key)
+    described = Configuration(path) if Path(path).exists() else None
+    first = None if described is not None and "layout" in described else _aot_file(frames)
+    if first is None:
+        return described or Configuration(path), "", None
+    sensor = read_aot(first[0], first[1] or key)
+    where = f"{first[0]}: sensor {sensor.name!r}"
     if sensor.layout is None:
         raise InputError(
-            f"{first}: sensor {sensor.name!r}: expected its sub-apertures (subaperture_mask, mask_offsets, "
-            f"subaperture_size), found none; give [layout] in {path}"
+            f"{where}: expected its sub-apertures (subaperture_mask, mask_offsets, subaperture_size), found "
+            f"none; give [layout] in {path}"
         )
-    try:
+    with errors_within(where):
         layout = Layout(**sensor.layout)
-    except InputError as error:
-        raise InputError(f"{first}: sensor {sensor.name!r}: {error}") from None
     words = ["sub-apertures", *(["reference slopes"] if sensor.reference is not None else [])]
-    document = dict(sensor.tables)
-    if not Path(path).exists() and not document:
-        command = _layout_command(frames[0], layout, path)
-        raise InputError(f"{path}: no such file, and {first} has no settings; `{command}` makes one")
-    if Path(path).exists():
-        document = read_tables(path)
-    else:
+    parts: dict[str, Any] = {"layout": layout}
+    if described is None:
+        if not sensor.tables:
+            command = _layout_command(frames[0], layout, path)
+            raise InputError(f"{path}: no such file, and {first[0]} has no settings; `{command}` makes one")
         words.append("settings")
-    file_path = Path(path)
-    if "settings" in words and sensor.parts is not None:
-        settings = Settings.from_tables(file_path, document)
-        measuring = configuration.Parts(settings, *configuration.unpacked(sensor.parts))
-    else:
-        measuring = configuration.Parts.from_tables(file_path, document)
-    parts = configuration.Configuration(layout, *measuring)
+        if sensor.parts is not None:
+            stored = configuration.unpacked(sensor.parts)
+            parts |= dict(zip(("calibration", "psf", "score"), stored, strict=True))
+    tables = sensor.tables if described is None else described.tables
     listed = " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
-    return parts, f"{listed} of {first}", sensor.reference
+    return Configuration(path, tables, **parts), f"{listed} of {first[0]}", sensor.reference
+
+
+def _aot_file(frames: Sequence[str | Path]) -> tuple[Path, str | None] | None:
+    """Return the first file of frames and the key in its name, if it is one of telemetry (AOT)."""
+    if isinstance(frames, str | Path) or not frames:
+        return None
+    try:
+        first = split_location(frames[0])
+    except InputError:  # whoever opens it says so, after what is wrong with the configuration
+        return None
+    return first if is_aot(first[0]) else None
 
 
 def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str:
@@ -294,7 +295,7 @@ def _attributes(
     pipeline: SlopePipeline,
     source: FrameSource,
     frames: Sequence[str | Path],
-    configuration_file: str | Path,
+    described: Configuration,
     key: str | None,
     unit: str,
     keep: Sequence[str],
@@ -321,8 +322,8 @@ def _attributes(
         "unit": unit,
         **({} if scale is None else {"pixel_scale_arcsec": scale}),
         "configuration": text,
-        "configuration_file": str(Path(configuration_file).resolve()),
-        **_files_of_the_spot(configuration_file),
+        "configuration_file": str(described.path.resolve()),
+        **_files_of_the_spot(described),
         "sources": paths,
         "source_key": key or "",
         "keep": sorted(keep),
@@ -331,14 +332,13 @@ def _attributes(
     }
 
 
-def _files_of_the_spot(configuration_file: str | Path) -> dict[str, str]:
+def _files_of_the_spot(described: Configuration) -> dict[str, str]:
     """Return the files of PSF and score, for a report: their own, or the configuration."""
-    path = Path(configuration_file).resolve()
+    path = described.path.resolve()
     if not path.exists():  # everything was in a file of telemetry
         return {}
-    tables = read_tables(path)
     return {
-        f"{part}_file": str(path.parent / tables[part].get("file", path.name))
+        f"{part}_file": str(path.parent / described[part].get("file", path.name))
         for part in ("psf", "score")
-        if part in tables
+        if part in described
     }

@@ -6,16 +6,14 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import tomlkit
 from numpy.typing import ArrayLike
-from tomlkit.exceptions import TOMLKitError
 
-from faintspot.base.config.tables import read_tables
 from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.base.flags import SubapertureFlag, kept_flags
+from faintspot.base.toml_files import parse_text
 from faintspot.io import StoredSlopes, read_slopes
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator
@@ -24,7 +22,7 @@ from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
-from faintspot.slopes.spots.laser_spots import LaserSpots, laser_of, load_laser
+from faintspot.slopes.spots.laser_spots import LaserSpots
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.score import Score, load_score
 
@@ -124,36 +122,22 @@ def open_run(path: Path) -> StoredRun:
 
 def _rebuild(store: StoredRun) -> None:
     """Make layout, settings and calibration from the stored text, and maps from the original file."""
-    try:
-        tables: dict[str, Any] = tomlkit.parse(store.text).unwrap()
-    except TOMLKitError as error:
-        raise InputError(f"not TOML: {str(error).splitlines()[0]}") from None
-    with TemporaryDirectory() as folder:
-        copy = Path(folder) / "configuration"
-        copy.write_text(tomlkit.dumps(tables), encoding="utf-8")
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DoubtWarning)  # said as a note
-                store.layout = configuration.load(copy, "layout")
-            store.settings = configuration.load(copy, "settings")
-            mapless = not any(_is_map(value) for value in tables.get("calibration", {}).values())
-            if mapless:
-                store.calibration = configuration.load(copy, "calibration")
-        except InputError as error:
-            raise InputError(str(error).replace(f"{copy}: ", "")) from None
-    if not mapless:
-        store.calibration = _original_calibration(store, tables["calibration"])
-    store.psf = _of_the_spot(store, "psf", PSF.load, configuration.psf_of)
-    store.score = _of_the_spot(store, "score", load_score, configuration.score_of)
-    store.laser = _of_the_spot(store, "laser", load_laser, laser_of)
+    stored = configuration.Configuration("", parse_text(store.text, "configuration"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtWarning)  # said as a note
+        store.layout = stored.layout
+    store.settings = stored.settings
+    table = stored.tables.get("calibration", {})
+    if any(map(_is_map, table.values())):
+        store.calibration = _original_calibration(store, table)
+    else:
+        store.calibration = stored.calibration
+    store.psf = _of_the_spot(store, "psf", PSF.load)
+    store.score = _of_the_spot(store, "score", load_score)
+    store.laser = _of_the_spot(store, "laser", lambda path: configuration.Configuration(path).laser)
 
 
-def _of_the_spot(
-    store: StoredRun,
-    name: str,
-    load: Callable[[str], _Part],
-    load_named: Callable[[Path, dict[str, dict[str, Any]]], _Part | None],
-) -> _Part | None:
+def _of_the_spot(store: StoredRun, name: str, load: Callable[[str], Any]) -> Any:
     """Read the PSF or the score of the run; a missing file is reported when it is needed."""
     attributes = store.stored.attributes
     file, original = (str(attributes.get(key, "")) for key in (f"{name}_file", "configuration_file"))
@@ -161,7 +145,7 @@ def _of_the_spot(
         if file and file != original:
             return load(file)
         if file or Path(original).is_file():
-            return load_named(Path(original), read_tables(original))
+            return getattr(configuration.Configuration(original), name)
     except InputError as error:
         words = {"psf": "PSF", "score": "trained score", "laser": "laser guide star"}[name]
         store.lost.append(f"the {words} of {store.path.name} is gone ({error})")
@@ -183,7 +167,7 @@ def _original_calibration(store: StoredRun, stored_table: dict[str, Any]) -> Cal
         )
         return None
     try:
-        calibration: Calibration = configuration.load(str(original), "calibration")
+        calibration = Calibration.load(str(original))
     except InputError as error:
         store.notes.append(f"The calibration maps of {store.path.name} cannot be read: {error}.")
         return None

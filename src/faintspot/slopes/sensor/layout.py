@@ -5,22 +5,17 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between, numbers_between, one_of, strings_of
-from faintspot.base.config.tables import (
-    check_fields,
-    chosen_fields,
-    errors_of_table,
-    read_tables,
-    save_tables,
-    table_of,
-)
-from faintspot.base.errors import DoubtWarning, InputError
+from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.config.options import TEXTS, number, setting
+from faintspot.base.config.tables import Table
+from faintspot.base.errors import DoubtWarning, InputError, errors_within
 from faintspot.base.sizes import check_size
 from faintspot.base.toml_files import check_keys, checked_table
 from faintspot.slopes.sensor.window_checks import check_centres, check_inside, check_overlap, chosen_index
@@ -39,8 +34,11 @@ LARGEST_BIN = 64
 """Largest `bin`."""
 
 
+_optics = partial(number, None, 0.0, _LARGEST_PX, low_open=True)
+
+
 @dataclass(frozen=True)
-class Layout:
+class Layout(Table, table="layout"):
     """Positions of the sub-apertures: one window of the same size for each illuminated lenslet.
 
     Parameters
@@ -96,21 +94,23 @@ class Layout:
     corners: NDArray[np.int64]
     centres: NDArray[np.float64] = None  # type: ignore[assignment]
     cells: NDArray[np.int64] = None  # type: ignore[assignment]
-    geometry: str = "square"
-    pitch_px: float | None = None
-    angle_deg: float = 0.0
-    pixel_scale_arcsec: float | None = None
-    subaperture_m: float | None = None
-    diameter_m: float | None = None
-    fitted: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
-    bin: int = 1
+    geometry: str = setting("square", choices=GEOMETRIES)
+    pitch_px: float | None = _optics()
+    angle_deg: float = number(0.0, -360, 360)
+    pixel_scale_arcsec: float | None = _optics(
+        "Side of a pixel on the sky: for slopes in arcsec and wavefronts.", unit="arcsec"
+    )
+    subaperture_m: float | None = _optics("Side of a sub-aperture in the telescope's pupil.", unit="m")
+    diameter_m: float | None = _optics("Diameter of the telescope's pupil.", unit="m")
+    fitted: tuple[str, ...] = setting((), kind=TEXTS)
+    doubts: tuple[str, ...] = setting((), kind=TEXTS)
+    bin: int = number(1, 1, LARGEST_BIN, whole=True)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         put = object.__setattr__
         put(self, "frame_shape", pair_of_numbers("layout.frame_shape", self.frame_shape, 1, 2**31))
         check_size("layout.frame_shape", self.frame_shape, what="pixels")
-        put(self, "bin", int(number_between("layout.bin", self.bin, 1, LARGEST_BIN, integer=True)))
         put(self, "window", window_size("layout.window", self.window, self.bin))
         corners = _rows_of_two("layout.corners", self.corners)
         corners = numbers_between("layout.corners", corners, -(2**31), 2**31, integer=True)
@@ -130,13 +130,6 @@ class Layout:
                     f"layout.{name}: expected {len(corners)} rows, one per corner, got {len(array)}"
                 )
         check_size("layout.cells", (np.ptp(cells, axis=0) + 1).tolist(), _MOST_LENSLETS, "lenslets")
-        one_of("layout.geometry", self.geometry, GEOMETRIES)
-        for name in ("pitch_px", *OPTICS):
-            if (value := getattr(self, name)) is not None:
-                put(self, name, number_between(f"layout.{name}", value, 0.0, _LARGEST_PX, low_open=True))
-        for name in ("fitted", "doubts"):
-            put(self, name, strings_of(f"layout.{name}", getattr(self, name)))
-        put(self, "angle_deg", number_between("layout.angle_deg", self.angle_deg, -360, 360))
         check_inside(corners, self.window, self.frame_shape)
         check_centres(centres - middle, self.window)
         check_overlap(corners, self.window)
@@ -253,9 +246,8 @@ class Layout:
         distance = np.hypot(*(cells - 0.5 * (np.array([n_rows, n_columns]) - 1)).T)
         cells = cells[(distance <= outer) & (distance >= inner)]
         if len(cells) == 0:
-            raise InputError(
-                f"outer_radius = {outer:g}, inner_radius = {inner:g}: no sub-aperture is illuminated"
-            )
+            name = f"outer_radius = {outer:g}, inner_radius = {inner:g}"
+            raise InputError("no sub-aperture is illuminated", name=name)
         if frame_shape is None:
             last = np.array(start) + (np.array([n_rows, n_columns]) - 1) * step + window
             frame_shape = (int(last[0]), int(last[1]))
@@ -352,42 +344,26 @@ class Layout:
         )
 
     @classmethod
-    def load(cls, path: str | Path) -> Layout:
-        """Read the table [layout] of a configuration file (TOML)."""
-        return cls.from_tables(path, read_tables(path))
-
-    @classmethod
-    def from_tables(cls, path: str | Path, document: Mapping[str, dict[str, Any]]) -> Layout:
-        """Return the layout in the tables of a configuration file; warn of doubts that are not settled."""
-        values = table_of(path, document, "layout")
-        with errors_of_table(path, "layout"):
-            layout = cls.from_table(values)
-        if layout.doubts:
-            settling = "look at its picture, then `faintspot layout --accept` or another layout settles it"
-            text = f"{path}: doubtful layout: {'; '.join(layout.doubts)} ({settling})"
-            warnings.warn(text, DoubtWarning, stacklevel=2)
-        return layout
-
-    def save(self, path: str | Path) -> None:
-        """Write the table [layout] of a configuration file (TOML); preserve other tables."""
-        save_tables(path, {"layout": self.to_table()})
-
-    def to_table(self) -> dict[str, Any]:
-        """Return the table of a configuration file."""
-        return chosen_fields(self)
-
-    @classmethod
-    def from_table(cls, values: Mapping[str, Any]) -> Layout:
-        """Return the layout in a table of a configuration file, which may contain the arguments of `grid`.
+    def from_table(cls, values: Mapping[str, Any], path: Path | None = None) -> Layout:
+        """Return the layout in a table, which may contain the arguments of `grid`; warn of unsettled doubts.
 
         Raises
         ------
         InputError
             If a key is unknown, or a value is missing or invalid.
         """
-        if "grid" not in values:
-            check_fields("layout", cls, values)
-            return cls(**values)
+        if "grid" in values:
+            with errors_within(path):
+                return cls._of_grid(values)
+        layout = super().from_table(values, path)
+        if layout.doubts:
+            settling = "look at its picture, then `faintspot layout --accept` or another layout settles it"
+            text = f"{path}: doubtful layout: {'; '.join(layout.doubts)} ({settling})"
+            warnings.warn(text, DoubtWarning, stacklevel=2)
+        return layout
+
+    @classmethod
+    def _of_grid(cls, values: Mapping[str, Any]) -> Layout:
         check_keys("layout.", values, ["grid", "bin", *OPTICS], what="key beside grid")
         optics = {name: values[name] for name in ("bin", *OPTICS) if name in values}
         grid = checked_table("layout.grid", values["grid"])
@@ -395,8 +371,7 @@ class Layout:
         try:
             return cls.grid(**grid, **optics)
         except InputError as error:
-            text = str(error)
-            raise InputError(text if text.startswith("layout") else f"layout.grid.{text}") from None
+            raise error if error.name.startswith("layout.") else error.within("", "layout.grid.") from None
 
     def images(self, frame: ArrayLike) -> NDArray[Any]:
         """Return the windows of a frame (h, w) or frames (n, h, w): (n_subapertures, ny, nx) or (n, ...)."""

@@ -68,7 +68,7 @@ def with_stated(
     if CENTRE not in fitted:
         point = finite_array("centre", centre)
         if point.shape != (2,):
-            raise InputError(f"centre: expected x and y [px], got {point.size} numbers")
+            raise InputError(f"expected x and y [px], got {point.size} numbers", name="centre")
         stated = complex(point[0], point[1])
         pivot, pivot_place = _half_node(pivot + (stated - pivot_place) / found, across), stated
     lattice = pivot_place + pitch * np.exp(1j * np.deg2rad(angle)) * (nodes - pivot)

@@ -20,11 +20,13 @@ def window_size(name: str, value: Any, factor: int = 1) -> tuple[int, int]:
     if max(window) > largest:
         needed = math.ceil(max(window) / LARGEST_WINDOW)
         raise InputError(
-            f"{name} = {max(window)}: expected at most {largest}; bin = {needed} allows larger windows"
+            f"expected at most {largest}; bin = {needed} allows larger windows",
+            name=name,
+            value=max(window),
         )
     numbers_between(name, window, SMALLEST_WINDOW * factor, largest)
     if any(side % factor for side in window):
-        raise InputError(f"{name}: expected multiples of bin = {factor}, got {window[0]} x {window[1]}")
+        raise InputError(f"expected multiples of bin = {factor}, got {window[0]} x {window[1]}", name=name)
     return window
 
 
@@ -32,6 +34,6 @@ def pair_of_numbers(name: str, value: Any, low: float, high: float) -> tuple[int
     """Return two whole numbers, from one or two."""
     array = numbers_between(name, value, low, high, integer=True)
     if array.ndim > 1 or array.size not in (1, 2):
-        raise InputError(f"{name}: expected one or two whole numbers, got shape {array.shape}")
+        raise InputError(f"expected one or two whole numbers, got shape {array.shape}", name=name)
     first, second = np.broadcast_to(array, 2)
     return int(first), int(second)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between, numbers_between, one_of
+from faintspot.base.checks import finite_array, numbers_between
+from faintspot.base.config.options import REQUIRED, Options, number, setting
 
 # Flux density (Jy) at magnitude 0 and relative width of the band: Bessell 1979 (PASP 91, 589) for B to I,
 # Campins, Rieke & Lebofsky 1985 (AJ 90, 896) for J to K.
@@ -35,8 +36,11 @@ DEFAULT_THROUGHPUT = 0.4  # atmosphere, telescope and the optics before the sens
 DEFAULT_QUANTUM_EFFICIENCY = 0.9
 
 
+_above_zero = partial(number, low=0.0, high=math.inf, low_open=True)
+
+
 @dataclass(frozen=True)
-class Photometry:
+class Photometry(Options):
     """Electrons from a star in a sub-aperture and a frame.
 
     electrons = zero_point * 10^(-0.4 magnitude) * area_m2 * frame_time_s * throughput * quantum_efficiency.
@@ -69,27 +73,17 @@ class Photometry:
     (368, 12.4)
     """
 
-    area_m2: float
-    frame_time_s: float
-    band: str = DEFAULT_BAND
-    zero_point: float | None = None
-    throughput: float = DEFAULT_THROUGHPUT
-    quantum_efficiency: float = DEFAULT_QUANTUM_EFFICIENCY
+    area_m2: float = _above_zero(REQUIRED)
+    frame_time_s: float = _above_zero(REQUIRED)
+    band: str = setting(DEFAULT_BAND, choices=tuple(ZERO_POINTS))
+    zero_point: float | None = _above_zero(None)
+    throughput: float = number(DEFAULT_THROUGHPUT, 0.0, 1.0, low_open=True)
+    quantum_efficiency: float = number(DEFAULT_QUANTUM_EFFICIENCY, 0.0, 1.0, low_open=True)
 
     def __post_init__(self) -> None:
-        one_of("band", self.band, list(ZERO_POINTS))
-        zero_point: Any = ZERO_POINTS[self.band] if self.zero_point is None else self.zero_point
-        checked = {
-            "area_m2": number_between("area_m2", self.area_m2, 0.0, low_open=True),
-            "frame_time_s": number_between("frame_time_s", self.frame_time_s, 0.0, low_open=True),
-            "zero_point": number_between("zero_point", zero_point, 0.0, low_open=True),
-            "throughput": number_between("throughput", self.throughput, 0.0, 1.0, low_open=True),
-            "quantum_efficiency": number_between(
-                "quantum_efficiency", self.quantum_efficiency, 0.0, 1.0, low_open=True
-            ),
-        }
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
+        super().__post_init__()
+        if self.zero_point is None:
+            object.__setattr__(self, "zero_point", ZERO_POINTS[self.band])
 
     @property
     def electrons_at_zero(self) -> float:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import number_between, numbers_between
-from faintspot.base.config.tables import errors_of_table, read_tables
-from faintspot.base.errors import InputError
-from faintspot.base.toml_files import check_keys
+from faintspot.base.checks import numbers_between
+from faintspot.base.config.options import FLAG, REQUIRED, number, setting
+from faintspot.base.config.tables import Table
+from faintspot.base.errors import InputError, errors_within
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_pitch, pupil_of, side_m
@@ -26,11 +26,17 @@ from faintspot.slopes.spots.sodium import SodiumProfile
 _FARTHEST_M = 1e3
 _BEYOND_PX = 3.0  # of the window, to which PSFs reach
 _LONGEST_S = 1e6
-_REQUIRED = "launch_m", "spot_fwhm_arcsec"
+
+
+def _position(name: str, value: Any) -> NDArray[np.float64]:
+    position = numbers_between(name, value, -_FARTHEST_M, _FARTHEST_M)
+    if position.shape != (2,):
+        raise InputError(f"expected x and y, got shape {position.shape}", name=name)
+    return position
 
 
 @dataclass(frozen=True, eq=False)
-class LaserSpots:
+class LaserSpots(Table, table="laser"):
     """Laser guide star of a sensor.
 
     Parameters
@@ -59,34 +65,18 @@ class LaserSpots:
         If a value is missing or out of range.
     """
 
-    launch_m: Any
-    spot_fwhm_arcsec: float
-    at_m: Any = None
+    launch_m: Any = setting(REQUIRED, unit="m", check=_position)
+    spot_fwhm_arcsec: float = number(REQUIRED, 0.0, 60.0, unit="arcsec", low_open=True)
+    at_m: Any = setting(None, unit="m", check=_position)
     profile: SodiumProfile = field(default_factory=SodiumProfile.gaussian)
     zenith_distance_deg: float = 0.0
     site_altitude_m: float = 0.0
-    matched_filter: bool = False
-    follow_every_s: float = 0.0
-    follow_time_constant_s: float = 4.0
-
-    def __post_init__(self) -> None:
-        for name in ("launch_m", "at_m"):
-            if getattr(self, name) is None and name not in _REQUIRED:
-                continue
-            position = numbers_between(f"laser.{name}", getattr(self, name), -_FARTHEST_M, _FARTHEST_M)
-            if position.shape != (2,):
-                raise InputError(f"laser.{name}: expected x and y, got shape {position.shape}")
-            object.__setattr__(self, name, position)
-        number_between("laser.spot_fwhm_arcsec", self.spot_fwhm_arcsec, 0.0, 60.0, low_open=True)
-        if not isinstance(self.matched_filter, bool):
-            raise InputError(f"laser.matched_filter = {self.matched_filter!r}: expected true or false")
-        number_between("laser.follow_every_s", self.follow_every_s, 0.0, _LONGEST_S)
-        number_between(
-            "laser.follow_time_constant_s", self.follow_time_constant_s, 0.0, _LONGEST_S, low_open=True
-        )
+    matched_filter: bool = setting(False, kind=FLAG)
+    follow_every_s: float = number(0.0, 0.0, _LONGEST_S)
+    follow_time_constant_s: float = number(4.0, 0.0, _LONGEST_S, low_open=True)
 
     @classmethod
-    def from_table(cls, path: str | Path, table: Mapping[str, Any]) -> Self:
+    def from_table(cls, values: Mapping[str, Any], path: Path | None = None) -> Self:
         """Read the table of a file; `profile` is the name of a file of `SodiumProfile.save` beside it.
 
         Raises
@@ -94,14 +84,15 @@ class LaserSpots:
         InputError
             For an unknown key, or a value that is missing or out of range.
         """
-        check_keys(f"{path}: laser.", table, [item.name for item in fields(cls)], required=_REQUIRED)
-        values = dict(table)
-        with errors_of_table(path, "laser"):
-            if "profile" in values:
-                if not isinstance(values["profile"], str):
-                    raise InputError("laser.profile: expected the name of a file")
-                values["profile"] = SodiumProfile.load(Path(path).parent / values["profile"])
-            return cls(**values)
+        name = values.get("profile")
+        if name is None:
+            return super().from_table(values, path)
+        path = path or Path()
+        if not isinstance(name, str):
+            raise InputError("expected the name of a file", name="laser.profile", where=f"{path}")
+        with errors_within(path):
+            profile = SodiumProfile.load(path.parent / name)
+        return super().from_table({**values, "profile": profile}, path)
 
     def star(self, positions_m: ArrayLike, pixel_arcsec: float) -> LaserGuideStar:
         """Return the star as sub-apertures at these places see it."""
@@ -173,19 +164,3 @@ def matched_filter(psf: PSF, layout: Layout, calibration: Calibration, flux_e: A
     flux_e = flux_e if per_window else float(np.mean(np.asarray(flux_e, np.float64)))
     excess = calibration.excess_noise
     return FixedWeights.matched(psf, layout.window, flux_e=flux_e, read_noise_e=noise, excess_noise=excess)
-
-
-def laser_of(path: str | Path, document: Mapping[str, dict[str, Any]]) -> LaserSpots | None:
-    """Return the laser guide star in the tables of a configuration file, or None."""
-    return LaserSpots.from_table(path, document["laser"]) if "laser" in document else None
-
-
-def load_laser(path: str | Path) -> LaserSpots | None:
-    """Return the laser guide star of a configuration file, or None.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or the table has an unknown key or a value out of range.
-    """
-    return laser_of(path, read_tables(path))

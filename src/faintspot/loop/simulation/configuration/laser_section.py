@@ -8,18 +8,25 @@ from typing import Any
 import numpy as np
 
 from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.config.options import LIST, number
+from faintspot.base.config.tables import Table
 from faintspot.base.errors import InputError
-from faintspot.loop.simulation.configuration.checked_fields import LIST, number
 from faintspot.slopes.spots.sodium import SodiumProfile, integration_points
 
 _STEPS = 8  # between two altitudes
 
 
 @dataclass(frozen=True)
-class Laser:
-    """Laser guide star: the sensor's spots are images of a sodium layer that changes with time."""
+class Laser(Table, table="laser"):
+    """Laser guide star: the sensor's spots are images of a sodium layer that changes with time.
 
-    launch_m: tuple[float, ...] = number((0.0, 0.0), -1e3, 1e3, several=LIST)
+    Raises
+    ------
+    InputError
+        If lists have other lengths, altitudes or times do not increase, or a density is negative.
+    """
+
+    launch_m: tuple[float, ...] = number((0.0, 0.0), -1e3, 1e3, kind=LIST)
     """x and y of the launch telescope, from the centre of the pupil."""
     spot_fwhm_arcsec: float = number(1.0, 0.05, 60.0)
     """Full width at half maximum of the beam at a single altitude, without the turbulence on its way down."""
@@ -27,9 +34,9 @@ class Laser:
     """Rms of the motion of all spots by the beam, on each axis, independent from frame to frame."""
     zenith_distance_deg: float = number(0.0, 0.0, 75.0)
     site_altitude_m: float = number(0.0, -500.0, 1e4)
-    altitude_m: tuple[float, ...] = number((80e3, 85e3, 90e3, 95e3, 100e3), 0.0, 1e6, several=LIST)
+    altitude_m: tuple[float, ...] = number((80e3, 85e3, 90e3, 95e3, 100e3), 0.0, 1e6, kind=LIST)
     """Altitudes of the sodium profile above sea level; the sensor is focused on the first profile."""
-    time_s: tuple[float, ...] = number((0.0,), 0.0, 1e6, several=LIST)
+    time_s: tuple[float, ...] = number((0.0,), 0.0, 1e6, kind=LIST)
     """Times of the profiles, increasing; between them the profile is interpolated."""
     density: tuple[tuple[float, ...], ...] = field(default=((0.0, 0.5, 1.0, 0.5, 0.0),))
     """Density at each altitude, in any unit: a list for each time."""
@@ -40,14 +47,8 @@ class Laser:
     follow_time_constant_frames: float = number(400.0, 1.0, 1e9)
     """Time constant of the running mean images that it is fitted to."""
 
-    def checked(self) -> Laser:
-        """Return it with lists as tuples.
-
-        Raises
-        ------
-        InputError
-            If lists have other lengths, altitudes or times do not increase, or a density is negative.
-        """
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if len(self.launch_m) != 2:
             raise InputError(f"laser.launch_m: expected x and y, got {list(self.launch_m)}")
         rows = tuple(np.ravel(row) for row in self.density) if np.ndim(self.density) else ()
@@ -62,7 +63,6 @@ class Laser:
             SodiumProfile(self.altitude_m, row)
         density: Any = tuple(map(tuple, values.tolist()))
         object.__setattr__(self, "density", density)
-        return self
 
     @property
     def focus_altitude_m(self) -> float:
@@ -87,7 +87,7 @@ class Laser:
 
 
 @dataclass(frozen=True)
-class NaturalStar:
+class NaturalStar(Table, table="natural_star"):
     """Natural star for tip, tilt and slow focus beside a laser guide star.
 
     Its sensor sees the mean gradients over the quadrants of the pupil after the mirror, with photon noise.

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from faintspot.loop.control.base import LEARNT
-from faintspot.loop.simulation.configuration.checked_fields import LIST, NUMBER_OR_LIST, number
-from faintspot.slopes.simulate.photometry import DEFAULT_BAND
+from faintspot.base.config.options import FLAG, LIST, NUMBER_OR_LIST, number, setting
+from faintspot.base.config.tables import Table
+from faintspot.loop.control.base import LEARNT, WINDS
+from faintspot.slopes.simulate.photometry import DEFAULT_BAND, ZERO_POINTS
 
 CLOSED, OPEN = "closed", "open"
 
 
 @dataclass(frozen=True)
-class Telescope:
+class Telescope(Table, table="telescope"):
     """Pupil of the telescope."""
 
     diameter_m: float = number(4.2, 0.05, 100.0)
@@ -21,7 +22,7 @@ class Telescope:
 
 
 @dataclass(frozen=True)
-class SensorParameters:
+class SensorParameters(Table, table="sensor"):
     """Shack-Hartmann sensor."""
 
     subapertures: int = number(7, 1, 200, whole=True)
@@ -42,41 +43,41 @@ class SensorParameters:
 
 
 @dataclass(frozen=True)
-class Mirror:
+class Mirror(Table, table="mirror"):
     """Deformable mirror."""
 
     actuators: int | None = number(None, 2, 201, whole=True)
     """Actuators across the pupil, its edges included. Default: one at each corner of the sub-apertures."""
     crosstalk: float = number(0.15, 0.0, 0.9, low_open=True)
     """Value of an actuator's Gaussian influence function at its neighbour."""
-    tip_tilt: bool = True
+    tip_tilt: bool = setting(True, kind=FLAG)
     """Whether there is a separate tip-tilt mirror."""
 
 
 @dataclass(frozen=True)
-class Atmosphere:
+class Atmosphere(Table, table="atmosphere"):
     """Layers of frozen turbulence moved by the wind; the star is on axis, so altitudes do not matter."""
 
-    r0_m: float | tuple[float, float] = number(0.15, 0.01, 1e3, several=NUMBER_OR_LIST)
+    r0_m: float | tuple[float, float] = number(0.15, 0.01, 1e3, kind=NUMBER_OR_LIST)
     """Fried parameter at 500 nm, or the two values between which it drifts."""
     drift_time_s: float = number(60.0, 0.0, 1e6, low_open=True)
     """Period of the drift."""
     outer_scale_m: float = number(25.0, 0.5, 200.0)
-    altitude_m: tuple[float, ...] = number((0.0, 2500.0, 4000.0, 13500.0), 0.0, 1e5, several=LIST)
-    fraction: tuple[float, ...] = number((0.45, 0.25, 0.15, 0.15), 0.0, 1e6, several=LIST)
+    altitude_m: tuple[float, ...] = number((0.0, 2500.0, 4000.0, 13500.0), 0.0, 1e5, kind=LIST)
+    fraction: tuple[float, ...] = number((0.45, 0.25, 0.15, 0.15), 0.0, 1e6, kind=LIST)
     """Relative strength of each layer."""
-    wind_speed_m_per_s: tuple[float, ...] = number((6.0, 9.0, 14.0, 22.0), 0.0, 200.0, several=LIST)
-    wind_direction_deg: tuple[float, ...] = number((20.0, 80.0, 150.0, 250.0), -360.0, 360.0, several=LIST)
+    wind_speed_m_per_s: tuple[float, ...] = number((6.0, 9.0, 14.0, 22.0), 0.0, 200.0, kind=LIST)
+    wind_direction_deg: tuple[float, ...] = number((20.0, 80.0, 150.0, 250.0), -360.0, 360.0, kind=LIST)
 
 
 @dataclass(frozen=True)
-class Camera:
+class Camera(Table, table="camera"):
     """The sensor's camera and the star's flux on it; as `faintspot.slopes.simulate.Detector`."""
 
     photons_per_subaperture: float | None = number(None, 0.0, 1e9, low_open=True)
     """Photo-electrons of a fully illuminated sub-aperture in a frame; or give the magnitude."""
     magnitude: float | None = number(None, -30.0, 60.0)
-    band: str = DEFAULT_BAND
+    band: str = setting(DEFAULT_BAND, choices=tuple(ZERO_POINTS))
     zero_point: float | None = number(None, 0.0, 1e20, low_open=True)
     """Photons per second and m^2 of magnitude 0. Default: that of the band."""
     throughput: float = number(0.4, 0.0, 1.0, low_open=True)
@@ -94,7 +95,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class ControlParameters:
+class ControlParameters(Table, table="control"):
     """Control loop."""
 
     frame_rate_hz: float = number(250.0, 0.0, 1e5, low_open=True)
@@ -103,13 +104,13 @@ class ControlParameters:
     gain: float = number(0.5, 0.0, 2.0)
     leak: float = number(0.01, 0.0, 1.0)
     """Fraction by which commands decay in each frame, so that a loop recovers after it lost the star."""
-    mode: str = CLOSED
+    mode: str = setting(CLOSED, choices=(CLOSED, OPEN))
     """"closed", or "open": the sensor does not see the mirror."""
     largest_condition: float = number(30.0, 1.0, 1e6)
     """Largest condition number of the reconstructor; weaker modes are not controlled."""
     telemetry_frames: int = number(2000, 260, 1_000_000, whole=True)
     """Length of the closed loop with an integrator from which other controllers learn; never scored."""
-    winds: str = LEARNT
+    winds: str = setting(LEARNT, choices=WINDS)
     """Winds of a predictive model: "learnt" from telemetry, "assumed" (those of the atmosphere) or "none"."""
     assumed_wind_factor: float = number(1.0, 0.0, 100.0)
     """Assumed winds as a multiple of the true ones."""
@@ -118,14 +119,14 @@ class ControlParameters:
 
 
 @dataclass(frozen=True)
-class Science:
+class Science(Table, table="science"):
     """Wavelength and field of the Strehl ratio, on axis."""
 
     wavelength_m: float = number(1.65e-6, 1e-7, 1e-4)
 
 
 @dataclass(frozen=True)
-class RunLength:
+class RunLength(Table, table="run"):
     """Length and number of runs."""
 
     frames: int = number(1500, 1, 10_000_000, whole=True)
@@ -133,5 +134,5 @@ class RunLength:
     """Number of frames at the beginning that are not scored."""
     seed: int = number(1, 0, 2**63 - 1, whole=True)
     realisations: int = number(5, 1, 100_000, whole=True)
-    photons_per_subaperture: tuple[float, ...] = number((), 0.0, 1e9, low_open=True, several=LIST)
+    photons_per_subaperture: tuple[float, ...] = number((), 0.0, 1e9, low_open=True, kind=LIST)
     """Fluxes at which estimators are compared."""

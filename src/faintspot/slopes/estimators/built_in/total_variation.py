@@ -85,8 +85,9 @@ class TotalVariation(KeepingBrightest):
         strength = self.noise_std
         if strength is None or (isinstance(strength, PerSubaperture) and strength.default is None):
             raise InputError(
-                'noise_std: expected a number (electrons) or "auto", got none; '
-                'or set estimator = "brightest", which does not denoise'
+                'expected a number (electrons) or "auto", got none; '
+                'or set estimator = "brightest", which does not denoise',
+                name="noise_std",
             )
 
     @property

@@ -177,13 +177,17 @@ def _pitch_range(pitch_px: float | None, shape: tuple[int, ...]) -> tuple[float,
     pitch_px = number_between("pitch_px", pitch_px, 0.0, low_open=True)
     if pitch_px < _SMALLEST_GIVEN_PITCH_PX:
         raise InputError(
-            f"pitch_px = {pitch_px:g}: expected {_SMALLEST_GIVEN_PITCH_PX} to {largest:g}; spots of quad "
-            "cells overlap too much to be found, --grid of faintspot layout gives their places"
+            f"expected {_SMALLEST_GIVEN_PITCH_PX} to {largest:g}; spots of quad cells overlap too much to "
+            "be found, --grid of faintspot layout gives their places",
+            name="pitch_px",
+            value=pitch_px,
         )
     if pitch_px > largest:
         raise InputError(
-            f"pitch_px = {pitch_px:g}: expected at most {largest:g}, two rows of lenslets must fit into "
-            f"{shape[1]} x {shape[0]} pixels"
+            f"expected at most {largest:g}, two rows of lenslets must fit into {shape[1]} x {shape[0]} "
+            "pixels",
+            name="pitch_px",
+            value=pitch_px,
         )
     return 0.8 * pitch_px, 1.2 * pitch_px
 
@@ -195,7 +199,8 @@ def _nothing_found(image: NDArray[np.float64], pitch_range_px: tuple[float, floa
     kind = "square or hexagonal" if geometry == "auto" else geometry
     return (
         f"frame: found no {kind} lattice of spots with a pitch of {pitch_range_px[0]:.1f} to "
-        f"{pitch_range_px[1]:.1f} px above the noise; average more frames, or give pitch_px or bad_pixels"
+        f"{pitch_range_px[1]:.1f} px above the noise; average more frames, or state the pitch or bad pixels; "
+        "--grid of faintspot layout is for an array that is known, such as quad cells"
     )
 
 
@@ -206,7 +211,7 @@ def _too_few(count: int, lattice: Lattice, pupil: PupilRegion | None) -> str:
     if pupil is not None:
         return f"{found}{count} of its lenslets lie in the pupil given, {expected}"
     number = "none of its lenslets is" if count == 0 else f"only {count} of its lenslets {_be(count)}"
-    return f"{found}{number} lit for certain, {expected}; average more frames, or give pitch_px"
+    return f"{found}{number} lit for certain, {expected}; average more frames, or state the pitch"
 
 
 def _be(count: int) -> str:
