@@ -143,7 +143,7 @@ def tables_as_text(tables: Mapping[str, Any]) -> str:
 
     document = tomlkit.document()
     for name, values in tables.items():
-        document[name] = _toml_table(values) if isinstance(values, Mapping) else values
+        document[name] = _toml_table(values) if isinstance(values, Mapping) else _toml_value(values)
     return tomlkit.dumps(document)
 
 

@@ -5,37 +5,49 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import tomlkit
 
-from faintspot.base.checks import number_between, one_of
-from faintspot.base.config.options import Option
-from faintspot.base.errors import InputError
+from faintspot.base.checks import number_between, one_of, strings_of
+from faintspot.base.config.options import FLAG, LIST, REQUIRED, TEXT, Options, number, setting
+from faintspot.base.config.tables import tables_as_text
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.sizes import check_size
 from faintspot.base.toml_files import check_keys, checked_table, parse_text, read_text
 from faintspot.experiments.methods import DEFAULT_METHODS, knows_the_spot
 from faintspot.experiments.store import fingerprint_of
-from faintspot.experiments.study.sweep import PARAMETERS, RANGES, Cell, Sweep, checked_numbers
+from faintspot.experiments.study.sweep import PARAMETERS, RANGES, Cell, Sweep
 from faintspot.slopes.estimators.registry import estimators
 
 BEST, CORRECTED = "best", "corrected"
 _MOST_CELLS = 100_000
-_CANDIDATE_RANGES = {
-    "strengths": Option("", "1", 0.0, 10.0, low_open=True),
-    "widths": Option("", "px", 0.0, 10.0, low_open=True),
-    "thresholds": Option("", "1", 0.0, 100.0),
-    "weight_widths": Option("", "1", 0.0, 100.0, low_open=True),
-    "blurs": Option("", "px", 0.0, 10.0),
-    "model_errors": Option("", "1", 0.0, 10.0),
-}
 _RANGE_KEYS = ("from", "to", "points", "spacing")
 
 
+def _checked_sweeps(name: str, values: Any) -> tuple[Sweep, ...]:
+    sweeps = tuple(values) if isinstance(values, Iterable) else ()
+    if not sweeps or not all(isinstance(sweep, Sweep) for sweep in sweeps):
+        raise InputError(f"expected at least one sweep, got {values!r}", name=name)
+    names = [sweep.name for sweep in sweeps]
+    for each in names:
+        if names.count(each) > 1:
+            raise InputError(f"expected different names, got {each!r} {names.count(each)} times", name=name)
+    check_size(f"{name}: cells", [sum(sweep.n_cells for sweep in sweeps)], _MOST_CELLS, "cells")
+    return sweeps
+
+
+def _checked_estimators(name: str, values: Any) -> tuple[str, ...]:
+    return tuple(one_of(name, each, list(estimators())) for each in strings_of(name, values))
+
+
+_listed = partial(number, kind=LIST)
+
+
 @dataclass(frozen=True)
-class StudySpecification:
+class StudySpecification(Options):
     """A Monte-Carlo study of the slope error.
 
     Parameters
@@ -88,20 +100,20 @@ class StudySpecification:
     (2, ('best', 'fixed20', 'fixed40', 'fixed60'))
     """
 
-    name: str
-    sweeps: Sequence[Sweep]
-    seed: int = 1
-    realisations: int = 10_000
-    estimators: Sequence[str] = DEFAULT_METHODS
-    strengths: Sequence[float] = (0.3, 0.5, 0.7, 0.85, 1.0)
-    widths: Sequence[float] = (0.4, 0.6, 0.8, 1.0, 1.3)
-    thresholds: Sequence[float] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-    weight_widths: Sequence[float] = (1.0, 1.4, 2.0, 3.0, 4.5)
-    blurs: Sequence[float] = (0.0, 0.5, 1.0, 1.8, 3.0, 5.0)
-    model_errors: Sequence[float] = (0.0, 0.2, 0.5)
-    fixed_k: Sequence[int] = (20, 40, 60)
-    corrected: bool = False
-    search_range_px: float | None = None
+    name: str = setting(REQUIRED, kind=TEXT)
+    sweeps: Sequence[Sweep] = setting(REQUIRED, check=_checked_sweeps)
+    seed: int = number(1, 0, 2**63 - 1, whole=True)
+    realisations: int = number(10_000, 20, 10_000_000, whole=True)
+    estimators: Sequence[str] = setting(DEFAULT_METHODS, check=_checked_estimators)
+    strengths: Sequence[float] = _listed((0.3, 0.5, 0.7, 0.85, 1.0), 0.0, 10.0, low_open=True)
+    widths: Sequence[float] = _listed((0.4, 0.6, 0.8, 1.0, 1.3), 0.0, 10.0, low_open=True)
+    thresholds: Sequence[float] = _listed((0.0, 1.0, 2.0, 3.0, 4.0, 5.0), 0.0, 100.0)
+    weight_widths: Sequence[float] = _listed((1.0, 1.4, 2.0, 3.0, 4.5), 0.0, 100.0, low_open=True)
+    blurs: Sequence[float] = _listed((0.0, 0.5, 1.0, 1.8, 3.0, 5.0), 0.0, 10.0)
+    model_errors: Sequence[float] = _listed((0.0, 0.2, 0.5), 0.0, 10.0)
+    fixed_k: Sequence[int] = _listed((20, 40, 60), 1, 1e9, whole=True)
+    corrected: bool = setting(False, kind=FLAG)
+    search_range_px: float | None = number(None, 0.0, math.inf, low_open=True)
 
     LISTED: ClassVar[Mapping[str, tuple[str, bool]]] = {
         "noise_std": ("strengths", False),
@@ -114,41 +126,17 @@ class StudySpecification:
     """By option of an estimator, which field lists its values, and whether only for speckled spots."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name:
-            raise InputError(f"name: expected a text, got {self.name!r}")
-        self._set("seed", int(number_between("seed", self.seed, 0, 2**63 - 1, integer=True)))
-        number = number_between("realisations", self.realisations, 20, 10_000_000, integer=True)
-        self._set("realisations", int(number))
-        self._set("sweeps", _checked_sweeps(self.sweeps))
-        names = [
-            one_of("estimators", name, list(estimators()))
-            for name in _checked_list("estimators", self.estimators)
-        ]
-        self._set("estimators", tuple(dict.fromkeys(names)))
-        for name, bounds in _CANDIDATE_RANGES.items():
-            items = _checked_list(name, getattr(self, name))
-            self._set(name, tuple(checked_numbers(name, items, bounds)))
-        self._set("fixed_k", self._checked_fixed_k())
-        if not isinstance(self.corrected, bool):
-            raise InputError(f"corrected = {self.corrected!r}: expected true or false")
-        if self.search_range_px is not None:
-            search = number_between("search_range_px", self.search_range_px, 0.0, low_open=True)
-            self._set("search_range_px", search)
-
-    def _set(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)
-
-    def _checked_fixed_k(self) -> tuple[int, ...]:
-        if not len(self.fixed_k):
-            return ()
-        largest = max(cell.pixels for cell in self.cells()) ** 2
-        kept = checked_numbers("fixed_k", self.fixed_k, Option("", "px", 1, 1e9, whole=True))
-        for k in kept:
+        super().__post_init__()
+        for name in ("estimators", "fixed_k", *(field for field, _ in self.LISTED.values())):
+            values = tuple(dict.fromkeys(getattr(self, name)))
+            if not values and name != "fixed_k":
+                raise InputError("expected at least one value, got an empty list", name=name)
+            object.__setattr__(self, name, values)
+        largest = self.largest_k + 1
+        for k in self.fixed_k:
             if k >= largest:
-                raise InputError(
-                    f"fixed_k = {k}: expected less than the {largest} pixels of the largest window"
-                )
-        return tuple(dict.fromkeys(kept))
+                expected = f"expected less than the {largest} pixels of the largest window"
+                raise InputError(expected, name="fixed_k", value=k)
 
     @property
     def modes(self) -> tuple[str, ...]:
@@ -185,16 +173,12 @@ class StudySpecification:
 
     def to_text(self) -> str:
         """Return the specification as TOML with every value written out."""
-        document = tomlkit.document()
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name != "sweeps" and value is not None:  # TOML has no word for nothing
-                document[field.name] = list(value) if isinstance(value, tuple) else value
-        sweeps = tomlkit.table()
-        for sweep in self.sweeps:
-            sweeps[sweep.name] = {name: list(getattr(sweep, name)) for name in PARAMETERS}
-        document["sweeps"] = sweeps
-        return tomlkit.dumps(document)
+        known = {name: value for name in self.declared() if (value := getattr(self, name)) is not None}
+        sweeps = {
+            sweep.name: {name: list(getattr(sweep, name)) for name in PARAMETERS} for sweep in self.sweeps
+        }
+        del known["sweeps"]  # the tables come last
+        return tables_as_text({**known, "sweeps": sweeps})
 
     @classmethod
     def from_text(cls, text: str, where: str = "specification") -> StudySpecification:
@@ -206,10 +190,8 @@ class StudySpecification:
             When it is not TOML, has an unknown key, lacks one or has a bad value.
         """
         document = parse_text(text, where)
-        try:
+        with errors_within(where):
             return _build(document)
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
 
     @classmethod
     def from_file(cls, path: str | Path) -> StudySpecification:
@@ -221,27 +203,6 @@ class StudySpecification:
             As `from_text`, and when the file cannot be read.
         """
         return cls.from_text(read_text(path), str(path))
-
-
-def _checked_list(name: str, values: Any) -> list[Any]:
-    """Return a list without repeated items, or raise InputError when it is none or empty."""
-    if isinstance(values, str) or np.ndim(values) != 1:
-        raise InputError(f"{name}: expected a list, got {values!r}")
-    if not len(values):
-        raise InputError(f"{name}: expected at least one value, got an empty list")
-    return list(dict.fromkeys(values))
-
-
-def _checked_sweeps(values: Any) -> tuple[Sweep, ...]:
-    sweeps = tuple(values) if isinstance(values, Iterable) else ()
-    if not sweeps or not all(isinstance(sweep, Sweep) for sweep in sweeps):
-        raise InputError(f"sweeps: expected at least one sweep, got {values!r}")
-    names = [sweep.name for sweep in sweeps]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"sweeps: expected different names, got {name!r} {names.count(name)} times")
-    check_size("sweeps: cells", [sum(sweep.n_cells for sweep in sweeps)], _MOST_CELLS, "cells")
-    return sweeps
 
 
 # Reading -----------------------------------------------------------------------------------------------
