@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.checks import number_between
+from faintspot.base.config.options import LIST, TEXTS, Options, number, setting
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Choice, MethodKind, method_kind
 from faintspot.loop.control.identification.learning import INTEGRATOR
@@ -35,7 +36,7 @@ _KEPT_OPTION, _STRENGTH_OPTION = "keep_brightest", "noise_std"
 
 
 @dataclass(frozen=True)
-class NightPlan:
+class NightPlan(Options, table="plan"):
     """Schedule of a night.
 
     Parameters
@@ -68,30 +69,22 @@ class NightPlan:
         For numbers out of range, lists of different lengths or unsuitable methods.
     """
 
-    block_frames: int = 600
-    settle_in_block: int = 100
-    strengths: tuple[int, ...] = (8, 20, 8, 20)
-    em_fractions: tuple[float, ...] = (1.0, 1.0, 0.75, 0.75)
-    repeats: tuple[int, ...] = (4, 2, 4, 2)
-    strongest_e: float = 2.0
-    methods: tuple[str, ...] = PAPER_METHODS
-    strengths_e: tuple[float, ...] = ()
-    strength_factors: tuple[float, ...] = ()
-    keep_brightest: int = 40
+    block_frames: int = number(600, 1, 10**6, whole=True)
+    settle_in_block: int = number(100, 0, 10**6, whole=True)
+    strengths: tuple[int, ...] = number((8, 20, 8, 20), 2, 100, kind=LIST, whole=True)
+    em_fractions: tuple[float, ...] = number((1.0, 1.0, 0.75, 0.75), 0, 1, kind=LIST, low_open=True)
+    repeats: tuple[int, ...] = number((4, 2, 4, 2), 1, 10**4, kind=LIST, whole=True)
+    strongest_e: float = number(2.0, 0, 1e6, low_open=True)
+    methods: tuple[str, ...] = setting(PAPER_METHODS, kind=TEXTS)
+    strengths_e: tuple[float, ...] = number((), 0, 1e6, kind=LIST)
+    strength_factors: tuple[float, ...] = number((), 0, 1e6, kind=LIST)
+    keep_brightest: int = number(40, 1, 10**6, whole=True)
 
     def __post_init__(self) -> None:
-        number_between("plan.settle_in_block", self.settle_in_block, 0, 10**6, integer=True)
-        number_between("plan.block_frames", self.block_frames, self.settle_in_block + 20, 10**6, integer=True)
-        number_between("plan.strongest_e", self.strongest_e, 0, 1e6, low_open=True)
-        number_between("plan.keep_brightest", self.keep_brightest, 1, 10**6, integer=True)
-        for name, values in (("strengths", self.strengths_e), ("strength factors", self.strength_factors)):
-            numbers_between(name, values or 0.0, 0, 1e6)
+        super().__post_init__()
+        number_between("plan.block_frames", self.block_frames, self.settle_in_block + 20)
         if not len(self.strengths) == len(self.em_fractions) == len(self.repeats) >= 1:
             raise InputError("plan: expected strengths, em_fractions and repeats for each set")
-        for count, fraction, repeats in zip(self.strengths, self.em_fractions, self.repeats, strict=True):
-            number_between("plan.strengths", count, 2, 100, integer=True)
-            number_between("plan.em_fractions", fraction, 0, 1, low_open=True)
-            number_between("plan.repeats", repeats, 1, 10**4, integer=True)
         if len(self.methods) < 2 or len(set(self.methods)) < len(self.methods):
             raise InputError(f"methods: expected two or more different ones, got {', '.join(self.methods)}")
         for name in self.methods:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from faintspot.base.checks import number_between, one_of
+from faintspot.base.config.options import REQUIRED, TEXT, Options, number, setting
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR
 from faintspot.slopes.estimators.base import Estimator
@@ -18,8 +18,14 @@ PRIOR = "prior_std_px"
 """Option of estimators whose prior the loop sets: standard deviation from the predicted position."""
 
 
+def _checked_settings(name: str, value: Any) -> Settings:
+    if not isinstance(value, Settings):
+        raise InputError(f"expected Settings, got {type(value).__name__}", name=name)
+    return value
+
+
 @dataclass(frozen=True, eq=False)
-class Method:
+class Method(Options, table="method"):
     """Method that experiments compare: estimator, settings, prior knowledge and control.
 
     Parameters
@@ -67,32 +73,20 @@ class Method:
     ('integrator', 0.4)
     """
 
-    label: str
-    settings: Settings
-    gain: float | None = None
-    window_pixels: int | None = None
+    label: str = setting(REQUIRED, kind=TEXT)
+    settings: Settings = setting(REQUIRED, check=_checked_settings)
+    gain: float | None = number(None, 0, 2)
+    window_pixels: int | None = number(None, 2, 64, whole=True)
     weighted_reconstructor: bool = False
     predict_prior: bool = False
     correct_gain: bool = True
     true_slopes: bool = False
-    control: str = INTEGRATOR
-    noise_scale: float = 1.0
+    control: str = setting(INTEGRATOR, choices=tuple(CONTROLS))
+    noise_scale: float = number(1.0, 0, 100, low_open=True)
     matched_weights: bool = False
     follows_profile: bool = False
     psf: PSF | None = None
     score: Score | None = None
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.label, str) or not self.label:
-            raise InputError(f"method.label: expected a text, got {self.label!r}")
-        if not isinstance(self.settings, Settings):
-            raise InputError(f"method.settings: expected Settings, got {type(self.settings).__name__}")
-        if self.gain is not None:
-            number_between("method.gain", self.gain, 0, 2)
-        if self.window_pixels is not None:
-            number_between("method.window_pixels", self.window_pixels, 2, 64, integer=True)
-        one_of("method.control", self.control, list(CONTROLS))
-        number_between("method.noise_scale", self.noise_scale, 0, 100, low_open=True)
 
     @property
     def estimator(self) -> Estimator:
