@@ -68,7 +68,7 @@ def test_the_loop_by_the_command_line(bench: Bench) -> None:
         (["loop=shut"], "action = 'shut': expected one of"),
         (["loop=open", "noise_std=1"], "noise_std: unknown name beside loop; known: loop"),
         (["methods=none,tv", "evry=3"], "evry: unknown name beside methods; did you mean every?"),
-        (["gain=x"], "gain"),
+        (["gain=0.3", "--subapertures", "1"], "--subapertures: expected settings"),
     ],
 )
 def test_what_send_refuses(bench: Bench, changes: list[str], message: str) -> None:

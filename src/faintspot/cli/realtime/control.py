@@ -40,6 +40,8 @@ def status(name: str, as_json: bool, watch: bool, telescope: bool, settings: tup
       faintspot realtime status
       faintspot realtime status keep_brightest noise_std
     """
+    if telescope and (settings or watch):
+        raise InputError("--telescope: expected it without settings and --watch, which are of an engine")
     if settings:
         names = None if "all" in settings else list(settings)
         for key, value in asked(name, "get", names=names)["settings"].items():
@@ -140,6 +142,8 @@ def send(name: str, subapertures: list[int] | None, telescope: bool, changes: tu
     for alone, beside in _ALONE.items():
         if alone in wanted and not telescope:
             check_keys("", wanted, beside, what=f"name beside {alone}")
+    if subapertures is not None and (telescope or wanted.keys() & _ALONE.keys()):
+        raise InputError("--subapertures: expected settings to change in them, got something else")
     if telescope:
         reply = asked(name, "set", TELESCOPE, changes=wanted)
         click.echo(f"{since(reply['frame'])}: {_conditions_in_words(reply['conditions'])}")
