@@ -179,7 +179,6 @@ def _report_night(
     settle: int | None,
 ) -> None:
     """Write the page and the numbers of methods that alternated."""
-    from faintspot.base.report.page import write_page
     from faintspot.experiments.night.measured_strehl import read_strehl
     from faintspot.experiments.night.recorded import recorded_night
     from faintspot.experiments.night.recorded_page import (
@@ -194,7 +193,7 @@ def _report_night(
     )
     numbers = derived(page, ".json")
     write_atomically(numbers, to_json(summary_of_recording(night), indent=1))
-    write_page(page_of_recording(night), page)
+    page_of_recording(night).write(page)
     click.echo(text_of_recording(night))
     click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 
 from faintspot.base.errors import InputError
-from faintspot.base.report.page import POSITIONS, Page, Section, Table, configuration_section, html_of
+from faintspot.base.report.page import POSITIONS, Report, Section, configuration_section
 from faintspot.base.report.texts import Texts
-from faintspot.base.statistics import Estimate
 from faintspot.base.validity import leave_out
 from faintspot.engine.telemetry.figures import latency_figure, methods_figure
 from faintspot.engine.telemetry.numbers import (
@@ -25,9 +25,9 @@ from faintspot.engine.telemetry.numbers import (
 from faintspot.io.telemetry.recording import Telemetry, read_telemetry
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.report.advice import warnings_in_words
-from faintspot.slopes.recorded.report.sections import all_sections, make_run
+from faintspot.slopes.recorded.report.run import SlopesRun
+from faintspot.slopes.recorded.report.sections import slopes_sections
 from faintspot.slopes.recorded.report.sodium_section import sodium_sections_of_changes
-from faintspot.slopes.recorded.report.wavefront_section import wavefront_sections
 from faintspot.slopes.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.slopes.sensor.layout import Layout
 
@@ -49,26 +49,22 @@ def report_of_telemetry(path: str | Path) -> str:
     if len(telemetry.frame) == 0:
         raise InputError(f"{path}: expected telemetry, no frame is recorded yet")
     layout = Layout(**telemetry.attributes["layout"])
-    run = make_run(_measured(telemetry), layout, {}, None, 0, "", ())
-    sections = [_timing(telemetry), _lost(telemetry)]
-    if len(method_names(telemetry)) > 1:
-        sections.append(_methods(telemetry))
-    sections += [_changes(telemetry), *sodium_sections_of_changes(telemetry.changes)]
-    sections += [*all_sections(run), *wavefront_sections(_slopes(telemetry), layout)]
-    settings = str(telemetry.attributes.get("settings", ""))
-    return html_of(
-        Page(
-            title=f"Telemetry of {Path(path).name}",
-            facts=_facts(telemetry, Path(path)),
-            sections=[*sections, configuration_section(settings)],
-            warnings=[
-                *_warnings(telemetry),
-                *run.comparison.warnings(),
-                *warnings_in_words(run.methods, run.summaries),
-            ],
-            remark=POSITIONS,
-        )
-    )
+    run = SlopesRun(_measured(telemetry), layout, why_no_stages="", slopes=_slopes(telemetry))
+    return Report(
+        title=f"Telemetry of {Path(path).name}",
+        facts=_facts(telemetry, Path(path)),
+        sections=[
+            _timing(telemetry),
+            _lost(telemetry),
+            *([_methods(telemetry)] if len(run.methods) > 1 else []),
+            _changes(telemetry),
+            *sodium_sections_of_changes(telemetry.changes),
+            *slopes_sections(run),
+            configuration_section(str(telemetry.attributes.get("settings", ""))),
+        ],
+        warnings=[*_warnings(telemetry), *run.comparison.warnings(), *warnings_in_words(run)],
+        remark=POSITIONS,
+    ).html()
 
 
 def _measured(telemetry: Telemetry) -> list[MeasuredSlopes]:
@@ -86,113 +82,89 @@ def _measured(telemetry: Telemetry) -> list[MeasuredSlopes]:
 
 
 def _facts(telemetry: Telemetry, path: Path) -> dict[str, str]:
-    seconds = float(telemetry.last_row_time_ns[-1] - telemetry.last_row_time_ns[0]) / 1e9
-    begun = np.datetime64(round(telemetry.unix_time_s[0] * 1e3), "ms")
-    ended = telemetry.attributes.get("ended_because", "not known; it may still go on")
-    facts = {
-        "Store": str(path),
-        "Engine": str(telemetry.attributes.get("name", "not stored")),
-        "Begun": f"{begun} UTC, by the wall clock",
-        "Frames": f"{len(telemetry.frame)} in {seconds:.1f} s",
-        "Sub-apertures": str(telemetry.x.shape[1]),
-        "Ended": str(ended),
-    }
     names = method_names(telemetry)
-    return facts | ({"In turn": ", ".join(names)} if len(names) > 1 else {})
+    return _TEXT.facts(
+        "telemetry.facts",
+        path=path,
+        name=telemetry.attributes.get("name", "not stored"),
+        begun=np.datetime64(round(telemetry.unix_time_s[0] * 1e3), "ms"),
+        frames=len(telemetry.frame),
+        seconds=float(telemetry.last_row_time_ns[-1] - telemetry.last_row_time_ns[0]) / 1e9,
+        subapertures=telemetry.x.shape[1],
+        ended=telemetry.attributes.get("ended_because", "not known; it may still go on"),
+        in_turn=", ".join(names) if len(names) > 1 else None,
+    )
 
 
 def _warnings(telemetry: Telemetry) -> list[str]:
-    lines = []
     lost = sum(gap.lost for gap in gaps(telemetry))
-    if lost:
-        share = 100 * lost / (lost + len(telemetry.frame))
-        lines.append(_TEXT("telemetry.lost_frames", lost=lost, share=share))
-    if telemetry.attributes.get("dropped_changes"):
-        lines.append(_TEXT["telemetry.lost_changes"])
     _, left_out = leave_out(telemetry.flags)
-    return [*lines, f"{left_out.capitalize()}."] if left_out else lines
+    return _TEXT.lines(
+        "telemetry.warnings",
+        lost=lost or None,
+        share=100 * lost / (lost + len(telemetry.frame)),
+        lost_changes=bool(telemetry.attributes.get("dropped_changes")),
+        left_out=left_out.capitalize() or None,
+    )
 
 
 def _timing(telemetry: Telemetry) -> Section:
     measured = timing(telemetry)
-    latency = 1e6 * telemetry.latency_s
     rows = []
     for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
-        us = latency[telemetry.method == method]
+        us = 1e6 * telemetry.latency_s[telemetry.method == method]
         rows.append([name, str(len(us)), *(f"{value:.1f}" for value in np.percentile(us, PERCENTILES))])
-    header = ["", "frames", "median (µs)", "99 % (µs)", "99.9 % (µs)", "longest (µs)"]
-    table = Table(header, rows, caption="Latency: from a frame's last row to its slopes.")
-    rate = "not known: no two frames have consecutive numbers"
-    if np.isfinite(measured.rate_hz):
-        rate = _TEXT("telemetry.rate", rate=measured.rate_hz, longest=1e3 * measured.longest_interval_s)
-    return Section("timing", "Rate and latency", [f"Rate: {rate}."], [table], [latency_figure(telemetry)])
+    is_known = bool(np.isfinite(measured.rate_hz))
+    return _TEXT.section(
+        "timing",
+        _TEXT.table("timing", rows),
+        latency_figure(telemetry),
+        rate=measured.rate_hz if is_known else None,
+        unknown=not is_known,
+        longest_ms=1e3 * measured.longest_interval_s,
+    )
 
 
 def _lost(telemetry: Telemetry) -> Section:
-    gap_list = gaps(telemetry)
-    lost = sum(gap.lost for gap in gap_list)
-    dropped = {
-        name: telemetry.attributes.get(f"dropped_{name}", 0) for name in ("records", "images", "changes")
-    }
-    rows = [
-        ["frame numbers that are missing", str(lost)],
-        ["of them overwritten before the recorder read them", str(dropped["records"])],
-        ["gaps", str(len(gap_list))],
-        ["longest gap, frames", str(max((gap.lost for gap in gap_list), default=0))],
-        ["times that frame numbers began anew", str(restarts(telemetry))],
-        ["images lost to the record", str(dropped["images"])],
-        ["changes of settings lost to the record", str(dropped["changes"])],
-    ]
-    text = [_TEXT["telemetry.lost"]]
-    tables = [Table(["", "number"], rows)]
-    if gap_list:
-        listed = [[str(gap.after_frame), str(gap.lost)] for gap in gap_list[:_MOST_GAPS]]
-        caption = f"The first {len(listed)} of {len(gap_list)} gaps."
-        tables.append(Table(["after frame", "frames lost"], listed, caption, folded="Where"))
-    return Section("lost", "Lost frames", text, tables)
+    every = gaps(telemetry)
+    numbers = _TEXT.facts(
+        "lost.numbers",
+        lost=sum(gap.lost for gap in every),
+        gaps=len(every),
+        longest=max((gap.lost for gap in every), default=0),
+        restarts=restarts(telemetry),
+        **{name: telemetry.attributes.get(f"dropped_{name}", 0) for name in ("records", "images", "changes")},
+    )
+    shown = every[:_MOST_GAPS]
+    return _TEXT.section(
+        "lost",
+        _TEXT.table("lost.table", list(numbers.items())),
+        _TEXT.table("lost.gaps", shown, shown=len(shown), all=len(every)),
+    )
 
 
 def _methods(telemetry: Telemetry) -> Section:
-    rows = []
     differences = {name: methods_in_turn(telemetry, values) for name, values in quantities(telemetry).items()}
+    records = []
     for name, compared in differences.items():
-        for method in compared:
-            difference = "–" if method.difference is None else _in_words(method.difference)
-            rows.append([name, method.method, _with_error(method.mean), difference])
+        for each in compared:
+            too_few = each.difference is not None and not math.isfinite(each.difference.low)
+            difference = None if too_few else each.difference
+            records.append({"quantity": name, **vars(each), "difference": difference, "too_few": too_few})
     first = next(iter(differences.values()))[0].method
-    header = ["", "method", "mean ± standard error", f"less {first!r} (95 %)"]
-    text = [_TEXT["methods.text"]]
-    return Section(
-        "methods", "Methods in turn", text, [Table(header, rows)], [methods_figure(telemetry, differences)]
+    return _TEXT.section(
+        "methods", _TEXT.table("methods", records, first=first), methods_figure(telemetry, differences)
     )
-
-
-def _in_words(estimate: Estimate) -> str:
-    if not np.isfinite(estimate.low):
-        return "too few turns"
-    value, low, high = (
-        f"{number:+.3g}".replace("-", "−") for number in (estimate.value, estimate.low, estimate.high)
-    )
-    return f"{value} ({low} to {high})"
-
-
-def _with_error(estimate: Estimate) -> str:
-    error = f"{estimate.standard_error:.2g}" if np.isfinite(estimate.standard_error) else "?"
-    return f"{estimate.value:.4g} ± {error}"
 
 
 def _changes(telemetry: Telemetry) -> Section:
-    title = "Changes of settings"
-    change_list = change_rows(telemetry)
-    if not change_list:
-        return Section("changes", title, ["None: the settings are those at the end of this page."])
-    rows = [
+    every = change_rows(telemetry)
+    shown = [
         [str(frame), f"{seconds:.3f}" if np.isfinite(seconds) else "before", where, change]
-        for frame, seconds, change, where in change_list[:_MOST_CHANGES]
+        for frame, seconds, change, where in every[:_MOST_CHANGES]
     ]
-    caption = f"The first {len(rows)} of {len(change_list)} changes." if len(rows) < len(change_list) else ""
-    table = Table(["from frame", "at (s)", "sub-apertures", "change"], rows, caption, words=True)
-    return Section("changes", title, tables=[table])
+    some = len(shown) if len(shown) < len(every) else None
+    return _TEXT.section("changes", _TEXT.table("changes", shown, some=some, all=len(every)))
 
 
 def _slopes(telemetry: Telemetry) -> dict[str, Slopes]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from faintspot.base.report.texts import Texts
+from faintspot.base.report.words import plain_number, with_error
 from faintspot.experiments.closed_loop.answer import Coverage, LoopAnswer
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Choice
 from faintspot.experiments.closed_loop.question import (
@@ -14,7 +15,6 @@ from faintspot.experiments.closed_loop.question import (
     REFERENCES,
     magnitudes_apart,
 )
-from faintspot.experiments.words import plain_number, with_error
 
 _TEXT = Texts("faintspot.experiments")
 _SMALLEST_ERROR = 0.001

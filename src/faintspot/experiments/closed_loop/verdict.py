@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from faintspot.base.errors import InputError
+from faintspot.base.report.words import with_interval
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.closed_loop.methods import VARIANTS
 from faintspot.experiments.closed_loop.question import REFERENCES
@@ -19,7 +20,6 @@ from faintspot.experiments.closed_loop.results import (
     gains_in_magnitude,
 )
 from faintspot.experiments.closed_loop.tables import budget_table, in_columns, strehl_table
-from faintspot.experiments.words import with_interval
 from faintspot.loop.simulation.files import BUDGET_FILE, MAGNITUDE_FILE
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 

@@ -161,9 +161,9 @@ def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | 
         panels[0].set_ylabel("R / R without denoising")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
-    title = _TEXT("baselines.title", profile=profile)
+    title = _TEXT("baselines_figure.title", profile=profile)
     figure.suptitle(f"{title}  (size 1, 16 × 16 px, positions within ±{reach:g} px)", fontsize=14)
-    caption = _TEXT("baselines.caption", largest=_LARGEST_RATIO)
+    caption = _TEXT("baselines_figure.caption", largest=_LARGEST_RATIO)
     every = [cell for part in cells.values() for cell in part]
     return FigureWithData(f"baselines-{profile}", title, caption, figure, *table_of_cells(dataset, every))
 

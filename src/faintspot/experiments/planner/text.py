@@ -6,11 +6,11 @@ import math
 from typing import Any
 
 from faintspot.base.report.texts import Texts
+from faintspot.base.report.words import plain_number, with_error
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.methods import Knowledge
 from faintspot.experiments.planner.answer import Answer, MethodResult, settings_in_words
 from faintspot.experiments.planner.question import Question
-from faintspot.experiments.words import plain_number, with_error
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 

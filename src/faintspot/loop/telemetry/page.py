@@ -9,7 +9,7 @@ import numpy as np
 
 from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
 from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.page import Page, Section, Table, html_of
+from faintspot.base.report.page import Report, Table
 from faintspot.base.report.texts import Texts
 from faintspot.loop.control.identification.measured import R0, Measured, wind_errors
 from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER
@@ -17,7 +17,6 @@ from faintspot.loop.telemetry.over_time import Piece
 from faintspot.loop.telemetry.report import LoopReport, Part
 
 _TEXT = Texts("faintspot.loop.telemetry")
-_STREHL = "Strehl ratio"
 _AGAINST_TIME = (
     R0,
     "r0 at 500 nm from differential image motion",
@@ -44,64 +43,55 @@ def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> str:
         "choices": _gain_figure,
     }
     sections = []
-    for name, part in report.parts.items():
-        drawn = figures[name](report) if name in figures else None
-        tables = [_table(part)] if part.values else []
-        if name == "choices" and report.choices:
-            tables.append(_choices_table(report))
-        text = [_TEXT[f"{name}.about"]] if not part.missing or tables else []
-        sections.append(
-            Section(name, part.title, text, tables, [] if drawn is None else [drawn], missing=part.missing)
-        )
     if pieces:
         missing = "; ".join(f"{piece.start_s:g} s: {piece.missing}" for piece in pieces if piece.missing)
-        sections.insert(
-            0, Section("time", _TEXT["time.title"], figures=[_time_figure(pieces)], missing=missing)
-        )
+        sections.append(_TEXT.section("time", _time_figure(pieces), missing=missing))
+    for name, part in report.parts.items():
+        figure = figures[name](report) if name in figures else None
+        replayed = _choices_table(report) if name == "choices" else None
+        sections.append(_TEXT.section(name, _table(part), replayed, figure, missing=part.missing))
     loop = report.loop
-    facts = {"Sub-apertures": str(len(loop.cells)), "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"}
-    todo = [report.advice] if report.advice else []
-    title = f"{'Loop' if loop.is_closed else 'Turbulence'} of {loop.name}"
-    remark = _TEXT["remark"]
-    return html_of(Page(title, facts, sections, todo, warnings_title="What to do", remark=remark))
+    return Report(
+        f"{'Loop' if loop.is_closed else 'Turbulence'} of {loop.name}",
+        {"Sub-apertures": str(len(loop.cells)), "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"},
+        sections,
+        [report.advice] if report.advice else [],
+        warnings_title="What to do",
+        remark=_TEXT["remark"],
+    ).html()
 
 
 def _table(part: Part) -> Table:
-    rows = [[value.name, _with_interval(value, value.unit), value.remark] for value in part.values]
-    return Table(["", "value (95 %)", "remark"], rows, words=True)
+    shown = [
+        {**vars(value), "shown": _with_interval(value, value.unit) or "not known"} for value in part.values
+    ]
+    return _TEXT.table("values", shown)
 
 
-def _with_interval(measured: Measured, unit: str = "") -> str:
-    """Return a value with its 95 % interval; counts have none."""
-    if not np.isfinite(measured.value):
-        return "not known"
+def _choices_table(report: LoopReport) -> Table:
+    compared = ("residual", "less", "total", "strehl")
+    records = [
+        {
+            **vars(choice),
+            "text": choice.gain_text or None,
+            **{name: _with_interval(getattr(choice, name)) for name in compared},
+        }
+        for choice in report.choices
+    ]
+    return _TEXT.table("choices", records, unit=report.choices[0].residual.unit if records else "")
+
+
+def _with_interval(measured: Measured, unit: str = "") -> str | None:
+    """Return a value with its 95 % interval, None if it is not known; counts have no interval."""
+    if not np.isfinite(measured.value) or not np.isfinite(measured.error):
+        return None
     if measured.error == 0:
         return f"{measured.value:.6g} {unit}".rstrip()
-    if not np.isfinite(measured.error):
-        return "not known"
     decimals = max(0, 1 - int(np.floor(np.log10(measured.error))))
     style = f".{decimals}f" if decimals <= _MOST_DECIMALS else ".1e"
     value, low_text, high_text = (f"{number:{style}}" for number in (measured.value, *measured.interval))
     text = f"{value} {unit}".rstrip() + f" ({low_text} to {high_text})"
     return text.replace("-", "−")
-
-
-def _choices_table(report: LoopReport) -> Table:
-    unit = report.choices[0].residual.unit
-    columns = {
-        f"residual ({unit})": [choice.residual for choice in report.choices],
-        f"less than as run ({unit})": [choice.less for choice in report.choices],
-        f"with fitting and aliasing ({unit})": [choice.total for choice in report.choices],
-        _STREHL: [choice.strehl for choice in report.choices],
-    }
-    shown = {
-        name: values for name, values in columns.items() if any(np.isfinite(value.value) for value in values)
-    }
-    rows = []
-    for choice, *values in zip(report.choices, *shown.values(), strict=True):
-        rows.append([choice.name, choice.gain_text or "–", *map(_with_interval, values)])
-    texts = ["choices.table", *(["choices.strehl"] if _STREHL in shown else [])]
-    return Table(["control", "gain", *shown], rows, " ".join(_TEXT[name] for name in texts))
 
 
 @styled

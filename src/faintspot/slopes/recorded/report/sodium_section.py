@@ -51,7 +51,7 @@ def sodium_section_of_frames(
     try:
         found = sodium_of_frames(source, layout, calibration, laser, most_frames=most_frames)
     except InputError as error:
-        return Section("sodium", "Sodium profile", missing=f"Not fitted: {error}.")
+        return _TEXT.section("sodium", missing=f"Not fitted: {error}.")
     sodium = found.sodium
     profiles = {"configured": sodium.star.focused(laser.profile), "these frames": sodium.fit.profile}
     return _section(profiles, sodium.spot_fwhm_arcsec, found.left_out)
@@ -72,6 +72,5 @@ def sodium_sections_of_changes(changes: Sequence[Mapping[str, Any]]) -> list[Sec
 
 
 def _section(profiles: Mapping[str, SodiumProfile], spot_fwhm_arcsec: float, left_out: str = "") -> Section:
-    text = [_TEXT["sodium.about"], _TEXT("sodium.spot", width=spot_fwhm_arcsec)]
-    text += [f"{left_out.capitalize()}."] if left_out else []
-    return Section("sodium", "Sodium profile", text, figures=[profile_figure(profiles)])
+    values = {"width": spot_fwhm_arcsec, "left_out": left_out.capitalize() or None}
+    return _TEXT.section("sodium", profile_figure(profiles), **values)

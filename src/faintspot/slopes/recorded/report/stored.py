@@ -18,6 +18,7 @@ from faintspot.io.frames import FrameSource
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slopes import Slopes, Stages
 from faintspot.slopes.recorded.report.page import slopes_report
+from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.report.sodium_section import sodium_section_of_frames
 from faintspot.slopes.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.slopes.recorded.stored_run import StoredRun, open_run
@@ -64,21 +65,18 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
     stages, reason = _example(stores, methods, example_frame, frames, notes)
     if any(word in reason for word in _SAID_FIRST):
         notes.append(reason)
+    slopes = {
+        method.name: Slopes.from_variables(store.stored.variables, method.n_frames, store.keep)
+        for store, method in zip(stores, methods, strict=True)
+    }
+    steps = (first.estimator or TotalVariation).steps_shown
+    run = SlopesRun(methods, first.layout, stages, None, example_frame, reason, steps, slopes)
     return slopes_report(
-        methods,
-        layout=first.layout,
-        stages=stages,
+        run,
         title=f"Slopes of {' and '.join(store.path.name for store in stores)}",
         facts=_facts(stores, methods),
         configurations=_configurations(stores, methods),
-        example_frame=example_frame,
-        steps=(first.estimator or TotalVariation).steps_shown,
         warnings=list(dict.fromkeys([*_labelled_notes(stores, methods), *notes])),
-        why_no_stages=reason,
-        slopes={
-            method.name: Slopes.from_variables(store.stored.variables, method.n_frames, store.keep)
-            for store, method in zip(stores, methods, strict=True)
-        },
         sections=_sodium(first, frames),
     )
 
@@ -92,7 +90,7 @@ def _sodium(store: StoredRun, frames: Sequence[str | Path] | None) -> list[Secti
             parts = store.layout, store.calibration, store.laser
             return [sodium_section_of_frames(source, *parts, _FRAMES_OF_PROFILE)]
     except InputError as error:
-        return [Section("sodium", "Sodium profile", missing=f"Not fitted: {error}.")]
+        return [_TEXT.section("sodium", missing=f"Not fitted: {error}.")]
 
 
 def _configurations(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
@@ -175,10 +173,10 @@ def _example(
     number: int,
     frames: Sequence[str | Path] | None,
     notes: list[str],
-) -> tuple[dict[str, Stages] | None, str]:
+) -> tuple[dict[str, Stages], str]:
     """Measure the example frame again in every method; or return why that cannot be done."""
     if stores[0].layout is None:
-        return None, "Not drawn: the layout is not known."
+        return {}, "Not drawn: the layout is not known."
     try:
         frame = _frame(stores[0], number, frames)
         stages: dict[str, Stages] = {}
@@ -190,7 +188,7 @@ def _example(
         if len(stores) == 1 and without is not None:
             stages[without.label] = stores[0].pipeline(without).explain(frame)
     except InputError as error:
-        return None, f"Not drawn: {error}."
+        return {}, f"Not drawn: {error}."
     return stages, ""
 
 
