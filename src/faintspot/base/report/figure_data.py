@@ -45,7 +45,7 @@ class FigureWithData:
     @property
     def width(self) -> int:
         """Width in CSS pixels."""
-        return round(self.figure.get_size_inches()[0] * _CSS_PIXELS_PER_INCH)
+        return round(float(self.figure.get_size_inches()[0]) * _CSS_PIXELS_PER_INCH)
 
     @cached_property
     def files(self) -> dict[str, bytes]:

@@ -64,7 +64,8 @@ class Texts:
     ) -> FigureWithData:
         """Return a figure with its title and caption, and the columns of its numbers."""
         title, caption = (self(f"{name}.{part}", **values) for part in ("title", "caption"))
-        return FigureWithData(name, title, caption, figure, columns or self[name].get("columns", ()), rows)
+        short = name.partition(".")[0]
+        return FigureWithData(short, title, caption, figure, columns or self[name].get("columns", ()), rows)
 
     def table(
         self, name: str, records: Iterable[Any], columns: Sequence[str] = (), /, **values: object
@@ -78,7 +79,7 @@ class Texts:
         declared, scope = self[name], _Scope(values, None)
         cells = declared.get("columns", ())
         header = [*(_filled(column, scope) for column in cells), *columns]
-        rows = [
+        rows: list[Sequence[str | TableCell]] = [
             record
             if isinstance(record, Sequence)
             else [_cell(template, _Scope(values, record)) for template in cells.values()]
@@ -139,7 +140,7 @@ def _sentences(text: str | Sequence[str], scope: _Scope, words: Words) -> list[s
 def _cell(template: str | Sequence[str] | Mapping[str, str], scope: _Scope) -> str | TableCell:
     """Return a cell; a dash if it has numbers and none of them is known, or nothing at all."""
     if isinstance(template, Mapping):
-        parts = {part: _filled(text, scope) for part, text in template.items()}
+        parts: dict[str, Any] = {part: _filled(text, scope) for part, text in template.items()}
         return TableCell(**parts) if next(iter(parts.values())) else NOTHING
     words = Words()
     sentences = _sentences(template, scope, words)

@@ -79,4 +79,4 @@ def methods_figure(telemetry: Telemetry, values: Mapping[str, Sequence[MethodDif
         panel.tick_params(axis="x", labelsize=9)
         panel.locator_params(axis="x", nbins=4)
     first = next(iter(values.values()))[0].method
-    return _TEXT.figure("methods_figure", figure, rows, first=first)
+    return _TEXT.figure("methods.figure", figure, rows, first=first)

@@ -184,7 +184,7 @@ def _means_table(night: Night) -> Table:
         cells: list[str | TableCell] = [where]
         for name, column in zip(named, columns, strict=True):
             known = with_paper and name in of_paper and row < len(PAPER_MEANS)
-            values = dict(zip(_MEAN, column[row], strict=True))
+            values: dict[str, float | None] = dict(zip(_MEAN, column[row], strict=True))
             values["paper"] = float(PAPER_MEANS[row, of_paper[name]]) if known else None
             cells.append(
                 TableCell(_TEXT("night-means.cell", values), small=_TEXT("night-means.small", values))

@@ -10,6 +10,7 @@ import numpy as np
 from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
 from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import Report, Table
+from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.base.report.texts import Texts
 from faintspot.loop.control.identification.measured import R0, Measured, wind_errors
 from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER
@@ -26,6 +27,7 @@ _AGAINST_TIME = (
 )
 """Quantities of pieces that are drawn."""
 _MOST_DECIMALS = 6
+_MEASURED = {"fmt": "o-", "color": METHOD_COLOURS[1], "capsize": 3}
 
 
 def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> str:
@@ -94,27 +96,20 @@ def _with_interval(measured: Measured, unit: str = "") -> str | None:
     return text.replace("-", "−")
 
 
-@styled
 def _time_figure(pieces: Sequence[Piece]) -> FigureWithData:
     """Draw r0, coherence time, wind and noise of each piece."""
-    panels: dict[str, list[Measured]] = {}
-    for piece in pieces:
-        for name in _AGAINST_TIME:
-            panels.setdefault(name, []).append(piece.values.get(name, Measured(name, "")))
-    known = {name: values for name, values in panels.items() if any(math.isfinite(v.value) for v in values)}
-    figure = new_figure(WIDTH, max(2.0, 2.4 * len(known)))
     middle = np.array([piece.start_s + piece.duration_s / 2 for piece in pieces])
-    rows: list[tuple[object, ...]] = []
-    for axes, (name, values) in zip(
-        figure.subplots(max(1, len(known)), 1, sharex=True, squeeze=False)[:, 0], known.items(), strict=False
-    ):
-        numbers = np.array([(value.value, *value.interval) for value in values]).T
-        spread = np.abs(numbers[1:] - numbers[0])
-        axes.errorbar(middle, numbers[0], spread, fmt="o-", color=METHOD_COLOURS[1], capsize=3)
-        unit = next(value.unit for value in values if math.isfinite(value.value))
-        axes.set(title=name, ylabel=unit, ylim=(0, None))
-        rows += [(name, time, *number) for time, number in zip(middle, numbers.T, strict=True)]
-    figure.axes[-1].set_xlabel("time since the first frame (s)")
+    panels, rows = [], []
+    for name in _AGAINST_TIME:
+        values = [piece.values.get(name, Measured(name, "")) for piece in pieces]
+        known = [value for value in values if math.isfinite(value.value)]
+        if known:
+            numbers = np.array([(value.value, *value.interval) for value in values]).T
+            line = Line("", middle, numbers[0], np.abs(numbers[1:] - numbers[0]), _MEASURED)
+            label = "time since the first frame (s)"
+            panels.append([Panel([line], label, known[0].unit, name, y_range=(0, None))])
+            rows += [(name, time, *number) for time, number in zip(middle, numbers.T, strict=True)]
+    figure = plot(panels or [[Panel([], "time (s)")]], max(2.0, 2.7 * len(panels)), legend="")
     return _TEXT.figure("time", figure, rows, ("quantity", "time", "value", "low", "high"))
 
 
@@ -161,50 +156,51 @@ def _wind_figure(report: LoopReport) -> FigureWithData | None:
     return _TEXT.figure("winds", figure, rows, ("x", "y", "error of x", "error of y", "share"))
 
 
-@styled
 def _spectra_figure(report: LoopReport) -> FigureWithData | None:
     """Draw spectra of open-loop slopes and of the fitted model."""
     spectra = report.spectra
     if spectra is None:
         return None
-    lines = (len(spectra.measured) + 1) // 2
-    figure = new_figure(WIDTH, 3.6 * lines)
-    rows = []
-    panels = figure.subplots(lines, 2).ravel()
-    for panel in panels[len(spectra.measured) :]:
-        panel.set_visible(False)
-    for panel, name in zip(panels, spectra.measured, strict=False):
+    panels, rows = [], []
+    unit = f"slope² ({report.loop.slope_unit}²/Hz)"
+    for name in spectra.measured:
         measured, model = (report.loop.unit**2 * power[name] for power in (spectra.measured, spectra.model))
-        panel.loglog(spectra.frequency_hz, measured, color=GREY, lw=1, label="measured")
-        panel.loglog(spectra.frequency_hz, model, color=METHOD_COLOURS[0], lw=1.6, label="found")
-        spread = np.exp(1.96 / np.sqrt(0.55 * spectra.pieces))
-        panel.fill_between(
-            spectra.frequency_hz, model / spread, model * spread, color=METHOD_COLOURS[0], alpha=0.15, lw=0
-        )
-        panel.set(title=name, xlabel="frequency (Hz)", ylabel=f"slope² ({report.loop.slope_unit}²/Hz)")
+        factor = np.exp(1.96 / np.sqrt(0.55 * spectra.pieces))
+        scatter = model - model / factor, model * factor - model
+        lines = [
+            Line("measured", spectra.frequency_hz, measured, style={"color": GREY, "lw": 1}),
+            Line(
+                "found",
+                spectra.frequency_hz,
+                model,
+                scatter,
+                {"color": METHOD_COLOURS[0], "lw": 1.6},
+                band=True,
+            ),
+        ]
+        panels.append(Panel(lines, "frequency (Hz)", unit, name, log=True, legend=True))
         rows += [(name, *row) for row in zip(spectra.frequency_hz, measured, model, strict=True)]
-        panel.legend(frameon=False)
+    pairs = [panels[first : first + 2] for first in range(0, len(panels), 2)]
+    figure = plot(pairs, 3.6 * len(pairs), legend="")
     return _TEXT.figure("spectra", figure, rows, ("slopes", "frequency", "measured", "found"))
 
 
-@styled
 def _gain_figure(report: LoopReport) -> FigureWithData | None:
     """Draw the residual of integrators against gain, and those of the loop and the filter."""
     curve = [choice for choice in report.choices if np.isfinite(choice.gain) and choice.name != BEST]
     curve = [choice for choice in curve if np.isfinite(choice.residual.value)]
     if not curve:
         return None
-    figure = new_figure(WIDTH * 0.7, 4.4)
-    axes = figure.subplots()
     values = [(choice.gain, choice.residual.value, choice.residual.error) for choice in curve]
     gain, residual, error = np.array(values).T
-    axes.errorbar(
-        gain, residual, 1.96 * error, fmt="o-", color=METHOD_COLOURS[1], capsize=3, label="integrator"
-    )
+    lines = [Line("integrator", gain, residual, 1.96 * error, _MEASURED)]
     for name, colour in ((AS_RUN, "black"), (FILTER, METHOD_COLOURS[0])):
         for choice in (choice for choice in report.choices if choice.name == name):
-            axes.axhline(choice.residual.value, color=colour, label=name)
-            axes.axhspan(*choice.residual.interval, color=colour, alpha=0.12, lw=0)
-    axes.set(xlabel="gain of an integrator", ylabel=f"residual ({curve[0].residual.unit})", ylim=(0, None))
-    axes.legend(frameon=False)
+            level, ends = choice.residual.value, np.array(choice.residual.interval)
+            spread = np.repeat(np.abs(ends - level)[:, None], 2, axis=1)
+            across = [gain.min(), gain.max()]
+            lines.append(Line(name, across, [level, level], spread, {"color": colour}, band=True))
+    label = f"residual ({curve[0].residual.unit})"
+    panel = Panel(lines, "gain of an integrator", label, y_range=(0, None), legend=True)
+    figure = plot([[panel]], 4.4, width=WIDTH * 0.7, legend="")
     return _TEXT.figure("gains", figure, values, ("gain", "residual", "standard error"))

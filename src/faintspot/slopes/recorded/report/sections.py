@@ -16,7 +16,7 @@ from faintspot.slopes.recorded.report import frame_pictures, maps
 from faintspot.slopes.recorded.report.advice import FLAGS_OF_DENOISING
 from faintspot.slopes.recorded.report.key_numbers import key_numbers
 from faintspot.slopes.recorded.report.run import SlopesRun
-from faintspot.slopes.recorded.statistics import jitter, median, rms
+from faintspot.slopes.recorded.statistics import Floats, jitter, median, rms
 from faintspot.slopes.wavefront import fit_wavefront
 from faintspot.slopes.wavefront.figure import wavefront_figure
 from faintspot.slopes.wavefront.words import mode_table, remarks, rms_table
@@ -113,7 +113,8 @@ def _iterations(run: SlopesRun) -> Section | None:
     if not any(method.valid.any() for method, _ in denoised):
         return _TEXT.section("iterations")
     medians = "; ".join(f"{method.name}: {summary.median_iterations:.0f}" for method, summary in denoised)
-    figure = maps.iteration_counts(*zip(*denoised, strict=True), run.layout)
+    methods, summaries = zip(*denoised, strict=True)
+    figure = maps.iteration_counts(methods, summaries, run.layout)
     return _TEXT.section("iterations", _TEXT.figure("iterations", figure, medians=medians))
 
 
@@ -158,6 +159,6 @@ def _frames(run: SlopesRun) -> dict[str, Any]:
     return {"several": several, "single": not several}
 
 
-def _mean(values: maps.Floats) -> float:
+def _mean(values: Floats) -> float:
     kept = values[np.isfinite(values)]
     return float(kept.mean()) if kept.size else np.nan
