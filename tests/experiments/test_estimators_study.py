@@ -68,7 +68,7 @@ def test_figures() -> None:
     assert set(made) == {f"{kind}-{spot}" for kind in KINDS for spot in spots} | {"corrected-rms-diffraction"}
     first = made["error-diffraction"].figure
     assert [axes.get_title() for axes in first.axes] == ["0.1 e- read noise", "3 e- read noise"]
-    assert len(first.axes[0].containers) == len(METHODS)
+    assert len(first.axes[0].containers) == len(METHODS) + 1  # and the bound
     turbulence = made["corrected-rms-diffraction"].figure
     assert [axes.get_title() for axes in turbulence.axes] == [
         "0.1 e- read noise, 50 e- signal",

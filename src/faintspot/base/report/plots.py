@@ -119,11 +119,11 @@ class Panel:
             axes.set(xscale="log", yscale="log")
         if self.x_ticks:
             axes.set_xscale("log")
-            plain_ticks(axes.xaxis, self.x_ticks, ".3g")
+            plain_ticks(axes.xaxis, self.x_ticks)
         if self.y_ticks:
             linear = self.y_linear_below
             axes.set_yscale(**({"value": "symlog", "linthresh": linear} if linear else {"value": "log"}))
-            plain_ticks(axes.yaxis, self.y_ticks, ".3g")
+            plain_ticks(axes.yaxis, self.y_ticks)
         axes.set(xlabel=self.x, ylabel=self.y, title=self.title, xlim=self.x_range, ylim=self.y_range)
         if self.above is not None:
             axis_above(axes, *self.above).tick_params(labelsize=10)
@@ -168,6 +168,8 @@ def plot(
         for axes, panel in zip(row, of_row, strict=False):
             panel.draw(axes)
             axes.tick_params(labelbottom=True)
+            if panel is not of_row[0] and panel.y == of_row[0].y:
+                axes.set_ylabel("")
         for axes in row[len(of_row) :]:
             axes.set_axis_off()
     if title:
@@ -183,9 +185,9 @@ def _add_legend(figure: Figure, handles: Sequence[Line], place: str, columns: in
     entries: dict[str, Any] = {line.label: Line2D([], [], **line.style) for line in handles}
     for axes in figure.axes:
         if axes.get_legend() is None:
-            shown, labels = axes.get_legend_handles_labels()
-            for label, handle in zip(labels, shown, strict=True):
-                entries.setdefault(label, handle)
+            found = list(zip(*axes.get_legend_handles_labels(), strict=True))
+            for handle, label in sorted(found, key=lambda entry: not isinstance(entry[0], tuple)):
+                entries.setdefault(label, handle)  # levels last
     if entries:
-        columns = min(columns, len(entries))
-        figure.legend(list(entries.values()), list(entries), loc=place, ncols=columns, frameon=False)
+        options: dict[str, Any] = {"loc": place, "ncols": min(columns, len(entries)), "frameon": False}
+        figure.legend(list(entries.values()), list(entries), **options)

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 class Texts:
     """Texts of a package by dotted names, with values put in where they have {names}.
 
-    A text is a string or a list of sentences. A sentence with a value that is None or False is left out;
-    True stands for no word. Formats are those of `Words`.
+    A text is a string or a list of sentences; one that begins with a semicolon goes on with the one before.
+    A sentence with a value that is None or False is left out; True stands for no word. Formats are those of
+    `Words`.
 
     Parameters
     ----------
@@ -86,12 +87,8 @@ class Texts:
             for record in records
         ]
         if declared.get("only_known"):
-            kept = [
-                column == 0 or any(row[column] != NOTHING for row in rows) for column in range(len(header))
-            ]
-            header, *rows = (
-                [cell for cell, keep in zip(row, kept, strict=True) if keep] for row in [header, *rows]
-            )
+            known = [n for n in range(len(header)) if n == 0 or any(row[n] != NOTHING for row in rows)]
+            header, rows = [header[n] for n in known], [[row[n] for n in known] for row in rows]
         options = {key: declared[key] for key in ("words", "prose") if key in declared}
         folded = self(f"{name}.folded", count=len(rows)) if "folded" in declared else ""
         about = [
@@ -126,7 +123,7 @@ class _Scope(dict[str, Any]):
 
 
 def _filled(text: str | Sequence[str], scope: _Scope) -> str:
-    return " ".join(_sentences(text, scope, Words()))
+    return " ".join(_sentences(text, scope, Words())).replace(" ; ", "; ")
 
 
 def _sentences(text: str | Sequence[str], scope: _Scope, words: Words) -> list[str]:

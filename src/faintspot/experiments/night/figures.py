@@ -32,7 +32,7 @@ def panels_figure(night: Night) -> FigureWithData:
     """Draw Strehl ratio against time, measured r0 and strength, with errors."""
     label, shown = strehl_axis(night.wavelength_m), _shown(night)
     lowest = float(np.nanmin(night.strehl - np.nan_to_num(night.strehl_error)))
-    bottom = {"y": label, "y_range": (min(0.0, 1.1 * lowest), None)}
+    bottom: dict[str, Any] = {"y": label, "y_range": (min(0.0, 1.1 * lowest), None)}
     starts = [night.start_s[night.set_number == number][0] / 60 for number in np.unique(night.set_number)[1:]]
     sets = {start: {"color": FLUX_GREY, "lw": 1.2, "zorder": 0} for start in starts}
     panels = [Panel(_points(night, shown, night.middle_s / 60), "time (min)", at=sets, **bottom)]
@@ -127,7 +127,7 @@ def _of_strengths(
     """Return blocks against strength, and the ranges at the height of the reference plus their difference."""
     reference = night.strehl[night.method == night.reference]
     mean, scatter = float(np.nanmean(reference)), float(np.nanstd(reference))
-    strengths = night.strength_e[np.isfinite(night.strength_e)]
+    strengths = night.strength_e[night.strength_e > 0]
     across, height = [strengths.min(), strengths.max()], [mean, mean]
     band = Line("mean without TV", across, height, [scatter, scatter], {"color": "black", "lw": 1}, band=True)
     drawn = [band, *_unnamed(_points(night, shown, night.strength_e))]

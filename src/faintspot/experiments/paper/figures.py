@@ -75,7 +75,7 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
         rows.setdefault((row["profile"], row["position_range_px"]), []).append(index)
     values = [float(row[axis]) for row in table]
     scale = axis_of_study(axis) | {"x_range": _range_of(axis, values), "y_ticks": _ERROR_TICKS}
-    panels = []
+    panels: list[list[Panel]] = []
     for (profile, reach), kept in sorted(rows.items()):
         parts = _by_label([table[i] for i in kept], [cells[i] for i in kept], axis, labelled)
         where = f"{profile} spots, positions within ±{reach:g} px"
@@ -118,7 +118,7 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
     if not rows_of_panels or not {NO_TV, TV} <= set(dataset["estimator"].values):
         return None
     rows: list[list[Any]] = []
-    panels = []
+    panels: list[list[Panel]] = []
     fixed = fixed_mode(dataset).removeprefix("fixed")
     for parts in rows_of_panels:
         panels.append([])
@@ -130,7 +130,11 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
                 lines, rows = lines + drawn, rows + data
             head, _, tail = part.title.partition(";" if part.title.startswith("signals") else ", ")
             title = f"{head.strip()}\n{tail.strip().replace(';', ',')}"
-            scale = {"x": "brightest pixels kept, k", "x_ticks": _KEPT_TICKS, "y_ticks": _ERROR_TICKS[2:]}
+            scale: dict[str, Any] = {
+                "x": "brightest pixels kept, k",
+                "x_ticks": _KEPT_TICKS,
+                "y_ticks": _ERROR_TICKS[2:],
+            }
             fixed_k = {float(fixed): {"ls": ":"}}
             panels[-1].append(Panel(lines, y=ERROR_AXIS, title=title, at=fixed_k, legend=True, **scale))
     title = f"{_TEXT['fig5.title']}  (solid: TV, dashed: no TV)"
@@ -145,7 +149,7 @@ def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | 
     methods = [str(method) for method in dataset["estimator"].values if not knows_the_spot(str(method))]
     if not cells or NO_TV not in methods or len(methods) < 2:
         return None
-    panels = []
+    panels: list[list[Panel]] = []
     for noise, indices in cells.items():
         panels.append([])
         for mode in _modes(dataset):
@@ -160,7 +164,7 @@ def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | 
             scale = axis_of_study("flux_e") | {
                 "x_range": _range_of("flux_e", dataset["flux_e"].values[indices])
             }
-            limits = {"y": "R / R without denoising", "y_range": (lowest, _LARGEST_RATIO)}
+            limits: dict[str, Any] = {"y": "R / R without denoising", "y_range": (lowest, _LARGEST_RATIO)}
             panels[-1].append(Panel(lines, title=title, **scale, **limits))
     every = [cell for part in cells.values() for cell in part]
     reach = float(dataset["position_range_px"].values[every[0]])

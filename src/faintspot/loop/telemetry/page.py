@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -99,17 +100,19 @@ def _with_interval(measured: Measured, unit: str = "") -> str | None:
 def _time_figure(pieces: Sequence[Piece]) -> FigureWithData:
     """Draw r0, coherence time, wind and noise of each piece."""
     middle = np.array([piece.start_s + piece.duration_s / 2 for piece in pieces])
-    panels, rows = [], []
+    panels: list[list[Panel]] = []
+    rows: list[tuple[object, ...]] = []
     for name in _AGAINST_TIME:
         values = [piece.values.get(name, Measured(name, "")) for piece in pieces]
         known = [value for value in values if math.isfinite(value.value)]
         if known:
             numbers = np.array([(value.value, *value.interval) for value in values]).T
             line = Line("", middle, numbers[0], np.abs(numbers[1:] - numbers[0]), _MEASURED)
-            label = "time since the first frame (s)"
-            panels.append([Panel([line], label, known[0].unit, name, y_range=(0, None))])
+            panels.append([Panel([line], "", known[0].unit, name, y_range=(0, None))])
             rows += [(name, time, *number) for time, number in zip(middle, numbers.T, strict=True)]
-    figure = plot(panels or [[Panel([], "time (s)")]], max(2.0, 2.7 * len(panels)), legend="")
+    panels = panels or [[Panel([], "")]]
+    panels[-1] = [replace(panels[-1][0], x="time since the first frame (s)")]
+    figure = plot(panels, 2.4 * len(panels), legend="", sharex=True)
     return _TEXT.figure("time", figure, rows, ("quantity", "time", "value", "low", "high"))
 
 
@@ -161,7 +164,8 @@ def _spectra_figure(report: LoopReport) -> FigureWithData | None:
     spectra = report.spectra
     if spectra is None:
         return None
-    panels, rows = [], []
+    panels: list[Panel] = []
+    rows: list[tuple[object, ...]] = []
     unit = f"slope² ({report.loop.slope_unit}²/Hz)"
     for name in spectra.measured:
         measured, model = (report.loop.unit**2 * power[name] for power in (spectra.measured, spectra.model))
