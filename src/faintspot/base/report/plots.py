@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from faintspot.base.report.drawing import (
@@ -20,6 +18,10 @@ from faintspot.base.report.drawing import (
     plain_ticks,
     styled,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 LEVEL: Mapping[str, Any] = {"color": GREY, "lw": 1}
 """Style of a horizontal line that is no measurement."""

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, new_figure, styled
 from faintspot.base.report.figure_data import FigureWithData
+from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.base.report.texts import Texts
 from faintspot.engine.telemetry.numbers import MethodDifference, method_names
 from faintspot.io.telemetry.recording import Telemetry
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _TEXT = Texts("faintspot.slopes.recorded")
 _BINS = 80
@@ -38,45 +44,48 @@ def latency_figure(telemetry: Telemetry) -> FigureWithData:
     left.set(xscale="log", yscale="log", xlabel="latency (µs)", ylabel="frames", ylim=(0.7, None))
     if len(np.unique(telemetry.method)) > 1:
         left.legend(frameon=False)
-    stretches = min(_MOST_TIMES, max(min(_FEW_TIMES, len(latency)), len(latency) // _FEWEST_TOGETHER))
-    marker = "o" if stretches <= _FEW_TIMES else ""
-    parts = np.array_split(np.arange(len(latency)), stretches)
-    time = (telemetry.last_row_time_ns - telemetry.last_row_time_ns[0]) / 1e9
-    middle = [float(time[part].mean()) for part in parts]
-    right.plot(
-        middle, [latency[part].max() for part in parts], color=GREY, marker=marker, lw=1, label="longest"
-    )
-    medians = [np.median(latency[part]) for part in parts]
-    right.plot(middle, medians, color="black", marker=marker, ms=3, lw=1.3, label="median")
-    right.set(yscale="log", xlabel="time since the first frame (s)", ylabel="latency (µs)")
-    right.legend(frameon=False)
-    n_together = len(parts[0])
-    course = f"median and longest of stretches of {n_together} frames" if n_together > 1 else "every frame"
+    course = _course(telemetry, latency, right)
     return _TEXT.figure("latency", figure, rows, course=course)
 
 
-@styled
+def _course(telemetry: Telemetry, latency: NDArray[np.float64], axes: Axes) -> str:
+    """Draw the course of latencies in time; return what was drawn in words."""
+    stretches = min(_MOST_TIMES, max(min(_FEW_TIMES, len(latency)), len(latency) // _FEWEST_TOGETHER))
+    parts = np.array_split(np.arange(len(latency)), stretches)
+    time = (telemetry.last_row_time_ns - telemetry.last_row_time_ns[0]) / 1e9
+    middle = [float(time[part].mean()) for part in parts]
+    style = {"marker": "o" if stretches <= _FEW_TIMES else "", "ms": 3}
+    longest, medians = ([reduce(latency[part]) for part in parts] for reduce in (np.max, np.median))
+    lines = [
+        Line("longest", middle, longest, style={**style, "color": GREY, "lw": 1}),
+        Line("median", middle, medians, style={**style, "color": "black", "lw": 1.3}),
+    ]
+    Panel(lines, "time since the first frame (s)", "latency (µs)", legend=True).draw(axes)
+    axes.set_yscale("log")
+    together = len(parts[0])
+    return f"median and longest of stretches of {together} frames" if together > 1 else "every frame"
+
+
 def methods_figure(telemetry: Telemetry, values: Mapping[str, Sequence[MethodDifference]]) -> FigureWithData:
     """Draw by how much every method differs from the first, a panel for each quantity."""
-    figure = new_figure(WIDTH, 1.6 + 0.45 * len(method_names(telemetry)))
-    rows = []
-    for panel, (name, compared) in zip(figure.subplots(1, len(values)), values.items(), strict=True):
-        methods = [method for method in compared if method.difference is not None]
-        for row, method in enumerate(methods):
+    panels, rows = [], []
+    names = [method.method for method in next(iter(values.values()))]
+    for name, compared in values.items():
+        lines = []
+        for row, method in enumerate(compared[1:]):
             shift = method.difference
             assert shift is not None
-            spread = np.nan_to_num([[shift.value - shift.low], [shift.high - shift.value]])
-            colour = METHOD_COLOURS[(row + 1) % len(METHOD_COLOURS)]
-            panel.errorbar([shift.value], [row], xerr=spread, fmt="o", color=colour, capsize=3)
+            spread = [[shift.value - shift.low], [shift.high - shift.value]]
+            style = {"fmt": "o", "color": METHOD_COLOURS[(row + 1) % len(METHOD_COLOURS)], "capsize": 3}
+            lines.append(Line("", [shift.value], [row], style=style, x_error=spread))
             rows.append((name, method.method, shift.value, shift.low, shift.high, shift.count))
-        panel.axvline(0, color=GREY, lw=1)
+        panels.append(Panel(lines, "", title=name, at={0.0: {}}, y_range=(len(names) - 1.4, -0.6)))
+    figure = plot([panels], 1.6 + 0.45 * len(names), legend="")
+    for panel in figure.axes:
         panel.set_yticks(
-            range(len(methods)),
-            [method.method for method in methods] if not panel.get_subplotspec().colspan.start else [],
+            range(len(names) - 1), names[1:] if panel is figure.axes[0] else [""] * (len(names) - 1)
         )
-        panel.set_ylim(len(methods) - 0.4, -0.6)
-        panel.set_title(name, fontsize=10)
+        panel.title.set_fontsize(10)
         panel.tick_params(axis="x", labelsize=9)
         panel.locator_params(axis="x", nbins=4)
-    first = next(iter(values.values()))[0].method
-    return _TEXT.figure("methods.figure", figure, rows, first=first)
+    return _TEXT.figure("methods.figure", figure, rows, first=names[0])
