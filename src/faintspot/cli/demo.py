@@ -140,10 +140,10 @@ def write_page(folder: Path, methods: list[MeasuredSlopes], **shown: Any) -> Non
         "Positions": f"uniform within +-{demonstration.POSITION_RANGE_PX:g} px",
         "Camera": "EMCCD, gain 500, read noise 45 e- at the output (0.09 e- referred to photo-electrons)",
     }
-    html = slopes_report(
+    report = slopes_report(
         SlopesRun(methods, **shown),
         title="faintspot demonstration",
         facts=facts,
         configurations={"Configuration": (folder / "tv.toml").read_text(encoding="utf-8")},
     )
-    write_atomically(folder / "report.html", html)
+    write_atomically(folder / "report.html", report.html())

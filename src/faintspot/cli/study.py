@@ -110,7 +110,7 @@ def paper(quick: bool, figures: tuple[str, ...], output: str | None, **where: An
       faintspot study paper --figure fig4 --figure night
     """
     from faintspot.experiments.paper.whole import paper_markdown, paper_rows
-    from faintspot.experiments.report.page import night_folder, write_study_report
+    from faintspot.experiments.report.page import night_folder, study_report
     from faintspot.experiments.study.built_in import FIGURES, NIGHT, paper_study
 
     target = output or "-".join(["paper", *(["quick"] if quick else []), *figures]) + ".zarr"
@@ -120,7 +120,7 @@ def paper(quick: bool, figures: tuple[str, ...], output: str | None, **where: An
     night = _night(night_folder(target), quick, **where) if NIGHT in figures or not figures else None
     if dataset is not None:
         page = derived(target, ".html")
-        write_study_report(dataset, page, night)
+        study_report(dataset, night).write(page)
         click.echo(f"{page}: open it in a browser")
     table = derived(target, ".md")
     write_atomically(table, paper_markdown(paper_rows(dataset, night)))
@@ -172,10 +172,10 @@ def estimators(quick: bool, output: str | None, **where: Any) -> None:
 
 def _measure_and_report(described: StudySpecification, target: str, where: dict[str, Any]) -> None:
     """Run a study and write its page beside the store."""
-    from faintspot.experiments.report.page import write_study_report
+    from faintspot.experiments.report.page import study_report
 
     page = derived(target, ".html")
-    write_study_report(_measure(described, target, **where), page)
+    study_report(_measure(described, target, **where)).write(page)
     click.echo(f"{page}: open it in a browser")
 
 

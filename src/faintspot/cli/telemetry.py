@@ -139,7 +139,7 @@ def command(
     numbers = derived(page, ".json")
     values = report.as_values() | {"over_time": [piece.as_values() for piece in pieces]}
     write_atomically(numbers, to_json(values, indent=1))
-    write_atomically(page, page_of_loop(report, pieces))
+    write_atomically(page, page_of_loop(report, pieces).html())
     if pieces:
         table = derived(page, "-over-time.csv")
         write_atomically(table, table_of_pieces(pieces))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.experiments.result_cases import made_up_budget, made_up_magnitude
 
-from faintspot.experiments.closed_loop.page import loop_page, loop_warnings, write_loop_report
+from faintspot.experiments.closed_loop.page import loop_page, loop_warnings
 from faintspot.experiments.closed_loop.verdict import NOWHERE, LoopResults
 from faintspot.loop.simulation.files import MAGNITUDE_FILE
 
@@ -18,7 +18,7 @@ pytest.importorskip("hcipy")
 def test_the_page_holds_everything(tmp_path: Path) -> None:
     made_up_magnitude().save(tmp_path / MAGNITUDE_FILE)
     made_up_budget().save(tmp_path / "budget.npz")
-    written = write_loop_report(tmp_path, tmp_path / "report.html")
+    written = loop_page(LoopResults.load(tmp_path)).write(tmp_path / "report.html")
     assert written[0] == tmp_path / "report.html"
     assert {path.name for path in written[1:]} == {
         f"{name}.{ending}" for name in ("magnitude", "gain", "budget") for ending in ("png", "svg", "csv")

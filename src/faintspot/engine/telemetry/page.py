@@ -35,15 +35,15 @@ _TEXT = Texts("faintspot.slopes.recorded")
 _MOST_GAPS, _MOST_CHANGES = 20, 200
 
 
-def report_of_telemetry(path: str | Path) -> str:
-    """Return the report page (HTML) of a store that `faintspot realtime record` has written.
+def report_of_telemetry(path: str | Path) -> Report:
+    """Return the report of a store that `faintspot realtime record` has written.
 
     Raises
     ------
     InputError
         When it is no such store, damaged, or without frames.
     MissingExtraError
-        When matplotlib, jinja2 or zarr is not installed.
+        When matplotlib or zarr is not installed.
     """
     telemetry = read_telemetry(path, images=False)
     if len(telemetry.frame) == 0:
@@ -64,7 +64,7 @@ def report_of_telemetry(path: str | Path) -> str:
         ],
         warnings=[*_warnings(telemetry), *run.comparison.warnings(), *warnings_in_words(run)],
         remark=POSITIONS,
-    ).html()
+    )
 
 
 def _measured(telemetry: Telemetry) -> list[MeasuredSlopes]:

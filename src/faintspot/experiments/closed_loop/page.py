@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -38,17 +37,6 @@ from faintspot.loop.simulation.configuration.configuration import LoopConfigurat
 _TEXT = Texts("faintspot.experiments")
 _FEW_REALISATIONS = 5
 _SLOPE_ERROR = "slope error"
-
-
-def write_loop_report(folder_of_results: str | Path, out_html: str | Path) -> list[Path]:
-    """Write the report of what `faintspot loop` left in a folder, finished or not, as `Report.write` does.
-
-    Raises
-    ------
-    InputError
-        When there are no results, or a file cannot be written.
-    """
-    return loop_page(LoopResults.load(folder_of_results)).write(out_html)
 
 
 def loop_page(results: LoopResults) -> Report:

@@ -91,18 +91,16 @@ def better_and_worse(result: MagnitudeResult, method: int, reference: int) -> tu
     "" for none.
     """
     decided = [difference.decided for difference in differences_by_flux(result, method, reference)]
-    if decided == [1] * len(decided):
-        return "all fluxes", ""
-    if decided == [-1] * len(decided):
-        return "", "all fluxes"
-    above, below = (
-        ", ".join(
-            f"{photons:.3g}" for photons, sign in zip(result.photons, decided, strict=True) if sign == outcome
-        )
-        for outcome in (1, -1)
-    )
-    unit = " photo-electrons"
-    return above and above + unit, below and below + unit
+
+    def words(outcome: int) -> str:
+        if decided == [outcome] * len(decided):
+            return "all fluxes"
+        fluxes = [
+            f"{flux:.3g}" for flux, sign in zip(result.photons, decided, strict=True) if sign == outcome
+        ]
+        return f"{', '.join(fluxes)} photo-electrons" if fluxes else ""
+
+    return words(1), words(-1)
 
 
 def _headline(comparisons: list[Estimate]) -> str:

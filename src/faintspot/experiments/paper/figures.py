@@ -25,12 +25,12 @@ from faintspot.experiments.study.specification import BEST
 from faintspot.experiments.study.sweep import PARAMETERS
 from faintspot.slopes.estimators.algorithms.noise import suggested_strength
 from faintspot.slopes.estimators.algorithms.total_variation import tv_denoise
+from faintspot.slopes.recorded.report.frame_pictures import assembled
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.simulate import Detector, spots
 
 if TYPE_CHECKING:
     import xarray
-    from matplotlib.axes import Axes
 
 
 _TEXT = Texts("faintspot.experiments")
@@ -318,16 +318,18 @@ def triple_picture() -> FigureWithData:
     layout, images = triple_images()
     shown = len(layout) // 2
     figure = new_figure(WIDTH, 9.4)
-    axes = figure.subplots(2, 3)
     brightest = float(np.percentile(images[1], 99.9))
-    for column, (name, stack) in enumerate(zip(_NAMES, images, strict=True)):
-        frame = np.full(layout.frame_shape, np.nan)
-        for (row, left), image in zip(layout.corners, stack, strict=True):
-            frame[row : row + layout.window[0], left : left + layout.window[1]] = image
-        sensor_image = _show(axes[0, column], frame, brightest, f"sensor, {name}")
-        spot_image = _show(axes[1, column], stack[shown], brightest, f"one spot, {name}")
-    colour_bar(list(axes[0]), sensor_image, "signal (e- per pixel)")
-    colour_bar(list(axes[1]), spot_image, "signal (e- per pixel)")
+    pictures = {
+        f"sensor, {name}": assembled(layout, stack) for name, stack in zip(_NAMES, images, strict=True)
+    }
+    pictures |= {f"one spot, {name}": stack[shown] for name, stack in zip(_NAMES, images, strict=True)}
+    axes = figure.subplots(2, 3)
+    for panel, (title, image) in zip(axes.flat, pictures.items(), strict=True):
+        drawn = panel.imshow(image, vmin=0.0, vmax=brightest, interpolation="nearest")
+        panel.set_title(title, fontsize=12)
+        panel.set(xlabel="column (px)", ylabel="row (px)")
+    for row in axes:
+        colour_bar(list(row), drawn, "signal (e- per pixel)")
     rows = [
         [y, x, *(f"{stack[shown, y, x]:.6g}" for stack in images)]
         for y in range(layout.window[0])
@@ -335,11 +337,3 @@ def triple_picture() -> FigureWithData:
     ]
     values = {"flux": FLUX_E, "noise": READ_NOISE_E, "reach": POSITION_RANGE_PX}
     return _TEXT.figure("fig1", figure, rows, **values)
-
-
-def _show(panel: Axes, image: NDArray[np.float64], brightest: float, title: str) -> object:
-    shown = panel.imshow(image, vmin=0.0, vmax=brightest, interpolation="nearest")
-    panel.set_title(title, fontsize=12)
-    panel.set_xlabel("column (px)")
-    panel.set_ylabel("row (px)")
-    return shown

@@ -42,15 +42,15 @@ _TEXT = Texts("faintspot.experiments")
 _KEPT_PIXELS = "fig5"
 
 
-def report_of_study(path: str | Path) -> str:
-    """Return the report page (HTML) of a stored study, finished or not.
+def report_of_study(path: str | Path) -> Report:
+    """Return the report of a stored study, finished or not.
 
     Raises
     ------
     InputError
         When there is no study, or none of its cells is finished.
     MissingExtraError
-        When xarray, zarr, matplotlib or jinja2 is not installed.
+        When xarray, zarr or matplotlib is not installed.
     """
     from faintspot.experiments.study.run import open_study
 
@@ -63,8 +63,8 @@ def night_folder(path: str | Path) -> Path:
     return derived(path, "-night")
 
 
-def study_report(dataset: xarray.Dataset, night: Night | None = None) -> str:
-    """Return the report page of a study as HTML: self-contained, without scripts.
+def study_report(dataset: xarray.Dataset, night: Night | None = None) -> Report:
+    """Return the report of a study.
 
     Parameters
     ----------
@@ -78,14 +78,29 @@ def study_report(dataset: xarray.Dataset, night: Night | None = None) -> str:
     InputError
         When no cell is finished.
     MissingExtraError
-        When matplotlib or jinja2 is not installed.
+        When matplotlib is not installed.
     """
-    return _page(dataset, night).html()
-
-
-def write_study_report(dataset: xarray.Dataset, path: str | Path, night: Night | None = None) -> list[Path]:
-    """Write the page of a study, as `Report.write` does."""
-    return _page(dataset, night).write(path)
+    if not bool(dataset["done"].any()):
+        raise InputError(f"study: none of its {dataset.sizes['cell']} cells is finished: run it first")
+    dataset = dataset.load()
+    attributes = dataset.attrs
+    done, total = int(dataset["done"].sum()), dataset.sizes["cell"]
+    specification = StudySpecification.from_text(str(attributes["specification"]))
+    of_estimators = compares_estimators(dataset)
+    subject = "Slope errors of the estimators" if of_estimators else "Slope errors with and without TV"
+    version = attributes.get("faintspot_version", "unknown")
+    values = {"done": done, "total": total, "widths": _widths_in_words(specification), "version": version}
+    return Report(
+        title=f"{subject}: study “{specification.name}”",
+        facts=_TEXT.facts("study.facts", attributes, **values),
+        sections=[
+            *(_of_estimators(dataset) if of_estimators else _of_claims(dataset, night)),
+            configuration_section(str(attributes["specification"]), "Specification"),
+        ],
+        warnings=_TEXT.lines("study.warnings", missing=(total - done) or None),
+        warnings_title="This study is not finished",
+        remark=_TEXT["study.remark"],
+    )
 
 
 def study_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
@@ -139,30 +154,6 @@ def _widths_in_words(specification: StudySpecification) -> str:
     is_paper = _is_paper(sweep.name.split()[0] for sweep in specification.sweeps)
     largest = 2 * FWHM_OF_SIZE_1_PX["diffraction"] if is_paper else None
     return _TEXT("study.widths", widths=", ".join(widths), largest=largest)
-
-
-def _page(dataset: xarray.Dataset, night: Night | None) -> Report:
-    if not bool(dataset["done"].any()):
-        raise InputError(f"study: none of its {dataset.sizes['cell']} cells is finished: run it first")
-    dataset = dataset.load()
-    attributes = dataset.attrs
-    done, total = int(dataset["done"].sum()), dataset.sizes["cell"]
-    specification = StudySpecification.from_text(str(attributes["specification"]))
-    of_estimators = compares_estimators(dataset)
-    subject = "Slope errors of the estimators" if of_estimators else "Slope errors with and without TV"
-    version = attributes.get("faintspot_version", "unknown")
-    values = {"done": done, "total": total, "widths": _widths_in_words(specification), "version": version}
-    return Report(
-        title=f"{subject}: study “{specification.name}”",
-        facts=_TEXT.facts("study.facts", attributes, **values),
-        sections=[
-            *(_of_estimators(dataset) if of_estimators else _of_claims(dataset, night)),
-            configuration_section(str(attributes["specification"]), "Specification"),
-        ],
-        warnings=_TEXT.lines("study.warnings", missing=(total - done) or None),
-        warnings_title="This study is not finished",
-        remark=_TEXT["study.remark"],
-    )
 
 
 def _of_estimators(dataset: xarray.Dataset) -> list[Section]:

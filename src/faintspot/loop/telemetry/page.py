@@ -31,14 +31,8 @@ _MOST_DECIMALS = 6
 _MEASURED = {"fmt": "o-", "color": METHOD_COLOURS[1], "capsize": 3}
 
 
-def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> str:
-    """Return the page (HTML) of a report, and of pieces of its recording.
-
-    Raises
-    ------
-    MissingExtraError
-        When matplotlib or jinja2 is not installed.
-    """
+def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> Report:
+    """Return the page of a report, and of pieces of its recording."""
     figures: dict[str, Callable[[LoopReport], FigureWithData | None]] = {
         "noise": _noise_figure,
         "turbulence": _wind_figure,
@@ -61,7 +55,7 @@ def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> str:
         [report.advice] if report.advice else [],
         warnings_title="What to do",
         remark=_TEXT["remark"],
-    ).html()
+    )
 
 
 def _table(part: Part) -> Table:

@@ -19,8 +19,8 @@ def slopes_report(
     configurations: Mapping[str, str],
     warnings: Sequence[str] = (),
     sections: Sequence[Section] = (),
-) -> str:
-    """Return the report page of a slopes run as HTML: self-contained, without scripts.
+) -> Report:
+    """Return the report of a slopes run.
 
     Parameters
     ----------
@@ -34,11 +34,6 @@ def slopes_report(
         Shown before those found in the slopes.
     sections : sequence of Section
         Further sections, before the configurations.
-
-    Raises
-    ------
-    MissingExtraError
-        When matplotlib or jinja2 is not installed.
     """
     n_frames, n = run.methods[0].x.shape
     return Report(
@@ -51,7 +46,7 @@ def slopes_report(
         ],
         warnings=[*warnings, *run.comparison.warnings(), *warnings_in_words(run)],
         remark=POSITIONS,
-    ).html()
+    )
 
 
 def _sensor_in_words(n: int, layout: Layout | None) -> str:

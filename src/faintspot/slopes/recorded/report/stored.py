@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.report.page import Section
+from faintspot.base.report.page import Report, Section
 from faintspot.base.report.texts import Texts
 from faintspot.base.validity import are_valid, leave_out
 from faintspot.io import open_frames
@@ -32,8 +32,8 @@ _SAID_FIRST = ("calibration", "PSF", "score")
 """Reasons for not drawing the frame that also stand at the top of the page."""
 
 
-def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path] | None = None) -> str:
-    """Return the report page (HTML) of one file of slopes, or of two of the same frames.
+def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path] | None = None) -> Report:
+    """Return the report of one file of slopes, or of two of the same frames.
 
     Layout, settings and calibration are rebuilt from what the file says about its run. The frame with the
     median total flux is taken from the run's sources and measured again for the pictures. What is missing is
@@ -51,7 +51,7 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
     InputError
         When a file cannot be read, has no finished frame, or two do not have the same sub-apertures.
     MissingExtraError
-        When matplotlib, jinja2 or the package that reads a file is not installed.
+        When matplotlib or the package that reads a file is not installed.
     """
     if not 1 <= len(paths) <= 2:
         raise InputError(f"slopes: expected one file or two to compare, got {len(paths)}")
@@ -241,16 +241,14 @@ def _median_standard_error(store: StoredRun) -> float:
 def _facts(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
     sources = list(dict.fromkeys(source for store in stores for source in store.sources))
     shown = ", ".join(sources[:4]) + (f" and {len(sources) - 4} more" if len(sources) > 4 else "")
-    versions = dict.fromkeys(
-        str(store.stored.attributes.get("faintspot_version", "unknown")) for store in stores
-    )
+    attributes = [store.stored.attributes for store in stores]
     facts = {"Slopes": ", ".join(str(store.path) for store in stores), "Sources": shown or "not stored"}
     for store, method in zip(stores, methods, strict=True):
         words = "not stored"
         if store.estimator is not None and store.layout is not None:
             words = store.estimator.in_words(len(store.layout), store.layout.pixels) + _range_in_words(store)
-        owner = f" of {method.name!r}" if len(methods) > 1 else ""
-        facts[f"Settings{owner}"] = words
-    if any("reference" in store.stored.attributes for store in stores):
-        facts["Reference"] = "slopes are relative to stored reference positions; crosses in pictures are not"
+        facts["Settings" if len(methods) == 1 else f"Settings of {method.name!r}"] = words
+    if any("reference" in of_run for of_run in attributes):
+        facts["Reference"] = _TEXT["stored.reference"]
+    versions = dict.fromkeys(str(of_run.get("faintspot_version", "unknown")) for of_run in attributes)
     return {**facts, "Measured with": f"faintspot {', '.join(versions)}"}
