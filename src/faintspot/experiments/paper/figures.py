@@ -41,7 +41,10 @@ _MARKERS = "osD^vPX<>*"
 _ERROR_TICKS = (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3)
 _KEPT_TICKS = (1, 3, 10, 30, 100)
 _TV_OR_NOT: dict[str, dict[str, Any]] = {TV: {"ls": "-"}, NO_TV: {"ls": "--", "mfc": "white"}}
-_LEGEND = {"TV": {"ls": "-"}, "no TV": {"ls": "--", "marker": "o", "mfc": "white"}}
+_LEGEND: dict[str, dict[str, Any]] = {
+    "TV": {"color": "#333333", "ls": "-"},
+    "no TV": {"color": "#333333", "ls": "--", "marker": "o", "mfc": "white"},
+}
 ERROR_AXIS = "slope error R (px)"
 MAIN_NOISES_E = (0.1, 3.0, 16.0)
 
@@ -73,37 +76,26 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
     rows: dict[tuple[str, float], list[int]] = {}
     for index, row in enumerate(table):
         rows.setdefault((row["profile"], row["position_range_px"]), []).append(index)
-    values = [float(row[axis]) for row in table]
-    scale = axis_of_study(axis) | {"x_range": _range_of(axis, values), "y_ticks": _ERROR_TICKS}
+    scale = axis_of_study(axis) | {"x_range": _range_of(axis, [float(row[axis]) for row in table])}
     panels: list[list[Panel]] = []
     for (profile, reach), kept in sorted(rows.items()):
         parts = _by_label([table[i] for i in kept], [cells[i] for i in kept], axis, labelled)
-        where = f"{profile} spots, positions within ±{reach:g} px"
-        panels.append(
-            [
-                Panel(
-                    _tv_lines(dataset.sel(mode=mode), parts, styles, axis),
-                    y=ERROR_AXIS,
-                    title=f"{mode_in_words(mode)}: {where}",
-                    levels={reach / 2: {"ls": ":"}},
-                    **scale,
-                )
-                for mode in _modes(dataset)
-            ]
-        )
+        scale |= {"y": ERROR_AXIS, "y_ticks": _ERROR_TICKS, "levels": {reach / 2: {"ls": ":"}}}
+        panels.append([])
+        for mode in _modes(dataset):
+            title = f"{mode_in_words(mode)}: {profile} spots, positions within ±{reach:g} px"
+            lines = _tv_lines(dataset.sel(mode=mode), parts, styles, axis)
+            panels[-1].append(Panel(lines, title=title, **scale))
     fixed = [parameter_in_words(key, table[0][key]) for key in PARAMETERS if key not in (*varied, axis)]
     named = ", ".join(words for words in fixed if not words.startswith("no "))
-    handles = [
-        Line(label, [], [], style={"color": "#333333", "lw": 2, **style}) for label, style in _LEGEND.items()
-    ]
-    handles += [Line(label, [], [], style={"lw": 2, **style}) for label, style in styles.items() if label]
-    height = _ROW_HEIGHT if len(_by_label(table, cells, axis, labelled)) <= _FEW_LINES else 1.3 * _ROW_HEIGHT
+    handles = {**_LEGEND, **{label: style for label, style in styles.items() if label}}
+    height = _ROW_HEIGHT if len(styles) <= _FEW_LINES else 1.3 * _ROW_HEIGHT
     figure = plot(
         panels,
         height * len(panels) + 0.8,
         title=f"{title}  ({named})" if named else title,
         columns=5,
-        handles=handles,
+        handles=[Line(label, [], [], style=style) for label, style in handles.items()],
         sharex=True,
         sharey="row",
     )

@@ -30,7 +30,7 @@ from faintspot.loop.control.identification.open_loop import (
 )
 from faintspot.loop.control.identification.predictive_control import ObservedLoop
 from faintspot.loop.control.identification.recording import Recording, prepared
-from faintspot.loop.telemetry.choices import Choice, advice, compared_choices
+from faintspot.loop.telemetry.choices import ControlChoice, advice, compared_choices
 from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
 from faintspot.loop.telemetry.spectra import ModalSpectra, modal_spectra
 from faintspot.loop.turbulence.image_motion import differential_image_motion
@@ -73,7 +73,7 @@ class LoopReport:
     noise_error_px: Floats | None = None
     turbulence: Identified | None = None
     spectra: ModalSpectra | None = None
-    choices: list[Choice] = field(default_factory=list)
+    choices: list[ControlChoice] = field(default_factory=list)
     delay: LoopDelay | None = None
     """Delay and centroid gain that were measured and are used."""
     observed: ObservedLoop | None = None
