@@ -67,6 +67,8 @@ def test_sentences_are_left_out_without_their_values() -> None:
     assert text("a", shown=False, number=float("nan"), part=None) == "– px."
     assert text.lines("a", shown=None, number=1.0, part=None) == ["1.0 px."]
     assert text.facts("b", {"c": "known"}, d=None) == {"x": "known"}
+    otherwise = made({"a": ["{rate:.0f} Hz.", "{rate:not}No rate."]})
+    assert [otherwise("a", rate=rate) for rate in (7.0, None)] == ["7 Hz.", "No rate."]
 
 
 def test_a_table_is_filled_in_from_records() -> None:

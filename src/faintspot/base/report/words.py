@@ -112,6 +112,7 @@ class Words(Formatter):
     """Formats of texts: those of Python, and by name as in "{value:interval 3}", with or without digits.
 
     Numbers that are not finite are a dash, True is no word, None and False leave out the sentence.
+    With "{value:not}" a sentence is there for None and False alone.
 
     Attributes
     ----------
@@ -125,7 +126,7 @@ class Words(Formatter):
     def get_field(self, field_name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         """Return the value of a field; parts of None leave out the sentence."""
         name = re.split(r"[.\[]", field_name)[0]
-        if kwargs[name] is None:
+        if kwargs[name] is None and name != field_name:
             raise LeftOut
         return super().get_field(field_name, args, kwargs)
 
@@ -133,12 +134,12 @@ class Words(Formatter):
         """Return a value in a format."""
         name, _, digits = format_spec.partition(" ")
         options = (int(digits),) if digits else ()
-        if value is None or value is False:
+        if (value is None or value is False) != (name == "not"):
             raise LeftOut
+        if value is True or name == "not":
+            return ""
         if name in _OF_ESTIMATES:
             return _OF_ESTIMATES[name](value, *options)
-        if value is True:
-            return ""
         if isinstance(value, float):
             self.known.append(math.isfinite(value))
             if not self.known[-1]:

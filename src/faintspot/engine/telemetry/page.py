@@ -125,13 +125,11 @@ def _timing(telemetry: Telemetry) -> Section:
     for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
         us = 1e6 * telemetry.latency_s[telemetry.method == method]
         rows.append([name, str(len(us)), *(f"{value:.1f}" for value in np.percentile(us, PERCENTILES))])
-    is_known = bool(np.isfinite(measured.rate_hz))
     return _TEXT.section(
         "timing",
         _TEXT.table("timing", rows),
         latency_figure(telemetry),
-        rate=measured.rate_hz if is_known else None,
-        unknown=not is_known,
+        rate=measured.rate_hz if np.isfinite(measured.rate_hz) else None,
         longest_ms=1e3 * measured.longest_interval_s,
     )
 

@@ -106,7 +106,6 @@ def _remarks(recorded: RecordedNight) -> list[str]:
     return _TEXT.lines(
         "remarks",
         measured=recorded.is_measured,
-        estimated=not recorded.is_measured,
         unknown=", ".join(unknown) or None,
         leaning=", ".join(recorded.leaning) or None,
     )

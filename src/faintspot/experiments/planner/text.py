@@ -65,9 +65,7 @@ def recommendation(answer: Answer) -> list[str]:
         unit="magnitude" if answer.question.photometry else "flux",
         budget=budget,
         limit=None if budget is None else _limit(answer, best),
-        limit_of_brightest=None if budget is None else _limit(answer, brightest),
-        alone=not is_better,
-        compared=is_better,
+        limit_of_brightest=_limit(answer, brightest) if is_better and budget is not None else None,
     )
     return lines + promise_lines(answer)
 
@@ -79,8 +77,7 @@ def promise_lines(answer: Answer) -> list[str]:
         return [UNCHECKED] if answer.question.facts else []
     simulated = min(answer.results, key=lambda result: result.statistics.ranking_rms)
     factor = answer.promises[simulated.method.name].factor
-    is_contradicted, is_corrected = promise.contradicted, promise.factor != 1
-    is_placed = not is_contradicted and promise.expected_px > _PLACED * promise.promised_px
+    is_placed = not promise.contradicted and promise.expected_px > _PLACED * promise.promised_px
     checked = _TEXT(
         "answer.checked",
         promise,
@@ -93,9 +90,8 @@ def promise_lines(answer: Answer) -> list[str]:
         promise,
         label=simulated.method.label if factor > 1 and simulated is not answer.best else None,
         factor_of_best=factor,
-        contradiction=CONTRADICTED,
-        expected=is_contradicted and is_corrected,
-        below=is_contradicted and not is_corrected,
+        contradiction=CONTRADICTED if promise.contradicted else None,
+        is_corrected=promise.factor != 1,
         why=" (pixels have another noise than was taken)" if promise.noise_differs else "",
     )
     return [checked, *lines]

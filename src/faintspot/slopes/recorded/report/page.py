@@ -98,7 +98,7 @@ def warnings_in_words(run: SlopesRun) -> list[str]:
     for method, summary in zip(run.methods, run.summaries, strict=True):
         prefix = f"{method.name}: " if len(run.methods) > 1 else ""
         lines += [prefix + line for line in _of_method(method, summary)]
-    if run.methods[0].n_frames == 1:
+    if not run.has_several_frames:
         lines.append(_TEXT["warnings.one_frame"])
     if np.ptp([summary.valid_fraction for summary in run.summaries]) > 0.01:
         lines.append(_TEXT["warnings.not_alike"])
@@ -203,7 +203,6 @@ def _frame(run: SlopesRun) -> Section | None:
         "raw_apart": not in_electrons and number != 2,
         "marked": marked,
         "circles": "" if truth is None else " and circles true ones",
-        "unmarked": not marked,
         "coarse": factor if factor > 1 else None,
         "several": number > 2,
     }
@@ -228,7 +227,7 @@ def _flux(run: SlopesRun) -> Section:
     if run.layout is None:
         return _TEXT.section("flux", table, missing=_NO_LAYOUT)
     figure = maps.flux_and_validity(run.methods, run.summaries, run.layout)
-    return _TEXT.section("flux", table, _TEXT.figure("flux", figure, **_frames(run)))
+    return _TEXT.section("flux", table, _TEXT.figure("flux", figure, several=run.has_several_frames))
 
 
 def _slopes(run: SlopesRun) -> Section:
@@ -251,7 +250,7 @@ def _slopes(run: SlopesRun) -> Section:
         "longest": longest,
         "percent": maps.ARROWS_WHOLE_PERCENT,
         "number": number or None,
-        **_frames(run),
+        "several": run.has_several_frames,
     }
     return _TEXT.section("slopes", _TEXT.figure("slopes", figure, **values))
 
@@ -272,7 +271,7 @@ def _iterations(run: SlopesRun) -> Section | None:
 
 
 def _jitter(run: SlopesRun) -> Section | None:
-    if run.methods[0].n_frames == 1:
+    if not run.has_several_frames:
         return None
     if not run.jitters[0].measured.any():
         return _TEXT.section("jitter")
@@ -304,12 +303,6 @@ def _wavefront(run: SlopesRun) -> Section | None:
         tables.append(Table(*mode_table(wavefront), name, folded=f"Coefficients of {name!r}"))
         figures.append(wavefront_figure(wavefront, run.layout, name, file=f"wavefront-{number + 1}"))
     return Section("wavefront", "Wavefront", [*text, *tables, *figures], " ".join(missing))
-
-
-def _frames(run: SlopesRun) -> dict[str, Any]:
-    """Return whether there is one frame or several."""
-    several = run.methods[0].n_frames > 1
-    return {"several": several, "single": not several}
 
 
 def _mean(values: Floats) -> float:

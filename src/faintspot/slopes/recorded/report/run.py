@@ -146,6 +146,11 @@ class SlopesRun:
             object.__setattr__(self, "truth", truth)
 
     @property
+    def has_several_frames(self) -> bool:
+        """Whether it has more than one frame."""
+        return self.methods[0].n_frames > 1
+
+    @property
     def true_positions(self) -> Floats | None:
         """The truth, where it is known."""
         return None if self.truth is None else np.asarray(self.truth)
