@@ -126,6 +126,7 @@ class Report:
         except ImportError:
             raise MissingExtraError("jinja2", "report", "Making a report page") from None
         environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+        environment.filters["unbroken"] = _unbroken
         template = environment.from_string(_template("page.html"))
         values = {"style": _template("page.css"), "version": __version__, "data_uri": data_uri}
         return template.render(page=self, **values)
@@ -169,6 +170,11 @@ def configuration_section(text: str, name: str = "Configuration") -> Section:
     missing = "" if text.strip() else f"The {name.lower()} of this run is not known."
     identifier = "-".join(re.findall(r"\w+", name.lower()))
     return Section(identifier, name, code=text.strip(), missing=missing)
+
+
+def _unbroken(text: str) -> str:
+    """Keep values with their errors, and the ends of intervals, on one line."""
+    return re.sub(r" ± | to (?=[+−\d])", lambda found: found.group().replace(" ", "\u00a0"), text)
 
 
 def _template(name: str) -> str:

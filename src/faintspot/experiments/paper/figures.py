@@ -83,9 +83,9 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
         scale |= {"y": ERROR_AXIS, "y_ticks": _ERROR_TICKS, "levels": {reach / 2: {"ls": ":"}}}
         panels.append([])
         for mode in _modes(dataset):
-            title = f"{mode_in_words(mode)}: {profile} spots, positions within ±{reach:g} px"
+            heading = f"{mode_in_words(mode)}: {profile} spots, positions within ±{reach:g} px"
             lines = _tv_lines(dataset.sel(mode=mode), parts, styles, axis)
-            panels[-1].append(Panel(lines, title=title, **scale))
+            panels[-1].append(Panel(lines, title=heading, **scale))
     fixed = [parameter_in_words(key, table[0][key]) for key in PARAMETERS if key not in (*varied, axis)]
     named = ", ".join(words for words in fixed if not words.startswith("no "))
     handles = {**_LEGEND, **{label: style for label, style in styles.items() if label}}
