@@ -126,7 +126,9 @@ class Panel:
             linear = self.y_linear_below
             axes.set_yscale(**({"value": "symlog", "linthresh": linear} if linear else {"value": "log"}))
             plain_ticks(axes.yaxis, self.y_ticks)
-        axes.set(xlabel=self.x, ylabel=self.y, title=self.title, xlim=self.x_range, ylim=self.y_range)
+        ranges = {"xlim": self.x_range, "ylim": self.y_range}
+        fixed = {name: limits for name, limits in ranges.items() if limits != (None, None)}
+        axes.set(xlabel=self.x, ylabel=self.y, title=self.title, **fixed)
         if self.above is not None:
             axis_above(axes, *self.above).tick_params(labelsize=10)
         if self.grid:

@@ -145,7 +145,7 @@ def jitter_plot(methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) ->
     label = f"sub-apertures, in order of the jitter of {methods[-1].name!r}"
     ordered = Panel(lines, label, "jitter, rms of x and y (px)", y_range=(0, None), levels=levels)
     panels = [ordered, _compared(methods, jitters)] if len(methods) == 2 else [ordered]
-    figure = plot([panels], _PANEL_HEIGHT, columns=5)  # the legend beside the data, never on it
+    figure = plot([panels], _PANEL_HEIGHT, columns=6)  # the legend beside the data, never on it
     if len(methods) == 2:
         figure.axes[1].set_aspect("equal")
     return figure
