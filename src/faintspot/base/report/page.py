@@ -175,7 +175,9 @@ def configuration_section(text: str, name: str = "Configuration") -> Section:
 def _unbroken(text: str) -> str:
     """Keep values with their errors and units, and the ends of intervals, on one line."""
     return re.sub(
-        r" ± | to (?=[+−\d])|(?<=\d) (?=%|e-)", lambda found: found.group().replace(" ", "\u00a0"), text
+        r"(?:^| )± | to (?=[+−\d])|(?<=\d) (?=%|e[-⁻])",
+        lambda found: found.group().replace(" ", "\u00a0"),
+        text,
     )
 
 
