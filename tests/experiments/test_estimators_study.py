@@ -20,7 +20,7 @@ from faintspot.experiments.report.efficiency import (
     result_sections,
 )
 from faintspot.experiments.report.estimator_figures import estimator_figures
-from faintspot.experiments.report.page import write_study_report
+from faintspot.experiments.report.page import study_report
 from faintspot.experiments.study.built_in import estimators_study
 from faintspot.experiments.study.sweep import Cell
 
@@ -68,7 +68,7 @@ def test_figures() -> None:
     assert set(made) == {f"{kind}-{spot}" for kind in KINDS for spot in spots} | {"corrected-rms-diffraction"}
     first = made["error-diffraction"].figure
     assert [axes.get_title() for axes in first.axes] == ["0.1 e- read noise", "3 e- read noise"]
-    assert len(first.axes[0].containers) == len(METHODS)
+    assert len(first.axes[0].containers) == len(METHODS) + 1  # and the bound
     turbulence = made["corrected-rms-diffraction"].figure
     assert [axes.get_title() for axes in turbulence.axes] == [
         "0.1 e- read noise, 50 e- signal",
@@ -134,7 +134,7 @@ def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = [row for row in quick if row["d_over_r0"] > 0 or row["read_noise_e"] == 3]
     data = dataset(few, error, methods=METHODS)
     data.attrs["specification"] = specification.to_text()
-    written = write_study_report(data, tmp_path / "study.html")
+    written = study_report(data).write(tmp_path / "study.html")
     assert (tmp_path / "study-figures" / "corrected-rms-diffraction.csv") in written
     html = written[0].read_text(encoding="utf-8")
     assert "What was found" in html

@@ -12,13 +12,13 @@ from rich.console import Console
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
+from faintspot.base.report.words import with_interval
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import can_make
 from faintspot.cli.shared.output import results_table
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.experiments import demonstration
 from faintspot.experiments.demonstration import Comparison
-from faintspot.experiments.words import with_interval
 from faintspot.io.slopes import read_slopes
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
@@ -132,6 +132,7 @@ def write_page(folder: Path, methods: list[MeasuredSlopes], **shown: Any) -> Non
     """Make the report."""
     from faintspot.base.files import write_atomically
     from faintspot.slopes.recorded.report.page import slopes_report
+    from faintspot.slopes.recorded.report.run import SlopesRun
 
     facts = {
         "Source": "simulated, with known truth",
@@ -139,11 +140,10 @@ def write_page(folder: Path, methods: list[MeasuredSlopes], **shown: Any) -> Non
         "Positions": f"uniform within +-{demonstration.POSITION_RANGE_PX:g} px",
         "Camera": "EMCCD, gain 500, read noise 45 e- at the output (0.09 e- referred to photo-electrons)",
     }
-    html = slopes_report(
-        methods,
-        **shown,
+    report = slopes_report(
+        SlopesRun(methods, **shown),
         title="faintspot demonstration",
         facts=facts,
         configurations={"Configuration": (folder / "tv.toml").read_text(encoding="utf-8")},
     )
-    write_atomically(folder / "report.html", html)
+    write_atomically(folder / "report.html", report.html())

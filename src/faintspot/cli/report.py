@@ -58,20 +58,21 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
     for name in recording:
         split_location(name)  # refuses what is not there
     if len(paths) == 1 and holds_loop_results(paths[0]):
-        from faintspot.experiments.closed_loop.page import write_loop_report
+        from faintspot.experiments.closed_loop.page import loop_page
+        from faintspot.experiments.closed_loop.verdict import LoopResults
 
         page = Path(output) if output is not None else paths[0] / "report.html"
-        write_loop_report(paths[0], page)
+        loop_page(LoopResults.load(paths[0])).write(page)
         click.echo(f"{page}: open it in a browser")
         return
     if len(paths) == 1 and kind_of_store(paths[0]) == "study":
-        html = report_of_study(paths[0])
+        report = report_of_study(paths[0])
     elif len(paths) == 1 and holds_telemetry(paths[0]):
         from faintspot.engine.telemetry.page import report_of_telemetry
 
-        html = report_of_telemetry(paths[0])
+        report = report_of_telemetry(paths[0])
     else:
-        html = report_of_stored(paths, frames=[Path(path) for path in recording] or None)
+        report = report_of_stored(paths, frames=[Path(path) for path in recording] or None)
     target = output or str(derived(paths[0], ".html"))
-    write_atomically(target, html)
+    write_atomically(target, report.html())
     click.echo(f"{target}: open it in a browser")

@@ -123,10 +123,10 @@ def _repeat_the_paper(target: str, quick: bool, figures: tuple[str, ...], where:
 
 def _write_page(dataset: xarray.Dataset, target: str, night: Night | None = None) -> None:
     """Write the page of a study beside its store."""
-    from faintspot.experiments.report.page import write_study_report
+    from faintspot.experiments.report.page import study_report
 
     page = derived(target, ".html")
-    write_study_report(dataset, page, night)
+    study_report(dataset, night).write(page)
     click.echo(f"{page}: open it in a browser")
 
 

@@ -137,7 +137,7 @@ def command(
     numbers = derived(page, ".json")
     values = report.as_values() | {"over_time": [piece.as_values() for piece in pieces]}
     write_atomically(numbers, to_json(values, indent=1))
-    write_atomically(page, page_of_loop(report, pieces))
+    write_atomically(page, page_of_loop(report, pieces).html())
     if pieces:
         table = derived(page, "-over-time.csv")
         write_atomically(table, table_of_pieces(pieces))
@@ -175,7 +175,6 @@ def _report_night(
     settle: int | None,
 ) -> None:
     """Write the page and the numbers of methods that alternated."""
-    from faintspot.base.report.page import write_page
     from faintspot.experiments.night.measured_strehl import read_strehl
     from faintspot.experiments.night.recorded import recorded_night
     from faintspot.experiments.night.recorded_page import (
@@ -190,7 +189,7 @@ def _report_night(
     )
     numbers = derived(page, ".json")
     write_atomically(numbers, to_json(summary_of_recording(night), indent=1))
-    write_page(page_of_recording(night), page)
+    page_of_recording(night).write(page)
     click.echo(text_of_recording(night))
     click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
 

@@ -11,52 +11,32 @@ from tests.slopes.recorded.recorded_cases import Page as Reader
 from faintspot.base.errors import InputError
 from faintspot.base.report.drawing import new_figure
 from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.page import (
-    Badge,
-    Cell,
-    Page,
-    Section,
-    Table,
-    configuration_section,
-    html_of,
-    write_page,
-)
+from faintspot.base.report.page import Report, Section, Table, TableCell, configuration_section
 
 pytestmark = pytest.mark.usefixtures("coarse_pictures")
 
 
 def sections() -> list[Section]:
-    rows: list[list[str | Cell]] = [
-        ["<a>", Cell("text", Badge("holds", "good"), "small", [("item", "remark")], ("last", "more"))]
+    cell = TableCell("text", "holds", "small", [("item", "remark")], ("last", "more"))
+    figures = [
+        FigureWithData("data", "With data", "Caption 1.", new_figure(1, 1), ["x", "y"], [[1, 2.5]]),
+        FigureWithData("picture", "Without", "Caption 2.", new_figure(2, 1)),
     ]
+    folded = Table(["c"], [["d"]], csv=("rows.csv", "c\nd,é\n"), folded="1 row")
     return [
-        Section("first", "First <1>", ["A paragraph & more."], points=["a point"], missing="None of it."),
-        Section(
-            "tables",
-            "Tables",
-            tables=[
-                Table(["", "b"], rows, "A caption."),
-                Table(["c"], [["d"]], csv=("rows.csv", "c\nd,é\n"), folded="1 row"),
-            ],
-        ),
-        Section(
-            "last",
-            "Last",
-            figures=[
-                FigureWithData("data", "With data", "Caption 1.", new_figure(1, 1), ["x", "y"], [[1, 2.5]]),
-                FigureWithData("picture", "Without", "Caption 2.", new_figure(2, 1)),
-            ],
-        ),
+        Section("first", "First <1>", ["A paragraph & more.", ["a point"]], missing="None of it."),
+        Section("tables", "Tables", [Table(["", "b"], [["<a>", cell]], "A caption."), folded]),
+        Section("last", "Last", figures),
         configuration_section("noise_std = 1 # <b>"),
     ]
 
 
-def page(**changes: object) -> Page:
-    return Page("A <title>", {"Sources": "a & b"}, sections(), **changes)  # type: ignore[arg-type]
+def page(**changes: object) -> Report:
+    return Report("A <title>", {"Sources": "a & b"}, sections(), **changes)  # type: ignore[arg-type]
 
 
 def test_everything_is_on_the_page() -> None:
-    reader = Reader(html_of(page(warnings=["look <here>"], remark="Units.")))
+    reader = Reader(page(warnings=["look <here>"], remark="Units.").html())
     assert reader.ids == ["first", "tables", "last", "configuration"]
     for words in (
         "A <title>",
@@ -76,19 +56,20 @@ def test_everything_is_on_the_page() -> None:
         "Units.",
     ):
         assert words in reader.text
+    assert {"class": "badge good"} in [found for tag, found in reader.tags if tag == "span"]
     links = [value for value in reader.values("href") if value.startswith("#")]
     assert links == ["#first", "#tables", "#last", "#configuration", "#last"]
 
 
 def test_links_lead_nowhere_else() -> None:
-    reader = Reader(html_of(page()))
+    reader = Reader(page().html())
     for attribute in ("src", "href"):
         assert all(value.startswith(("data:", "#")) for value in reader.values(attribute))
     assert "script" not in [tag for tag, _ in reader.tags]
 
 
 def test_figures_with_data_can_be_saved_and_pictures_are_png() -> None:
-    reader = Reader(html_of(page()))
+    reader = Reader(page().html())
     saved = {
         found["download"]: base64.b64decode((found["href"] or "").partition(",")[2])
         for tag, found in reader.tags
@@ -107,11 +88,11 @@ def test_an_unknown_configuration_is_said() -> None:
 
 
 def test_files_lie_beside_the_page(tmp_path: Path) -> None:
-    written = write_page(page(), tmp_path / "a.html")
+    written = page().write(tmp_path / "a.html")
     assert written[0] == tmp_path / "a.html"
     assert {path.name for path in written[1:]} == {"data.png", "data.svg", "data.csv"}
     assert {path.parent for path in written[1:]} == {tmp_path / "a-figures"}
     assert all(path.exists() for path in written)
     (tmp_path / "b-figures").write_text("a file")
     with pytest.raises(InputError, match="choose another folder"):
-        write_page(page(), tmp_path / "b.html")
+        page().write(tmp_path / "b.html")

@@ -1,86 +1,121 @@
-"""The texts of pages: each is asked for by a module that reads its file, with the values that it names."""
+"""The texts of pages: each is asked for by a module that reads its file; sentences, cells and columns."""
 
 from __future__ import annotations
 
-import ast
 import re
-import string
 import tomllib
 from collections.abc import Iterator, Mapping
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-PACKAGES = ("faintspot.experiments", "faintspot.slopes.recorded")
-PARTS = r"(\.(title|caption|columns))?"  # `Texts.figure` and `Texts.table` take these of a table
+from faintspot.base.report.page import TableCell
+from faintspot.base.report.texts import Texts
+from faintspot.base.report.words import Words
+from faintspot.base.statistics import Estimate
+
+PACKAGES = (
+    "faintspot.experiments",
+    "faintspot.experiments.night",
+    "faintspot.loop.telemetry",
+    "faintspot.slopes.recorded",
+)
 
 
-def leaves(content: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+def tables(content: Mapping[str, Any], above: str = "") -> Iterator[str]:
     for name, value in content.items():
-        if isinstance(value, dict):
-            yield from leaves(value, f"{above}{name}.")
-        else:
-            yield f"{above}{name}", value
+        yield f"{above}{name}"
+        if isinstance(value, dict) and name not in ("columns", "about"):
+            yield from tables(value, f"{above}{name}.")
 
 
-def texts_of(package: str) -> dict[str, Any]:
-    text = files(package).joinpath("texts.toml").read_text(encoding="utf-8")
-    return dict(leaves(tomllib.loads(text)))
-
-
-def placeholders(text: object) -> set[str]:
-    """Return the names in braces; none of a list."""
-    parsed = string.Formatter().parse(text) if isinstance(text, str) else ()
-    return {re.split(r"[.\[]", name)[0] for _, name, _, _ in parsed if name}
-
-
-@cache
-def asked_for(package: str) -> tuple[tuple[str, frozenset[str] | None], ...]:
-    """Return the patterns of names that modules ask for, and the values given with each; None: not known."""
-    found: list[tuple[str, frozenset[str] | None]] = []
-    for path in Path(str(files("faintspot"))).rglob("*.py"):
-        code = path.read_text(encoding="utf-8")
-        if f'Texts("{package}")' not in code:
-            continue
-        for node in ast.walk(ast.parse(code)):
-            if isinstance(node, ast.Subscript) and re.match(r"_TEXT$|Texts\(", ast.unparse(node.value)):
-                found += [(name, None) for name in names(node.slice)]
-            elif isinstance(node, ast.Call) and re.match(r"_TEXT(\.\w+)?$", ast.unparse(node.func)):
-                given = frozenset(each.arg for each in node.keywords if each.arg is not None)
-                known = len(given) == len(node.keywords)
-                found += [(name, given if known else None) for name in names(node.args[0])]
-    return tuple(found)
-
-
-def names(node: ast.expr) -> list[str]:
-    """Return patterns of the names that an expression may be."""
-    if isinstance(node, ast.JoinedStr):
-        parts = (
-            re.escape(str(each.value)) if isinstance(each, ast.Constant) else "[^.]+" for each in node.values
-        )
-        return ["".join(parts)]
-    if isinstance(node, ast.IfExp):
-        return names(node.body) + names(node.orelse)
-    return [re.escape(node.value)] if isinstance(node, ast.Constant) and isinstance(node.value, str) else []
-
-
-@pytest.mark.parametrize(("package", "name"), [(each, name) for each in PACKAGES for name in texts_of(each)])
-def test_every_text_is_used_and_filled_in(package: str, name: str) -> None:
-    needed = placeholders(texts_of(package)[name])
-    users = [given for pattern, given in asked_for(package) if re.fullmatch(pattern + PARTS, name)]
-    whole_tables = [pattern for pattern, _ in asked_for(package) if re.match(rf"{pattern}\.", name)]
-    assert users or whole_tables
-    assert all(given is None or needed <= given for given in users)
+def made(texts: Mapping[str, Any]) -> Texts:
+    found = Texts("faintspot.experiments")
+    found._tables = dict(texts)
+    return found
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_every_name_that_modules_ask_for_is_there(package: str) -> None:
-    every = texts_of(package)
-    asked = {pattern for pattern, _ in asked_for(package)}
-    assert len(asked) > 20
-    assert not [
-        pattern for pattern in asked if not any(re.match(rf"{pattern}(\.|$)", name) for name in every)
+def test_texts_and_modules_name_each_other(package: str) -> None:
+    every = [path.read_text(encoding="utf-8") for path in Path(str(files("faintspot"))).rglob("*.py")]
+    code = "\n".join(text for text in every if f'Texts("{package}")' in text)
+    own = "\n".join(text for text in every if f'_TEXT = Texts("{package}")' in text)
+    text = files(package).joinpath("texts.toml").read_text(encoding="utf-8")
+    names = set(tables(tomllib.loads(text)))
+    asked = set(re.findall(r'_TEXT(?:\.\w+)?[(\[]\s*"([^"]+)"', own))
+    assert len(asked) > 5
+    assert asked - names == set()
+    unused = [
+        name
+        for name in names
+        if not any(
+            re.search(rf'"{re.escape(part)}["\[.]', code)
+            for part in (name[:end] for end in range(1, len(name) + 1))
+        )
     ]
+    assert unused == []
+
+
+def test_sentences_are_left_out_without_their_values() -> None:
+    text = made(
+        {"a": ["{shown}One.", "{number:.1f} px.", "{part.real} of it."], "b": {"x": "{c}", "y": "{d}"}}
+    )
+    assert text("a", shown=True, number=2.0, part=3) == "One. 2.0 px. 3 of it."
+    assert text("a", shown=False, number=float("nan"), part=None) == "– px."
+    assert text.lines("a", shown=None, number=1.0, part=None) == ["1.0 px."]
+    assert text.facts("b", {"c": "known"}, d=None) == {"x": "known"}
+    otherwise = made({"a": ["{rate:.0f} Hz.", "{rate:not}No rate."]})
+    assert [otherwise("a", rate=rate) for rate in (7.0, None)] == ["7 Hz.", "No rate."]
+
+
+def test_a_table_is_filled_in_from_records() -> None:
+    columns = {
+        "name": "{name}",
+        "of {other}": ["{value:interval}", "{few}too few"],
+        "badge": {"badge": "{outcome}", "small": "{number:.2f}"},
+        "unknown": "{nothing} px",
+        "± NaN": "{number:.1f} ± {number:.1f}",
+    }
+    about = {"of best": "About {other}.", "unknown": "Not said."}
+    text = made({"t": {"columns": columns, "only_known": True, "caption": "It.", "about": about}})
+    first = SimpleNamespace(
+        name="a", value=Estimate(1.0, 0.1), few=None, outcome="holds", number=1.0, nothing=None
+    )
+    second = {**vars(first), "value": None, "few": True, "outcome": "", "number": float("nan")}
+    table = text.table("t", [first, second], other="best")
+    assert table.header == ["name", "of best", "badge", "± NaN"]
+    cell = TableCell(badge="holds", small="1.00")
+    assert table.rows[0] == ["a", "+1.000 (+0.804 to +1.196)", cell, "1.0 ± 1.0"]
+    assert table.rows[1] == ["a", "too few", "–", "–"]
+    assert table.caption == "It. About best."
+
+
+def test_a_section_without_parts_has_a_reason() -> None:
+    text = made({"part.a": "", "s": {"title": "T{n}", "text": "Text.", "missing": "None of {n}."}})
+    empty = text.section("s", None, [], n=2)
+    assert (empty.name, empty.title, list(empty.parts), empty.missing) == ("s", "T2", [], "None of 2.")
+    whole = text.section("s", ["a point"], missing="Half.", n=2)
+    assert (whole.parts, whole.missing) == (["Text.", ["a point"]], "Half.")
+
+
+@pytest.mark.parametrize(
+    ("form", "value", "words"),
+    [
+        ("hours", 0.05, "3 min"),
+        ("hours", 2.25, "2.2 h"),
+        ("hours", 12345.0, "12\u202f345 h"),
+        ("hours", float("inf"), "–"),
+        ("percent", 0.0004, "< 0.1 %"),
+        ("percent 0", 0.25, "25 %"),
+        ("significant 4", 1.5, "1.500"),
+        ("change", -0.01234, "−0.0123"),
+        ("sigma", Estimate(2.0, 1.0), "+2.0 σ"),
+    ],
+)
+def test_formats_by_name(form: str, value: object, words: str) -> None:
+    assert Words().format(f"{{value:{form}}}", value=value).replace(" ", "\u202f") == words.replace(
+        " ", "\u202f"
+    )

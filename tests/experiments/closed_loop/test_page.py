@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from tests.experiments.result_cases import made_up_budget, made_up_magnitude
 
-from faintspot.base.report.page import html_of
-from faintspot.experiments.closed_loop.page import loop_page, loop_sections, loop_warnings, write_loop_report
+from faintspot.experiments.closed_loop.page import loop_page, loop_warnings
 from faintspot.experiments.closed_loop.verdict import NOWHERE, LoopResults
 from faintspot.loop.simulation.files import MAGNITUDE_FILE
 
@@ -19,7 +18,7 @@ pytest.importorskip("hcipy")
 def test_the_page_holds_everything(tmp_path: Path) -> None:
     made_up_magnitude().save(tmp_path / MAGNITUDE_FILE)
     made_up_budget().save(tmp_path / "budget.npz")
-    written = write_loop_report(tmp_path, tmp_path / "report.html")
+    written = loop_page(LoopResults.load(tmp_path)).write(tmp_path / "report.html")
     assert written[0] == tmp_path / "report.html"
     assert {path.name for path in written[1:]} == {
         f"{name}.{ending}" for name in ("magnitude", "gain", "budget") for ending in ("png", "svg", "csv")
@@ -35,13 +34,13 @@ def test_the_page_holds_everything(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("undrawn_pictures")
 def test_the_page_says_when_tv_gains_nothing() -> None:
-    page = html_of(loop_page(LoopResults(made_up_magnitude(-0.3))))
+    page = loop_page(LoopResults(made_up_magnitude(-0.3))).html()
     assert NOWHERE in page
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
 def test_what_was_not_run_is_said() -> None:
-    page = html_of(loop_page(LoopResults(budget=made_up_budget())))
+    page = loop_page(LoopResults(budget=made_up_budget())).html()
     assert "Not run: “faintspot loop magnitude” does that." in page
     assert "Nothing to compare yet." in page
 
@@ -54,10 +53,10 @@ def test_unfinished_results_make_a_page() -> None:
     strehl[3] = np.nan
     results = LoopResults(magnitude=dataclasses.replace(whole, strehl=strehl))
     assert "runs are still missing" in loop_warnings(results)[0]
-    page = html_of(loop_page(results))
+    page = loop_page(results).html()
     assert ">nan" not in page
     nothing = LoopResults(magnitude=dataclasses.replace(whole, strehl=np.full_like(strehl, np.nan)))
-    assert ">nan" not in html_of(loop_page(nothing))
+    assert ">nan" not in loop_page(nothing).html()
 
 
 def test_few_realisations_are_warned_of() -> None:
@@ -66,5 +65,5 @@ def test_few_realisations_are_warned_of() -> None:
 
 
 def test_sections_have_different_names() -> None:
-    names = [section.name for section in loop_sections(LoopResults(made_up_magnitude()))]
+    names = [section.name for section in loop_page(LoopResults(made_up_magnitude())).sections]
     assert len(set(names)) == len(names)

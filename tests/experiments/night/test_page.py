@@ -11,7 +11,7 @@ from tests.experiments.night_cases import night_with, without_r0
 
 from faintspot.experiments.night.analysis import differences
 from faintspot.experiments.night.blocks import load_night
-from faintspot.experiments.night.page import in_hours, night_summary, night_summary_text, write_night
+from faintspot.experiments.night.page import night_summary, night_summary_text, write_night
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("zarr")
@@ -56,11 +56,3 @@ def test_the_text_has_a_line_for_each_verdict_and_difference() -> None:
     assert len(lines) == 4 + 2
     assert all(" σ" in line for line in lines)
     assert all("alternating" in line for line in lines[4:])
-
-
-@pytest.mark.parametrize(
-    ("hours", "words"),
-    [(0.05, "3 min"), (0.5, "30 min"), (2.25, "2.2 h"), (48.0, "48 h"), (12345.0, "12 345 h"), (np.inf, "–")],
-)
-def test_durations(hours: float, words: str) -> None:
-    assert in_hours(hours).replace("\u202f", " ") == words

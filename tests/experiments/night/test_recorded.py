@@ -153,7 +153,7 @@ def test_page(tmp_path: Path) -> None:
     page = page_of_recording(recorded_night(stored(tmp_path, alternating(3000))))
     assert [section.name for section in page.sections][-2:] == ["phase", "blocks"]
     blocks = page.sections[-1]
-    assert "60 turns" in blocks.text[0]
+    assert "60 turns" in str(blocks.parts)
     assert [row[0] for row in blocks.tables[0].rows] == list(METHODS)
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from faintspot.loop.control.identification.measured import Measured
-from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER, Choice, _saved, _signed_root, advice
+from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER, ControlChoice, _saved, _signed_root, advice
 
 
-def choice(name: str, residual: float, less: float, error: float, gain: float = math.nan) -> Choice:
+def choice(name: str, residual: float, less: float, error: float, gain: float = math.nan) -> ControlChoice:
     """Return a choice that leaves a residual, and less than as it ran by `less`."""
     saved = Measured("less than as it ran", "nm", less, error)
-    return Choice(name, Measured("residual", "nm", residual, 10.0), saved, saved, saved, gain)
+    return ControlChoice(name, Measured("residual", "nm", residual, 10.0), saved, saved, saved, gain)
 
 
 RAN = choice(AS_RUN, 100.0, 0.0, 0.0)

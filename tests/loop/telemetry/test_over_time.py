@@ -49,7 +49,7 @@ def test_pieces_of_an_open_loop() -> None:
     assert float(rows[1]["r0 at 500 nm (m)"]) == pytest.approx(
         pieces[1].values["r0 at 500 nm"].value, rel=1e-4
     )
-    page = page_of_loop(report_of_loop(loop, compare=False), pieces)
+    page = page_of_loop(report_of_loop(loop, compare=False), pieces).html()
     assert "Against time" in page
 
 

@@ -121,7 +121,7 @@ def test_dead_and_rarely_measured_sub_apertures() -> None:
     assert [k for k, noise in enumerate(plain["noise"]["of_slopes"]) if noise is None] == [3, 7, 28]
     assert "five consecutive frames" in plain["noise"]["of_slopes_unknown"]
     assert all(math.isfinite(each["value"]) for each in numbers(plain["choices"]))
-    assert "5 % intervals" in page_of_loop(found)
+    assert "5 % intervals" in page_of_loop(found).html()
 
 
 def test_what_is_unknown_has_a_reason() -> None:
@@ -221,4 +221,4 @@ def test_a_single_sub_aperture() -> None:
     assert value(found, "vibrations", "frequency of tip").value == pytest.approx(20.0, abs=0.3)
     left = {each.name: each.residual for each in found.choices}
     assert left[FILTER].value + left[FILTER].error < left[BEST].value
-    assert "with fitting and aliasing" not in page_of_loop(found)
+    assert "with fitting and aliasing" not in page_of_loop(found).html()

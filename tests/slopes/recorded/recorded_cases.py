@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.report.page import Report
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Stages
@@ -42,13 +43,14 @@ def two_methods(layout: Layout, frames: NDArray[Any]) -> tuple[list[MeasuredSlop
 class Page(HTMLParser):
     """What is in a page; fails where a tag is not closed or closed twice."""
 
-    html: str
+    report: Report | str
     tags: list[tuple[str, dict[str, str | None]]] = field(default_factory=list)
     words: list[str] = field(default_factory=list)
     opened: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         super().__init__(convert_charrefs=True)
+        self.html = self.report if isinstance(self.report, str) else self.report.html()
         self.feed(self.html)
         self.close()
         assert self.opened == []

@@ -82,11 +82,11 @@ def svg(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
-def plain_ticks(axis: XAxis | YAxis, values: Iterable[float], form: str = "g") -> None:
-    """Set ticks at these values only, formatted as plain numbers."""
+def plain_ticks(axis: XAxis | YAxis, values: Iterable[float]) -> None:
+    """Set ticks at these values only, with three digits and no exponent."""
     axis.set_major_locator(FixedLocator([float(value) for value in values]))
     axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:{form}}"))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{float(f'{value:.3g}'):g}"))
 
 
 _LONG_LABEL = 6  # letters, from which every other one is left out

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+_CSS_PIXELS_PER_INCH = 100
+_MEDIA_TYPES = {"png": "image/png", "svg": "image/svg+xml", "csv": "text/csv;charset=utf-8"}
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,22 @@ class FigureWithData:
         """Return the numbers as CSV text."""
         return csv_text(self.header, self.rows)
 
+    @property
+    def width(self) -> int:
+        """Width in CSS pixels."""
+        return round(float(self.figure.get_size_inches()[0]) * _CSS_PIXELS_PER_INCH)
+
+    @cached_property
+    def files(self) -> dict[str, bytes]:
+        """Contents of its files by ending, png alone or png, svg and csv."""
+        from faintspot.base.report import drawing
+
+        contents = {"png": drawing.png(self.figure)}
+        if self.header:
+            self.figure.set_layout_engine("none")  # keep the layout, which is slow to compute
+            contents |= {"svg": drawing.svg(self.figure), "csv": self.csv().encode()}
+        return contents
+
 
 def csv_text(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     """Return a table as CSV text."""
@@ -45,3 +66,9 @@ def csv_text(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     writer.writerow(header)
     writer.writerows(rows)
     return stream.getvalue()
+
+
+def data_uri(ending: str, content: bytes | str) -> str:
+    """Return a file (png, svg or csv) as a data URI."""
+    octets = content.encode() if isinstance(content, str) else content
+    return f"data:{_MEDIA_TYPES[ending]};base64,{base64.b64encode(octets).decode('ascii')}"

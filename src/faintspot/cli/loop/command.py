@@ -251,7 +251,7 @@ def _measure(
     scheduler: str | None,
 ) -> None:
     """Run an experiment with a progress bar, print the summary of its result and write its page."""
-    from faintspot.experiments.closed_loop.page import write_loop_report
+    from faintspot.experiments.closed_loop.page import loop_page
     from faintspot.experiments.closed_loop.verdict import LoopResults, loop_summary
     from faintspot.loop.simulation.configuration.configuration import load_loop
 
@@ -261,7 +261,7 @@ def _measure(
         result = run(loop, folder, *what, quick=quick, pool=pool, overwrite=overwrite)
     click.echo(loop_summary(LoopResults(**{name: result})))
     page = Path(folder) / "report.html"
-    write_loop_report(folder, page)
+    loop_page(LoopResults.load(folder)).write(page)
     click.echo(f"{shlex.quote(str(page))}: open it in a browser")
 
 

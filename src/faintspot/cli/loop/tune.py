@@ -143,7 +143,7 @@ def show(answer: LoopAnswer) -> None:
 
 def strehl_table(answer: LoopAnswer) -> Table:
     """Return the Strehl ratios of all candidates at all measured magnitudes as a table."""
-    from faintspot.experiments.words import plain_number
+    from faintspot.base.report.words import plain_number
 
     fluxes = list(reversed(range(len(answer.photons))))
     stars = (f"{answer.magnitudes[flux]:.2f}\n{plain_number(answer.photons[flux])} e-" for flux in fluxes)

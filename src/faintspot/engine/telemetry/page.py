@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.report.page import POSITIONS, Page, Section, Table, configuration_section, html_of
+from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, new_figure, styled
+from faintspot.base.report.figure_data import FigureWithData
+from faintspot.base.report.page import POSITIONS, Report, Section, configuration_section
+from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.base.report.texts import Texts
-from faintspot.base.statistics import Estimate
 from faintspot.base.validity import leave_out
-from faintspot.engine.telemetry.figures import latency_figure, methods_figure
 from faintspot.engine.telemetry.numbers import (
     PERCENTILES,
+    MethodDifference,
     change_rows,
     gaps,
     method_names,
@@ -24,50 +30,51 @@ from faintspot.engine.telemetry.numbers import (
 )
 from faintspot.io.telemetry.recording import Telemetry, read_telemetry
 from faintspot.slopes.pipeline.slopes import Slopes
-from faintspot.slopes.recorded.report.advice import warnings_in_words
-from faintspot.slopes.recorded.report.sections import all_sections, make_run
+from faintspot.slopes.recorded.report.page import slopes_sections, warnings_in_words
+from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.report.sodium_section import sodium_sections_of_changes
-from faintspot.slopes.recorded.report.wavefront_section import wavefront_sections
 from faintspot.slopes.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.slopes.sensor.layout import Layout
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 _TEXT = Texts("faintspot.slopes.recorded")
 _MOST_GAPS, _MOST_CHANGES = 20, 200
+_BINS = 80
+# Points of the course in time, frames in each, and so many points that they are drawn as dots.
+_MOST_TIMES, _FEWEST_TOGETHER, _FEW_TIMES = 400, 50, 20
 
 
-def report_of_telemetry(path: str | Path) -> str:
-    """Return the report page (HTML) of a store that `faintspot realtime record` has written.
+def report_of_telemetry(path: str | Path) -> Report:
+    """Return the report of a store that `faintspot realtime record` has written.
 
     Raises
     ------
     InputError
         When it is no such store, damaged, or without frames.
     MissingExtraError
-        When matplotlib, jinja2 or zarr is not installed.
+        When matplotlib or zarr is not installed.
     """
     telemetry = read_telemetry(path, images=False)
     if len(telemetry.frame) == 0:
         raise InputError(f"{path}: expected telemetry, no frame is recorded yet")
     layout = Layout(**telemetry.attributes["layout"])
-    run = make_run(_measured(telemetry), layout, {}, None, 0, "", ())
-    sections = [_timing(telemetry), _lost(telemetry)]
-    if len(method_names(telemetry)) > 1:
-        sections.append(_methods(telemetry))
-    sections += [_changes(telemetry), *sodium_sections_of_changes(telemetry.changes)]
-    sections += [*all_sections(run), *wavefront_sections(_slopes(telemetry), layout)]
-    settings = str(telemetry.attributes.get("settings", ""))
-    return html_of(
-        Page(
-            title=f"Telemetry of {Path(path).name}",
-            facts=_facts(telemetry, Path(path)),
-            sections=[*sections, configuration_section(settings)],
-            warnings=[
-                *_warnings(telemetry),
-                *run.comparison.warnings(),
-                *warnings_in_words(run.methods, run.summaries),
-            ],
-            remark=POSITIONS,
-        )
+    run = SlopesRun(_measured(telemetry), layout, why_no_stages="", slopes=_slopes(telemetry))
+    return Report(
+        title=f"Telemetry of {Path(path).name}",
+        facts=_facts(telemetry, Path(path)),
+        sections=[
+            _timing(telemetry),
+            _lost(telemetry),
+            *([_methods(telemetry)] if len(run.methods) > 1 else []),
+            _changes(telemetry),
+            *sodium_sections_of_changes(telemetry.changes),
+            *slopes_sections(run),
+            configuration_section(str(telemetry.attributes.get("settings", ""))),
+        ],
+        warnings=[*_warnings(telemetry), *run.comparison.warnings(), *warnings_in_words(run)],
+        remark=POSITIONS,
     )
 
 
@@ -86,113 +93,87 @@ def _measured(telemetry: Telemetry) -> list[MeasuredSlopes]:
 
 
 def _facts(telemetry: Telemetry, path: Path) -> dict[str, str]:
-    seconds = float(telemetry.last_row_time_ns[-1] - telemetry.last_row_time_ns[0]) / 1e9
-    begun = np.datetime64(round(telemetry.unix_time_s[0] * 1e3), "ms")
-    ended = telemetry.attributes.get("ended_because", "not known; it may still go on")
-    facts = {
-        "Store": str(path),
-        "Engine": str(telemetry.attributes.get("name", "not stored")),
-        "Begun": f"{begun} UTC, by the wall clock",
-        "Frames": f"{len(telemetry.frame)} in {seconds:.1f} s",
-        "Sub-apertures": str(telemetry.x.shape[1]),
-        "Ended": str(ended),
-    }
     names = method_names(telemetry)
-    return facts | ({"In turn": ", ".join(names)} if len(names) > 1 else {})
+    return _TEXT.facts(
+        "telemetry.facts",
+        path=path,
+        name=telemetry.attributes.get("name", "not stored"),
+        begun=np.datetime64(round(telemetry.unix_time_s[0] * 1e3), "ms"),
+        frames=len(telemetry.frame),
+        seconds=float(telemetry.last_row_time_ns[-1] - telemetry.last_row_time_ns[0]) / 1e9,
+        subapertures=telemetry.x.shape[1],
+        ended=telemetry.attributes.get("ended_because", "not known; it may still go on"),
+        in_turn=", ".join(names) if len(names) > 1 else None,
+    )
 
 
 def _warnings(telemetry: Telemetry) -> list[str]:
-    lines = []
     lost = sum(gap.lost for gap in gaps(telemetry))
-    if lost:
-        share = 100 * lost / (lost + len(telemetry.frame))
-        lines.append(_TEXT("telemetry.lost_frames", lost=lost, share=share))
-    if telemetry.attributes.get("dropped_changes"):
-        lines.append(_TEXT["telemetry.lost_changes"])
     _, left_out = leave_out(telemetry.flags)
-    return [*lines, f"{left_out.capitalize()}."] if left_out else lines
+    return _TEXT.lines(
+        "telemetry.warnings",
+        lost=lost or None,
+        share=100 * lost / (lost + len(telemetry.frame)),
+        lost_changes=bool(telemetry.attributes.get("dropped_changes")),
+        left_out=left_out.capitalize() or None,
+    )
 
 
 def _timing(telemetry: Telemetry) -> Section:
     measured = timing(telemetry)
-    latency = 1e6 * telemetry.latency_s
     rows = []
     for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
-        us = latency[telemetry.method == method]
+        us = 1e6 * telemetry.latency_s[telemetry.method == method]
         rows.append([name, str(len(us)), *(f"{value:.1f}" for value in np.percentile(us, PERCENTILES))])
-    header = ["", "frames", "median (µs)", "99 % (µs)", "99.9 % (µs)", "longest (µs)"]
-    table = Table(header, rows, caption="Latency: from a frame's last row to its slopes.")
-    rate = "not known: no two frames have consecutive numbers"
-    if np.isfinite(measured.rate_hz):
-        rate = _TEXT("telemetry.rate", rate=measured.rate_hz, longest=1e3 * measured.longest_interval_s)
-    return Section("timing", "Rate and latency", [f"Rate: {rate}."], [table], [latency_figure(telemetry)])
+    return _TEXT.section(
+        "timing",
+        _TEXT.table("timing", rows),
+        latency_figure(telemetry),
+        rate=measured.rate_hz if np.isfinite(measured.rate_hz) else None,
+        longest_ms=1e3 * measured.longest_interval_s,
+    )
 
 
 def _lost(telemetry: Telemetry) -> Section:
-    gap_list = gaps(telemetry)
-    lost = sum(gap.lost for gap in gap_list)
-    dropped = {
-        name: telemetry.attributes.get(f"dropped_{name}", 0) for name in ("records", "images", "changes")
-    }
-    rows = [
-        ["frame numbers that are missing", str(lost)],
-        ["of them overwritten before the recorder read them", str(dropped["records"])],
-        ["gaps", str(len(gap_list))],
-        ["longest gap, frames", str(max((gap.lost for gap in gap_list), default=0))],
-        ["times that frame numbers began anew", str(restarts(telemetry))],
-        ["images lost to the record", str(dropped["images"])],
-        ["changes of settings lost to the record", str(dropped["changes"])],
-    ]
-    text = [_TEXT["telemetry.lost"]]
-    tables = [Table(["", "number"], rows)]
-    if gap_list:
-        listed = [[str(gap.after_frame), str(gap.lost)] for gap in gap_list[:_MOST_GAPS]]
-        caption = f"The first {len(listed)} of {len(gap_list)} gaps."
-        tables.append(Table(["after frame", "frames lost"], listed, caption, folded="Where"))
-    return Section("lost", "Lost frames", text, tables)
+    every = gaps(telemetry)
+    numbers = _TEXT.facts(
+        "lost.numbers",
+        lost=sum(gap.lost for gap in every),
+        gaps=len(every),
+        longest=max((gap.lost for gap in every), default=0),
+        restarts=restarts(telemetry),
+        **{name: telemetry.attributes.get(f"dropped_{name}", 0) for name in ("records", "images", "changes")},
+    )
+    shown = every[:_MOST_GAPS]
+    return _TEXT.section(
+        "lost",
+        _TEXT.table("lost.table", list(numbers.items())),
+        _TEXT.table("lost.gaps", shown, shown=len(shown), all=len(every)),
+    )
 
 
 def _methods(telemetry: Telemetry) -> Section:
-    rows = []
     differences = {name: methods_in_turn(telemetry, values) for name, values in quantities(telemetry).items()}
+    records = []
     for name, compared in differences.items():
-        for method in compared:
-            difference = "–" if method.difference is None else _in_words(method.difference)
-            rows.append([name, method.method, _with_error(method.mean), difference])
+        for each in compared:
+            too_few = each.difference is not None and not math.isfinite(each.difference.low)
+            difference = None if too_few else each.difference
+            records.append({"quantity": name, **vars(each), "difference": difference, "too_few": too_few})
     first = next(iter(differences.values()))[0].method
-    header = ["", "method", "mean ± standard error", f"less {first!r} (95 %)"]
-    text = [_TEXT["methods.text"]]
-    return Section(
-        "methods", "Methods in turn", text, [Table(header, rows)], [methods_figure(telemetry, differences)]
+    return _TEXT.section(
+        "methods", _TEXT.table("methods", records, first=first), methods_figure(telemetry, differences)
     )
-
-
-def _in_words(estimate: Estimate) -> str:
-    if not np.isfinite(estimate.low):
-        return "too few turns"
-    value, low, high = (
-        f"{number:+.3g}".replace("-", "−") for number in (estimate.value, estimate.low, estimate.high)
-    )
-    return f"{value} ({low} to {high})"
-
-
-def _with_error(estimate: Estimate) -> str:
-    error = f"{estimate.standard_error:.2g}" if np.isfinite(estimate.standard_error) else "?"
-    return f"{estimate.value:.4g} ± {error}"
 
 
 def _changes(telemetry: Telemetry) -> Section:
-    title = "Changes of settings"
-    change_list = change_rows(telemetry)
-    if not change_list:
-        return Section("changes", title, ["None: the settings are those at the end of this page."])
-    rows = [
+    every = change_rows(telemetry)
+    shown = [
         [str(frame), f"{seconds:.3f}" if np.isfinite(seconds) else "before", where, change]
-        for frame, seconds, change, where in change_list[:_MOST_CHANGES]
+        for frame, seconds, change, where in every[:_MOST_CHANGES]
     ]
-    caption = f"The first {len(rows)} of {len(change_list)} changes." if len(rows) < len(change_list) else ""
-    table = Table(["from frame", "at (s)", "sub-apertures", "change"], rows, caption, words=True)
-    return Section("changes", title, tables=[table])
+    some = len(shown) if len(shown) < len(every) else None
+    return _TEXT.section("changes", _TEXT.table("changes", shown, some=some, all=len(every)))
 
 
 def _slopes(telemetry: Telemetry) -> dict[str, Slopes]:
@@ -204,3 +185,70 @@ def _slopes(telemetry: Telemetry) -> dict[str, Slopes]:
         arrays = {array: getattr(telemetry, array)[telemetry.method == method] for array in names}
         slopes[name] = Slopes(**arrays, bad_pixels=np.zeros(arrays["x"].shape, np.int32))
     return slopes
+
+
+@styled
+def latency_figure(telemetry: Telemetry) -> FigureWithData:
+    """Draw how often each latency occurred, by method, and its course in time."""
+    figure = new_figure(WIDTH, 4.6)
+    left, right = figure.subplots(1, 2)
+    latency = 1e6 * telemetry.latency_s
+    low, high = float(latency.min()), float(latency.max())
+    edges = np.geomspace(max(low, 0.1), max(high, low + 1, 1.0) * 1.001, _BINS + 1)
+    rows = []
+    for index, (method, name) in enumerate(
+        zip(np.unique(telemetry.method), method_names(telemetry), strict=True)
+    ):
+        counts = np.histogram(latency[telemetry.method == method], edges)[0]
+        left.stairs(counts, edges, color=METHOD_COLOURS[index % len(METHOD_COLOURS)], label=name, lw=1.5)
+        rows += [
+            (name, f"{a:.4g}", f"{b:.4g}", int(n)) for a, b, n in zip(edges, edges[1:], counts, strict=False)
+        ]
+    left.set(xscale="log", yscale="log", xlabel="latency (µs)", ylabel="frames", ylim=(0.7, None))
+    if len(np.unique(telemetry.method)) > 1:
+        left.legend(frameon=False)
+    course = _course(telemetry, latency, right)
+    return _TEXT.figure("latency", figure, rows, course=course)
+
+
+def _course(telemetry: Telemetry, latency: NDArray[np.float64], axes: Axes) -> str:
+    """Draw the course of latencies in time; return what was drawn in words."""
+    stretches = min(_MOST_TIMES, max(min(_FEW_TIMES, len(latency)), len(latency) // _FEWEST_TOGETHER))
+    parts = np.array_split(np.arange(len(latency)), stretches)
+    time = (telemetry.last_row_time_ns - telemetry.last_row_time_ns[0]) / 1e9
+    middle = [float(time[part].mean()) for part in parts]
+    style = {"marker": "o" if stretches <= _FEW_TIMES else "", "ms": 3}
+    longest, medians = ([reduce(latency[part]) for part in parts] for reduce in (np.max, np.median))
+    lines = [
+        Line("longest", middle, longest, style={**style, "color": GREY, "lw": 1}),
+        Line("median", middle, medians, style={**style, "color": "black", "lw": 1.3}),
+    ]
+    Panel(lines, "time since the first frame (s)", "latency (µs)", legend=True).draw(axes)
+    axes.set_yscale("log")
+    together = len(parts[0])
+    return f"median and longest of stretches of {together} frames" if together > 1 else "every frame"
+
+
+def methods_figure(telemetry: Telemetry, values: Mapping[str, Sequence[MethodDifference]]) -> FigureWithData:
+    """Draw by how much every method differs from the first, a panel for each quantity."""
+    panels, rows = [], []
+    names = [method.method for method in next(iter(values.values()))]
+    for name, compared in values.items():
+        lines = []
+        for row, method in enumerate(compared[1:]):
+            shift = method.difference
+            assert shift is not None
+            spread = [[shift.value - shift.low], [shift.high - shift.value]]
+            style = {"fmt": "o", "color": METHOD_COLOURS[(row + 1) % len(METHOD_COLOURS)], "capsize": 3}
+            lines.append(Line("", [shift.value], [row], style=style, x_error=spread))
+            rows.append((name, method.method, shift.value, shift.low, shift.high, shift.count))
+        panels.append(Panel(lines, "", title=name, at={0.0: {}}, y_range=(len(names) - 1.4, -0.6)))
+    figure = plot([panels], 1.6 + 0.45 * len(names), legend="")
+    for panel in figure.axes:
+        panel.set_yticks(
+            range(len(names) - 1), names[1:] if panel is figure.axes[0] else [""] * (len(names) - 1)
+        )
+        panel.title.set_fontsize(10)
+        panel.tick_params(axis="x", labelsize=9)
+        panel.locator_params(axis="x", nbins=4)
+    return _TEXT.figure("methods.figure", figure, rows, first=names[0])

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from faintspot.base.report.drawing import GREY, WIDTH, axis_above, new_figure, plain_ticks, styled
+from faintspot.base.report.drawing import GREY, WIDTH, new_figure, styled
 from faintspot.base.report.figure_data import FigureWithData
+from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import paired_mean
 from faintspot.experiments.closed_loop.methods import CONTROL_SIGN
@@ -17,6 +19,8 @@ from faintspot.slopes.estimators.registry import estimators
 
 _TEXT = Texts("faintspot.experiments")
 _STREHL = "H-band Strehl ratio"
+_MAGNITUDE = "guide-star magnitude"
+_PHOTONS = "photo-electrons of a sub-aperture in a frame"
 _DODGE = 0.008  # of the axis, between methods at the same magnitude
 _LEARNING_LINE = (0, (6, 1.5, 1, 1.5))
 
@@ -26,55 +30,45 @@ def strehl_axis(wavelength_m: float) -> str:
     return _STREHL if 1.5e-6 <= wavelength_m <= 1.8e-6 else f"Strehl ratio at {wavelength_m * 1e6:.3g} µm"
 
 
-@styled
 def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> FigureWithData:
     """Draw Strehl against magnitude for every method, and what each gains over the reference."""
-    figure = new_figure(WIDTH, 6.4)
-    left, right = figure.subplots(1, 2)
     shift = _DODGE * float(np.ptp(result.magnitudes) or 1.0)
-    rows = []
+    strehls, differences, rows = [], [], []
     for method, name in enumerate(result.labels):
-        runs = [paired_mean(values) for values in result.strehl[method]]
-        value = np.array([run.value for run in runs])
-        error = np.nan_to_num([run.standard_error for run in runs])
-        shifted = result.magnitudes + (method - len(result.labels) / 2) * shift
-        style = method_style(result.names[method])
-        left.errorbar(result.magnitudes, value, error, label=name, capsize=2, **style)
-        differences = differences_by_flux(result, method, reference)
-        low, middle, high = np.array([[d.low, d.value, d.high] for d in differences]).T
+        value, error = means_of(result.strehl[method])
+        style = {**method_style(result.names[method]), "capsize": 2}
+        strehls.append(Line(name, result.magnitudes, value, error, style))
+        found = differences_by_flux(result, method, reference)
+        low, middle, high = np.array([[d.low, d.value, d.high] for d in found]).T
         if method != reference:
-            right.errorbar(shifted, middle, np.nan_to_num([middle - low, high - middle]), capsize=2, **style)
+            shifted = result.magnitudes + (method - len(result.labels) / 2) * shift
+            differences.append(Line("", shifted, middle, (middle - low, high - middle), style))
         count = np.full(len(value), result.strehl.shape[-1])
         columns = result.magnitudes, result.photons, value, error, count, low, middle, high
         rows += [[name, *row] for row in zip(*columns, strict=True)]
-    right.axhline(0, color=GREY, lw=1)
-    left.set(xlabel="guide-star magnitude", ylabel=label)
-    left.set_ylim(bottom=0)
+    above = result.magnitudes, result.photons.tolist(), _PHOTONS
     than = f"Strehl ratio minus that of {result.labels[reference]}, paired"
-    right.set(xlabel="guide-star magnitude", ylabel=than)
-    for panel in (left, right):
-        label_above = "photo-electrons of a sub-aperture in a frame"
-        axis_above(panel, result.magnitudes, result.photons, label_above).tick_params(labelsize=10)
-    figure.legend(loc="outside lower center", ncols=min(4, len(result.labels)), frameon=False)
-    return _TEXT.figure("magnitude", figure, rows)
+    left = Panel(strehls, _MAGNITUDE, label, y_range=(0, None), above=above)
+    right = Panel(differences, _MAGNITUDE, than, levels={0.0: {}}, above=above)
+    return _TEXT.figure("magnitude", plot([[left, right]], 6.4), rows)
 
 
-@styled
 def gain_figure(result: MagnitudeResult) -> FigureWithData:
     """Draw the centroid gain of every method against the star's flux."""
-    figure = new_figure(WIDTH * 0.7, 5.2)
-    panel = figure.subplots()
-    rows = []
+    lines, rows = [], []
     for method, name in enumerate(result.labels):
-        value = np.array([paired_mean(values).value for values in result.centroid_gain[method]])
-        panel.plot(result.photons, value, label=name, **method_style(result.names[method]))
+        value, _ = means_of(result.centroid_gain[method])
+        lines.append(Line(name, result.photons, value, style=method_style(result.names[method])))
         rows += [[name, p, v] for p, v in zip(result.photons, value, strict=True)]
-    panel.axhline(1, color=GREY, lw=1)
-    panel.set_xscale("log")
-    plain_ticks(panel.xaxis, result.photons, ".3g")
-    panel.set(xlabel="photo-electrons of a sub-aperture in a frame", ylabel="centroid gain")
-    panel.set_ylim(bottom=0)
-    figure.legend(loc="outside right upper", frameon=False)
+    panel = Panel(
+        lines,
+        _PHOTONS,
+        "centroid gain",
+        x_ticks=result.photons.tolist(),
+        y_range=(0, None),
+        levels={1.0: {}},
+    )
+    figure = plot([[panel]], 5.2, width=WIDTH * 0.7, columns=1, legend="outside right upper")
     return _TEXT.figure("gain", figure, rows)
 
 
@@ -86,9 +80,7 @@ def budget_figure(result: BudgetResult, label: str) -> FigureWithData:
     panel = figure.subplots()
     rows = []
     for method, name in enumerate(result.labels):
-        runs = [paired_mean(values) for values in result.strehl[method]]
-        value = np.array([run.value for run in runs])
-        error = np.nan_to_num([run.standard_error for run in runs])
+        value, error = means_of(result.strehl[method])
         y = np.arange(terms) + (method - (methods - 1) / 2) * 0.8 / methods
         colour = method_style(result.names[method])["color"]
         panel.barh(y, value, 0.72 / methods, xerr=error, color=colour, label=name, capsize=2, ecolor=GREY)
@@ -99,6 +91,12 @@ def budget_figure(result: BudgetResult, label: str) -> FigureWithData:
     panel.set(xlabel=label)
     figure.legend(loc="outside lower center", ncols=min(3, methods), frameon=False)
     return _TEXT.figure("budget", figure, rows)
+
+
+def means_of(runs: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the mean of each row of runs, and its standard error, 0 where that is not known."""
+    means = [paired_mean(values) for values in runs]
+    return np.array([mean.value for mean in means]), np.nan_to_num([mean.standard_error for mean in means])
 
 
 def _switched(term: str) -> str:

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
+from faintspot.base.report.words import with_error
 from faintspot.base.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws
-from faintspot.experiments.words import with_error
 
 Floats = NDArray[np.float64]
 

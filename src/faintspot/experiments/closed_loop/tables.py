@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from faintspot.base.json_text import parse_json
 from faintspot.base.report.page import Table
 from faintspot.base.report.texts import Texts
+from faintspot.base.report.words import with_error, with_interval
 from faintspot.base.statistics import paired_mean
 from faintspot.experiments.closed_loop.budget import TERMS
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN
@@ -20,32 +21,25 @@ from faintspot.experiments.closed_loop.results import (
     differences_by_flux,
     gains_in_magnitude,
 )
-from faintspot.experiments.words import NOTHING, with_error, with_interval
 
 _TEXT = Texts("faintspot.experiments")
 
 
 def gain_table(result: MagnitudeResult, methods: Sequence[int], reference: int) -> Table:
     """Return the gains in limiting magnitude of methods over a reference at equal Strehl."""
-    gains = {method: gains_in_magnitude(result, method, reference) for method in methods}
+    gains = {result.labels[method]: gains_in_magnitude(result, method, reference) for method in methods}
     rows = [
-        [result.labels[method], *(with_interval(gain, 2) for gain in at_levels.values())]
-        for method, at_levels in gains.items()
+        [name, *(with_interval(gain, 2) for gain in of_method.values())] for name, of_method in gains.items()
     ]
-    levels = next(iter(gains.values()), {})
-    columns = [f"at Strehl {level:g}" for level in levels]
+    columns = [f"at Strehl {level:g}" for level in next(iter(gains.values()), {})]
     return _TEXT.table("tables.gain", rows, columns, reference=result.labels[reference])
 
 
-def difference_table(result: MagnitudeResult, pairs: Sequence[tuple[int, int]]) -> Table:
+def difference_table(result: MagnitudeResult, pairs: Sequence[Sequence[int]]) -> Table:
     """Return the difference in Strehl of pairs of methods at each flux."""
     rows = [
-        [
-            result.labels[method],
-            result.labels[reference],
-            *map(with_interval, differences_by_flux(result, method, reference)),
-        ]
-        for method, reference in pairs
+        [*(result.labels[method] for method in pair), *map(with_interval, differences_by_flux(result, *pair))]
+        for pair in pairs
     ]
     return _TEXT.table("tables.difference", rows, _fluxes(result))
 
@@ -62,28 +56,30 @@ def centroid_gain_table(result: MagnitudeResult) -> Table:
     return _TEXT.table("tables.centroid_gain", _by_flux(result, result.centroid_gain, 2), _fluxes(result))
 
 
-def _by_flux(result: MagnitudeResult, values: NDArray[np.float64], digits: int) -> list[list[str]]:
-    return [
-        [label, *(with_error(paired_mean(runs), digits) for runs in of_method)]
-        for label, of_method in zip(result.labels, values, strict=True)
+def settings_table(result: MagnitudeResult) -> Table:
+    """Return the tuned loop gain and settings of every method at each flux."""
+    rows = [
+        [label, *map(_settings_words, choices, settings)]
+        for label, choices, settings in zip(result.labels, result.choices, result.settings, strict=True)
     ]
+    return _TEXT.table("tables.settings", rows, _fluxes(result))
 
 
 def budget_table(result: BudgetResult) -> Table:
     """Return the Strehl ratio and the rms wavefront of every method without each term."""
-    rows = []
-    for method, name in enumerate(result.labels):
-        for number, term in enumerate(result.terms):
-            strehl, residual = (
-                paired_mean(values[method, number]) for values in (result.strehl, result.residual_nm)
-            )
-            change = (
-                None if number == 0 else paired_mean(result.strehl[method, number] - result.strehl[method, 0])
-            )
-            off = NOTHING if number == 0 else term
-            rows.append([name, off, with_error(strehl), with_error(residual, 0), with_interval(change)])
+    records = [
+        {
+            "method": name,
+            "term": "–" if number == 0 else term,
+            "strehl": paired_mean(strehl[number]),
+            "residual": paired_mean(residual[number]),
+            "change": paired_mean(strehl[number] - strehl[0]) if number else None,
+        }
+        for name, strehl, residual in zip(result.labels, result.strehl, result.residual_nm, strict=True)
+        for number, term in enumerate(result.terms)
+    ]
     meanings = "; ".join(f"{term}: {_TEXT[f'terms.{term}']}" for term in result.terms[1:] if term in TERMS)
-    return _TEXT.table("tables.budget", rows, meanings=meanings)
+    return _TEXT.table("tables.budget", records, meanings=meanings)
 
 
 def in_columns(table: Table, most: int | None = None) -> str:
@@ -94,13 +90,11 @@ def in_columns(table: Table, most: int | None = None) -> str:
     return "\n".join(f"{row[0]:{widths[0]}}  {line}" for row, line in zip(rows, lines, strict=True))
 
 
-def settings_table(result: MagnitudeResult) -> Table:
-    """Return the tuned loop gain and settings of every method at each flux."""
-    rows = [
-        [label, *map(_settings_words, choices, settings)]
-        for label, choices, settings in zip(result.labels, result.choices, result.settings, strict=True)
+def _by_flux(result: MagnitudeResult, values: NDArray[np.float64], digits: int) -> list[list[str]]:
+    return [
+        [label, *(with_error(paired_mean(runs), digits) for runs in of_method)]
+        for label, of_method in zip(result.labels, values, strict=True)
     ]
-    return _TEXT.table("tables.settings", rows, _fluxes(result))
 
 
 def _fluxes(result: MagnitudeResult) -> list[str]:
@@ -111,11 +105,8 @@ def _settings_words(choice: str, text: str) -> str:
     """Return tuned values as one line."""
     if not text:
         return "not tuned yet"
-    parts = [f"gain {parse_json(choice)[LOOP_GAIN]:.2g}"]
-    for options in tomllib.loads(text).values():
-        parts += [_value_words(name, value) for name, value in options.items() if name != "name"]
-    return ", ".join(parts)
-
-
-def _value_words(name: str, value: object) -> str:
-    return f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
+    options = [item for table in tomllib.loads(text).values() for item in table.items() if item[0] != "name"]
+    words = (
+        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}" for name, value in options
+    )
+    return ", ".join([f"gain {parse_json(choice)[LOOP_GAIN]:.2g}", *words])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from faintspot.base.report.texts import Texts
+from faintspot.base.report.words import plain_number, with_error
 from faintspot.experiments.closed_loop.answer import Coverage, LoopAnswer
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Choice
 from faintspot.experiments.closed_loop.question import (
@@ -14,7 +15,6 @@ from faintspot.experiments.closed_loop.question import (
     REFERENCES,
     magnitudes_apart,
 )
-from faintspot.experiments.words import plain_number, with_error
 
 _TEXT = Texts("faintspot.experiments")
 _SMALLEST_ERROR = 0.001
@@ -45,21 +45,22 @@ def recommendation(answer: LoopAnswer) -> list[str]:
     """Return the recommendation in a few sentences, the first a heading."""
     flux, best = answer.at_star, answer.best
     same = [name for name in answer.equal(flux) if name != best.name]
-    lines = [f"Recommended: {best.name} ({choice_in_words(answer.choice(best.name, flux))})"]
-    strehl = with_error(answer.strehl(best.name, flux), smallest=_SMALLEST_ERROR)
-    wavelength = 1e6 * answer.question.configuration.science.wavelength_m
-    lines.append(_TEXT("loop_answer.expected", strehl=strehl, wavelength_um=wavelength))
-    if same:
-        chosen = "the baseline" if best.name == BASELINE else "what is simplest"
-        lines.append(_TEXT("loop_answer.no_winner", same=", ".join(same), taken=chosen))
-    lines += [
+    against = [
         f"against {reference}: {difference_in_words(answer, best.name, reference)}"
         for reference in REFERENCES
         if reference != best.name
     ]
-    lines += _along_the_magnitudes(answer)
-    lines += [f"{_ends(answer)}"] if _ends(answer) else []
-    return lines
+    heading, *lines = _TEXT.lines(
+        "loop_answer.recommendation",
+        name=best.name,
+        choice=choice_in_words(answer.choice(best.name, flux)),
+        strehl=with_error(answer.strehl(best.name, flux), smallest=_SMALLEST_ERROR),
+        wavelength_um=1e6 * answer.question.configuration.science.wavelength_m,
+        same=", ".join(same) or None,
+        taken="the baseline" if best.name == BASELINE else "what is simplest",
+    )
+    by_star = _TEXT.lines("loop_answer.by_star", stars=_along_the_magnitudes(answer), ends=_ends(answer))
+    return [heading, *lines, *against, *by_star]
 
 
 def difference_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
@@ -115,51 +116,50 @@ def about_the_sky(answer: LoopAnswer) -> list[str]:
     radius = answer.question.radius
     if radius is None:
         return [_TEXT["loop_answer.no_sky"]]
-    origin = "given" if answer.question.radius_arcsec is not None else "the isoplanatic angle of the layers"
-    best, parts = answer.best.name, []
-    for place in PLACES:
-        coverage = answer.coverage(best, place)
-        assert coverage is not None
-        parts.append(f"{plain_number(100 * coverage.model_error, 2)} ({place})")
-    percent = 100 * MODEL_ERROR
-    return [
-        _TEXT("loop_answer.sky", level=answer.level, radius=radius, given=origin),
-        _TEXT("loop_answer.sky_errors", percent=percent, best=best, parts=", ".join(parts)),
+    coverages = {place: answer.coverage(answer.best.name, place) for place in PLACES}
+    errors = [
+        f"{plain_number(100 * coverage.model_error, 2)} ({place})"
+        for place, coverage in coverages.items()
+        if coverage
     ]
+    return _TEXT.lines(
+        "loop_answer.sky",
+        answer,
+        radius=radius,
+        given="given" if answer.question.radius_arcsec is not None else "the isoplanatic angle of the layers",
+        percent=100 * MODEL_ERROR,
+        errors=", ".join(errors),
+    )
 
 
 def foundations(answer: LoopAnswer) -> list[str]:
     """Describe what the answer is based on."""
-    step = magnitudes_apart(answer.photons.tolist())
-    measured = ", ".join(f"{magnitude:.2f}" for magnitude in answer.magnitudes[::-1])
-    photons = ", ".join(plain_number(flux) for flux in answer.photons[::-1])
-    counts = {"count": answer.realisations, "frames": answer.scored_frames}
-    lines = [
-        _TEXT("loop_answer.measured", magnitudes=measured, photons=photons, step=step),
-        _TEXT("loop_answer.realisations", **counts),
-        _TEXT["loop_answer.paired"],
-        _TEXT["loop_answer.limits"],
-    ]
+    lines = _TEXT.lines(
+        "loop_answer.foundations",
+        answer,
+        measured_at=", ".join(f"{magnitude:.2f}" for magnitude in answer.magnitudes[::-1]),
+        fluxes=", ".join(plain_number(flux) for flux in answer.photons[::-1]),
+        step=magnitudes_apart(answer.photons.tolist()),
+    )
     return lines + [f"{name} was not tried: {reason}" for name, reason in answer.left_out.items()]
 
 
-def _along_the_magnitudes(answer: LoopAnswer) -> list[str]:
-    """Describe the recommendation for other stars."""
+def _along_the_magnitudes(answer: LoopAnswer) -> str:
+    """Return the recommendation for other stars."""
     parts = []
     for flux in range(len(answer.photons) - 1, -1, -1):
         best, *same = answer.equal(flux)
         text = f"{answer.magnitudes[flux]:.2f} {best}"
         parts.append(f"{text} (as good: {', '.join(same)})" if same else text)
-    return [f"by magnitude: {'; '.join(parts)}"]
+    return "; ".join(parts)
 
 
-def _ends(answer: LoopAnswer) -> str:
+def _ends(answer: LoopAnswer) -> str | None:
     """Name tuned values of the recommended and reference methods that are at the end of their range."""
     flux = answer.at_star
-    parts = []
-    for name in dict.fromkeys((answer.best.name, *REFERENCES)):
-        choice = answer.choice(name, flux)
-        parts += [f"{value} {plain_number(choice[value])} of {name}" for value in answer.at_end(name, flux)]
-    if not parts:
-        return ""
-    return _TEXT("loop_answer.at_end", parts=", ".join(parts))
+    parts = [
+        f"{value} {plain_number(answer.choice(name, flux)[value])} of {name}"
+        for name in dict.fromkeys((answer.best.name, *REFERENCES))
+        for value in answer.at_end(name, flux)
+    ]
+    return ", ".join(parts) or None

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from faintspot.base.errors import InputError
+from faintspot.base.report.words import with_interval
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.closed_loop.methods import VARIANTS
 from faintspot.experiments.closed_loop.question import REFERENCES
@@ -19,7 +20,6 @@ from faintspot.experiments.closed_loop.results import (
     gains_in_magnitude,
 )
 from faintspot.experiments.closed_loop.tables import budget_table, in_columns, strehl_table
-from faintspot.experiments.words import with_interval
 from faintspot.loop.simulation.files import BUDGET_FILE, MAGNITUDE_FILE
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 
@@ -91,18 +91,16 @@ def better_and_worse(result: MagnitudeResult, method: int, reference: int) -> tu
     "" for none.
     """
     decided = [difference.decided for difference in differences_by_flux(result, method, reference)]
-    if decided == [1] * len(decided):
-        return "all fluxes", ""
-    if decided == [-1] * len(decided):
-        return "", "all fluxes"
-    above, below = (
-        ", ".join(
-            f"{photons:.3g}" for photons, sign in zip(result.photons, decided, strict=True) if sign == outcome
-        )
-        for outcome in (1, -1)
-    )
-    unit = " photo-electrons"
-    return above and above + unit, below and below + unit
+
+    def words(outcome: int) -> str:
+        if decided == [outcome] * len(decided):
+            return "all fluxes"
+        fluxes = [
+            f"{flux:.3g}" for flux, sign in zip(result.photons, decided, strict=True) if sign == outcome
+        ]
+        return f"{', '.join(fluxes)} photo-electrons" if fluxes else ""
+
+    return words(1), words(-1)
 
 
 def _headline(comparisons: list[Estimate]) -> str:

@@ -76,6 +76,14 @@ class Line:
     correlation: float
     blocks: int
 
+    @property
+    def slope_per_cm(self) -> Estimate:
+        """The slope for a centimetre of r0."""
+        slope = self.slope_per_m
+        return Estimate(
+            slope.value / 100, slope.standard_error / 100, slope.low / 100, slope.high / 100, slope.count
+        )
+
 
 def groups(night: Night) -> list[Group]:
     """Return what is compared with the reference: all strengths, those of the paper's column, other methods.

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.report.drawing import FLUX_GREY, METHOD_COLOURS, WIDTH, new_figure, styled
+from faintspot.base.report.drawing import FLUX_GREY, METHOD_COLOURS, WIDTH
 from faintspot.base.report.figure_data import FigureWithData
+from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.closed_loop.figures import strehl_axis
 from faintspot.experiments.night.analysis import ALL_STRENGTHS, BEST, by_strength, groups, lines
 from faintspot.experiments.night.blocks import Night
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Floats = NDArray[np.float64]
 
@@ -29,32 +28,27 @@ _MARKERS = "Dv<>P"
 _POINT: dict[str, Any] = {"ls": "", "ms": 5, "elinewidth": 0.7, "alpha": 0.85}
 
 
-@styled
 def panels_figure(night: Night) -> FigureWithData:
     """Draw Strehl ratio against time, measured r0 and strength, with errors."""
-    shown = _shown(night)
-    has_r0, has_strength = bool(np.isfinite(night.r0_m).any()), bool((night.strength_e > 0).any())
-    names = ["time", *(["r0"] if has_r0 else []), *(["strength"] if has_strength else [])]
-    figure = new_figure(0.72 * WIDTH, 4.1 * len(names))
-    panels = dict(zip(names, figure.subplots(len(names), squeeze=False)[:, 0], strict=True))
-    label = strehl_axis(night.wavelength_m)
-    _against(panels["time"], night, night.middle_s / 60, None, shown)
-    for number in np.unique(night.set_number)[1:]:
-        panels["time"].axvline(
-            night.start_s[night.set_number == number][0] / 60, color=FLUX_GREY, lw=1.2, zorder=0
-        )
-    panels["time"].set(xlabel="time (min)", ylabel=label)
-    if has_r0:
-        _against(panels["r0"], night, night.r0_m * 100, night.r0_error_m * 100, shown)
-        _draw_lines(panels["r0"], night)
-        panels["r0"].set(xlabel="measured r0 at 500 nm (cm)", ylabel=label)
-    if has_strength:
-        _draw_strengths(panels["strength"], night, shown)
-        panels["strength"].set(xlabel="strength (e⁻)", ylabel=label)
-    for panel in panels.values():
-        panel.set_ylim(bottom=min(0.0, panel.get_ylim()[0]))
-    handles, texts = panels["time"].get_legend_handles_labels()
-    figure.legend(handles, texts, loc="outside upper center", ncols=min(3, len(texts)), frameon=False)
+    label, shown = strehl_axis(night.wavelength_m), _shown(night)
+    lowest = float(np.nanmin(night.strehl - np.nan_to_num(night.strehl_error)))
+    bottom: dict[str, Any] = {"y": label, "y_range": (min(0.0, 1.1 * lowest), None)}
+    starts = [night.start_s[night.set_number == number][0] / 60 for number in np.unique(night.set_number)[1:]]
+    sets = {start: {"color": FLUX_GREY, "lw": 1.2, "zorder": 0} for start in starts}
+    panels = [Panel(_points(night, shown, night.middle_s / 60), "time (min)", at=sets, **bottom)]
+    if np.isfinite(night.r0_m).any():
+        points = _points(night, shown, night.r0_m * 100, night.r0_error_m * 100)
+        fits = _regressions(night)
+        panels.append(Panel([*_unnamed(points), *fits], "measured r0 at 500 nm (cm)", legend=True, **bottom))
+    if (night.strength_e > 0).any():
+        panels.append(_of_strengths(night, shown, bottom))
+    figure = plot(
+        [[panel] for panel in panels],
+        4.1 * len(panels),
+        width=0.72 * WIDTH,
+        columns=3,
+        legend="outside upper center",
+    )
     columns = (
         night.middle_s,
         night.strehl,
@@ -71,73 +65,77 @@ def panels_figure(night: Night) -> FigureWithData:
     return _TEXT.figure("panels", figure, rows, **values)
 
 
-def _shown(night: Night) -> list[tuple[str, NDArray[np.bool_], dict[str, Any]]]:
-    """Return name, blocks and style of what is drawn; each block once, the reference last."""
-    found: list[tuple[str, NDArray[np.bool_], dict[str, Any]]] = []
+def _shown(night: Night) -> dict[str, tuple[NDArray[np.bool_], dict[str, Any]]]:
+    """Return blocks and style of what is drawn, by name; each block once, the reference last."""
     every = groups(night)
     best = next((group.rows for group in every if group.name == BEST), np.zeros(len(night.strehl), np.bool_))
-    others = 0
+    shown: dict[str, tuple[NDArray[np.bool_], dict[str, Any]]] = {}
+    others = [group for group in every if group.name not in _TV_STYLES]
     for group in every:
-        if group.name in _TV_STYLES:
-            rows = group.rows & ~best if group.name == ALL_STRENGTHS else group.rows
-            name = "TV, other strengths" if group.name == ALL_STRENGTHS and best.any() else group.name
-            found.append((name, rows, _TV_STYLES[group.name]))
+        if group.name == ALL_STRENGTHS and best.any():
+            shown["TV, other strengths"] = group.rows & ~best, _TV_STYLES[group.name]
+        elif group in others:
+            index = others.index(group)
+            style = {"color": METHOD_COLOURS[1 + index % 3], "marker": _MARKERS[index % len(_MARKERS)]}
+            shown[group.name] = group.rows, style
         else:
-            style = {"color": METHOD_COLOURS[1 + others % 3], "marker": _MARKERS[others % len(_MARKERS)]}
-            found.append((group.name, group.rows, style))
-            others += 1
-    reference = night.method == night.reference
-    return [*found, (night.labels[night.reference], reference, _REFERENCE_STYLE)]
+            shown[group.name] = group.rows, _TV_STYLES[group.name]
+    return shown | {night.labels[night.reference]: (night.method == night.reference, _REFERENCE_STYLE)}
 
 
-def _against(
-    panel: Axes,
+def _points(
     night: Night,
+    shown: dict[str, tuple[NDArray[np.bool_], dict[str, Any]]],
     x: Floats,
-    x_error: Floats | None,
-    shown: list[tuple[str, NDArray[np.bool_], dict[str, Any]]],
-) -> None:
-    for name, rows, style in shown:
-        across = None if x_error is None else np.nan_to_num(x_error[rows])
-        up = np.nan_to_num(night.strehl_error[rows])
-        panel.errorbar(x[rows], night.strehl[rows], up, across, label=name, **_POINT, **style)
-
-
-def _draw_lines(panel: Axes, night: Night) -> None:
-    """Draw the regression lines with their correlation."""
-    styles = {**_TV_STYLES, night.labels[night.reference]: _REFERENCE_STYLE}
-    for line in lines(night):
-        colour = styles.get(line.name, {"color": METHOD_COLOURS[1]})["color"]
-        ends = np.array([np.nanmin(night.r0_m), np.nanmax(night.r0_m)])
-        text = f"{line.name}: r = {line.correlation:.2f}"
-        panel.plot(
-            100 * ends, line.intercept + line.slope_per_m.value * ends, color=colour, lw=1.5, label=text
+    x_error: Floats | None = None,
+) -> list[Line]:
+    return [
+        Line(
+            name,
+            x[rows],
+            night.strehl[rows],
+            night.strehl_error[rows],
+            {**_POINT, **style},
+            x_error=None if x_error is None else x_error[rows],
         )
-    handles, texts = panel.get_legend_handles_labels()
-    drawn = [(handle, text) for handle, text in zip(handles, texts, strict=True) if " r = " in text]
-    panel.legend(*zip(*drawn, strict=True), frameon=False, fontsize=10)
+        for name, (rows, style) in shown.items()
+    ]
 
 
-def _draw_strengths(
-    panel: Axes, night: Night, shown: list[tuple[str, NDArray[np.bool_], dict[str, Any]]]
-) -> None:
-    """Draw blocks against strength, and the ranges at the height of the reference plus their difference."""
+def _unnamed(points: list[Line]) -> list[Line]:
+    return [replace(line, label="") for line in points]
+
+
+def _regressions(night: Night) -> list[Line]:
+    """Return the regression lines with their correlation."""
+    styles = {**_TV_STYLES, night.labels[night.reference]: _REFERENCE_STYLE}
+    ends = np.array([np.nanmin(night.r0_m), np.nanmax(night.r0_m)])
+    return [
+        Line(
+            f"{line.name}: r = {line.correlation:.2f}",
+            100 * ends,
+            line.intercept + line.slope_per_m.value * ends,
+            style={"color": styles.get(line.name, {"color": METHOD_COLOURS[1]})["color"], "lw": 1.5},
+        )
+        for line in lines(night)
+    ]
+
+
+def _of_strengths(
+    night: Night, shown: dict[str, tuple[NDArray[np.bool_], dict[str, Any]]], bottom: dict[str, Any]
+) -> Panel:
+    """Return blocks against strength, and the ranges at the height of the reference plus their difference."""
     reference = night.strehl[night.method == night.reference]
     mean, scatter = float(np.nanmean(reference)), float(np.nanstd(reference))
-    panel.axhspan(mean - scatter, mean + scatter, color=FLUX_GREY, zorder=0, lw=0)
-    panel.axhline(mean, color="black", lw=1, label="mean without TV")
-    for _, rows, style in shown:
-        chosen = rows & np.isfinite(night.strength_e)
-        up = np.nan_to_num(night.strehl_error[chosen])
-        panel.errorbar(night.strength_e[chosen], night.strehl[chosen], up, **_POINT, **style)
+    strengths = night.strength_e[night.strength_e > 0]
+    across, height = [strengths.min(), strengths.max()], [mean, mean]
+    band = Line("mean without TV", across, height, [scatter, scatter], {"color": "black", "lw": 1}, band=True)
+    drawn = [band, *_unnamed(_points(night, shown, night.strength_e))]
     ranges = by_strength(night)
     if ranges:
-        x = [strength for strength, _ in ranges]
         found = [each.measured for _, each in ranges]
-        ends = np.nan_to_num([[e.value - e.low for e in found], [e.high - e.value for e in found]])
-        y = [mean + each.value for each in found]
-        colour = METHOD_COLOURS[1]
-        panel.errorbar(
-            x, y, ends, color=colour, marker="s", ms=8, lw=2, capsize=4, label="ranges of strengths"
-        )
-    panel.legend(frameon=False, fontsize=10)
+        ends = [each.value - each.low for each in found], [each.high - each.value for each in found]
+        style = {"color": METHOD_COLOURS[1], "marker": "s", "ms": 8, "lw": 2, "capsize": 4}
+        middle, y = [strength for strength, _ in ranges], [mean + each.value for each in found]
+        drawn.append(Line("ranges of strengths", middle, y, ends, style))
+    return Panel(drawn, "strength (e⁻)", legend=True, **bottom)

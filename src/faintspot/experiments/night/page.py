@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
 from faintspot.base.json_text import to_json
-from faintspot.base.report.page import Badge, Cell, Page, Section, Table, configuration_section, write_page
+from faintspot.base.report.page import Report, Section, Table, TableCell, configuration_section
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.night.analysis import (
@@ -25,18 +24,43 @@ from faintspot.experiments.night.analysis import (
     group_means,
     groups,
     lines,
-    significance,
 )
 from faintspot.experiments.night.blocks import NIGHT_STORE, Night
 from faintspot.experiments.night.figures import panels_figure
 from faintspot.experiments.night.protocol import PAPER_MEANS
-from faintspot.experiments.night.verdicts import FAILS, HOLDS, OPEN, NightVerdict, verdicts
-from faintspot.experiments.words import NOTHING, number_or_dash, signed, with_error, with_interval
+from faintspot.experiments.night.verdicts import verdicts
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 
 SUMMARY_FILE, PAGE_FILE = "night.json", "night.html"
 _TEXT = Texts("faintspot.experiments.night")
-_COLOURS = {HOLDS: "good", FAILS: "bad", OPEN: "grey"}
+# Names in JSON, and the attributes that they stand for.
+_MEAN = ("mean", "standard_deviation", "blocks")
+_DIFFERENCE = {
+    "method": "name",
+    "blocks": "blocks",
+    "at_equal_r0": "measured",
+    "without_r0": "without_r0",
+    "in_the_same_turbulence": "paired",
+    "hours": "hours",
+    "hours_needed": "hours_needed",
+    "is_long_enough": "is_long_enough",
+}
+_LINE = {
+    "method": "name",
+    "slope_per_m": "slope_per_m",
+    "intercept": "intercept",
+    "correlation": "correlation",
+    "blocks": "blocks",
+}
+_VERDICT = {
+    "statement": "statement",
+    "outcome": "outcome",
+    "measured": "measured",
+    "significance": "significance",
+    "in_the_same_turbulence": "paired",
+    "outcome_in_the_same_turbulence": "paired_outcome",
+    "hours_needed": "hours_needed",
+}
 
 
 def write_night(night: Night, folder: str | Path) -> list[Path]:
@@ -53,238 +77,130 @@ def write_night(night: Night, folder: str | Path) -> list[Path]:
     night.save(folder / NIGHT_STORE)
     text = to_json(night_summary(night), indent=2)
     write_atomically(folder / SUMMARY_FILE, text + "\n")
-    pages = write_page(night_page(night), folder / PAGE_FILE)
+    pages = night_page(night).write(folder / PAGE_FILE)
     return [folder / NIGHT_STORE, folder / SUMMARY_FILE, *pages]
 
 
 def night_summary(night: Night) -> dict[str, Any]:
     """Return differences, verdicts, lines and means as plain values for JSON; null is not known."""
-    reference = night.method == night.reference
-    named = [
-        (night.labels[night.reference], reference),
-        *((group.name, group.rows) for group in groups(night)),
-    ]
+    sets = [*night.set_names, "all"]
     return {
         "source": night.source,
         "reference": night.labels[night.reference],
-        "hours": _plain(night.hours),
+        "hours": plain(night.hours),
         "methods": [
             {"label": label, "settings": text}
             for label, text in zip(night.labels, night.settings, strict=True)
         ],
         "means": {
             name: [
-                {"set": where, "mean": _plain(mean), "standard_deviation": _plain(scatter), "blocks": count}
-                for where, (mean, scatter, count) in zip(
-                    [*night.set_names, "all"], group_means(night, rows), strict=True
-                )
+                {"set": where, **dict(zip(_MEAN, map(plain, values), strict=True))}
+                for where, values in zip(sets, group_means(night, rows), strict=True)
             ]
-            for name, rows in named
+            for name, rows in _compared(night).items()
         },
-        "differences": [_difference_values(each) for each in differences(night)],
+        "differences": [_plain_record(each, _DIFFERENCE) for each in differences(night)],
         "by_strength": [
-            {"mean_strength_e": _plain(strength), **_difference_values(each)}
+            {"mean_strength_e": plain(strength), **_plain_record(each, _DIFFERENCE)}
             for strength, each in by_strength(night)
         ],
-        "against_r0": [
-            {
-                "method": line.name,
-                "slope_per_m": _values(line.slope_per_m),
-                "intercept": _plain(line.intercept),
-                "correlation": _plain(line.correlation),
-                "blocks": line.blocks,
-            }
-            for line in lines(night)
-        ],
-        "verdicts": [
-            {
-                "statement": each.statement,
-                "outcome": each.outcome,
-                "measured": _values(each.measured),
-                "significance": _plain(each.significance),
-                "in_the_same_turbulence": _values(each.paired),
-                "outcome_in_the_same_turbulence": each.paired_outcome or None,
-                "hours_needed": _plain(each.hours_needed),
-            }
-            for each in verdicts(night)
-        ],
+        "against_r0": [_plain_record(line, _LINE) for line in lines(night)],
+        "verdicts": [_plain_record(each, _VERDICT) for each in verdicts(night)],
     }
+
+
+def plain(value: Any) -> Any:
+    """Return a value for JSON: numbers to six digits, estimates with their intervals; None is not known."""
+    if isinstance(value, Estimate):
+        return _plain_estimate(value)
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+    return None if value == "" else value
 
 
 def night_summary_text(night: Night) -> str:
     """Return verdicts and differences as lines of text."""
-    found = [f"{each.statement}: {each.outcome}; {_effect(each)}" for each in verdicts(night)]
-    return "\n".join([*found, *_conclusions(night)])
+    return "\n".join([*(_TEXT("lines.verdict", each) for each in verdicts(night)), *_conclusions(night)])
 
 
 def night_sections(night: Night) -> list[Section]:
     """Return the sections of a night, for a page of its own or another one."""
+    names = {"reference": night.labels[night.reference]}
+    statements = _TEXT.table("night-verdicts", verdicts(night))
+    compared = _TEXT.table(
+        "night-differences", differences(night), effect="paired" if night.is_paired else "measured", **names
+    )
+    of_ranges = _TEXT.table("strengths", [each for _, each in by_strength(night)], **names)
+    settings = list(zip(night.labels, night.settings, strict=True))
     return [
-        _verdicts_section(night),
-        Section("night-panels", _TEXT["panels.title"], figures=[panels_figure(night)]),
-        Section("night-means", _TEXT["table1.title"], tables=[_means_table(night)]),
-        _differences_section(night),
-        _seeing_section(night),
-        Section("night-settings", _TEXT["settings.title"], tables=[_settings_table(night)]),
+        _TEXT.section("night-verdicts", _conclusions(night) if statements else None, statements),
+        _TEXT.section("night-panels", panels_figure(night)),
+        _TEXT.section("night-means", _means_table(night)),
+        _TEXT.section("night-differences", compared, of_ranges, **names),
+        _TEXT.section("night-r0", _TEXT.table("night-r0", lines(night)), **_quality_of_r0(night)),
+        _TEXT.section("night-settings", _TEXT.table("night-settings", settings)),
     ]
 
 
-def night_page(night: Night) -> Page:
+def night_page(night: Night) -> Report:
     """Return the page of a night."""
     configuration = _configuration(night)
     name = "" if configuration is None else f": “{configuration.name}”"
     sections = night_sections(night)
     if night.configuration:
         sections.append(configuration_section(night.configuration))
-    return Page(_TEXT("page.title", name=name), _facts(night), sections)
-
-
-def verdict_in_words(verdict: NightVerdict) -> str:
-    """Return the measured effect, the one in the same turbulence and the hours for 3 sigma."""
-    paired = ""
-    if verdict.paired_outcome:
-        paired = f"; in the same turbulence {with_interval(verdict.paired)}"
-    return f"{_effect(verdict)}{paired}; 3 σ take {in_hours(verdict.hours_needed)} of alternating"
-
-
-def in_hours(hours: float) -> str:
-    """Return a duration in minutes, hours or nights of eight hours."""
-    if not math.isfinite(hours):
-        return NOTHING
-    if hours < 1:
-        return f"{60 * hours:.2g} min" if 60 * hours < 9.95 else f"{60 * hours:.0f} min"
-    return f"{hours:.1f} h" if hours < 9.95 else f"{hours:,.0f} h".replace(",", " ")
+    return Report(_TEXT("page.title", name=name), _facts(night), sections)
 
 
 def _conclusions(night: Night) -> list[str]:
-    """Return one sentence for each difference."""
+    """Return one sentence for each difference, and whether the night was long enough for it."""
     return [
-        _TEXT(
-            "page.conclusion",
-            name=each.name,
-            value=with_interval(each.measured),
-            significance=_sigma(each.measured),
-            length=_length(each),
-        )
+        f"{_TEXT('lines.conclusion', each)} {_TEXT(f'lines.{_length(each)}', each)}"
         for each in differences(night)
     ]
 
 
 def _length(difference: Difference) -> str:
     if math.isinf(difference.hours_needed) and difference.shared_error > 0:
-        return str(_TEXT["page.never"])
+        return "never"
     if not math.isfinite(difference.hours_needed):
-        return str(_TEXT["page.unknown"])
-    values = {"hours": in_hours(difference.hours), "needed": in_hours(difference.hours_needed)}
-    return _TEXT(f"page.{'long_enough' if difference.is_long_enough else 'too_short'}", **values)
+        return "unknown"
+    return "long_enough" if difference.is_long_enough else "too_short"
 
 
-def _sigma(estimate: Estimate) -> str:
-    value = significance(estimate)
-    return f"{signed(value, 1)} σ" if math.isfinite(value) else NOTHING
-
-
-def _effect(verdict: NightVerdict) -> str:
-    unit = f" {verdict.unit}" if verdict.unit else ""
-    return f"{with_interval(verdict.measured)}{unit}, {_sigma(verdict.measured)}"
-
-
-def _verdicts_section(night: Night) -> Section:
-    found = verdicts(night)
-    title = _TEXT["verdicts.title"]
-    if not found:
-        return Section("night-verdicts", title, missing=_TEXT["verdicts.missing"])
-    rows: list[list[str | Cell]] = [
-        [
-            each.statement,
-            Cell(badge=Badge(each.outcome, _COLOURS[each.outcome]), small=_effect(each)),
-            Cell(each.paired_outcome, small=with_interval(each.paired)) if each.paired_outcome else NOTHING,
-            in_hours(each.hours_needed),
-        ]
-        for each in found
-    ]
-    table = replace(_TEXT.table("verdicts", rows), prose=True)
-    return Section("night-verdicts", title, tables=[table], points=_conclusions(night))
+def _compared(night: Night) -> dict[str, Any]:
+    """Return the blocks of the reference and of each group, by name."""
+    reference = {night.labels[night.reference]: night.method == night.reference}
+    return reference | {group.name: group.rows for group in groups(night)}
 
 
 def _means_table(night: Night) -> Table:
-    reference = night.labels[night.reference]
-    named = [(reference, night.method == night.reference)]
-    named += [(group.name, group.rows) for group in groups(night)]
-    columns = [group_means(night, rows) for _, rows in named]
-    of_paper = {reference: 0, ALL_STRENGTHS: 1, BEST: 2}
-    with_paper = len(night.set_names) == len(PAPER_MEANS) and BEST in dict(named)
-    rows: list[list[str | Cell]] = []
+    named = _compared(night)
+    columns = [group_means(night, rows) for rows in named.values()]
+    of_paper = {night.labels[night.reference]: 0, ALL_STRENGTHS: 1, BEST: 2}
+    with_paper = len(night.set_names) == len(PAPER_MEANS) and BEST in named
+    rows: list[list[str | TableCell]] = []
     for row, where in enumerate([*night.set_names, "all sets"]):
-        cells: list[str | Cell] = [where]
-        for (name, _), column in zip(named, columns, strict=True):
-            mean, scatter, count = column[row]
-            small = f"± {number_or_dash(scatter, 3)} ({count})"
-            if with_paper and name in of_paper and row < len(PAPER_MEANS):
-                small += f"; paper {number_or_dash(float(PAPER_MEANS[row, of_paper[name]]), 3)}"
-            cells.append(Cell(number_or_dash(mean, 3), small=small))
+        cells: list[str | TableCell] = [where]
+        for name, column in zip(named, columns, strict=True):
+            known = with_paper and name in of_paper and row < len(PAPER_MEANS)
+            values: dict[str, float | None] = dict(zip(_MEAN, column[row], strict=True))
+            values["paper"] = float(PAPER_MEANS[row, of_paper[name]]) if known else None
+            cells.append(
+                TableCell(_TEXT("night-means.cell", values), small=_TEXT("night-means.small", values))
+            )
         rows.append(cells)
     missing = with_paper and not np.isfinite(PAPER_MEANS).any()
-    paper = _TEXT["table1.paper"] if missing else ""
-    return _TEXT.table("table1", rows, [name for name, _ in named], paper=paper)
+    return _TEXT.table("night-means", rows, list(named), no_paper=missing)
 
 
-def _differences_section(night: Night) -> Section:
-    reference = night.labels[night.reference]
-    rows: list[list[str | Cell]] = [
-        [
-            each.name,
-            f"{each.blocks}",
-            with_interval(each.measured),
-            with_interval(each.without_r0),
-            _sigma(each.measured),
-            with_interval(each.paired),
-            in_hours(each.hours),
-            in_hours(each.hours_needed),
-        ]
-        for each in differences(night)
-    ]
-    effect = "paired" if night.is_paired else "measured"
-    tables = [_TEXT.table("differences", rows, reference=reference, effect=effect)]
-    ranges: list[list[str | Cell]] = [
-        [
-            each.name,
-            f"{each.blocks}",
-            with_interval(each.measured),
-            with_interval(each.paired),
-            in_hours(each.hours_needed),
-        ]
-        for _, each in by_strength(night)
-    ]
-    if ranges:
-        tables.append(_TEXT.table("strengths", ranges, reference=reference))
-    return Section("night-differences", _TEXT("differences.title", reference=reference), tables=tables)
-
-
-def _seeing_section(night: Night) -> Section:
-    fits = lines(night)
-    if not fits:
-        return Section("night-r0", _TEXT["seeing.title"], missing=_TEXT["seeing.missing"])
-    text = [_TEXT["seeing.text"]]
+def _quality_of_r0(night: Night) -> dict[str, Any]:
+    """Return the measured over the true r0, where both are known."""
     ratio = (night.r0_m / night.true_r0_m)[np.isfinite(night.r0_m / night.true_r0_m)]
-    if len(ratio):
-        within = 100 * float(np.mean(np.abs(ratio - 1) < 0.1))
-        text.append(_TEXT("seeing.truth", ratio=np.median(ratio), within=within, count=len(ratio)))
-    rows: list[list[str | Cell]] = [
-        [
-            line.name,
-            with_error(Estimate(line.slope_per_m.value / 100, line.slope_per_m.standard_error / 100), 4),
-            f"{line.correlation:.2f}",
-            f"{line.blocks}",
-        ]
-        for line in fits
-    ]
-    return Section("night-r0", _TEXT["seeing.title"], text, [_TEXT.table("seeing", rows)])
-
-
-def _settings_table(night: Night) -> Table:
-    rows = [[label, text] for label, text in zip(night.labels, night.settings, strict=True)]
-    return replace(_TEXT.table("settings", rows), prose=True, folded=f"{len(rows)} methods")
+    if not len(ratio):
+        return {"ratio": None}
+    within = 100 * float(np.mean(np.abs(ratio - 1) < 0.1))
+    return {"ratio": np.median(ratio), "within": within, "count": len(ratio)}
 
 
 def _configuration(night: Night) -> LoopConfiguration | None:
@@ -295,50 +211,29 @@ def _configuration(night: Night) -> LoopConfiguration | None:
 
 
 def _facts(night: Night) -> Mapping[str, str]:
-    r0, how = night.true_r0_m, "the simulation’s"
-    if not np.isfinite(r0).any():
-        r0, how = night.r0_m, "measured"
+    is_simulated = bool(np.isfinite(night.true_r0_m).any())
+    r0 = night.true_r0_m if is_simulated else night.r0_m
     has_r0 = bool(np.isfinite(r0).any())
-    values = {
-        "sets": len(night.set_names),
-        "blocks": len(night.strehl),
-        "seconds": float(np.median(night.duration_s)),
-        "overhead": night.overhead_s,
-        "hours": in_hours(night.hours),
-        "source": night.source,
-        "methods": f"{len(night.labels)}, compared with {night.labels[night.reference]}",
-        "low": float(np.nanmin(r0)) if has_r0 else math.nan,
-        "high": float(np.nanmax(r0)) if has_r0 else math.nan,
-        "how": how,
-        "um": night.wavelength_m * 1e6,
-    }
-    return {name: _TEXT(f"facts.{name}", **values) for name in _TEXT["facts"] if has_r0 or name != "r0"}
+    return _TEXT.facts(
+        "facts",
+        night,
+        sets=len(night.set_names),
+        blocks=len(night.strehl),
+        seconds=float(np.median(night.duration_s)),
+        methods=f"{len(night.labels)}, compared with {night.labels[night.reference]}",
+        low=float(np.nanmin(r0)) if has_r0 else None,
+        high=float(np.nanmax(r0)) if has_r0 else None,
+        how="the simulation’s" if is_simulated else "measured",
+        um=night.wavelength_m * 1e6,
+    )
 
 
-def _difference_values(difference: Difference) -> dict[str, Any]:
-    return {
-        "method": difference.name,
-        "blocks": difference.blocks,
-        "at_equal_r0": _values(difference.measured),
-        "without_r0": _values(difference.without_r0),
-        "in_the_same_turbulence": _values(difference.paired),
-        "hours": _plain(difference.hours),
-        "hours_needed": _plain(difference.hours_needed),
-        "is_long_enough": difference.is_long_enough,
-    }
+def _plain_record(record: Any, names: Mapping[str, str]) -> dict[str, Any]:
+    return {name: plain(getattr(record, attribute)) for name, attribute in names.items()}
 
 
-def _values(estimate: Estimate | None) -> dict[str, Any] | None:
-    if estimate is None or not math.isfinite(estimate.value):
+def _plain_estimate(estimate: Estimate) -> dict[str, Any] | None:
+    if not math.isfinite(estimate.value):
         return None
-    return {
-        "value": _plain(estimate.value),
-        "standard_error": _plain(estimate.standard_error),
-        "low": _plain(estimate.low),
-        "high": _plain(estimate.high),
-        "pieces": estimate.count,
-    }
-
-
-def _plain(value: float) -> float | None:
-    return float(f"{value:.6g}") if math.isfinite(value) else None
+    numbers = {name: plain(getattr(estimate, name)) for name in ("value", "standard_error", "low", "high")}
+    return {**numbers, "pieces": estimate.count}

@@ -44,6 +44,11 @@ class NightVerdict:
     """Hours of alternating for 3 standard errors of the paired effect, else of the measured one."""
 
     @property
+    def is_paired(self) -> bool:
+        """Whether the effect in the same turbulence is known."""
+        return math.isfinite(self.paired.value)
+
+    @property
     def outcome(self) -> str:
         """What the alternating observations say."""
         return _outcome(self.measured)
@@ -51,7 +56,7 @@ class NightVerdict:
     @property
     def paired_outcome(self) -> str:
         """What the same turbulence says; "" where it is not known."""
-        return _outcome(self.paired) if math.isfinite(self.paired.value) else ""
+        return _outcome(self.paired) if self.is_paired else ""
 
     @property
     def significance(self) -> float:
@@ -86,11 +91,9 @@ def verdicts(night: Night) -> list[NightVerdict]:
         verdict.append(NightVerdict(_TEXT["statements.range"], measured, paired, "", needed))
     fits = lines(night)
     if fits:
-        slope = fits[0].slope_per_m
-        ends = slope.low / 100, slope.high / 100
-        to_cm = Estimate(slope.value / 100, slope.standard_error / 100, *ends, slope.count)
-        needed = hours_needed(to_cm.value, to_cm.standard_error, night.hours)
-        verdict.append(NightVerdict(_TEXT["statements.r0"], to_cm, _NO_ESTIMATE, "per cm", needed))
+        slope = fits[0].slope_per_cm
+        needed = hours_needed(slope.value, slope.standard_error, night.hours)
+        verdict.append(NightVerdict(_TEXT["statements.r0"], slope, _NO_ESTIMATE, " per cm", needed))
     return verdict
 
 

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.report.drawing import (
-    GREY,
-    METHOD_COLOURS,
-    WIDTH,
-    colour_bar,
-    new_figure,
-    plain_ticks,
-    styled,
-)
+from faintspot.base.report.drawing import METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
 from faintspot.base.report.figure_data import FigureWithData
+from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.methods import NO_TV, TV, knows_the_spot, label_of, style_of
 from faintspot.experiments.paper.claims import fixed_mode
@@ -33,13 +25,12 @@ from faintspot.experiments.study.specification import BEST
 from faintspot.experiments.study.sweep import PARAMETERS
 from faintspot.slopes.estimators.algorithms.noise import suggested_strength
 from faintspot.slopes.estimators.algorithms.total_variation import tv_denoise
+from faintspot.slopes.recorded.report.frame_pictures import assembled
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.simulate import Detector, spots
 
 if TYPE_CHECKING:
     import xarray
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 _TEXT = Texts("faintspot.experiments")
@@ -47,18 +38,23 @@ _ROW_HEIGHT = 4.7
 _FEW_LINES = 5  # in a panel; with more it is made higher
 _LARGEST_RATIO = 1.6  # of R to R without denoising; what is above is cut off
 _MARKERS = "osD^vPX<>*"
+_ERROR_TICKS = (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3)
+_KEPT_TICKS = (1, 3, 10, 30, 100)
+_TV_OR_NOT: dict[str, dict[str, Any]] = {TV: {"ls": "-"}, NO_TV: {"ls": "--", "mfc": "white"}}
+_LEGEND: dict[str, dict[str, Any]] = {
+    "TV": {"color": "#333333", "ls": "-"},
+    "no TV": {"color": "#333333", "ls": "--", "marker": "o", "mfc": "white"},
+}
 ERROR_AXIS = "slope error R (px)"
 MAIN_NOISES_E = (0.1, 3.0, 16.0)
 
 
-@dataclass(frozen=True)
-class _Line:
-    label: str
-    x: np.ndarray
-    cells: np.ndarray
+def axis_of_study(axis: str) -> dict[str, Any]:
+    """Return label and ticks of the axis of a parameter, as of `Panel`; the flux's is logarithmic."""
+    ticks = (10, 30, 100, 300, 1000, 3000, 10000) if axis == "flux_e" else ()
+    return {"x": _TEXT[f"axes.{axis}"], "x_ticks": ticks, "grid": True}
 
 
-@styled
 def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title: str) -> FigureWithData:
     """Draw R of the cells of a sweep with TV (solid) and without (dashed), in both modes side by side.
 
@@ -74,97 +70,100 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
     """
     table = parameters_of(dataset, cells)
     axis = _axis_of(table)
-    rows = sorted({(row["profile"], row["position_range_px"]) for row in table})
     varied = [key for key in PARAMETERS if len({row[key] for row in table}) > 1]
     labelled = [key for key in varied if key not in (axis, "profile", "position_range_px")]
-    modes = _modes(dataset)
-    everything = _lines(table, cells, axis, labelled)
-    height = _ROW_HEIGHT if len(everything) <= _FEW_LINES else 1.3 * _ROW_HEIGHT
-    figure = new_figure(WIDTH, height * len(rows) + 0.8)
-    axes = figure.subplots(len(rows), len(modes), squeeze=False, sharex=True, sharey="row")
-    styles = _styles([line.label for line in everything])
-    for panels, (profile, reach) in zip(axes, rows, strict=True):
-        part = [row["profile"] == profile and row["position_range_px"] == reach for row in table]
-        kept = [index for index, belongs in enumerate(part) if belongs]
-        lines = _lines([table[i] for i in kept], [cells[i] for i in kept], axis, labelled)
-        for panel, mode in zip(panels, modes, strict=True):
-            _limit(panel, axis, [row[axis] for row in table])
-            _draw_lines(panel, dataset, lines, mode, styles)
-            panel.set_title(f"{mode_in_words(mode)}: {profile} spots, positions within ±{reach:g} px")
-            panel.axhline(reach / 2, color=GREY, lw=1, ls=":")
-            label_axes(panel, axis)
-        panels[0].set_ylabel(ERROR_AXIS)
-    _legend(figure, styles)
+    styles = _styles([label for label, _ in _by_label(table, cells, axis, labelled)])
+    rows: dict[tuple[str, float], list[int]] = {}
+    for index, row in enumerate(table):
+        rows.setdefault((row["profile"], row["position_range_px"]), []).append(index)
+    scale = axis_of_study(axis) | {"x_range": _range_of(axis, [float(row[axis]) for row in table])}
+    panels: list[list[Panel]] = []
+    for (profile, reach), kept in sorted(rows.items()):
+        parts = _by_label([table[i] for i in kept], [cells[i] for i in kept], axis, labelled)
+        scale |= {"y": ERROR_AXIS, "y_ticks": _ERROR_TICKS, "levels": {reach / 2: {"ls": ":"}}}
+        panels.append([])
+        for mode in _modes(dataset):
+            heading = f"{mode_in_words(mode)}: {profile} spots, positions within ±{reach:g} px"
+            lines = _tv_lines(dataset.sel(mode=mode), parts, styles, axis)
+            panels[-1].append(Panel(lines, title=heading, **scale))
     fixed = [parameter_in_words(key, table[0][key]) for key in PARAMETERS if key not in (*varied, axis)]
-    named = [words for words in fixed if not words.startswith("no ")]
-    figure.suptitle(f"{title}  ({', '.join(named)})" if named else title, fontsize=14)
+    named = ", ".join(words for words in fixed if not words.startswith("no "))
+    handles = {**_LEGEND, **{label: style for label, style in styles.items() if label}}
+    height = _ROW_HEIGHT if len(styles) <= _FEW_LINES else 1.3 * _ROW_HEIGHT
+    figure = plot(
+        panels,
+        height * len(panels) + 0.8,
+        title=f"{title}  ({named})" if named else title,
+        columns=5,
+        handles=[Line(label, [], [], style=style) for label, style in handles.items()],
+        sharex=True,
+        sharey="row",
+    )
     caption = _TEXT("sweep.caption", fixed=", ".join(fixed) or "nothing")
     return FigureWithData(name, title, caption, figure, *table_of_cells(dataset, cells))
 
 
-@styled
 def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
     """Draw R against the number of brightest pixels kept (the paper's figure 5); None without cells."""
     profiles = sorted({str(p) for p in dataset["profile"].values[dataset["done"].values]})
-    panels = [(profile, kept_panels(dataset, profile)) for profile in profiles]
-    panels = [(profile, parts) for profile, parts in panels if parts]
-    if not panels or not {NO_TV, TV} <= set(dataset["estimator"].values):
+    rows_of_panels = [parts for profile in profiles if (parts := kept_panels(dataset, profile))]
+    if not rows_of_panels or not {NO_TV, TV} <= set(dataset["estimator"].values):
         return None
-    figure = new_figure(WIDTH * 1.25, _ROW_HEIGHT * len(panels) * 1.1)
-    axes = figure.subplots(len(panels), 3, squeeze=False)
     rows: list[list[Any]] = []
+    panels: list[list[Panel]] = []
     fixed = fixed_mode(dataset).removeprefix("fixed")
-    for line, (_, parts) in zip(axes, panels, strict=True):
-        for panel, part in zip(line, parts, strict=True):
+    for parts in rows_of_panels:
+        panels.append([])
+        for part in parts:
+            lines: list[Line] = []
             styles = _styles([label for label, _ in part.cells])
             for label, cell in part.cells:
-                rows += _draw_over_k(panel, dataset, cell, label, styles[label][0])
-            panel.axvline(float(fixed), color=GREY, lw=1, ls=":")
-            panel.set_xscale("log")
-            panel.set_yscale("log")
-            plain_ticks(panel.xaxis, (1, 3, 10, 30, 100))
-            plain_ticks(panel.yaxis, (0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3))
+                drawn, data = _over_k(dataset, cell, label, styles[label]["color"])
+                lines, rows = lines + drawn, rows + data
             head, _, tail = part.title.partition(";" if part.title.startswith("signals") else ", ")
-            panel.set_title(f"{head.strip()}\n{tail.strip().replace(';', ',')}", fontsize=12)
-            panel.set_xlabel("brightest pixels kept, k")
-            panel.legend(frameon=False, fontsize=10, handlelength=1.2)
-        line[0].set_ylabel(ERROR_AXIS)
-    figure.suptitle(f"{_TEXT['fig5.title']}  (solid: TV, dashed: no TV)", fontsize=14)
+            title = f"{head.strip()}\n{tail.strip().replace(';', ',')}"
+            scale: dict[str, Any] = {
+                "x": "brightest pixels kept, k",
+                "x_ticks": _KEPT_TICKS,
+                "y_ticks": _ERROR_TICKS[2:],
+            }
+            fixed_k = {float(fixed): {"ls": ":"}}
+            panels[-1].append(Panel(lines, y=ERROR_AXIS, title=title, at=fixed_k, legend=True, **scale))
+    title = f"{_TEXT['fig5.title']}  (solid: TV, dashed: no TV)"
+    figure = plot(panels, _ROW_HEIGHT * len(panels) * 1.1, width=WIDTH * 1.25, title=title, legend="")
     header = ["panel", "method", "k", "R_px", "R_se_px", *PARAMETERS]
     return _TEXT.figure("fig5", figure, rows, header, fixed=fixed)
 
 
-@styled
 def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | None:
     """Draw R of every method over R without denoising, for the main read noises; None without cells."""
     cells = _main_cells(dataset, profile)
     methods = [str(method) for method in dataset["estimator"].values if not knows_the_spot(str(method))]
     if not cells or NO_TV not in methods or len(methods) < 2:
         return None
-    modes = _modes(dataset)
-    figure = new_figure(WIDTH, _ROW_HEIGHT * len(cells) + 0.8)
-    axes = figure.subplots(len(cells), len(modes), squeeze=False, sharey="row")
-    reach = float(dataset["position_range_px"].values[next(iter(cells.values()))[0]])
-    for panels, (noise, indices) in zip(axes, cells.items(), strict=True):
-        lowest = 0.6
-        for panel, mode in zip(panels, modes, strict=True):
-            _limit(panel, "flux_e", dataset["flux_e"].values[indices])
+    panels: list[list[Panel]] = []
+    for noise, indices in cells.items():
+        panels.append([])
+        for mode in _modes(dataset):
+            lines = []
             for method in methods:
-                flux, ratio, se = _ratio(dataset, indices, method, mode)
-                lowest = min([lowest, *(0.95 * ratio)])
                 style = style_of(method)
-                bars = {"color": style.colour, "marker": style.marker, "ms": 5, "lw": 2, "elinewidth": 1}
-                panel.errorbar(flux, ratio, se, label=label_of(method), ls=style.line, **bars)
-            panel.set_title(f"{mode_in_words(mode)}: {noise:g} e- read noise")
-            label_axes(panel, "flux_e", log_y=False)
-        panels[0].set_ylim(lowest, _LARGEST_RATIO)
-        panels[0].set_ylabel("R / R without denoising")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
-    title = _TEXT("baselines.title", profile=profile)
-    figure.suptitle(f"{title}  (size 1, 16 × 16 px, positions within ±{reach:g} px)", fontsize=14)
-    caption = _TEXT("baselines.caption", largest=_LARGEST_RATIO)
+                bars = {"color": style.colour, "ls": style.line, "marker": style.marker, "ms": 5, "lw": 2}
+                ratio = _ratio(dataset, indices, method, mode)
+                lines.append(Line(label_of(method), *ratio, {**bars, "elinewidth": 1}))
+            lowest = min([0.6, *(0.95 * np.min(line.y) for line in lines)])
+            title = f"{mode_in_words(mode)}: {noise:g} e- read noise"
+            scale = axis_of_study("flux_e") | {
+                "x_range": _range_of("flux_e", dataset["flux_e"].values[indices])
+            }
+            limits: dict[str, Any] = {"y": "R / R without denoising", "y_range": (lowest, _LARGEST_RATIO)}
+            panels[-1].append(Panel(lines, title=title, **scale, **limits))
     every = [cell for part in cells.values() for cell in part]
+    reach = float(dataset["position_range_px"].values[every[0]])
+    title = _TEXT("baselines_figure.title", profile=profile)
+    above = f"{title}  (size 1, 16 × 16 px, positions within ±{reach:g} px)"
+    figure = plot(panels, _ROW_HEIGHT * len(cells) + 0.8, title=above, columns=3)
+    caption = _TEXT("baselines_figure.caption", largest=_LARGEST_RATIO)
     return FigureWithData(f"baselines-{profile}", title, caption, figure, *table_of_cells(dataset, every))
 
 
@@ -180,105 +179,77 @@ def _modes(dataset: xarray.Dataset) -> list[str]:
     return [mode for mode in (BEST, fixed_mode(dataset)) if mode in measured]
 
 
-def _lines(
+def _by_label(
     table: list[dict[str, Any]], cells: Sequence[int], axis: str, labelled: Sequence[str]
-) -> list[_Line]:
-    """Return the lines of a panel, by increasing value of what varies."""
+) -> list[tuple[str, list[int]]]:
+    """Return the cells of each line of a panel, by increasing value of what varies, after their label."""
     groups: dict[tuple[Any, ...], list[tuple[float, int]]] = {}
     for row, cell in zip(table, cells, strict=True):
         groups.setdefault(tuple(row[key] for key in labelled), []).append((float(row[axis]), cell))
-    lines = []
-    for values, points in sorted(groups.items()):
-        label = ", ".join(parameter_in_words(key, value) for key, value in zip(labelled, values, strict=True))
-        x, index = zip(*sorted(points), strict=True)
-        lines.append(_Line(label, np.array(x), np.array(index)))
-    return lines
+    return [
+        (", ".join(map(parameter_in_words, labelled, values)), [cell for _, cell in sorted(points)])
+        for values, points in sorted(groups.items())
+    ]
 
 
-def _styles(labels: Sequence[str]) -> dict[str, tuple[Any, str]]:
+def _styles(labels: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return colour and marker of each label: told apart with any colour vision, in order when many."""
     from matplotlib import colormaps
 
-    if len(labels) <= 4:
-        colours: list[Any] = list(METHOD_COLOURS)
-    else:
+    colours: Sequence[Any] = METHOD_COLOURS
+    if len(labels) > len(METHOD_COLOURS):
         colours = [colormaps["viridis"](fraction) for fraction in np.linspace(0.0, 0.9, len(labels))]
-    return {label: (colours[i], _MARKERS[i % len(_MARKERS)]) for i, label in enumerate(dict.fromkeys(labels))}
+    return {
+        label: {"color": colours[i], "marker": _MARKERS[i % len(_MARKERS)]}
+        for i, label in enumerate(dict.fromkeys(labels))
+    }
 
 
-def _draw_lines(
-    panel: Axes, dataset: xarray.Dataset, lines: Sequence[_Line], mode: str, styles: dict[str, Any]
-) -> None:
-    for line in lines:
-        colour, marker = styles[line.label]
-        for method, style, face in ((TV, "-", colour), (NO_TV, "--", "white")):
-            if method not in dataset["estimator"].values:
-                continue
-            part = dataset[["error", "error_se"]].sel(estimator=method, mode=mode).isel(cell=line.cells)
-            y, se = part["error"].values, part["error_se"].values
-            finite = np.isfinite(y)
-            bars = {"color": colour, "marker": marker, "ms": 5, "mfc": face, "elinewidth": 1, "capsize": 0}
-            panel.errorbar(line.x[finite], y[finite], se[finite], ls=style, lw=1.9, **bars)
+def _tv_lines(
+    dataset: xarray.Dataset, parts: list[tuple[str, list[int]]], styles: dict[str, dict[str, Any]], axis: str
+) -> list[Line]:
+    """Return R with and without TV against an axis, for each label."""
+    lines = []
+    for label, cells in parts:
+        for method, line in _TV_OR_NOT.items():
+            if method in dataset["estimator"].values:
+                part = dataset[["error", "error_se"]].sel(estimator=method).isel(cell=cells)
+                style = {**styles[label], "ms": 5, "elinewidth": 1, "lw": 1.9, **line}
+                lines.append(
+                    Line("", part[axis].values, part["error"].values, part["error_se"].values, style)
+                )
+    return lines
 
 
-def _limit(panel: Axes, axis: str, values: Any) -> None:
-    """Set the horizontal limits beforehand: of a single value, as of an unfinished study, there are none."""
+def _range_of(axis: str, values: Any) -> tuple[float | None, float | None]:
+    """Return the limits of an axis: a single value, as of an unfinished study, gives none."""
     low, high = float(np.min(values)), float(np.max(values))
     if axis == "flux_e":
-        panel.set_xlim(low / 1.25, high * 1.25)
-    else:
-        margin = 0.05 * (high - low)
-        panel.set_xlim(low - margin, high + margin)
+        return low / 1.25, high * 1.25
+    margin = 0.05 * (high - low)
+    return (low - margin, high + margin) if margin else (None, None)
 
 
-def label_axes(panel: Axes, axis: str, *, log_y: bool = True) -> None:
-    """Label the axis of a parameter; the flux's is logarithmic."""
-    if axis == "flux_e":
-        panel.set_xscale("log")
-        plain_ticks(panel.xaxis, (10, 30, 100, 300, 1000, 3000, 10000))
-    if log_y:
-        panel.set_yscale("log")
-        plain_ticks(panel.yaxis, (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3))
-    panel.set_xlabel(_TEXT[f"axes.{axis}"])
-    panel.tick_params(labelbottom=True)
-    panel.grid(which="major", color="#e4e4e4", lw=0.7)
-
-
-def _legend(figure: Figure, styles: dict[str, tuple[Any, str]]) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D([], [], color="#333333", lw=2, label="TV"),
-        Line2D([], [], color="#333333", lw=2, ls="--", marker="o", mfc="white", label="no TV"),
-    ]
-    handles += [
-        Line2D([], [], color=colour, marker=marker, lw=2, label=label)
-        for label, (colour, marker) in styles.items()
-        if label
-    ]
-    columns = min(len(handles), 5)
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
-
-
-def _draw_over_k(panel: Axes, dataset: xarray.Dataset, cell: int, label: str, colour: Any) -> list[list[Any]]:
-    rows = []
-    k = dataset["k"].values
-    parameters = parameters_of(dataset, [cell])[0]
-    for method, style in ((TV, "-"), (NO_TV, "--")):
+def _over_k(
+    dataset: xarray.Dataset, cell: int, label: str, colour: Any
+) -> tuple[list[Line], list[list[Any]]]:
+    """Return R of a cell against the number of pixels kept as lines and as rows; circles are those chosen."""
+    lines, rows = [], []
+    k, (parameters,) = dataset["k"].values, parameters_of(dataset, [cell])
+    for method in (TV, NO_TV):
         part = dataset.sel(estimator=method).isel(cell=cell)
         y, se = part["error_at_k"].values, part["error_at_k_se"].values
-        ok = np.isfinite(y)
-        panel.plot(k[ok], y[ok], ls=style, color=colour, lw=1.9, label=label if method == TV else None)
-        panel.fill_between(k[ok], (y - se)[ok], (y + se)[ok], color=colour, alpha=0.25, lw=0)
-        chosen = float(part["chosen_k"].sel(mode=BEST))
-        if np.isfinite(chosen):
-            error = y[k == int(chosen)]
-            panel.plot([chosen] * len(error), error, "o", color=colour, mfc="white", ms=7, mew=1.6)
+        style = {"color": colour, "lw": 1.9, "ls": _TV_OR_NOT[method]["ls"]}
+        lines.append(Line(label if method == TV else "", k, y, se, style, band=True))
+        chosen = k == float(part["chosen_k"].sel(mode=BEST))
+        circle = {"color": colour, "ls": "", "marker": "o", "mfc": "white", "ms": 7, "mew": 1.6}
+        lines.append(Line("", k[chosen], y[chosen], style=circle))
         rows += [
             [label, method, int(number), f"{value:.6g}", f"{error:.3g}", *parameters.values()]
-            for number, value, error in zip(k[ok], y[ok], se[ok], strict=True)
+            for number, value, error in zip(k, y, se, strict=True)
+            if np.isfinite(value)
         ]
-    return rows
+    return lines, rows
 
 
 def _main_cells(dataset: xarray.Dataset, profile: str) -> dict[float, list[int]]:
@@ -339,16 +310,18 @@ def triple_picture() -> FigureWithData:
     layout, images = triple_images()
     shown = len(layout) // 2
     figure = new_figure(WIDTH, 9.4)
-    axes = figure.subplots(2, 3)
     brightest = float(np.percentile(images[1], 99.9))
-    for column, (name, stack) in enumerate(zip(_NAMES, images, strict=True)):
-        frame = np.full(layout.frame_shape, np.nan)
-        for (row, left), image in zip(layout.corners, stack, strict=True):
-            frame[row : row + layout.window[0], left : left + layout.window[1]] = image
-        sensor_image = _show(axes[0, column], frame, brightest, f"sensor, {name}")
-        spot_image = _show(axes[1, column], stack[shown], brightest, f"one spot, {name}")
-    colour_bar(list(axes[0]), sensor_image, "signal (e- per pixel)")
-    colour_bar(list(axes[1]), spot_image, "signal (e- per pixel)")
+    pictures = {
+        f"sensor, {name}": assembled(layout, stack) for name, stack in zip(_NAMES, images, strict=True)
+    }
+    pictures |= {f"one spot, {name}": stack[shown] for name, stack in zip(_NAMES, images, strict=True)}
+    axes = figure.subplots(2, 3)
+    for panel, (title, image) in zip(axes.flat, pictures.items(), strict=True):
+        drawn = panel.imshow(image, vmin=0.0, vmax=brightest, interpolation="nearest")
+        panel.set_title(title, fontsize=12)
+        panel.set(xlabel="column (px)", ylabel="row (px)")
+    for row in axes:
+        colour_bar(list(row), drawn, "signal (e- per pixel)")
     rows = [
         [y, x, *(f"{stack[shown, y, x]:.6g}" for stack in images)]
         for y in range(layout.window[0])
@@ -356,11 +329,3 @@ def triple_picture() -> FigureWithData:
     ]
     values = {"flux": FLUX_E, "noise": READ_NOISE_E, "reach": POSITION_RANGE_PX}
     return _TEXT.figure("fig1", figure, rows, **values)
-
-
-def _show(panel: Axes, image: NDArray[np.float64], brightest: float, title: str) -> object:
-    shown = panel.imshow(image, vmin=0.0, vmax=brightest, interpolation="nearest")
-    panel.set_title(title, fontsize=12)
-    panel.set_xlabel("column (px)")
-    panel.set_ylabel("row (px)")
-    return shown

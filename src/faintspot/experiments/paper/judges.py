@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from faintspot.base.report.texts import Texts
+from faintspot.base.report.words import with_error, with_interval
 from faintspot.experiments.curves import Curve, Gain, gain_at_error, gain_at_flux
 from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.experiments.study.curves import (
@@ -26,7 +27,6 @@ from faintspot.experiments.study.curves import (
     spread,
     study_curves,
 )
-from faintspot.experiments.words import with_error, with_interval
 
 if TYPE_CHECKING:
     import xarray

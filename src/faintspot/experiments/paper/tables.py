@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from faintspot.base.report.figure_data import csv_text
-from faintspot.base.report.page import Badge, Cell, Section, Table
+from faintspot.base.report.page import Section, TableCell
 from faintspot.base.report.texts import Texts
+from faintspot.base.report.words import NOTHING
 from faintspot.experiments.curves import Gain, gain_at_error
 from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV, label_of
 from faintspot.experiments.paper.claims import fixed_mode
@@ -24,7 +26,6 @@ from faintspot.experiments.study.curves import (
 )
 from faintspot.experiments.study.specification import BEST, CORRECTED
 from faintspot.experiments.study.sweep import PARAMETERS
-from faintspot.experiments.words import NOTHING
 
 if TYPE_CHECKING:
     import xarray
@@ -71,98 +72,67 @@ def table_of_cells(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[
 
 
 _MOST_CASES_SHOWN = 3  # in the verdict table; the page lists all of them below it
-_CASES = "cases"
-_COLOURS = {Outcome.HOLDS: "good", Outcome.IN_PART: "mixed", Outcome.FAILS: "bad"}
 
 
 def verdicts_section(judged: list[Verdict], fixed: str) -> Section:
     """Return the section of the verdicts; `fixed` names the mode of a fixed number of pixels."""
-    title = "Verdicts on the claims of Basden et al. 2015"
-    if not judged:
-        return Section("verdicts", title, missing=f"No verdicts: they need the methods “{NO_TV}” and “{TV}”.")
-    text = _TEXT("tables.verdicts.text", summary=_summary(judged, fixed), fixed=fixed)
     rows = [
         [
-            Cell(f"{item.number}. {item.claim}", small=item.rule),
-            Cell(badge=_badge(item.outcome)),
+            TableCell(f"{item.number}. {item.claim}", small=item.rule),
+            TableCell(badge=item.outcome),
             _cell_of_mode(item.best),
             _cell_of_mode(item.fixed),
         ]
         for item in judged
     ]
-    header = [*_TEXT["tables.verdicts.columns"], fixed.capitalize()]
-    return Section("verdicts", title, [text], tables=[Table(header, rows, prose=True)])
+    table = _TEXT.table("verdicts", rows, [fixed.capitalize()])
+    return _TEXT.section("verdicts", table, summary=_summary(judged, fixed), fixed=fixed)
 
 
 def cases_section(judged: list[Verdict]) -> Section:
     """Return the section of all cases that the verdicts rest on."""
-    title = "All cases behind the verdicts"
     cases = [
         (item, finding.mode, case)
         for item in judged
         for finding in (item.best, item.fixed)
         for case in finding.cases
     ]
-    if not cases:
-        return Section(_CASES, title, missing="There are none.")
-    data = [
-        [item.number, item.claim, mode, case.where, case.finding, case.outcome.value]
-        for item, mode, case in cases
-    ]
-    table = Table(
-        ["Claim", "mode", "where", "finding", "outcome"],
-        [
-            [str(item.number), mode_in_words(mode), case.where, case.finding, case.outcome.value]
-            for item, mode, case in cases
-        ],
-        prose=True,
-        csv=("verdicts.csv", csv_text(["number", "claim", "mode", "where", "finding", "outcome"], data)),
-        folded=f"{len(cases)} cases",
-    )
-    return Section(_CASES, title, tables=[table])
+    rows, data = [], []
+    for item, mode, case in cases:
+        found = [case.where, case.finding, case.outcome.value]
+        rows.append([str(item.number), mode_in_words(mode), *found])
+        data.append([item.number, item.claim, mode, *found])
+    text = csv_text(["number", "claim", "mode", "where", "finding", "outcome"], data)
+    return _TEXT.section("cases", replace(_TEXT.table("cases", rows), csv=("verdicts.csv", text)))
 
 
 def baselines_section(dataset: xarray.Dataset) -> Section:
     """Return the section that compares TV with every other method."""
-    title = "TV and the other methods"
-    modes = [mode for mode in ("best", fixed_mode(dataset)) if mode in dataset["mode"].values]
-    rows = [
-        [
-            label_of(row.method),
-            row.profile,
-            mode_in_words(mode),
-            str(row.cells),
-            str(row.smaller),
-            str(row.larger),
-            str(row.cells - row.smaller - row.larger),
-            str(row.smallest),
-            f"{row.mean_ratio:.3f}",
-        ]
-        for mode in modes
+    records = [
+        {
+            **vars(row),
+            "label": label_of(row.method),
+            "mode": mode_in_words(mode),
+            "undecided": row.cells - row.smaller - row.larger,
+        }
+        for mode in (BEST, fixed_mode(dataset))
+        if mode in dataset["mode"].values
         for row in against_tv(dataset, mode)
     ]
-    if not rows:
-        why = "Nothing to compare: TV or all others are not in this study."
-        return Section("baselines", title, missing=why)
-    return Section("baselines", title, tables=[_TEXT.table("tables.baselines", rows)])
+    return _TEXT.section("baselines", _TEXT.table("baselines", records))
 
 
 def gains_section(dataset: xarray.Dataset) -> Section:
     """Return the section of the flux gain, for every way to choose the number of pixels."""
-    title = "Flux gain of TV for every way to choose k"
     modes = [str(mode) for mode in dataset["mode"].values]
     rows = [
         [
-            configuration.in_words(),
+            key.in_words(),
             *(NOTHING if (gain := gains.get(mode)) is None else gain.in_words() for mode in modes),
         ]
-        for configuration, gains in gains_by_mode(dataset).items()
+        for key, gains in gains_by_mode(dataset).items()
     ]
-    if not rows:
-        why = "No configuration of this study has the error 0.15 px within its fluxes."
-        return Section("gains", title, missing=why)
-    table = _TEXT.table("tables.gains", rows, [mode_in_words(mode) for mode in modes])
-    return Section("gains", title, tables=[table])
+    return _TEXT.section("gains", _TEXT.table("gains", rows, [mode_in_words(mode) for mode in modes]))
 
 
 def gains_by_mode(dataset: xarray.Dataset) -> dict[Configuration, dict[str, Gain | None]]:
@@ -200,19 +170,15 @@ def _summary(judged: list[Verdict], fixed: str) -> str:
     return f"Of {len(judged)} claims: best k: {best}; {fixed}: {at_fixed}; both together: {together}"
 
 
-def _badge(outcome: Outcome) -> Badge:
-    return Badge(outcome.value, _COLOURS.get(outcome, "grey"))
-
-
-def _cell_of_mode(finding: Finding) -> Cell:
+def _cell_of_mode(finding: Finding) -> TableCell:
     """Return a mode's outcome and its first cases, of different outcomes where there are any."""
     shown = list({case.outcome: case for case in reversed(finding.cases)}.values())[::-1]
     shown += [case for case in finding.cases if case not in shown]
     shown = sorted(shown[:_MOST_CASES_SHOWN], key=list(finding.cases).index)
     more = len(finding.cases) - len(shown)
-    return Cell(
+    return TableCell(
         finding.in_words(),
-        _badge(finding.outcome),
+        finding.outcome,
         items=[(f"{case.finding} – {case.outcome.value}", case.where) for case in shown],
-        link=(_CASES, f"and {more} more") if more else None,
+        link=("cases", f"and {more} more") if more else None,
     )

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from faintspot.base.report.page import Badge, Cell, Section
+from faintspot.base.report.page import Section
 from faintspot.base.report.texts import Texts
-from faintspot.experiments.night.page import verdict_in_words
 from faintspot.experiments.night.verdicts import verdicts as night_verdicts
 from faintspot.experiments.paper.claims import fixed_mode, verdicts
 from faintspot.experiments.study.curves import Finding, Outcome, Verdict
@@ -19,8 +18,8 @@ if TYPE_CHECKING:
     from faintspot.experiments.night.blocks import Night
 
 _TEXT = Texts("faintspot.experiments")
+_NIGHT = Texts("faintspot.experiments.night")
 HOLDS, HOLDS_IF, FAILS, NOT_MEASURED = "holds", "holds if", "does not hold", "not measured"
-_COLOURS = {HOLDS: "good", HOLDS_IF: "mixed", FAILS: "bad"}
 
 
 @dataclass(frozen=True)
@@ -56,29 +55,20 @@ def paper_rows(dataset: xarray.Dataset | None, night: Night | None) -> list[Pape
     if night is not None:
         for each in night_verdicts(night):
             word = each.paired_outcome or each.outcome
-            rows.append(PaperRow(_TEXT["whole.night"], each.statement, word, "", verdict_in_words(each)))
+            rows.append(
+                PaperRow(_TEXT["whole.night"], each.statement, word, "", _NIGHT("lines.number", each))
+            )
     return rows
 
 
 def paper_section(rows: Sequence[PaperRow]) -> Section:
     """Return the section of the whole paper for a page."""
-    cells: list[list[str | Cell]] = [
-        [
-            row.part,
-            row.statement,
-            Cell(badge=Badge(row.verdict, _COLOURS.get(row.verdict, "grey")), small=row.condition),
-            row.number,
-        ]
-        for row in rows
-    ]
-    missing = "" if rows else _TEXT["whole.missing"]
-    tables = [replace(_TEXT.table("whole.table", cells), prose=True)] if rows else []
-    return Section("paper", _TEXT["whole.title"], tables=tables, missing=missing)
+    return _TEXT.section("paper", _TEXT.table("paper", rows))
 
 
 def paper_markdown(rows: Sequence[PaperRow]) -> str:
     """Return the table of the whole paper as Markdown."""
-    header = ["figure or table", "statement", "verdict", "number"]
+    header = list(_TEXT["paper.columns"])
     table = [header, ["---"] * len(header)]
     for row in rows:
         condition = f"<br>{row.condition}" if row.condition else ""

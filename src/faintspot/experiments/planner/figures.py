@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.report.drawing import FLUX_GREY, GREY, axis_above, new_figure, note, plain_ticks, styled
+from faintspot.base.report.drawing import FLUX_GREY, note, styled
+from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.experiments.closed_loop.figures import method_style
 from faintspot.experiments.closed_loop.question import MODEL_ERROR, PLACES
 from faintspot.experiments.planner import text as answer_text
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from faintspot.experiments.closed_loop.answer import LoopAnswer
-    from faintspot.experiments.planner.answer import Answer
+    from faintspot.experiments.planner.answer import Answer, MethodResult
 
 
 _WIDTH, _HEIGHT = 10.5, 6.6
@@ -41,68 +42,60 @@ def tune_figure(answer: Answer) -> Figure:
     >>> from faintspot.experiments import tune_figure
     >>> figure = tune_figure(answer)  # of faintspot.tune  # doctest: +SKIP
     """
-    figure = new_figure(_WIDTH, _HEIGHT)
-    axes = figure.subplots()
     magnitudes = answer.magnitudes(answer.flux_e)
-    for result in answer.results:
-        _draw_method(axes, answer, result, magnitudes)
     saturated = answer.question.search_range_px / 2
     bound = np.where(answer.bound_px < 1.5 * saturated, answer.bound_px, np.nan)
-    axes.plot(magnitudes, bound, color="black", lw=1.3, label="Cramér-Rao bound, without a prior", zorder=6)
-    axes.axhline(saturated, color=GREY, lw=1, ls=(0, (1, 4)), label="always the reference")
-    axes.set_yscale("log")
-    _axis_limits(axes, answer, saturated)
+    lines = [_line(answer, result, magnitudes) for result in answer.results]
+    style = {"color": "black", "lw": 1.3, "zorder": 6}
+    lines.append(Line("Cramér-Rao bound, without a prior", magnitudes, bound, style=style))
+    panel = Panel(
+        lines,
+        answer.magnitude_label,
+        "slope error R, mean |error| per axis (px)",
+        y_ticks=_TICKS,
+        y_range=_limits(answer, saturated),
+        levels={saturated: {"ls": (0, (1, 4)), "label": "always the reference"}},
+        above=(magnitudes, answer.flux_e.tolist(), "electrons per sub-aperture and frame"),
+        grid=True,
+    )
+    figure = plot([[panel]], _HEIGHT, width=_WIDTH, legend="")
+    axes = figure.axes[0]
     _mark_star(axes, answer)
     _mark_budget(axes, answer)
-    axis_above(axes, magnitudes, answer.flux_e, "electrons per sub-aperture and frame")
-    plain_ticks(axes.yaxis, _TICKS)
-    axes.grid(which="major", color=FLUX_GREY, lw=0.7)
     if answer.promise is not None and answer.promise.contradicted:
         title = textwrap.fill(answer_text.promise_lines(answer)[-1], _TITLE_LETTERS)
         axes.set_title(title, color="#b00020", loc="left")
     why = textwrap.fill(answer_text.below_bound(answer), _NOTE_LETTERS)
     axes.text(1.03, 0.0, why, transform=axes.transAxes, color="#666666", fontsize=10, va="bottom")
-    axes.set_xlabel(answer.magnitude_label)
-    axes.set_ylabel("slope error R, mean |error| per axis (px)")
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0)
     return figure
 
 
-def _draw_method(axes: Axes, answer: Any, result: Any, magnitudes: NDArray[np.float64]) -> None:
-    style = result.method.estimator.style
-    best = result is answer.best
-    axes.errorbar(
-        magnitudes,
-        result.error_px,
-        result.standard_error_px,
-        color=style.colour,
-        ls=style.line,
-        marker=style.marker,
-        ms=7 if best else 5,
-        lw=3 if best else 1.6,
-        elinewidth=1,
-        zorder=4 if best else 3,
-        label=f"{result.method.label} (recommended)" if best else result.method.label,
-    )
+def _line(answer: Answer, result: MethodResult, magnitudes: NDArray[np.float64]) -> Line:
+    style, best = result.method.estimator.style, result is answer.best
+    drawn = {"color": style.colour, "ls": style.line, "marker": style.marker, "elinewidth": 1}
+    drawn |= {"ms": 7, "lw": 3, "zorder": 4} if best else {"ms": 5, "lw": 1.6, "zorder": 3}
+    label = f"{result.method.label} (recommended)" if best else result.method.label
+    return Line(label, magnitudes, result.error_px, result.standard_error_px, drawn)
 
 
-def _axis_limits(axes: Axes, answer: Any, saturated: float) -> None:
+def _limits(answer: Answer, saturated: float) -> tuple[float, float]:
     drawn = [result.error_px for result in answer.results]
     lowest = min(float(np.min(drawn)), float(answer.bound_px.min()))
     highest = min(float(np.max(drawn)), 2.5 * saturated)
     budget = answer.question.budget_px
     if budget is not None and lowest / 3 < budget < 3 * highest:
         lowest, highest = min(lowest, budget), max(highest, budget)
-    axes.set_ylim(lowest / 1.15, highest * 1.15)
+    return lowest / 1.15, highest * 1.15
 
 
-def _mark_star(axes: Axes, answer: Any) -> None:
+def _mark_star(axes: Axes, answer: Answer) -> None:
     where = float(answer.magnitudes(answer.question.star_flux_e))
     axes.axvline(where, color="black", lw=0.8, ls=":", zorder=0)
     note(axes, f"the {answer.question.subject}", (where, 0.015), "data, axes fraction", xytext=(4, 0))
 
 
-def _mark_budget(axes: Axes, answer: Any) -> None:
+def _mark_budget(axes: Axes, answer: Answer) -> None:
     budget, limit = answer.question.budget_px, answer.best.limiting_flux_e
     if budget is None:
         return
@@ -133,47 +126,57 @@ def loop_figure(answer: LoopAnswer) -> Figure:
     >>> from faintspot.experiments import loop_figure
     >>> figure = loop_figure(answer)  # of tune_loop  # doctest: +SKIP
     """
-    figure = new_figure(_LOOP_WIDTH, _LOOP_HEIGHT)
-    if answer.question.radius is None:
-        left = figure.subplots()
-    else:
-        left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
-        _draw_sky(right, answer)
-    _draw_strehl(left, answer)
-    handles, labels = left.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles), frameon=False)
+    has_sky = answer.question.radius is not None
+    panels = [_strehl_panel(answer), *([Panel([], "")] if has_sky else [])]
+    names = {
+        name: f"{name} (recommended)" if kind is answer.best else name for name, kind in answer.kinds.items()
+    }
+    figure = plot(
+        [panels],
+        _LOOP_HEIGHT,
+        width=_LOOP_WIDTH,
+        columns=len(names),
+        handles=[Line(label, [], [], style=method_style(name)) for name, label in names.items()],
+        width_ratios=(1.25, 1.0)[: len(panels)],
+    )
+    left = figure.axes[0]
+    words, position = f"Strehl {answer.level:.2f}: limiting magnitudes", (0.01, answer.level)
+    note(left, words, position, "axes fraction, data", xytext=(0, 3), color="#666666")
+    if answer.question.configuration.photons in answer.photons:
+        text_at = (answer.magnitudes[answer.at_star], 0.99)
+        note(left, "the star", text_at, "data, axes fraction", xytext=(4, -10))
+    if has_sky:
+        _draw_sky(figure.axes[1], answer)
     return figure
 
 
-def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
-    magnitudes = answer.magnitudes
-    for name, kind in answer.kinds.items():
+def _strehl_panel(answer: LoopAnswer) -> Panel:
+    """Return the curves, the ratios that were measured and the limiting magnitudes of all methods."""
+    magnitudes, loop = answer.magnitudes, answer.question.configuration
+    lines = []
+    for name in answer.kinds:
         drawn = method_style(name)
-        label = f"{name} (recommended)" if kind is answer.best else name
-        axes.plot(magnitudes, answer.curve(name), **{**drawn, "marker": ""})
-        axes.plot([], [], label=label, **drawn)
         values = [answer.strehl(name, flux) for flux in range(len(magnitudes))]
         errors = [strehl.standard_error for strehl in values]
         bars = {**drawn, "lw": 0, "elinewidth": 1.2, "capsize": 2.5}
-        axes.errorbar(magnitudes, [strehl.value for strehl in values], errors, **bars)
+        lines.append(Line("", magnitudes, answer.curve(name), style={**drawn, "marker": ""}))
+        lines.append(Line("", magnitudes, [strehl.value for strehl in values], errors, bars))
         limit = answer.limit(name)
         if limit.is_known:
-            error = limit.error if np.isfinite(limit.error) else 0.0
             mark = {"color": drawn["color"], "marker": "|", "ms": 16, "mew": 2.2, "lw": 0, "elinewidth": 2.2}
-            axes.errorbar(limit.magnitude.value, answer.level, xerr=error, zorder=5, **mark)
-    axes.axhline(answer.level, color=GREY, lw=1, zorder=0)
-    words, position = f"Strehl {answer.level:.2f}: limiting magnitudes", (0.01, answer.level)
-    note(axes, words, position, "axes fraction, data", xytext=(0, 3), color="#666666")
-    if answer.question.configuration.photons in answer.photons:
-        axes.axvline(magnitudes[answer.at_star], color="black", lw=0.8, ls=":", zorder=0)
-        text_at = (magnitudes[answer.at_star], 0.99)
-        note(axes, "the star", text_at, "data, axes fraction", xytext=(4, -10))
-    axes.set_ylim(0, 1)
-    axes.grid(color=FLUX_GREY, lw=0.7)
-    loop = answer.question.configuration
-    axes.set_xlabel(f"guide star magnitude ({loop.camera.band}); markers are measured, lines interpolated")
-    axes.set_ylabel(f"Strehl ratio at {1e6 * loop.science.wavelength_m:.3g} µm")
-    axis_above(axes, magnitudes, answer.photons, "photo-electrons per sub-aperture and frame")
+            place = [limit.magnitude.value], [answer.level]
+            lines.append(Line("", *place, style={**mark, "zorder": 5}, x_error=[limit.error]))
+    star = {"color": "black", "lw": 0.8, "ls": ":", "zorder": 0}
+    return Panel(
+        lines,
+        f"guide star magnitude ({loop.camera.band}); markers are measured, lines interpolated",
+        f"Strehl ratio at {1e6 * loop.science.wavelength_m:.3g} µm",
+        y_range=(0, 1),
+        levels={answer.level: {"zorder": 0}},
+        at={magnitudes[answer.at_star]: star} if loop.photons in answer.photons else {},
+        above=(magnitudes, answer.photons.tolist(), "photo-electrons per sub-aperture and frame"),
+        grid=True,
+    )
 
 
 def _draw_sky(axes: Axes, answer: LoopAnswer) -> None:

@@ -6,11 +6,10 @@ import math
 from typing import Any
 
 from faintspot.base.report.texts import Texts
+from faintspot.base.report.words import plain_number, with_error
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.methods import Knowledge
 from faintspot.experiments.planner.answer import Answer, MethodResult, settings_in_words
-from faintspot.experiments.planner.question import Question
-from faintspot.experiments.words import plain_number, with_error
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 
@@ -43,29 +42,32 @@ def situation(answer: Answer) -> str:
 
 def recommendation(answer: Answer) -> list[str]:
     """Return the recommendation in a few sentences, the first a heading."""
-    best = answer.best
-    lines = [f"Recommended: {best.method.label} ({settings_in_words(best.settings)})"]
-    if answer.is_hopeless:
-        rms = best.statistics.corrected_rms.value
-        lines.append(
-            _TEXT("answer.too_faint", rms=rms, prior=answer.prior_rms_px, subject=answer.question.subject)
-        )
-    if best.method.name != BRIGHTEST:
-        gains = (gain_in_words(answer, gain) for gain in (best.over_brightest, best.over_thresholded))
-        lines.append(_TEXT("answer.saves", **dict(zip(("brightest", "thresholded"), gains, strict=True))))
-    others = [answer[name].method.label for name in answer.equal[1:]]
-    if others:
-        lines.append(_TEXT("answer.as_good", others=", ".join(others)))
-    lines += _about_tv(answer)
-    gain = best.statistics.gain.value
-    if gain < _LOW_GAIN:
-        lines.append(_TEXT("answer.low_gain", gain=gain))
+    best, brightest, tv = answer.best, answer[BRIGHTEST], answer[TV]
     alternative = answer.best_without_psf
-    if Knowledge.of(best.method.estimator) == Knowledge.SPOT:
-        words = {"label": alternative.method.label, "settings": settings_in_words(alternative.settings)}
-        gained = gain_in_words(answer, alternative.over_brightest)
-        lines.append(_TEXT("answer.without_spot", **words, gain=gained))
-    return lines + _limiting(answer) + promise_lines(answer)
+    is_better, knows_spot = best is not brightest, Knowledge.of(best.method.estimator) == Knowledge.SPOT
+    by_tv, budget = gain_in_words(answer, tv.over_brightest), answer.question.budget_px
+    lines = _TEXT.lines(
+        "answer.recommendation",
+        best=best,
+        settings=settings_in_words(best.settings),
+        subject=answer.question.subject if answer.is_hopeless else None,
+        prior=answer.prior_rms_px,
+        over_brightest=gain_in_words(answer, best.over_brightest) if is_better else None,
+        over_thresholded=gain_in_words(answer, best.over_thresholded),
+        others=", ".join(answer[name].method.label for name in answer.equal[1:]) or None,
+        tv_does_not=by_tv if tv is not best and not _helps(tv.over_brightest) else None,
+        tv_saves=by_tv if tv is not best and _helps(tv.over_brightest) else None,
+        times=tv.method.estimator.cost / best.method.estimator.cost,
+        low_gain=best.statistics.gain.value if best.statistics.gain.value < _LOW_GAIN else None,
+        without_spot=alternative.method.label if knows_spot else None,
+        settings_without=settings_in_words(alternative.settings),
+        gain_without=gain_in_words(answer, alternative.over_brightest),
+        unit="magnitude" if answer.question.photometry else "flux",
+        budget=budget,
+        limit=None if budget is None else _limit(answer, best),
+        limit_of_brightest=_limit(answer, brightest) if is_better and budget is not None else None,
+    )
+    return lines + promise_lines(answer)
 
 
 def promise_lines(answer: Answer) -> list[str]:
@@ -73,56 +75,44 @@ def promise_lines(answer: Answer) -> list[str]:
     promise = answer.promise
     if promise is None:
         return [UNCHECKED] if answer.question.facts else []
-    errors = {"expected": promise.expected_px, "promised": promise.promised_px}
-    text = _TEXT(
-        "answer.checked",
-        flux=plain_number(promise.flux_e),
-        predicted=with_error(promise.predicted, 4),
-        measured=with_error(promise.measured, 4),
-        ratio=promise.noise_ratio,
-    )
-    if math.isfinite(promise.frame_to_frame.value):
-        text += _TEXT("answer.frame_to_frame", error=with_error(promise.frame_to_frame, 4))
-    if not promise.contradicted and promise.expected_px > _PLACED * promise.promised_px:
-        text += _TEXT("answer.placed", **errors)
-    lines = [text]
     simulated = min(answer.results, key=lambda result: result.statistics.ranking_rms)
     factor = answer.promises[simulated.method.name].factor
-    if factor > 1 and simulated is not answer.best:
-        lines.append(_TEXT("answer.contradicted_best", label=simulated.method.label, factor=factor))
-    if promise.contradicted:
-        why = " (pixels have another noise than was taken)" if promise.noise_differs else ""
-        expected = _TEXT("answer.expect", **errors)
-        if promise.factor == 1:
-            expected = _TEXT("answer.not_corrected", **errors)
-        lines.append(f"{CONTRADICTED}: {expected}{why}")
-    return lines
+    is_placed = not promise.contradicted and promise.expected_px > _PLACED * promise.promised_px
+    checked = _TEXT(
+        "answer.checked",
+        promise,
+        flux=plain_number(promise.flux_e),
+        moving=promise.frame_to_frame if math.isfinite(promise.frame_to_frame.value) else None,
+        placed=is_placed,
+    )
+    lines = _TEXT.lines(
+        "answer.promise",
+        promise,
+        label=simulated.method.label if factor > 1 and simulated is not answer.best else None,
+        factor_of_best=factor,
+        contradiction=CONTRADICTED if promise.contradicted else None,
+        is_corrected=promise.factor != 1,
+        why=" (pixels have another noise than was taken)" if promise.noise_differs else "",
+    )
+    return [checked, *lines]
 
 
 def foundations(answer: Answer) -> list[str]:
     """Describe what the answer is based on."""
-    question = answer.question
-    spots = f"{answer.realisations} simulated spots at each of {len(answer.flux_e)} fluxes"
-    lines = list(question.facts)
-    if question.laser is not None:
-        lines.append(question.laser.in_words(question.pixel_scale_arcsec, question.shape))
-    lines.append(_shape(question, spots))
-    lines.append(_TEXT["answer.positions"])
-    if question.photometry is not None:
-        lines.append(_TEXT("answer.photometry", flux=question.photometry))
-    if question.d_over_r0:
-        lines.append(_TEXT["answer.bound"])
-    lines += [f"{name} was not tried: {reason}" for name, reason in answer.left_out.items()]
-    return lines
-
-
-def _shape(question: Question, spots: str) -> str:
-    """Describe the shape of the spots, and who knows it."""
-    if question.laser is not None:
-        return _TEXT("answer.laser_psf", spots=spots)
-    if question.psf is not None:
-        return _TEXT("answer.learnt_psf", spots=spots)
-    return _TEXT("answer.assumed_profile", spots=spots, profile=question.profile)
+    question, laser = answer.question, answer.question.laser
+    is_learnt = laser is None and question.psf is not None
+    lines = _TEXT.lines(
+        "answer.foundations",
+        question,
+        spots=f"{answer.realisations} simulated spots at each of {len(answer.flux_e)} fluxes",
+        laser_words=laser and laser.in_words(question.pixel_scale_arcsec, question.shape),
+        laser=laser is not None,
+        learnt=is_learnt,
+        assumed=laser is None and not is_learnt,
+        speckled=bool(question.d_over_r0),
+    )
+    not_tried = [f"{name} was not tried: {reason}" for name, reason in answer.left_out.items()]
+    return [*question.facts, *lines, *not_tried]
 
 
 def gain_in_words(answer: Answer, gain: Estimate) -> str:
@@ -144,21 +134,11 @@ def _span(answer: Answer) -> float:
     return float(2.5 * math.log10(answer.flux_e[-1] / answer.question.star_flux_e))
 
 
-def _about_tv(answer: Answer) -> list[str]:
-    """Describe the gain of TV where it is not recommended."""
-    tv, best = answer[TV], answer.best
-    if tv is best:
-        return []
-    times = tv.method.estimator.cost / best.method.estimator.cost
-    gain = tv.over_brightest
+def _helps(gain: Estimate) -> bool:
+    """Whether a gain is worth a word."""
     if not math.isfinite(gain.value):
-        helps = gain.value > 0
-    else:
-        helps = gain.value > max(_HELPS_ABOVE_MAG, 2 * gain.standard_error)
-    if not helps:
-        return [_TEXT("answer.tv_does_not", gain=gain_in_words(answer, gain))]
-    saved = gain_in_words(answer, gain)
-    return [_TEXT("answer.tv_saves", gain=saved, times=times, label=best.method.label)]
+        return gain.value > 0
+    return gain.value > max(_HELPS_ABOVE_MAG, 2 * gain.standard_error)
 
 
 def below_bound(answer: Answer) -> str:
@@ -173,18 +153,6 @@ def below_bound(answer: Answer) -> str:
         return ""
     reach = answer.question.search_range_px
     return _TEXT("answer.below_bound", labels=", ".join(labels), reach=reach)
-
-
-def _limiting(answer: Answer) -> list[str]:
-    """Return the limiting magnitudes of the recommended method and of brightest pixels."""
-    budget = answer.question.budget_px
-    if budget is None:
-        return []
-    brightest = answer[BRIGHTEST]
-    text = f"for R = {budget:.3g} px: {_limit(answer, answer.best)}"
-    if answer.best is not brightest:
-        text += f"; with brightest pixels {_limit(answer, brightest)}"
-    return [f"limiting {'magnitude' if answer.question.photometry else 'flux'} {text}"]
 
 
 def _limit(answer: Answer, result: MethodResult) -> str:

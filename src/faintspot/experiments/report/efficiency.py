@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.report.page import Section
 from faintspot.base.report.texts import Texts
+from faintspot.base.report.words import number_or_dash
 from faintspot.experiments.methods import knows_the_spot
 from faintspot.experiments.study.curves import Configuration
 from faintspot.experiments.study.specification import BEST, CORRECTED
-from faintspot.experiments.words import number_or_dash
 from faintspot.slopes.estimators.built_in.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.slopes.estimators.built_in.maximum_likelihood import MaximumLikelihood
 from faintspot.slopes.estimators.built_in.weighted import Weighted
@@ -49,154 +49,148 @@ def enough_photons(read_noise_e: float, flux_e: float) -> bool:
     return bool(flux_e >= needed * (1 - 1e-9))
 
 
-class _Cells:
-    """Finished cells of a study, with their values by method."""
-
-    def __init__(self, dataset: xarray.Dataset, speckled: bool) -> None:
-        done = dataset["done"].values & ((dataset["d_over_r0"].values > 0) == speckled)
-        self._dataset = dataset.isel(cell=np.flatnonzero(done))
-        self.methods = [str(method) for method in dataset["estimator"].values]
-        self.count = int(done.sum())
-
-    def coordinate(self, name: str) -> NDArray[Any]:
-        return self._dataset[name].values
-
-    def values(self, name: str, mode: str | None = None) -> Floats:
-        """Values of all methods, (cells, methods)."""
-        variable = self._dataset[name] if mode is None else self._dataset[name].sel(mode=mode)
-        return np.asarray(variable.transpose("cell", "estimator").values, dtype=np.float64)
-
-    def of(self, name: str, method: str, mode: str | None = BEST) -> Floats:
-        """Values of one method, (cells,)."""
-        return self.values(name, mode)[:, self.methods.index(method)]
-
-    def words(self, cell: int) -> str:
-        """A cell in one line."""
-        names = Configuration.__dataclass_fields__
-        configuration = Configuration(**{name: self.coordinate(name)[cell].item() for name in names})
-        return f"{self.coordinate('flux_e')[cell]:g} e-, {configuration.in_words()}"
-
-    def order(self) -> list[int]:
-        """Indices by spot, camera and flux."""
-        names = ("profile", "elongation", "size", "pixels", "position_range_px", "read_noise_e")
-        keys = [self.coordinate(name) for name in (*names, "d_over_r0", "flux_e")]
-        return [int(index) for index in np.lexsort(keys[::-1])]
-
-
 def findings(dataset: xarray.Dataset) -> list[str]:
     """Return what a study says about the estimators, a sentence or two each."""
-    sentences = []
-    cells = _Cells(dataset, speckled=False)
-    if cells.count:
-        sentences += _efficient(cells)
-        sentences += _outlier_dominated(cells)
-    speckled = _Cells(dataset, speckled=True)
-    if speckled.count:
-        sentences += _near_the_best(speckled, dataset)
-    return sentences
+    cells, speckled = _finished(dataset, speckled=False), _finished(dataset, speckled=True)
+    found = [*_efficient(cells), *_outlier_dominated(cells)]
+    return found + (_near_the_best(speckled) if speckled.sizes["cell"] else [])
 
 
-def _efficient(cells: _Cells) -> list[str]:
-    conditions = zip(cells.coordinate("read_noise_e"), cells.coordinate("flux_e"), strict=True)
-    enough = np.array([enough_photons(float(noise), float(flux)) for noise, flux in conditions])
+def result_sections(dataset: xarray.Dataset) -> list[Section]:
+    """Return the tables of a study: efficiency, calibration of the stated errors, speckled spots."""
+    cells, speckled = (_in_order(_finished(dataset, speckled=speckled)) for speckled in (False, True))
+    methods = _methods(dataset)
+    knowing = [method for method in methods if knows_the_spot(method)]
+    sections = []
+    if cells.sizes["cell"]:
+        efficiency = cells["photon_efficiency"].sel(mode=BEST).values
+        rows = [
+            [f"{bound:.4f}", *map(number_or_dash, of_cell)]
+            for bound, of_cell in zip(cells["bound"].values, efficiency, strict=True)
+        ]
+        sections.append(_section(cells, "efficiency-table", rows, methods))
+        stated = [cells[f"stated_over_actual{part}"].sel(estimator=knowing).values for part in ("", "_all")]
+        rows = [
+            [
+                f"{number_or_dash(inliers)} ({number_or_dash(every)})"
+                for inliers, every in zip(*pair, strict=True)
+            ]
+            for pair in zip(*stated, strict=True)
+        ]
+        sections.append(_section(cells, "calibration-table", rows, knowing))
+    if speckled.sizes["cell"]:
+        values, ratio = _corrected_rms(speckled)
+        best = np.nanargmin(values, axis=1)
+        rows = [
+            [
+                f"{values[i, of_cell]:.4f}",
+                methods[of_cell],
+                *(number_or_dash(x, 0) for x in 100 * (ratio[i] - 1)),
+            ]
+            for i, of_cell in enumerate(best)
+        ]
+        sections.append(_section(speckled, "speckled-table", rows, methods))
+    return sections
+
+
+def _finished(dataset: xarray.Dataset, *, speckled: bool) -> xarray.Dataset:
+    """Return the finished cells of a study, with or without speckles."""
+    done = dataset["done"].values & ((dataset["d_over_r0"].values > 0) == speckled)
+    return dataset.isel(cell=np.flatnonzero(done)).transpose("cell", "estimator", ...)
+
+
+def _in_order(cells: xarray.Dataset) -> xarray.Dataset:
+    """Return cells by spot, camera and flux."""
+    names = (
+        "profile",
+        "elongation",
+        "size",
+        "pixels",
+        "position_range_px",
+        "read_noise_e",
+        "d_over_r0",
+        "flux_e",
+    )
+    return cells.isel(cell=np.lexsort([cells[name].values for name in reversed(names)]))
+
+
+def _methods(cells: xarray.Dataset) -> list[str]:
+    return [str(method) for method in cells["estimator"].values]
+
+
+def _in_words(cells: xarray.Dataset) -> list[str]:
+    """Return each cell in one line."""
+    names = Configuration.__dataclass_fields__
+    columns = [cells[name].values.tolist() for name in names]
+    keys = [Configuration(**dict(zip(names, values, strict=True))) for values in zip(*columns, strict=True)]
+    fluxes = cells["flux_e"].values
+    return [f"{flux:g} e-, {key.in_words()}" for flux, key in zip(fluxes, keys, strict=True)]
+
+
+def _corrected_rms(cells: xarray.Dataset) -> tuple[Floats, Floats]:
+    """Return the gain-corrected rms, (cells, methods), and its ratio to the smallest of all methods."""
+    values = cells["corrected_rms"].sel(mode=corrected_mode(cells)).values
+    return values, values / np.nanmin(values, axis=1, keepdims=True)
+
+
+def _efficient(cells: xarray.Dataset) -> list[str]:
+    conditions = zip(cells["read_noise_e"].values, cells["flux_e"].values, strict=True)
+    enough = [enough_photons(float(noise), float(flux)) for noise, flux in conditions]
+    bright = cells.isel(cell=np.flatnonzero(enough))
     sentences = []
     for method, target in EXPECTED_EFFICIENCY.items():
-        if method in cells.methods and enough.any():
-            values = np.where(enough, cells.of("photon_efficiency", method), np.inf)
-            lowest = int(np.argmin(values))
-            reached = int(np.sum(values[enough] >= target))
-            words = {"method": method, "target": target, "reached": reached, "cells": enough.sum()}
-            condition = cells.words(lowest)
-            sentences.append(_TEXT("findings.efficient", **words, lowest=values[lowest], where=condition))
+        if method in _methods(cells) and any(enough):
+            efficiency = bright["photon_efficiency"].sel(mode=BEST, estimator=method).values
+            lowest = int(np.argmin(efficiency))
+            values = {"lowest": efficiency[lowest], "where": _in_words(bright)[lowest]}
+            counts = {"reached": np.sum(efficiency >= target), "cells": len(efficiency)}
+            sentences.append(_TEXT("findings.efficient", method=method, target=target, **counts, **values))
     return sentences
 
 
-def _outlier_dominated(cells: _Cells) -> list[str]:
-    if not {ML, MAP} <= set(cells.methods):
+def _outlier_dominated(cells: xarray.Dataset) -> list[str]:
+    if not {ML, MAP} <= set(_methods(cells)):
         return []
-    dominated = cells.of("outlier_fraction", ML) > _OUTLIERS
-    if not dominated.any():
+    best = cells.sel(mode=BEST)
+    dominated = best.isel(cell=np.flatnonzero(best["outlier_fraction"].sel(estimator=ML).values > _OUTLIERS))
+    if not dominated.sizes["cell"]:
         return []
-    errors, se = cells.values("error", BEST)[dominated], cells.of("error_se", MAP)[dominated]
-    of_map = cells.of("error", MAP)[dominated]
-    smallest = errors.min(axis=1)
-    ratio = of_map / smallest
-    stated = cells.of("stated_over_actual_all", MAP, None)[dominated]
+    smallest, of_map = dominated["error"].values.min(axis=1), dominated.sel(estimator=MAP)
+    error, stated = of_map["error"].values, of_map["stated_over_actual_all"].values
     return [
         _TEXT(
             "findings.outliers",
             limit=_OUTLIERS,
-            cells=dominated.sum(),
-            smallest=int(np.sum(ratio <= 1)),
-            near=int(np.sum(of_map - smallest <= 2 * se)),
-            most=ratio.max(),
+            cells=len(error),
+            smallest=np.sum(error <= smallest),
+            near=np.sum(error - smallest <= 2 * of_map["error_se"].values),
+            most=np.max(error / smallest),
             low=stated.min(),
             high=stated.max(),
         )
     ]
 
 
-def _near_the_best(cells: _Cells, dataset: xarray.Dataset) -> list[str]:
-    ratio = _ratio_to_best(cells.values("corrected_rms", _corrected_mode(dataset)))
-    d_over_r0 = cells.coordinate("d_over_r0")
+def _near_the_best(cells: xarray.Dataset) -> list[str]:
+    _, every = _corrected_rms(cells)
+    d_over_r0 = cells["d_over_r0"].values
     sentences = []
     for words, part in (("all", d_over_r0 > 0), ("d/r0 up to 1", d_over_r0 <= 1), ("above 1", d_over_r0 > 1)):
         if part.any():
-            near = {
-                method: int(np.sum(ratio[part, i] <= NEAR_BEST)) for i, method in enumerate(cells.methods)
-            }
-            worst = {method: float(ratio[part, i].max()) for i, method in enumerate(cells.methods)}
-            ranked = sorted(near, key=lambda method: (-near[method], worst[method]))
-            listed = ", ".join(
-                f"{method} {near[method]} (worst {100 * (worst[method] - 1):.0f} %)" for method in ranked[:5]
-            )
-            near_percent = 100 * (NEAR_BEST - 1)
-            counts = {"which": words, "cells": part.sum(), "near": near_percent}
+            near, worst = (every[part] <= NEAR_BEST).sum(axis=0), 100 * (every[part].max(axis=0) - 1)
+            ranked = sorted(zip(-near, worst, _methods(cells), strict=True), key=lambda each: each[:2])[:5]
+            listed = ", ".join(f"{name} {-count} (worst {percent:.0f} %)" for count, percent, name in ranked)
+            counts = {"which": words, "cells": part.sum(), "near": 100 * (NEAR_BEST - 1)}
             sentences.append(_TEXT("findings.near_best", **counts, ranked=listed))
     return sentences
 
 
-def _ratio_to_best(values: Floats) -> Floats:
-    ratio: Floats = values / np.nanmin(values, axis=1, keepdims=True)
-    return ratio
-
-
-def result_sections(dataset: xarray.Dataset) -> list[Section]:
-    """Return the tables of a study: efficiency, calibration of the stated errors, speckled spots."""
-    sections = []
-    cells, speckled = _Cells(dataset, speckled=False), _Cells(dataset, speckled=True)
-    if cells.count:
-        efficiency, bound = cells.values("photon_efficiency", BEST), cells.coordinate("bound")
-        rows = [[f"{bound[i]:.4f}", *map(number_or_dash, efficiency[i])] for i in cells.order()]
-        sections.append(_section(cells, "efficiency", rows, cells.methods))
-        inliers, everything = (cells.values(f"stated_over_actual{part}") for part in ("", "_all"))
-        kept = [i for i, method in enumerate(cells.methods) if knows_the_spot(method)]
-        rows = [
-            [f"{number_or_dash(inliers[i, j])} ({number_or_dash(everything[i, j])})" for j in kept]
-            for i in cells.order()
-        ]
-        sections.append(_section(cells, "calibration", rows, [cells.methods[j] for j in kept]))
-    if speckled.count:
-        values = speckled.values("corrected_rms", _corrected_mode(dataset))
-        best, excess = np.nanargmin(values, axis=1), 100 * (_ratio_to_best(values) - 1)
-        rows = [
-            [
-                f"{values[i, best[i]]:.4f}",
-                speckled.methods[best[i]],
-                *(number_or_dash(percent, 0) for percent in excess[i]),
-            ]
-            for i in speckled.order()
-        ]
-        sections.append(_section(speckled, "speckled", rows, speckled.methods))
-    return sections
-
-
-def _section(cells: _Cells, name: str, rows: list[list[str]], methods: list[str]) -> Section:
+def _section(cells: xarray.Dataset, name: str, rows: list[list[str]], methods: list[str]) -> Section:
     """Return the section of a table with a row for each cell."""
-    named = [[cells.words(index), *row] for index, row in zip(cells.order(), rows, strict=True)]
-    table = _TEXT.table(f"estimator_tables.{name}", named, methods)
-    return Section(f"{name}-table", _TEXT[f"estimator_tables.{name}.title"], tables=[table])
+    named = [[words, *row] for words, row in zip(_in_words(cells), rows, strict=True)]
+    return _TEXT.section(name, _TEXT.table(name, named, methods))
 
 
-def _corrected_mode(dataset: xarray.Dataset) -> str:
+def corrected_mode(dataset: xarray.Dataset) -> str:
+    """Return the mode whose settings are chosen for the gain-corrected rms, where the study has it."""
     return CORRECTED if CORRECTED in dataset["mode"].values else BEST

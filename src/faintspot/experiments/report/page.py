@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
 from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.page import Page, Section, configuration_section, html_of, write_page
+from faintspot.base.report.page import Report, Section, configuration_section
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.night.blocks import NIGHT_STORE, Night, load_night
 from faintspot.experiments.night.page import night_sections
@@ -42,15 +42,15 @@ _TEXT = Texts("faintspot.experiments")
 _KEPT_PIXELS = "fig5"
 
 
-def report_of_study(path: str | Path) -> str:
-    """Return the report page (HTML) of a stored study, finished or not.
+def report_of_study(path: str | Path) -> Report:
+    """Return the report of a stored study, finished or not.
 
     Raises
     ------
     InputError
         When there is no study, or none of its cells is finished.
     MissingExtraError
-        When xarray, zarr, matplotlib or jinja2 is not installed.
+        When xarray, zarr or matplotlib is not installed.
     """
     from faintspot.experiments.study.run import open_study
 
@@ -63,8 +63,8 @@ def night_folder(path: str | Path) -> Path:
     return derived(path, "-night")
 
 
-def study_report(dataset: xarray.Dataset, night: Night | None = None) -> str:
-    """Return the report page of a study as HTML: self-contained, without scripts.
+def study_report(dataset: xarray.Dataset, night: Night | None = None) -> Report:
+    """Return the report of a study.
 
     Parameters
     ----------
@@ -78,14 +78,29 @@ def study_report(dataset: xarray.Dataset, night: Night | None = None) -> str:
     InputError
         When no cell is finished.
     MissingExtraError
-        When matplotlib or jinja2 is not installed.
+        When matplotlib is not installed.
     """
-    return html_of(_page(_checked(dataset), night))
-
-
-def write_study_report(dataset: xarray.Dataset, path: str | Path, night: Night | None = None) -> list[Path]:
-    """Write the page of a study, checked as by `study_report`, as `write_page` does."""
-    return write_page(_page(_checked(dataset), night), path)
+    if not bool(dataset["done"].any()):
+        raise InputError(f"study: none of its {dataset.sizes['cell']} cells is finished: run it first")
+    dataset = dataset.load()
+    attributes = dataset.attrs
+    done, total = int(dataset["done"].sum()), dataset.sizes["cell"]
+    specification = StudySpecification.from_text(str(attributes["specification"]))
+    of_estimators = compares_estimators(dataset)
+    subject = "Slope errors of the estimators" if of_estimators else "Slope errors with and without TV"
+    version = attributes.get("faintspot_version", "unknown")
+    values = {"done": done, "total": total, "widths": _widths_in_words(specification), "version": version}
+    return Report(
+        title=f"{subject}: study “{specification.name}”",
+        facts=_TEXT.facts("study.facts", attributes, **values),
+        sections=[
+            *(_of_estimators(dataset) if of_estimators else _of_claims(dataset, night)),
+            configuration_section(str(attributes["specification"]), "Specification"),
+        ],
+        warnings=_TEXT.lines("study.warnings", missing=(total - done) or None),
+        warnings_title="This study is not finished",
+        remark=_TEXT["study.remark"],
+    )
 
 
 def study_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
@@ -107,17 +122,11 @@ def study_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
             if figure is not None:
                 yield figure
         elif cells:
-            yield sweep_figure(dataset, cells, name, _TEXT["paper"].get(name, name))
+            yield sweep_figure(dataset, cells, name, _TEXT["paper_figures"].get(name, name))
     for profile in sorted({str(name) for name in dataset["profile"].values}):
         figure = baselines_figure(dataset, profile)
         if figure is not None:
             yield figure
-
-
-def _checked(dataset: xarray.Dataset) -> xarray.Dataset:
-    if not bool(dataset["done"].any()):
-        raise InputError(f"study: none of its {dataset.sizes['cell']} cells is finished: run it first")
-    return dataset.load()
 
 
 def _cells_by_figure(dataset: xarray.Dataset) -> dict[str, list[int]]:
@@ -137,50 +146,19 @@ def _cells_by_figure(dataset: xarray.Dataset) -> dict[str, list[int]]:
 
 
 def _is_paper(names: Iterable[str]) -> bool:
-    return all(name in _TEXT["paper"] or name == _KEPT_PIXELS for name in names)
+    return all(name in _TEXT["paper_figures"] or name == _KEPT_PIXELS for name in names)
 
 
 def _widths_in_words(specification: StudySpecification) -> str:
-    widths = {profile: f"{fwhm:.2f} s" for profile, fwhm in FWHM_OF_SIZE_1_PX.items()}
-    text = "FWHM in px: " + ", ".join(f"{width} ({profile})" for profile, width in widths.items())
-    largest = 2 * FWHM_OF_SIZE_1_PX["diffraction"]
-    if _is_paper(sweep.name.split()[0] for sweep in specification.sweeps):
-        text += _TEXT("study.widths", largest=largest)
-    return text
-
-
-def _page(dataset: xarray.Dataset, night: Night | None) -> Page:
-    attributes = dataset.attrs
-    done, total = int(dataset["done"].sum()), dataset.sizes["cell"]
-    specification = StudySpecification.from_text(str(attributes["specification"]))
-    of_estimators = compares_estimators(dataset)
-    subject = "Slope errors of the estimators" if of_estimators else "Slope errors with and without TV"
-    values = {
-        "done": done,
-        "total": total,
-        "n": attributes["n"],
-        "widths": _widths_in_words(specification),
-        "seed": attributes["seed"],
-        "version": attributes.get("faintspot_version", "unknown"),
-    }
-    return Page(
-        title=f"{subject}: study “{specification.name}”",
-        facts={name: _TEXT(f"study.facts.{name}", **values) for name in _TEXT["study.facts"]},
-        sections=[
-            *(_of_estimators(dataset) if of_estimators else _of_claims(dataset, night)),
-            configuration_section(str(attributes["specification"]), "Specification"),
-        ],
-        warnings=[_TEXT("study.unfinished", missing=total - done)] if done < total else [],
-        warnings_title="This study is not finished",
-        remark=_TEXT["study.remark"],
-    )
+    widths = [f"{fwhm:.2f} s ({profile})" for profile, fwhm in FWHM_OF_SIZE_1_PX.items()]
+    is_paper = _is_paper(sweep.name.split()[0] for sweep in specification.sweeps)
+    largest = 2 * FWHM_OF_SIZE_1_PX["diffraction"] if is_paper else None
+    return _TEXT("study.widths", widths=", ".join(widths), largest=largest)
 
 
 def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
-    points = findings(dataset)
-    missing = "" if points else _TEXT["study.no_findings"]
     return [
-        Section("findings", "What was found", points=points, missing=missing),
+        _TEXT.section("sections.findings", findings(dataset)),
         *_figure_sections(dataset),
         *result_sections(dataset),
         baselines_section(dataset),
@@ -192,7 +170,7 @@ def _of_claims(dataset: xarray.Dataset, night: Night | None) -> list[Section]:
     return [
         paper_section(paper_rows(dataset, night)),
         verdicts_section(judged, mode_in_words(fixed_mode(dataset))),
-        Section("guidance", "When to use TV", text=guidance(dataset)),
+        _TEXT.section("sections.guidance", *guidance(dataset)),
         baselines_section(dataset),
         gains_section(dataset),
         *_figure_sections(dataset),
@@ -202,4 +180,4 @@ def _of_claims(dataset: xarray.Dataset, night: Night | None) -> list[Section]:
 
 
 def _figure_sections(dataset: xarray.Dataset) -> list[Section]:
-    return [Section(figure.name, figure.title, figures=[figure]) for figure in study_figures(dataset)]
+    return [Section(figure.name, figure.title, [figure]) for figure in study_figures(dataset)]

@@ -49,7 +49,7 @@ _R0_WAVELENGTH_NM = 500.0
 
 
 @dataclass(frozen=True)
-class Choice:
+class ControlChoice:
     """Controller and its replayed residual in the second half of the recording."""
 
     name: str
@@ -92,7 +92,7 @@ def compared_choices(
     site: SlopeTurbulence,
     r0: Measured,
     identified: Identified | None,
-) -> list[Choice]:
+) -> list[ControlChoice]:
     """Replay integrators of several gains and a predictive filter that learns from the first half.
 
     Where the turbulence is identified, the filter's residual is that in this turbulence, and the difference
@@ -235,7 +235,7 @@ def _choice(
     scale: _Scale,
     gain: float = math.nan,
     expected: float = math.nan,
-) -> Choice:
+) -> ControlChoice:
     """Return a choice from its squared phase in each view, or from the expected one."""
     unit = scale.factor**2
     without = [values - level for values, level in zip(squares, noise, strict=True)]
@@ -254,7 +254,7 @@ def _choice(
     wave = (2 * math.pi / scale.wavelength_nm) ** 2
     strehl = math.exp(-wave * total) if math.isfinite(total) else math.nan
     remark = "" if math.isfinite(total) else "r0, pixel_scale_arcsec or subaperture_m is unknown"
-    return Choice(
+    return ControlChoice(
         name,
         _root("residual", scale.unit, square, error),
         less,
@@ -306,14 +306,14 @@ def _signed_root(name: str, unit: str, square: float, error: float) -> Measured:
     return Measured(name, unit, root, max(root - low, high - root) / _WIDE)
 
 
-def _at_gain(choice: Choice, gain: float) -> Choice:
+def _at_gain(choice: ControlChoice, gain: float) -> ControlChoice:
     """Return a choice whose integrator's gains are those of slopes as measured."""
     modal = choice.modal_gains
     of_modes = None if modal is None else (modal[0] / gain, modal[1] / gain)
     return replace(choice, gain=choice.gain / gain, modal_gains=of_modes)
 
 
-def advice(choices: list[Choice]) -> str:
+def advice(choices: list[ControlChoice]) -> str:
     """Return one sentence that says which control to use."""
     others = [choice for choice in choices if choice.name != AS_RUN]
     if not others:
@@ -331,11 +331,11 @@ def advice(choices: list[Choice]) -> str:
     return f"Use {_recommended(best)}: it leaves {amount} less than the loop as it ran."
 
 
-def _residual(choice: Choice) -> float:
+def _residual(choice: ControlChoice) -> float:
     return choice.residual.value if math.isfinite(choice.residual.value) else math.inf
 
 
-def _recommended(choice: Choice) -> str:
+def _recommended(choice: ControlChoice) -> str:
     if choice.modal_gains is not None:
         return f"an integrator with a gain for each mode, {choice.gain_text}"
     if choice.gain_text:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
 from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.page import Page, Section, Table, html_of
+from faintspot.base.report.page import Report, Table
+from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.base.report.texts import Texts
 from faintspot.loop.control.identification.measured import R0, Measured, wind_errors
 from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER
@@ -17,7 +19,6 @@ from faintspot.loop.telemetry.over_time import Piece
 from faintspot.loop.telemetry.report import LoopReport, Part
 
 _TEXT = Texts("faintspot.loop.telemetry")
-_STREHL = "Strehl ratio"
 _AGAINST_TIME = (
     R0,
     "r0 at 500 nm from differential image motion",
@@ -27,16 +28,11 @@ _AGAINST_TIME = (
 )
 """Quantities of pieces that are drawn."""
 _MOST_DECIMALS = 6
+_MEASURED = {"fmt": "o-", "color": METHOD_COLOURS[1], "capsize": 3}
 
 
-def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> str:
-    """Return the page (HTML) of a report, and of pieces of its recording.
-
-    Raises
-    ------
-    MissingExtraError
-        When matplotlib or jinja2 is not installed.
-    """
+def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> Report:
+    """Return the page of a report, and of pieces of its recording."""
     figures: dict[str, Callable[[LoopReport], FigureWithData | None]] = {
         "noise": _noise_figure,
         "turbulence": _wind_figure,
@@ -44,41 +40,50 @@ def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> str:
         "choices": _gain_figure,
     }
     sections = []
-    for name, part in report.parts.items():
-        drawn = figures[name](report) if name in figures else None
-        tables = [_table(part)] if part.values else []
-        if name == "choices" and report.choices:
-            tables.append(_choices_table(report))
-        text = [_TEXT[f"{name}.about"]] if not part.missing or tables else []
-        sections.append(
-            Section(name, part.title, text, tables, [] if drawn is None else [drawn], missing=part.missing)
-        )
     if pieces:
         missing = "; ".join(f"{piece.start_s:g} s: {piece.missing}" for piece in pieces if piece.missing)
-        sections.insert(
-            0, Section("time", _TEXT["time.title"], figures=[_time_figure(pieces)], missing=missing)
-        )
+        sections.append(_TEXT.section("time", _time_figure(pieces), missing=missing))
+    for name, part in report.parts.items():
+        figure = figures[name](report) if name in figures else None
+        replayed = _choices_table(report) if name == "choices" else None
+        sections.append(_TEXT.section(name, _table(part), replayed, figure, missing=part.missing))
     loop = report.loop
-    facts = {"Sub-apertures": str(len(loop.cells)), "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"}
-    todo = [report.advice] if report.advice else []
-    title = f"{'Loop' if loop.is_closed else 'Turbulence'} of {loop.name}"
-    remark = _TEXT["remark"]
-    return html_of(Page(title, facts, sections, todo, warnings_title="What to do", remark=remark))
+    return Report(
+        f"{'Loop' if loop.is_closed else 'Turbulence'} of {loop.name}",
+        {"Sub-apertures": str(len(loop.cells)), "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"},
+        sections,
+        [report.advice] if report.advice else [],
+        warnings_title="What to do",
+        remark=_TEXT["remark"],
+    )
 
 
 def _table(part: Part) -> Table:
-    rows = [[value.name, _with_interval(value, value.unit), value.remark] for value in part.values]
-    return Table(["", "value (95 %)", "remark"], rows, words=True)
+    shown = [
+        {**vars(value), "shown": _with_interval(value, value.unit) or "not known"} for value in part.values
+    ]
+    return _TEXT.table("values", shown)
 
 
-def _with_interval(measured: Measured, unit: str = "") -> str:
-    """Return a value with its 95 % interval; counts have none."""
-    if not np.isfinite(measured.value):
-        return "not known"
+def _choices_table(report: LoopReport) -> Table:
+    compared = ("residual", "less", "total", "strehl")
+    records = [
+        {
+            **vars(choice),
+            "text": choice.gain_text or None,
+            **{name: _with_interval(getattr(choice, name)) for name in compared},
+        }
+        for choice in report.choices
+    ]
+    return _TEXT.table("choices", records, unit=report.choices[0].residual.unit if records else "")
+
+
+def _with_interval(measured: Measured, unit: str = "") -> str | None:
+    """Return a value with its 95 % interval, None if it is not known; counts have no interval."""
+    if not np.isfinite(measured.value) or not np.isfinite(measured.error):
+        return None
     if measured.error == 0:
         return f"{measured.value:.6g} {unit}".rstrip()
-    if not np.isfinite(measured.error):
-        return "not known"
     decimals = max(0, 1 - int(np.floor(np.log10(measured.error))))
     style = f".{decimals}f" if decimals <= _MOST_DECIMALS else ".1e"
     value, low_text, high_text = (f"{number:{style}}" for number in (measured.value, *measured.interval))
@@ -86,45 +91,22 @@ def _with_interval(measured: Measured, unit: str = "") -> str:
     return text.replace("-", "−")
 
 
-def _choices_table(report: LoopReport) -> Table:
-    unit = report.choices[0].residual.unit
-    columns = {
-        f"residual ({unit})": [choice.residual for choice in report.choices],
-        f"less than as run ({unit})": [choice.less for choice in report.choices],
-        f"with fitting and aliasing ({unit})": [choice.total for choice in report.choices],
-        _STREHL: [choice.strehl for choice in report.choices],
-    }
-    shown = {
-        name: values for name, values in columns.items() if any(np.isfinite(value.value) for value in values)
-    }
-    rows = []
-    for choice, *values in zip(report.choices, *shown.values(), strict=True):
-        rows.append([choice.name, choice.gain_text or "–", *map(_with_interval, values)])
-    texts = ["choices.table", *(["choices.strehl"] if _STREHL in shown else [])]
-    return Table(["control", "gain", *shown], rows, " ".join(_TEXT[name] for name in texts))
-
-
-@styled
 def _time_figure(pieces: Sequence[Piece]) -> FigureWithData:
     """Draw r0, coherence time, wind and noise of each piece."""
-    panels: dict[str, list[Measured]] = {}
-    for piece in pieces:
-        for name in _AGAINST_TIME:
-            panels.setdefault(name, []).append(piece.values.get(name, Measured(name, "")))
-    known = {name: values for name, values in panels.items() if any(math.isfinite(v.value) for v in values)}
-    figure = new_figure(WIDTH, max(2.0, 2.4 * len(known)))
     middle = np.array([piece.start_s + piece.duration_s / 2 for piece in pieces])
+    panels: list[list[Panel]] = []
     rows: list[tuple[object, ...]] = []
-    for axes, (name, values) in zip(
-        figure.subplots(max(1, len(known)), 1, sharex=True, squeeze=False)[:, 0], known.items(), strict=False
-    ):
-        numbers = np.array([(value.value, *value.interval) for value in values]).T
-        spread = np.abs(numbers[1:] - numbers[0])
-        axes.errorbar(middle, numbers[0], spread, fmt="o-", color=METHOD_COLOURS[1], capsize=3)
-        unit = next(value.unit for value in values if math.isfinite(value.value))
-        axes.set(title=name, ylabel=unit, ylim=(0, None))
-        rows += [(name, time, *number) for time, number in zip(middle, numbers.T, strict=True)]
-    figure.axes[-1].set_xlabel("time since the first frame (s)")
+    for name in _AGAINST_TIME:
+        values = [piece.values.get(name, Measured(name, "")) for piece in pieces]
+        known = [value for value in values if math.isfinite(value.value)]
+        if known:
+            numbers = np.array([(value.value, *value.interval) for value in values]).T
+            line = Line("", middle, numbers[0], np.abs(numbers[1:] - numbers[0]), _MEASURED)
+            panels.append([Panel([line], "", known[0].unit, name, y_range=(0, None))])
+            rows += [(name, time, *number) for time, number in zip(middle, numbers.T, strict=True)]
+    panels = panels or [[Panel([], "")]]
+    panels[-1] = [replace(panels[-1][0], x="time since the first frame (s)")]
+    figure = plot(panels, 2.4 * len(panels), legend="", sharex=True)
     return _TEXT.figure("time", figure, rows, ("quantity", "time", "value", "low", "high"))
 
 
@@ -171,50 +153,52 @@ def _wind_figure(report: LoopReport) -> FigureWithData | None:
     return _TEXT.figure("winds", figure, rows, ("x", "y", "error of x", "error of y", "share"))
 
 
-@styled
 def _spectra_figure(report: LoopReport) -> FigureWithData | None:
     """Draw spectra of open-loop slopes and of the fitted model."""
     spectra = report.spectra
     if spectra is None:
         return None
-    lines = (len(spectra.measured) + 1) // 2
-    figure = new_figure(WIDTH, 3.6 * lines)
-    rows = []
-    panels = figure.subplots(lines, 2).ravel()
-    for panel in panels[len(spectra.measured) :]:
-        panel.set_visible(False)
-    for panel, name in zip(panels, spectra.measured, strict=False):
+    panels: list[Panel] = []
+    rows: list[tuple[object, ...]] = []
+    unit = f"slope² ({report.loop.slope_unit}²/Hz)"
+    for name in spectra.measured:
         measured, model = (report.loop.unit**2 * power[name] for power in (spectra.measured, spectra.model))
-        panel.loglog(spectra.frequency_hz, measured, color=GREY, lw=1, label="measured")
-        panel.loglog(spectra.frequency_hz, model, color=METHOD_COLOURS[0], lw=1.6, label="found")
-        spread = np.exp(1.96 / np.sqrt(0.55 * spectra.pieces))
-        panel.fill_between(
-            spectra.frequency_hz, model / spread, model * spread, color=METHOD_COLOURS[0], alpha=0.15, lw=0
-        )
-        panel.set(title=name, xlabel="frequency (Hz)", ylabel=f"slope² ({report.loop.slope_unit}²/Hz)")
+        factor = np.exp(1.96 / np.sqrt(0.55 * spectra.pieces))
+        scatter = model - model / factor, model * factor - model
+        lines = [
+            Line("measured", spectra.frequency_hz, measured, style={"color": GREY, "lw": 1}),
+            Line(
+                "found",
+                spectra.frequency_hz,
+                model,
+                scatter,
+                {"color": METHOD_COLOURS[0], "lw": 1.6},
+                band=True,
+            ),
+        ]
+        panels.append(Panel(lines, "frequency (Hz)", unit, name, log=True, legend=True))
         rows += [(name, *row) for row in zip(spectra.frequency_hz, measured, model, strict=True)]
-        panel.legend(frameon=False)
+    pairs = [panels[first : first + 2] for first in range(0, len(panels), 2)]
+    figure = plot(pairs, 3.6 * len(pairs), legend="")
     return _TEXT.figure("spectra", figure, rows, ("slopes", "frequency", "measured", "found"))
 
 
-@styled
 def _gain_figure(report: LoopReport) -> FigureWithData | None:
     """Draw the residual of integrators against gain, and those of the loop and the filter."""
     curve = [choice for choice in report.choices if np.isfinite(choice.gain) and choice.name != BEST]
     curve = [choice for choice in curve if np.isfinite(choice.residual.value)]
     if not curve:
         return None
-    figure = new_figure(WIDTH * 0.7, 4.4)
-    axes = figure.subplots()
     values = [(choice.gain, choice.residual.value, choice.residual.error) for choice in curve]
     gain, residual, error = np.array(values).T
-    axes.errorbar(
-        gain, residual, 1.96 * error, fmt="o-", color=METHOD_COLOURS[1], capsize=3, label="integrator"
-    )
+    lines = [Line("integrator", gain, residual, 1.96 * error, _MEASURED)]
     for name, colour in ((AS_RUN, "black"), (FILTER, METHOD_COLOURS[0])):
         for choice in (choice for choice in report.choices if choice.name == name):
-            axes.axhline(choice.residual.value, color=colour, label=name)
-            axes.axhspan(*choice.residual.interval, color=colour, alpha=0.12, lw=0)
-    axes.set(xlabel="gain of an integrator", ylabel=f"residual ({curve[0].residual.unit})", ylim=(0, None))
-    axes.legend(frameon=False)
+            level, ends = choice.residual.value, np.array(choice.residual.interval)
+            spread = np.repeat(np.abs(ends - level)[:, None], 2, axis=1)
+            across = [gain.min(), gain.max()]
+            lines.append(Line(name, across, [level, level], spread, {"color": colour}, band=True))
+    label = f"residual ({curve[0].residual.unit})"
+    panel = Panel(lines, "gain of an integrator", label, y_range=(0, None), legend=True)
+    figure = plot([[panel]], 4.4, width=WIDTH * 0.7, legend="")
     return _TEXT.figure("gains", figure, values, ("gain", "residual", "standard error"))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.base.report.texts import Texts
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
 from faintspot.loop.control.identification.measured import (
@@ -29,7 +30,7 @@ from faintspot.loop.control.identification.open_loop import (
 )
 from faintspot.loop.control.identification.predictive_control import ObservedLoop
 from faintspot.loop.control.identification.recording import Recording, prepared
-from faintspot.loop.telemetry.choices import Choice, advice, compared_choices
+from faintspot.loop.telemetry.choices import ControlChoice, advice, compared_choices
 from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
 from faintspot.loop.telemetry.spectra import ModalSpectra, modal_spectra
 from faintspot.loop.turbulence.image_motion import differential_image_motion
@@ -40,6 +41,8 @@ from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 
 Floats = NDArray[np.float64]
 
+_TEXT = Texts("faintspot.loop.telemetry")
+_PARTS = ("frames", "loop", "noise", "turbulence", "vibrations", "spectra", "choices")
 _TIMES_AT_LIMIT = 3  # that a largest value occurs, to be taken for a limit
 _DRAWS = 1000
 _GAIN_SPREAD = 0.5  # of the deviation of the centroid gain from 1: it differs between spatial scales
@@ -70,7 +73,7 @@ class LoopReport:
     noise_error_px: Floats | None = None
     turbulence: Identified | None = None
     spectra: ModalSpectra | None = None
-    choices: list[Choice] = field(default_factory=list)
+    choices: list[ControlChoice] = field(default_factory=list)
     delay: LoopDelay | None = None
     """Delay and centroid gain that were measured and are used."""
     observed: ObservedLoop | None = None
@@ -124,16 +127,8 @@ def report_of_loop(
         When the slopes do not vary, or commands and slopes are not of one loop.
     """
     ready = prepared(loop)
-    titles = {
-        "frames": "Frames",
-        "loop": "Loop",
-        "noise": "Noise",
-        "turbulence": "Turbulence",
-        "vibrations": "Vibrations",
-        "spectra": "Spectra",
-        "choices": "Other choices of control",
-    }
-    report = LoopReport(ready.recording, {name: Part(title) for name, title in titles.items()})
+    parts = {name: Part(_TEXT[f"{name}.title"]) for name in _PARTS}
+    report = LoopReport(ready.recording, parts)
     _frames(report)
     progress("delay")
     delay = _loop(report)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,23 +23,31 @@ def subaperture_shapes(layout: Layout) -> NDArray[np.float64]:
     return lenslet_outlines(layout, 0.96 if len(layout) <= MOST_WITH_GAPS else 1.0)
 
 
-def subaperture_map(
-    axes: Axes, layout: Layout, values: NDArray[Any], *, label: str, limits: tuple[float, float], title: str
-) -> None:
-    """Draw one value per sub-aperture at its position; NaN gives an empty outline."""
+class Map(NamedTuple):
+    """One value per sub-aperture; NaN is an empty outline."""
+
+    values: NDArray[Any]
+    label: str
+    """Of the colour bar, with the unit."""
+    title: str
+    limits: tuple[float, float]
+
+
+def subaperture_map(axes: Axes, layout: Layout, shown: Map) -> None:
+    """Draw the values of sub-apertures at their positions."""
     from matplotlib.collections import PolyCollection
 
     shapes = subaperture_shapes(layout)
-    known = np.isfinite(values)
+    known = np.isfinite(shown.values)
     empty = PolyCollection(list(shapes[~known]), facecolors="white", edgecolors=GREY, linewidths=0.6)
-    filled = PolyCollection(list(shapes[known]), array=values[known], cmap=COLOUR_MAP, linewidths=0)
+    filled = PolyCollection(list(shapes[known]), array=shown.values[known], cmap=COLOUR_MAP, linewidths=0)
     filled.set_antialiased(len(layout) <= MOST_WITH_GAPS)
-    filled.set_clim(*limits)
+    filled.set_clim(*shown.limits)
     axes.add_collection(empty)
     axes.add_collection(filled)
     place_axes(axes, layout)
-    axes.set_title(title)
-    colour_bar(axes, filled, label)
+    axes.set_title(shown.title)
+    colour_bar(axes, filled, shown.label)
 
 
 def place_axes(axes: Axes, layout: Layout) -> None:

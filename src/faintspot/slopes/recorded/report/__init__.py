@@ -1,1 +1,1 @@
-"""Report of recorded slopes: `page` is made of `sections`, whose numbers are in `key_numbers` and `maps`."""
+"""Report of recorded slopes: `page` shows a `run`, with pictures in `maps` and `frame_pictures`."""

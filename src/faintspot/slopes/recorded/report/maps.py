@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,12 +17,18 @@ from faintspot.base.report.drawing import (
     new_figure,
     styled,
 )
+from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.slopes.recorded.statistics import Floats, Jitter, MeasuredSlopes, SlopesSummary, median
-from faintspot.slopes.sensor.drawing import MOST_WITH_GAPS, place_axes, subaperture_map, subaperture_shapes
+from faintspot.slopes.sensor.drawing import (
+    MOST_WITH_GAPS,
+    Map,
+    place_axes,
+    subaperture_map,
+    subaperture_shapes,
+)
 from faintspot.slopes.sensor.layout import Layout
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _PANEL_HEIGHT = 5.0
@@ -37,23 +44,18 @@ def flux_and_validity(
 ) -> Figure:
     """Draw median flux and fraction of valid frames, a row of maps a method; of one frame, flux only."""
     several = methods[0].n_frames > 1
-    figure, axes = _panels(len(methods), 2, layout) if several else _panels(1, len(methods), layout)
     limits = limits_of(*(summary.flux_e for summary in summaries), low=0.0)
-    for number, (method, summary) in enumerate(zip(methods, summaries, strict=True)):
-        panel = axes[number, 0] if several else axes[0, number]
-        title = f"{method.name}: {'median ' if several else ''}flux"
-        subaperture_map(panel, layout, summary.flux_e, label="flux (e-)", limits=limits, title=title)
-        if several:
-            percent = 100.0 * summary.valid_frames / method.n_frames
-            subaperture_map(
-                axes[number, 1],
-                layout,
-                percent,
-                label="valid frames (%)",
-                limits=(0, 100),
-                title=f"{method.name}: valid frames",
-            )
-    return figure
+    title = "{}: median flux" if several else "{}: flux"
+    pairs = list(zip(methods, summaries, strict=True))
+    flux = [Map(summary.flux_e, "flux (e-)", title.format(method.name), limits) for method, summary in pairs]
+    if not several:
+        return _maps(layout, [flux])
+    percent = [100.0 * summary.valid_frames / method.n_frames for method, summary in pairs]
+    names = [f"{method.name}: valid frames" for method in methods]
+    valid = [
+        Map(values, "valid frames (%)", name, (0, 100)) for values, name in zip(percent, names, strict=True)
+    ]
+    return _maps(layout, list(zip(flux, valid, strict=True)))
 
 
 @styled
@@ -99,25 +101,19 @@ def iteration_counts(
     methods: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
 ) -> Figure:
     """Draw the mean iterations of every sub-aperture (first method) and how often each number occurred."""
-    figure, axes = _panels(1, 2, layout)
-    limits = limits_of(summaries[0].iterations, low=0.0)
+    figure, ((left, panel),) = _panels(1, 2, layout)
     title = f"{methods[0].name}: {'mean ' if methods[0].n_frames > 1 else ''}iterations"
-    subaperture_map(
-        axes[0, 0], layout, summaries[0].iterations, label="iterations", limits=limits, title=title
-    )
-    panel = axes[0, 1]
+    values = summaries[0].iterations
+    subaperture_map(left, layout, Map(values, "iterations", title, limits_of(values, low=0.0)))
     most = max(int(method.iterations.max()) for method in methods)
     step = max(1, -(-(most + 1) // _HISTOGRAM_BINS))
     edges = np.arange(0, most + 1 + step, step) - 0.5
     for method, colour in zip(methods, METHOD_COLOURS, strict=False):
         counts = np.histogram(method.iterations[method.valid], edges)[0]
         panel.stairs(100.0 * counts / max(1, counts.sum()), edges, fill=True, color=colour, label=method.name)
-    panel.set_xlabel("iterations")
-    panel.set_yscale("log")
-    panel.yaxis.set_major_formatter("{x:g}")
-    panel.set_ylim(top=200)
-    panel.set_ylabel("valid measurements (%)")
+    panel.set(xlabel="iterations", yscale="log", ylabel="valid measurements (%)", ylim=(None, 200))
     panel.set_title("How many iterations it took")
+    panel.yaxis.set_major_formatter("{x:g}")
     if len(methods) > 1:
         panel.legend(frameon=False)
     return figure
@@ -126,41 +122,49 @@ def iteration_counts(
 @styled
 def jitter_maps(methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter], layout: Layout) -> Figure:
     """Draw the jitter of every sub-aperture, one map per method, on one scale."""
-    figure, axes = _panels(1, len(methods), layout)
     limits = limits_of(*(item.px for item in jitters), low=0.0)
-    for panel, method, item in zip(axes[0], methods, jitters, strict=True):
-        title = f"{method.name}: median {median(item.px):.3f} px"
-        subaperture_map(panel, layout, item.px, label="jitter (px)", limits=limits, title=title)
-    return figure
+    titles = [
+        f"{method.name}: median {median(item.px):.3f} px"
+        for method, item in zip(methods, jitters, strict=True)
+    ]
+    maps = [Map(item.px, "jitter (px)", title, limits) for item, title in zip(jitters, titles, strict=True)]
+    return _maps(layout, [maps])
 
 
-@styled
 def jitter_plot(methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> Figure:
     """Draw the jitter of the sub-apertures in order, and one method against another where there are two."""
-    pair = len(methods) == 2
-    figure = new_figure(WIDTH, _PANEL_HEIGHT)
-    axes = figure.subplots(1, 2 if pair else 1, squeeze=False)[0]
     order = np.argsort(jitters[-1].px)
+    lines, levels = [], {}
     for method, item, colour in zip(methods, jitters, METHOD_COLOURS, strict=False):
         order = order[item.measured[order]]
         rank = np.arange(1, len(order) + 1)
-        axes[0].plot(rank, item.px[order], ".", color=colour, label=f"{method.name}: standard deviation")
-        axes[0].plot(
-            rank,
-            _running_median(item.robust_px[order]),
-            "-",
-            lw=1.3,
-            color=colour,
-            label=f"{method.name}: robust",
-        )
-        axes[0].axhline(median(item.px), color=colour, lw=0.9, ls=":")
-    axes[0].set_xlabel(f"sub-apertures, in order of the jitter of {methods[-1].name!r}")
-    axes[0].set_ylabel("jitter, rms of x and y (px)")
-    axes[0].set_ylim(bottom=0)
-    if pair:
-        _scatter(axes[1], methods, jitters)
-    figure.legend(loc="outside lower center", ncols=5, frameon=False)  # beside the data, never on it
+        dots, line = {"color": colour, "ls": "", "marker": "."}, {"color": colour, "lw": 1.3}
+        lines.append(Line(f"{method.name}: standard deviation", rank, item.px[order], style=dots))
+        lines.append(Line(f"{method.name}: robust", rank, _running_median(item.robust_px[order]), style=line))
+        levels[median(item.px)] = {"color": colour, "lw": 0.9, "ls": ":"}
+    label = f"sub-apertures, in order of the jitter of {methods[-1].name!r}"
+    ordered = Panel(lines, label, "jitter, rms of x and y (px)", y_range=(0, None), levels=levels)
+    panels = [ordered, _compared(methods, jitters)] if len(methods) == 2 else [ordered]
+    figure = plot([panels], _PANEL_HEIGHT, columns=6)  # the legend beside the data, never on it
+    if len(methods) == 2:
+        figure.axes[1].set_aspect("equal")
     return figure
+
+
+def _compared(methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> Panel:
+    """Return the second method's jitter along x against the first's along y."""
+    across, up = jitters[1].px, jitters[0].px
+    stop = 1.08 * limits_of(across, up, low=0.0)[1]
+    dots = {"color": METHOD_COLOURS[1], "ls": "", "marker": ".", "ms": 7 if len(up) < 500 else 3}
+    diamond = {"color": METHOD_COLOURS[0], "ls": "", "marker": "D", "ms": 9, "mec": "black"}
+    lines = [
+        Line("", across, up, style=dots),
+        Line("equal", [0, stop], [0, stop], style={"color": GREY, "lw": 1}),
+        Line("medians", [median(across)], [median(up)], style=diamond),
+    ]
+    labels = (f"jitter, {methods[1].name} (px)", f"jitter, {methods[0].name} (px)")
+    title = "Below the line: the first method is steadier"
+    return Panel(lines, *labels, title, x_range=(0, stop), y_range=(0, stop))
 
 
 def _running_median(values: Floats) -> Floats:
@@ -171,23 +175,11 @@ def _running_median(values: Floats) -> Floats:
     return medians
 
 
-def _scatter(axes: Axes, methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> None:
-    """Draw the second method's jitter along x against the first's along y."""
-    across, up = jitters[1].px, jitters[0].px
-    axes.plot(across, up, ".", color=METHOD_COLOURS[1], markersize=7 if len(up) < 500 else 3)
-    _, stop = limits_of(across, up, low=0.0)
-    stop *= 1.08
-    axes.plot([0, stop], [0, stop], color=GREY, lw=1)
-    axes.annotate("equal", (0.93 * stop, 0.95 * stop), ha="right", color="#555555")
-    axes.plot(
-        median(across), median(up), "D", color=METHOD_COLOURS[0], markersize=9, mec="black", label="medians"
-    )
-    axes.set_xlim(0, stop)
-    axes.set_ylim(0, stop)
-    axes.set_aspect("equal")
-    axes.set_xlabel(f"jitter, {methods[1].name} (px)")
-    axes.set_ylabel(f"jitter, {methods[0].name} (px)")
-    axes.set_title("Below the line: the first method is steadier", fontsize=12)
+def _maps(layout: Layout, rows: Sequence[Sequence[Map]]) -> Figure:
+    figure, axes = _panels(len(rows), len(rows[0]), layout)
+    for panel, shown in zip(axes.flat, chain(*rows), strict=True):
+        subaperture_map(panel, layout, shown)
+    return figure
 
 
 def _panels(rows: int, columns: int, layout: Layout) -> tuple[Figure, Any]:

@@ -1,143 +1,310 @@
-"""The report page of a slopes run: one HTML text that needs nothing else."""
+"""The report page of a slopes run: what each table and picture is, and what to look for in it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
-from faintspot.base.report.page import POSITIONS, Page, Section, configuration_section, html_of
-from faintspot.slopes.estimators.base import Step
-from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
-from faintspot.slopes.pipeline.slopes import Slopes, Stages
-from faintspot.slopes.recorded.report.advice import warnings_in_words
-from faintspot.slopes.recorded.report.sections import all_sections, make_run
-from faintspot.slopes.recorded.report.wavefront_section import wavefront_sections
-from faintspot.slopes.recorded.statistics import MeasuredSlopes
+from faintspot.base.flags import SubapertureFlag
+from faintspot.base.report.figure_data import FigureWithData
+from faintspot.base.report.page import POSITIONS, Report, Section, Table, configuration_section
+from faintspot.base.report.texts import Texts
+from faintspot.base.report.words import percentage
+from faintspot.base.statistics import Estimate
+from faintspot.slopes.recorded.report import frame_pictures, maps
+from faintspot.slopes.recorded.report.run import SlopesRun
+from faintspot.slopes.recorded.statistics import (
+    Floats,
+    MeasuredSlopes,
+    SlopesSummary,
+    error_ratio,
+    flux_gain,
+    jitter,
+    median,
+    rms,
+    slope_error,
+)
 from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.wavefront import fit_wavefront
+from faintspot.slopes.wavefront.figure import wavefront_figure
+from faintspot.slopes.wavefront.words import mode_table, remarks, rms_table
+
+_TEXT = Texts("faintspot.slopes.recorded")
+_FLAGS_OF_DENOISING = (SubapertureFlag.INFEASIBLE_STRENGTH, SubapertureFlag.NOT_CONVERGED)
+_MOST_LISTED = 20
+_NO_LAYOUT = "Not drawn: the layout of the sub-apertures is not known."
 
 
 def slopes_report(
-    methods: Sequence[MeasuredSlopes],
+    run: SlopesRun,
     *,
-    layout: Layout | None,
-    stages: Mapping[str, Stages] | None,
-    truth: ArrayLike | None = None,
     title: str,
     facts: Mapping[str, str],
     configurations: Mapping[str, str],
-    example_frame: int = 0,
     warnings: Sequence[str] = (),
-    why_no_stages: str = "Not drawn: no frame was given.",
-    steps: Sequence[Step] = TotalVariation.steps_shown,
-    slopes: Mapping[str, Slopes] | None = None,
     sections: Sequence[Section] = (),
-) -> str:
-    """Return the report page of a slopes run as HTML: self-contained, without scripts.
+) -> Report:
+    """Return the report of a slopes run.
 
     Parameters
     ----------
-    methods : sequence of MeasuredSlopes
-        The same frames, measured in one or several ways. Others are compared with the last one.
-    layout : Layout or None
-        None leaves the maps out, which the page says.
-    stages : mapping of Stages, or None
-        `SlopePipeline.explain` of frame `example_frame`, by name. The first one's images are shown; the
-        positions of all are marked, and must be measured without a reference.
-    truth : array (n_frames, n_subapertures, 2), optional
-        True x, y, px from each sub-aperture's centre.
+    run : SlopesRun
     title : str
     facts : mapping of str
         What was run, for the top of the page, as sources and settings in words.
     configurations : mapping of str
         TOML text by the name of what it is of; "" when not known.
-    example_frame : int
     warnings : sequence of str
         Shown before those found in the slopes.
-    why_no_stages : str
-        What the page says in place of the frame.
-    steps : sequence of Step
-        Which pictures of the frame are drawn.
-    slopes : mapping of Slopes, optional
-        Slopes by method, whose wavefronts are shown. Default: no wavefronts.
     sections : sequence of Section
         Further sections, before the configurations.
-
-    Raises
-    ------
-    InputError
-        When the parts do not fit together.
-    MissingExtraError
-        When matplotlib or jinja2 is not installed.
     """
-    methods = list(methods)
-    _check_methods(methods, layout)
-    shape = methods[0].x.shape
-    number_between("example_frame", example_frame, 0, shape[0] - 1, integer=True)
-    true = None if truth is None else _checked_truth(truth, shape)
-    stages = _checked_stages(stages or {}, shape[1])
-    run = make_run(methods, layout, stages, true, int(example_frame), why_no_stages, steps)
-    return html_of(
-        Page(
-            title=title,
-            facts={**facts, "Frames": str(shape[0]), "Sub-apertures": _sensor_in_words(shape[1], layout)},
-            sections=[
-                *all_sections(run),
-                *wavefront_sections(slopes or {}, layout),
-                *sections,
-                *(configuration_section(text, name) for name, text in configurations.items()),
-            ],
-            warnings=[*warnings, *run.comparison.warnings(), *warnings_in_words(run.methods, run.summaries)],
-            remark=POSITIONS,
-        )
+    n_frames, n = run.methods[0].x.shape
+    return Report(
+        title=title,
+        facts={**facts, "Frames": str(n_frames), "Sub-apertures": _sensor_in_words(n, run.layout)},
+        sections=[
+            *slopes_sections(run),
+            *sections,
+            *(configuration_section(text, name) for name, text in configurations.items()),
+        ],
+        warnings=[*warnings, *run.comparison.warnings(), *warnings_in_words(run)],
+        remark=POSITIONS,
     )
-
-
-def _check_methods(methods: Sequence[MeasuredSlopes], layout: Layout | None) -> None:
-    if not methods:
-        raise InputError("methods: expected at least one, got none")
-    names = [method.name for method in methods]
-    if len(set(names)) < len(names):
-        raise InputError(f"methods: expected a different name for each, got {', '.join(names)}")
-    for method in methods[1:]:
-        if method.x.shape != methods[0].x.shape:
-            raise InputError(
-                f"methods: expected the same frames and sub-apertures in all, got shape {methods[0].x.shape} "
-                f"in {methods[0].name!r} and {method.x.shape} in {method.name!r}"
-            )
-    if layout is not None and len(layout) != methods[0].n_subapertures:
-        raise InputError(
-            f"layout: expected {methods[0].n_subapertures} sub-apertures, as in the slopes, got {len(layout)}"
-        )
-
-
-def _checked_truth(truth: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    array = finite_array("truth", truth).astype(np.float64)
-    if array.shape != (*shape, 2):
-        raise InputError(f"truth: expected shape {(*shape, 2)}, got {array.shape}")
-    return array
-
-
-def _checked_stages(stages: Mapping[str, Stages], n: int) -> dict[str, Stages]:
-    """Return the stages of one frame each; `explain` of a stack of one frame is accepted too."""
-    for name, item in stages.items():
-        if item.raw.ndim != 3 or len(item.raw) != n:
-            raise InputError(
-                f"stages: {name}: expected images (n_subapertures, ny, nx) of one frame with {n} "
-                f"sub-apertures, got shape {item.raw.shape}"
-            )
-    return dict(stages)
 
 
 def _sensor_in_words(n: int, layout: Layout | None) -> str:
     if layout is None:
         return str(n)
     pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
-    height, width = layout.frame_shape
-    return (
-        f"{n} of {layout.window[0]} × {layout.window[1]} px, {layout.geometry}{pitch}, in frames of "
-        f"{height} × {width} px"
+    (window_height, window_width), (height, width) = layout.window, layout.frame_shape
+    size = f"{window_height} × {window_width} px"
+    return f"{n} of {size}, {layout.geometry}{pitch}, in frames of {height} × {width} px"
+
+
+def slopes_sections(run: SlopesRun) -> list[Section]:
+    """Return the sections in the order of the page."""
+    makers = _frame, _flux, _slopes, _iterations, _jitter, _wavefront
+    made = (make(run) for make in makers)
+    return [_key_numbers(run), *(section for section in made if section is not None)]
+
+
+def warnings_in_words(run: SlopesRun) -> list[str]:
+    """Return what is wrong with a run and what to do next, a sentence or two each."""
+    lines = []
+    for method, summary in zip(run.methods, run.summaries, strict=True):
+        prefix = f"{method.name}: " if len(run.methods) > 1 else ""
+        lines += [prefix + line for line in _of_method(method, summary)]
+    if not run.has_several_frames:
+        lines.append(_TEXT["warnings.one_frame"])
+    if np.ptp([summary.valid_fraction for summary in run.summaries]) > 0.01:
+        lines.append(_TEXT["warnings.not_alike"])
+    return lines
+
+
+def _of_method(method: MeasuredSlopes, summary: SlopesSummary) -> list[str]:
+    lines = [] if summary.valid_fraction else [_TEXT["warnings.none_valid"]]
+    for flag, advice in _TEXT["advice"].items():
+        fraction = method.flag_count(SubapertureFlag[flag]) / method.x.size
+        if fraction > advice["above"]:
+            lines.append(_TEXT(f"advice.{flag}.text", fraction=fraction))
+    never = np.flatnonzero(summary.valid_frames == 0)
+    if 0 < len(never) < method.n_subapertures:
+        listed = ", ".join(str(number) for number in never[:_MOST_LISTED])
+        more = f" and {len(never) - _MOST_LISTED} more" if len(never) > _MOST_LISTED else ""
+        counts = {"count": len(never), "all": method.n_subapertures, "listed": listed + more}
+        lines.append(_TEXT("warnings.never_valid", **counts))
+    return lines
+
+
+def _key_numbers(run: SlopesRun) -> Section:
+    """Return the table of all methods: errors where the truth is known, noise, and the rest."""
+    methods, last, truth = run.methods, run.methods[-1], run.true_positions
+    n_frames, n = methods[0].x.shape
+    alike = all(method.n_frames == n_frames for method in methods)
+    table = _TEXT.table(
+        "numbers",
+        [_record(run, index) for index in range(len(methods))],
+        last=last.name,
+        counted=f": {n_frames} × {n} = {n_frames * n}" if alike else "",
+        together=alike and len(methods) > 1,
     )
+    if truth is None:
+        return _TEXT.section("numbers", run.comparison.verdict(), table)
+    note = _TEXT(
+        "numbers.truth",
+        low=truth.min(),
+        high=truth.max(),
+        count=np.count_nonzero(run.valid[-1]),
+        shared="valid" if len(methods) == 1 else "valid in every method",
+        last=last.name if len(methods) > 1 else None,
+    )
+    return _TEXT.section("numbers", note, table)
+
+
+def _record(run: SlopesRun, index: int) -> dict[str, Any]:
+    """Return the numbers of a method; None where they say nothing."""
+    method, comparison = run.methods[index], run.comparison
+    scale = None if run.layout is None else run.layout.pixel_scale_arcsec
+    noise, gain = median(comparison.noise_px[index]), Estimate(*comparison.gains[index])
+    record = {
+        "method": method.name,
+        "noise": noise,
+        "noise_arcsec": None if scale is None else noise * scale,
+        "is_last": False,
+        "relative_gain": None,
+        "noise_at_equal_gain": None,
+        "stated_error": method.standard_error_px,
+        "jitter": median(run.jitters[index].px),
+        "summary": run.summaries[index],
+        **_against_truth(run, method),
+    }
+    if run.truth is None and np.isfinite([gain for gain, _ in comparison.gains[:-1]]).any():
+        record["is_last"] = gain.standard_error == 0
+        record["relative_gain"] = None if record["is_last"] else gain
+        record["noise_at_equal_gain"] = median(comparison.equal_noise(index))
+    return record
+
+
+def _against_truth(run: SlopesRun, method: MeasuredSlopes) -> dict[str, Any]:
+    """Return the numbers that need the truth; None without."""
+    truth, last, valid = run.true_positions, run.methods[-1], run.valid[-1]
+    if truth is None:
+        return dict.fromkeys(("error", "gain", "ratio", "flux_gain"))
+    error, gain = slope_error(method, truth, valid)
+    ratio = Estimate(*error_ratio(method, last, truth, valid))
+    is_known = method is not last and np.isfinite(ratio.value)
+    return {
+        "error": error,
+        "gain": gain,
+        "ratio": ratio if is_known else None,
+        "flux_gain": flux_gain(ratio.value) if is_known else None,
+    }
+
+
+def _frame(run: SlopesRun) -> Section | None:
+    if not run.stages and not run.why_no_stages:
+        return None
+    if run.layout is None or not run.stages:
+        return _TEXT.section("frame", missing=_NO_LAYOUT if run.layout is None else run.why_no_stages)
+    truth = None if run.true_positions is None else run.true_positions[run.example_frame]
+    example = frame_pictures.Example(run.layout, run.stages, truth, run.steps)
+    number, factor = len(example.shown_steps), frame_pictures.coarseness(run.layout)
+    marked, in_electrons = len(run.layout) <= frame_pictures.MOST_MARKED, example.raw_is_calibrated
+    values = {
+        "frame": run.example_frame,
+        "shown": next(iter(run.stages)),
+        "in_electrons": in_electrons,
+        "all_alike": in_electrons and number > 1,
+        "both_scales": not in_electrons and number == 2,
+        "raw_apart": not in_electrons and number != 2,
+        "marked": marked,
+        "circles": "" if truth is None else " and circles true ones",
+        "coarse": factor if factor > 1 else None,
+        "several": number > 2,
+    }
+    return _TEXT.section(
+        "frame",
+        _TEXT.figure("sensor", frame_pictures.whole_sensor(example), **values),
+        _TEXT.figure("subapertures", frame_pictures.zoom(example), several=number > 2),
+    )
+
+
+def _flux(run: SlopesRun) -> Section:
+    denoised = any(method.is_denoised for method in run.methods)
+    rows = []
+    for name, meaning in _TEXT["flags"].items():
+        flag = SubapertureFlag[name]
+        counts = {method.name: method.flag_count(flag) for method in run.methods}
+        if any(counts.values()) or denoised or flag not in _FLAGS_OF_DENOISING:
+            shares = [percentage(counts[method.name] / method.flags.size) for method in run.methods]
+            cells = [f"{count} ({share})" for count, share in zip(counts.values(), shares, strict=True)]
+            rows.append([name, *cells, meaning])
+    table = _TEXT.table("flux.flags", rows, [*(method.name for method in run.methods), "meaning"])
+    if run.layout is None:
+        return _TEXT.section("flux", table, missing=_NO_LAYOUT)
+    figure = maps.flux_and_validity(run.methods, run.summaries, run.layout)
+    return _TEXT.section("flux", table, _TEXT.figure("flux", figure, several=run.has_several_frames))
+
+
+def _slopes(run: SlopesRun) -> Section:
+    if run.layout is None:
+        return _TEXT.section("slopes", missing=_NO_LAYOUT)
+    each = list(zip(run.methods, run.summaries, run.jitters, strict=True))
+    tilts = [
+        _TEXT("slopes.tilt", name=method.name, x=_mean(summary.x_px), y=_mean(summary.y_px))
+        for method, summary, _ in each
+    ]
+    errors = [
+        _TEXT("slopes.error", name=method.name, error=median(item.px / np.sqrt(np.maximum(item.n_frames, 1))))
+        for method, _, item in each
+    ]
+    longest, number = maps.longest_arrow(run.summaries)
+    figure = maps.slope_arrows(run.methods, run.summaries, run.layout)
+    values = {
+        "tilts": "; ".join(tilts),
+        "errors": "; ".join(errors) if run.jitters[0].measured.any() else None,
+        "longest": longest,
+        "percent": maps.ARROWS_WHOLE_PERCENT,
+        "number": number or None,
+        "several": run.has_several_frames,
+    }
+    return _TEXT.section("slopes", _TEXT.figure("slopes", figure, **values))
+
+
+def _iterations(run: SlopesRun) -> Section | None:
+    pairs = zip(run.methods, run.summaries, strict=True)
+    denoised = [(method, summary) for method, summary in pairs if method.is_denoised]
+    if not denoised:
+        return None
+    if run.layout is None:
+        return _TEXT.section("iterations", missing=_NO_LAYOUT)
+    if not any(method.valid.any() for method, _ in denoised):
+        return _TEXT.section("iterations")
+    medians = "; ".join(f"{method.name}: {summary.median_iterations:.0f}" for method, summary in denoised)
+    methods, summaries = zip(*denoised, strict=True)
+    figure = maps.iteration_counts(methods, summaries, run.layout)
+    return _TEXT.section("iterations", _TEXT.figure("iterations", figure, medians=medians))
+
+
+def _jitter(run: SlopesRun) -> Section | None:
+    if not run.has_several_frames:
+        return None
+    if not run.jitters[0].measured.any():
+        return _TEXT.section("jitter")
+    motion, truth = None, run.true_positions
+    if truth is not None:
+        motion = rms(jitter(truth[..., 0], truth[..., 1], run.valid[-1]).px)
+    figures = [_TEXT.figure("jitter", maps.jitter_plot(run.methods, run.jitters))]
+    if run.layout is not None:
+        shown = maps.jitter_maps(run.methods, run.jitters, run.layout)
+        figures.insert(0, _TEXT.figure("jitter-map", shown))
+    return _TEXT.section("jitter", *figures, motion=motion)
+
+
+def _wavefront(run: SlopesRun) -> Section | None:
+    """Return the section with the wavefronts fitted to the slopes of each method; none without a layout."""
+    if run.layout is None or not run.slopes:
+        return None
+    tables: list[Table] = []
+    figures: list[FigureWithData] = []
+    text, missing = [_TEXT["wavefront.about"]], []
+    for number, (name, slopes) in enumerate(run.slopes.items()):
+        try:
+            wavefront = fit_wavefront(slopes, run.layout)
+        except InputError as error:
+            missing.append(f"Wavefront of {name!r}: {error}.")
+            continue
+        text += [line for line in remarks(wavefront) if line not in text]
+        tables.append(Table(*rms_table(wavefront), name))
+        tables.append(Table(*mode_table(wavefront), name, folded=f"Coefficients of {name!r}"))
+        figures.append(wavefront_figure(wavefront, run.layout, name, file=f"wavefront-{number + 1}"))
+    return Section("wavefront", "Wavefront", [*text, *tables, *figures], " ".join(missing))
+
+
+def _mean(values: Floats) -> float:
+    kept = values[np.isfinite(values)]
+    return float(kept.mean()) if kept.size else np.nan

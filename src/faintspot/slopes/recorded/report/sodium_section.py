@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from faintspot.base.errors import InputError
-from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, new_figure, styled
+from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH
 from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import Section
+from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.base.report.texts import Texts
 from faintspot.io.frames import FrameSource
 from faintspot.slopes.camera.calibration import Calibration
@@ -23,13 +24,10 @@ from faintspot.slopes.training.known_sodium import SODIUM
 _TEXT = Texts("faintspot.slopes.recorded")
 
 
-@styled
 def profile_figure(profiles: Mapping[str, SodiumProfile]) -> FigureWithData:
     """Draw the density of profiles against altitude; the last one is emphasised."""
-    figure = new_figure(0.6 * WIDTH, 4.6)
-    axes = figure.subplots()
-    rows: list[tuple[Any, ...]] = []
     *before, newest = profiles
+    lines, rows = [], []
     for index, (name, profile) in enumerate(profiles.items()):
         altitude, density = profile.altitudes_m / 1e3, 1e3 * profile.density
         style: dict[str, Any] = {"color": METHOD_COLOURS[1], "lw": 2.2}
@@ -37,11 +35,11 @@ def profile_figure(profiles: Mapping[str, SodiumProfile]) -> FigureWithData:
             dashes = ("--", ":", "-.")[index % 3] if len(before) > 1 else "--"
             style = {"color": GREY, "lw": 1.6, "ls": dashes}
         mean = f"mean {profile.mean_m / 1e3:.1f} km, std {profile.std_m / 1e3:.1f} km"
-        axes.plot(density, altitude, label=f"{name}\n({mean})", **style)
+        lines.append(Line(f"{name}\n({mean})", density, altitude, style=style))
         rows += [(name, f"{a:.6g}", f"{b:.6g}") for a, b in zip(altitude, density, strict=True)]
-    axes.set(xlabel="return flux per km of altitude", ylabel="altitude above sea level (km)", xlim=(0, None))
-    axes.legend(frameon=False)
-    return _TEXT.figure("sodium", figure, rows)
+    flux, height = "return flux per km of altitude", "altitude above sea level (km)"
+    panel = Panel(lines, flux, height, x_range=(0, None), legend=True)
+    return _TEXT.figure("sodium", plot([[panel]], 4.6, width=0.6 * WIDTH, legend=""), rows)
 
 
 def sodium_section_of_frames(
@@ -51,7 +49,7 @@ def sodium_section_of_frames(
     try:
         found = sodium_of_frames(source, layout, calibration, laser, most_frames=most_frames)
     except InputError as error:
-        return Section("sodium", "Sodium profile", missing=f"Not fitted: {error}.")
+        return _TEXT.section("sodium", missing=f"Not fitted: {error}.")
     sodium = found.sodium
     profiles = {"configured": sodium.star.focused(laser.profile), "these frames": sodium.fit.profile}
     return _section(profiles, sodium.spot_fwhm_arcsec, found.left_out)
@@ -72,6 +70,5 @@ def sodium_sections_of_changes(changes: Sequence[Mapping[str, Any]]) -> list[Sec
 
 
 def _section(profiles: Mapping[str, SodiumProfile], spot_fwhm_arcsec: float, left_out: str = "") -> Section:
-    text = [_TEXT["sodium.about"], _TEXT("sodium.spot", width=spot_fwhm_arcsec)]
-    text += [f"{left_out.capitalize()}."] if left_out else []
-    return Section("sodium", "Sodium profile", text, figures=[profile_figure(profiles)])
+    doubt = left_out.capitalize() or None
+    return _TEXT.section("sodium", profile_figure(profiles), width=spot_fwhm_arcsec, left_out=doubt)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.report.page import Section
+from faintspot.base.report.page import Report, Section
 from faintspot.base.report.texts import Texts
 from faintspot.base.validity import are_valid, leave_out
 from faintspot.io import open_frames
@@ -18,6 +18,7 @@ from faintspot.io.frames import FrameSource
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slopes import Slopes, Stages
 from faintspot.slopes.recorded.report.page import slopes_report
+from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.report.sodium_section import sodium_section_of_frames
 from faintspot.slopes.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.slopes.recorded.stored_run import StoredRun, open_run
@@ -31,8 +32,8 @@ _SAID_FIRST = ("calibration", "PSF", "score")
 """Reasons for not drawing the frame that also stand at the top of the page."""
 
 
-def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path] | None = None) -> str:
-    """Return the report page (HTML) of one file of slopes, or of two of the same frames.
+def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path] | None = None) -> Report:
+    """Return the report of one file of slopes, or of two of the same frames.
 
     Layout, settings and calibration are rebuilt from what the file says about its run. The frame with the
     median total flux is taken from the run's sources and measured again for the pictures. What is missing is
@@ -50,7 +51,7 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
     InputError
         When a file cannot be read, has no finished frame, or two do not have the same sub-apertures.
     MissingExtraError
-        When matplotlib, jinja2 or the package that reads a file is not installed.
+        When matplotlib or the package that reads a file is not installed.
     """
     if not 1 <= len(paths) <= 2:
         raise InputError(f"slopes: expected one file or two to compare, got {len(paths)}")
@@ -64,21 +65,18 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
     stages, reason = _example(stores, methods, example_frame, frames, notes)
     if any(word in reason for word in _SAID_FIRST):
         notes.append(reason)
+    slopes = {
+        method.name: Slopes.from_variables(store.stored.variables, method.n_frames, store.keep)
+        for store, method in zip(stores, methods, strict=True)
+    }
+    steps = (first.estimator or TotalVariation).steps_shown
+    run = SlopesRun(methods, first.layout, stages, None, example_frame, reason, steps, slopes)
     return slopes_report(
-        methods,
-        layout=first.layout,
-        stages=stages,
+        run,
         title=f"Slopes of {' and '.join(store.path.name for store in stores)}",
         facts=_facts(stores, methods),
         configurations=_configurations(stores, methods),
-        example_frame=example_frame,
-        steps=(first.estimator or TotalVariation).steps_shown,
         warnings=list(dict.fromkeys([*_labelled_notes(stores, methods), *notes])),
-        why_no_stages=reason,
-        slopes={
-            method.name: Slopes.from_variables(store.stored.variables, method.n_frames, store.keep)
-            for store, method in zip(stores, methods, strict=True)
-        },
         sections=_sodium(first, frames),
     )
 
@@ -92,7 +90,7 @@ def _sodium(store: StoredRun, frames: Sequence[str | Path] | None) -> list[Secti
             parts = store.layout, store.calibration, store.laser
             return [sodium_section_of_frames(source, *parts, _FRAMES_OF_PROFILE)]
     except InputError as error:
-        return [Section("sodium", "Sodium profile", missing=f"Not fitted: {error}.")]
+        return [_TEXT.section("sodium", missing=f"Not fitted: {error}.")]
 
 
 def _configurations(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
@@ -175,10 +173,10 @@ def _example(
     number: int,
     frames: Sequence[str | Path] | None,
     notes: list[str],
-) -> tuple[dict[str, Stages] | None, str]:
+) -> tuple[dict[str, Stages], str]:
     """Measure the example frame again in every method; or return why that cannot be done."""
     if stores[0].layout is None:
-        return None, "Not drawn: the layout is not known."
+        return {}, "Not drawn: the layout is not known."
     try:
         frame = _frame(stores[0], number, frames)
         stages: dict[str, Stages] = {}
@@ -190,7 +188,7 @@ def _example(
         if len(stores) == 1 and without is not None:
             stages[without.label] = stores[0].pipeline(without).explain(frame)
     except InputError as error:
-        return None, f"Not drawn: {error}."
+        return {}, f"Not drawn: {error}."
     return stages, ""
 
 
@@ -243,16 +241,14 @@ def _median_standard_error(store: StoredRun) -> float:
 def _facts(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
     sources = list(dict.fromkeys(source for store in stores for source in store.sources))
     shown = ", ".join(sources[:4]) + (f" and {len(sources) - 4} more" if len(sources) > 4 else "")
-    versions = dict.fromkeys(
-        str(store.stored.attributes.get("faintspot_version", "unknown")) for store in stores
-    )
+    attributes = [store.stored.attributes for store in stores]
     facts = {"Slopes": ", ".join(str(store.path) for store in stores), "Sources": shown or "not stored"}
     for store, method in zip(stores, methods, strict=True):
         words = "not stored"
         if store.estimator is not None and store.layout is not None:
             words = store.estimator.in_words(len(store.layout), store.layout.pixels) + _range_in_words(store)
-        owner = f" of {method.name!r}" if len(methods) > 1 else ""
-        facts[f"Settings{owner}"] = words
-    if any("reference" in store.stored.attributes for store in stores):
-        facts["Reference"] = "slopes are relative to stored reference positions; crosses in pictures are not"
+        facts["Settings" if len(methods) == 1 else f"Settings of {method.name!r}"] = words
+    if any("reference" in of_run for of_run in attributes):
+        facts["Reference"] = _TEXT["stored.reference"]
+    versions = dict.fromkeys(str(of_run.get("faintspot_version", "unknown")) for of_run in attributes)
     return {**facts, "Measured with": f"faintspot {', '.join(versions)}"}

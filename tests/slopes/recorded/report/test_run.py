@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from faintspot.slopes.recorded.report.key_numbers import Comparison
+from faintspot.slopes.recorded.report.run import NoiseComparison
 from faintspot.slopes.recorded.statistics import MeasuredSlopes, frame_to_frame_noise, relative_gain
 
 
@@ -49,12 +49,12 @@ def test_noise_is_taken_from_frames_that_follow_each_other() -> None:
 def test_methods_are_ranked_at_equal_gain() -> None:
     """The one that shrinks all motion has less noise and jitter, and is the worse one."""
     methods = [moving(0.5, 0.15, 2), moving(1.0, 0.2, 1)]
-    found = Comparison.of(methods, [methods[0].valid] * 2)
+    found = NoiseComparison.of(methods, [methods[0].valid] * 2)
     assert np.median(found.noise_px[0]) < np.median(found.noise_px[1])
     assert np.median(found.equal_noise(0)) == pytest.approx(0.3, rel=0.05)
     assert "'1' has the least noise" in found.verdict()
     assert len(found.warnings()) == 1
-    alike = Comparison.of([methods[1], moving(1.0, 0.2, 3)], [methods[0].valid] * 2)
+    alike = NoiseComparison.of([methods[1], moving(1.0, 0.2, 3)], [methods[0].valid] * 2)
     assert alike.warnings() == []
     assert "not differ" in alike.verdict()
 
@@ -66,6 +66,6 @@ def test_no_gain_is_claimed_where_nothing_moves() -> None:
         MeasuredSlopes(name, rng.normal(size=(50, 20)), rng.normal(size=(50, 20)), flux, flags, flags)
         for name in "ab"
     ]
-    found = Comparison.of(methods, [methods[0].valid] * 2)
+    found = NoiseComparison.of(methods, [methods[0].valid] * 2)
     assert np.isnan(found.gains[0][0])
     assert found.warnings() == []
