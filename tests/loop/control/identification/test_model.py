@@ -92,7 +92,7 @@ def test_what_is_refused(learnt: dict[str, ControlModel], tmp_path: Path) -> Non
         assert message in str(caught.value)
 
     kalman = ControlOptions(controller="kalman")
-    refused("model: expected a file with the learnt model", kalman, None)
+    refused("model: expected a file with the model", kalman, None)
     model.save(path)
     refused("expected a model of controller 'polc'", ControlOptions(controller="polc"))
     with pytest.raises(InputError, match="which need the camera's read noise"):
