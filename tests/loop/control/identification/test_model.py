@@ -99,7 +99,7 @@ def test_what_is_refused(learnt: dict[str, ControlModel], tmp_path: Path) -> Non
         Control(INTERACTION, None, kalman, model).check_errors(Calibration())
     Control(INTERACTION, None, kalman, model).check_errors(Calibration(read_noise_e=1.0))
     Control(INTERACTION).check_errors(Calibration())
-    refused('prediction = "stream"', ControlOptions(controller="kalman", prediction="stream"))
+    refused("prediction = 'stream'", ControlOptions(controller="kalman", prediction="stream"))
     arrays = dict(np.load(path))
     np.savez(path, **{**arrays, "first": arrays["first"][0]})
     refused("first: expected shape (1, 18, 18), got (18, 18)", kalman)
