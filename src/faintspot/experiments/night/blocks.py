@@ -103,6 +103,11 @@ class Night:
         return float((self.duration_s + self.overhead_s).sum()) / 3600
 
     @property
+    def has_strengths(self) -> bool:
+        """Whether there are blocks with TV."""
+        return bool((self.strength_e > 0).any())
+
+    @property
     def is_paired(self) -> bool:
         """Whether the reference is known in the same turbulence."""
         return bool(np.isfinite(self.paired_strehl).any())

@@ -40,7 +40,7 @@ def panels_figure(night: Night) -> FigureWithData:
         points = _points(night, shown, night.r0_m * 100, night.r0_error_m * 100)
         fits = _regressions(night)
         panels.append(Panel([*_unnamed(points), *fits], "measured r0 at 500 nm (cm)", legend=True, **bottom))
-    if (night.strength_e > 0).any():
+    if night.has_strengths:
         panels.append(_of_strengths(night, shown, bottom))
     figure = plot(
         [[panel] for panel in panels],
@@ -62,7 +62,7 @@ def panels_figure(night: Night) -> FigureWithData:
         for b, values in enumerate(zip(*columns, strict=True))
     ]
     values = {"seconds": float(np.median(night.duration_s)), "reference": night.labels[night.reference]}
-    return _TEXT.figure("panels", figure, rows, **values)
+    return _TEXT.figure("panels", figure, rows, strengths=night.has_strengths, **values)
 
 
 def _shown(night: Night) -> dict[str, tuple[NDArray[np.bool_], dict[str, Any]]]:
