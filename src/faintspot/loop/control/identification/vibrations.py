@@ -32,7 +32,8 @@ _LEAST_DAMPING = 1e-3  # of a model: the phase of no vibration is certain for ev
 _START_DAMPING = 3e-3
 _GRID_DAMPING, _GRID_OFF = 0.08, 0.3
 """Line of a layer that passes over the grid of sub-apertures: half the damping of a line fitted to its
-maximum, in sides of a sub-aperture in the sensor; largest distance from its frequency, in widths of the maximum."""
+maximum, in sides of a sub-aperture in the sensor; largest distance from its frequency, in widths of the
+maximum."""
 
 
 @dataclass(frozen=True)
