@@ -19,7 +19,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -40,7 +40,8 @@ for number in range(FRAMES):
     _, seen_nm = telescope.wavefronts((number + 0.5) / RATE_HZ, still)
     movie[number] = camera.expose(np.pad(telescope.frame(number, seen_nm), 8), rng)
 
-folder = Path(mkdtemp())
+temporary = TemporaryDirectory()
+folder = Path(temporary.name)
 np.save(folder / "night.npy", movie)
 
 # %%
