@@ -283,9 +283,9 @@ if __name__ == "__main__":
     parser.add_argument("photons", type=float)
     parser.add_argument("--frames", type=int, default=700)
     parser.add_argument("--realisations", type=int, default=3)
-    told = parser.parse_args()
-    asked = load_loop(told.configuration).replace("camera", photons_per_subaperture=told.photons)
-    if told.loop == "open":
+    options = parser.parse_args()
+    asked = load_loop(options.configuration).replace("camera", photons_per_subaperture=options.photons)
+    if options.loop == "open":
         open_loop(asked)
     else:
-        closed_loop(asked.replace("run", frames=told.frames), told.realisations)
+        closed_loop(asked.replace("run", frames=options.frames), options.realisations)

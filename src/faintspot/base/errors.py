@@ -47,7 +47,7 @@ class InputError(ValueError):
 
 @contextmanager
 def errors_within(where: object, prefix: str = "") -> Iterator[None]:
-    """Say in errors in which file or part they occur; see `InputError.within`."""
+    """Add the file or part to the errors raised within; see `InputError.within`."""
     try:
         yield
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Which slopes are valid, and the line that says which ones a result leaves out."""
+"""Validity of slopes, and the line that names those a result leaves out."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ from faintspot.slopes.kernels.parallel import available_cpus
 
 Progress = Callable[[int, int], None]
 Advance = Callable[[int], None]
-"""Told how much of a unit is done, in the measure of its `size`."""
+"""Called with the finished part of a unit, in the measure of its `size`."""
 
 _LOOK_S = 0.5  # between looks at how far workers are
 _ATTEMPTS = 3  # where workers die or a connection is lost
@@ -196,17 +196,17 @@ def _by_joblib(
     how = {"return_as": "generator_unordered", "batch_size": 1}
     with ExitStack() as stack:
         if pool.scheduler is not None:
-            backend, told = stack.enter_context(_cluster(pool.scheduler, pool.say)), None
+            backend, progress_file = stack.enter_context(_cluster(pool.scheduler, pool.say)), None
             parallel = Parallel(backend=backend, pre_dispatch="all", **how)
         else:
             pool.say(f"{processes} processes on this machine")
-            told = stack.enter_context(_followed(count))
+            progress_file = stack.enter_context(_followed(count))
             with parallel_config("loky", inner_max_num_threads=1, initializer=_begin, initargs=[os.getpid()]):
                 parallel = Parallel(processes, **how)
         own = [kind for kind in estimators().values() if not kind.__module__.startswith("faintspot.")]
         # In tuples: other large arguments would stay with one worker, and be lost with it.
         results = parallel(
-            delayed(_in_worker)((function, unit.arguments), (number, told), (own, __version__))
+            delayed(_in_worker)((function, unit.arguments), (number, progress_file), (own, __version__))
             for number, unit in list(units.items())
         )
         try:
@@ -219,12 +219,12 @@ def _by_joblib(
 
 def _in_worker(work: tuple[Any, ...], place: tuple[int, Path | None], package: tuple[Any, ...]) -> Any:
     """Run a unit with the estimators that are registered where the experiment was started."""
-    (function, arguments), (number, told), (own, version) = work, place, package
+    (function, arguments), (number, progress_file), (own, version) = work, place, package
     if version != __version__:
         raise InputError("a worker has another version of faintspot: install the same one everywhere")
     for kind in own:
         register(kind)
-    done = np.zeros(number + 1) if told is None else np.load(told, mmap_mode="r+")
+    done = np.zeros(number + 1) if progress_file is None else np.load(progress_file, mmap_mode="r+")
     try:
         return number, function(*arguments, lambda amount: done.__setitem__(number, amount))
     except ImportError as error:  # whose own kind cannot be sent to another process

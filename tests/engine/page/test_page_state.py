@@ -47,10 +47,24 @@ def test_flux_is_that_of_the_star_whatever_methods_keep() -> None:
         page_state.add(Batch(made, picture=Picture(10 * turn, np.zeros((24, 24), np.float32), image + noise)))
     values, arrays = page_state.now()
     assert values["flux_of"] == "of the star"
+    assert values["strip_methods"] == {0: "none", 1: "tv"}
     np.testing.assert_allclose(arrays["flux"], 35.0, atol=6.0)  # 64 pixels of .1, twice for the background
     strip = arrays["strip"][:, values["strip"].index("flux_e")]
     np.testing.assert_allclose(strip, 35.0, atol=6.0)
     assert page_state.methods_compared()[0]["figures"]["flux kept (e-)"]["mean"] == pytest.approx(100.0)
+
+
+def test_methods_of_one_read_have_a_row_each_in_the_strip_charts() -> None:
+    page_state = PageState(["none", "tv"])
+    made = np.concatenate([records(0, 10, method=1), records(10, 10, method=0)])
+    made["flux"][10:] = 60.0
+    page_state.add(Batch(made, missed=2))
+    values, arrays = page_state.now()
+    strip = {name: arrays["strip"][:, place] for place, name in enumerate(values["strip"])}
+    np.testing.assert_array_equal(strip["method"], [1, 0])
+    np.testing.assert_allclose(strip["time_s"], [-0.1, 0.0], atol=1e-6)
+    np.testing.assert_allclose(strip["flux_e"], [100.0, 60.0])
+    np.testing.assert_array_equal(strip["lost"], [0, 2])
 
 
 def test_truth_that_comes_before_its_frame_counts_for_it() -> None:

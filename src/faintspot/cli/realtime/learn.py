@@ -107,9 +107,9 @@ def _learn_from(
     control = load_control(described)
     if control is None:
         raise InputError(f"{config}: expected a table [control], which calibrate writes")
-    layout, night = described.layout, read_telemetry(store, images=False)
+    layout, recording = described.layout, read_telemetry(store, images=False)
     prior = prior_std_px(described.settings, layout)
-    loop = recorded_loop(night, control, layout, prior)
+    loop = recorded_loop(recording, control, layout, prior)
     _, delay, unknown = known_delay(loop)
     telemetry, rate_hz = open_loop_of(loop, delay).telemetry, loop.frame_rate_hz
     known = site_of(layout, layers), rate_hz, ASSUMED if layers else winds
@@ -118,7 +118,7 @@ def _learn_from(
     path = derived(config, ".model.npz")
     replace(learnt, centroid_gain=delay.gain).save(path)
     save_control(config, controller=kind, model=path.name)
-    left, left_out = learnt.left, leave_out(night.flags)[1]
+    left, left_out = learnt.left, leave_out(recording.flags)[1]
     if left_out:
         click.echo(left_out)
     click.echo(

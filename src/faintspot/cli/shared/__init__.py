@@ -1,1 +1,1 @@
-"""What all commands share: options, messages, progress, output."""
+"""Code shared by all commands: options, messages, progress, output."""

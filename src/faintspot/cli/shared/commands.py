@@ -127,7 +127,7 @@ def flag_of(name: str) -> str:
 
 @contextmanager
 def errors_of_options(where: object) -> Iterator[None]:
-    """Say in errors where they occur, and name values that the command's options give by their options."""
+    """Add the file or part to the errors raised within; name values that options give by their options."""
     try:
         yield
     except InputError as error:

@@ -24,8 +24,8 @@ _MOST_FRAMES = 1 << 17  # limit for very fast cameras
 _MOST_CHANGES = 20  # kept for display
 _MEAN_FRAMES = 500  # time constant of a sub-aperture's mean slope, about which the rms is taken
 _FEWEST_FRAMES = 10  # needed for a mean
-_STRIP = ("time_s", "latency_us", "longest_us", "rms_px", "flux_e", "lost", "strehl", "rms_nm")
-"""Row of the strip charts: result of one read of the telemetry."""
+_STRIP = ("time_s", "method", "latency_us", "longest_us", "rms_px", "flux_e", "lost", "strehl", "rms_nm")
+"""Row of the strip charts: frames of one method in one read of the telemetry."""
 _FRAME = ("time_s", "method", "latency_us", "rms_px", "flux_e", "valid", "strehl")
 """Row of the last frames."""
 _MEAN_PICTURES = 20  # time constant of the mean images from which the star's flux is taken
@@ -88,7 +88,7 @@ class PageState:
         self.seen, self.lost = self.seen + len(records), self.lost + lost
         self.newest, self._last = records[-1].copy(), records
         self._frames.append(rows)
-        self._strip.append(self._strip_row(rows, lost, batch))
+        self._strip.extend(self._strip_rows(rows, lost, batch))
         self._forget(rows[-1, 0])
 
     @property
@@ -129,11 +129,13 @@ class PageState:
         strip = np.array(self._strip, np.float64).reshape(-1, len(_STRIP))
         if len(strip):
             strip[:, 0] -= strip[-1, 0]
+        shown = np.unique(strip[:, _STRIP.index("method")]).astype(int).tolist()
         star = self.star_flux_e
         values: dict[str, Any] = {
             "flux_of": "kept by the method" if star is None else "of the star",
             "strip": _STRIP,
             "strip_s": STRIP_S,
+            "strip_methods": {number: self._method_name(number) for number in shown},
             "seen": self.seen,
             "lost": self.lost,
             "missed": self.missed,
@@ -238,20 +240,18 @@ class PageState:
             frames = np.concatenate([[self.newest["frame"]], frames])
         return int(np.maximum(all_left_out(frames), 0).sum())
 
-    def _strip_row(self, rows: Floats, lost: int, batch: Batch) -> tuple[float, ...]:
-        latency, rms, kept = (rows[:, _FRAME.index(name)] for name in ("latency_us", "rms_px", "flux_e"))
-        star = self.star_flux_e
-        valid = are_valid(batch.records["flags"][-1])
-        flux = kept if star is None else star[valid]
-        return (
-            rows[-1, 0],
-            float(np.median(latency)),
-            float(latency.max()),
-            _mean(rms),
-            _mean(flux),
-            float(lost + batch.missed),
-            *(self._truths[-1][1:] if self._truths else (np.nan, np.nan)),
-        )
+    def _strip_rows(self, rows: Floats, lost: int, batch: Batch) -> list[tuple[float, ...]]:
+        star, method = self.star_flux_e, rows[:, _FRAME.index("method")]
+        star_e = None if star is None else _mean(star[are_valid(batch.records["flags"][-1])])
+        truth = self._truths[-1][1:] if self._truths else (np.nan, np.nan)
+        strip = []
+        for number in np.unique(method):
+            own = rows[method == number]
+            latency, rms, kept = (own[:, _FRAME.index(name)] for name in ("latency_us", "rms_px", "flux_e"))
+            times = own[-1, 0], number, float(np.median(latency)), float(latency.max())
+            lost_then = float(lost + batch.missed) if own[-1, 0] == rows[-1, 0] else 0.0
+            strip.append((*times, _mean(rms), _mean(kept) if star_e is None else star_e, lost_then, *truth))
+        return sorted(strip)
 
     def _forget(self, now_s: float) -> None:
         """Discard old data."""

@@ -45,7 +45,7 @@ class DarkFollower:
         for dtype in self._add:  # compile now
             self._add[dtype](test, np.zeros((1, *layout.frame_shape), dtype), 0, 0, 1.0, self._mean)
         self.dark = np.zeros(self._n, np.bool_)
-        """Which sub-apertures are dark, (n,)."""
+        """Mask of the dark sub-apertures, (n,)."""
         self.changes = 0
         """Number of changes of `dark`."""
 

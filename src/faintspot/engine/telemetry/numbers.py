@@ -1,4 +1,4 @@
-"""The numbers of a recorded night: rates, latencies, lost frames, and methods in turn."""
+"""Numbers of a recording: rates, latencies, lost frames, and methods that alternated."""
 
 from __future__ import annotations
 

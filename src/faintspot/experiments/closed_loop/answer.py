@@ -69,7 +69,7 @@ class LoopAnswer:
     measured: MagnitudeResult
     """Strehl ratios and tuned values of all candidates with rising flux."""
     scored_frames: int
-    """Of every run."""
+    """Number of scored frames of every run."""
     left_out: dict[str, str]
     """Candidates that were not tried, and why."""
 

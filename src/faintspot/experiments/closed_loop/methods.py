@@ -78,7 +78,7 @@ class Variant:
 
     label: str
     changes: Mapping[str, bool]
-    """Of the `Method`, which says what they mean."""
+    """Attributes of the `Method` that differ, by name."""
 
 
 VARIANTS = {

@@ -145,7 +145,7 @@ def tune(
         Settings of the slopes with the integrator, of which only the loop gain is searched again, from the
         given one. Default: searched; for control that learns, first.
     advance : callable, optional
-        Told the number of frames simulated, after every run.
+        Called with the number of frames simulated, after every run.
 
     Returns
     -------

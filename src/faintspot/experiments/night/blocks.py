@@ -69,7 +69,7 @@ class Night:
     wavelength_m: float
     """Science wavelength of Strehl ratio and phase."""
     source: str
-    """Where the blocks come from, in words: "simulated" or a file."""
+    """Source of the blocks: "simulated" or a file."""
     configuration: str
     """TOML text of the simulated configuration, or ""."""
     shared_error: Floats | None = None

@@ -224,7 +224,7 @@ class _Scored:
     turn: Turn
     phase: TurnPhase
     strehl: Floats
-    """Of the exposures within it."""
+    """Strehl ratios of the exposures within it."""
 
     @classmethod
     def of(

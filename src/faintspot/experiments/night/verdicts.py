@@ -36,7 +36,7 @@ class NightVerdict:
     statement: str
     """In our words."""
     measured: Estimate
-    """What the statement says to be above 0, as the alternating observations show it."""
+    """Difference that is above 0 if the statement holds, from the alternating observations."""
     paired: Estimate
     """The same from the same turbulence; NaN where that is not known."""
     unit: str
@@ -50,12 +50,12 @@ class NightVerdict:
 
     @property
     def outcome(self) -> str:
-        """What the alternating observations say."""
+        """Verdict of the alternating observations."""
         return _outcome(self.measured)
 
     @property
     def paired_outcome(self) -> str:
-        """What the same turbulence says; "" where it is not known."""
+        """Verdict of the same turbulence; "" where it is not known."""
         return _outcome(self.paired) if self.is_paired else ""
 
     @property

@@ -107,7 +107,7 @@ class Answer:
 
     @property
     def magnitude_label(self) -> str:
-        """What `magnitudes` counts."""
+        """Name of the quantity in `magnitudes`."""
         photometry = self.question.photometry
         if photometry is None:
             return f"magnitudes fainter than the {self.question.subject}"

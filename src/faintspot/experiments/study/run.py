@@ -167,8 +167,8 @@ def run(
         Zarr store to write every cell to as it finishes, and to go on with when it is there. Without one,
         results are in memory only.
     pool : WorkerPool, optional
-        Where the work is done; its progress is told the number of finished cells and of all, if any are
-        missing. Default: processes on this machine.
+        Where the work is done; its progress is called with the number of finished cells and of all, if
+        any are missing. Default: processes on this machine.
     overwrite : bool
         Replace the store, if it is one of a study.
 

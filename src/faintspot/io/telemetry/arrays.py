@@ -1,4 +1,4 @@
-"""How the arrays of telemetry are stored: types, dimensions and units."""
+"""Storage of the arrays of telemetry: types, dimensions and units."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from faintspot.io.stored.slopes_format import VARIABLES
 
 
 class StoredArray(NamedTuple):
-    """How an array of telemetry is stored."""
+    """Storage of an array of telemetry."""
 
     dtype: np.dtype[Any]
     dimensions: tuple[str, ...]

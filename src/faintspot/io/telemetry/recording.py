@@ -42,8 +42,8 @@ class Telemetry:
     Examples
     --------
     >>> from faintspot.io import read_telemetry
-    >>> night = read_telemetry("night.zarr", images=False)  # doctest: +SKIP
-    >>> night.x.std(axis=0), night.latency_s.max()  # doctest: +SKIP
+    >>> recording = read_telemetry("night.zarr", images=False)  # doctest: +SKIP
+    >>> recording.x.std(axis=0), recording.latency_s.max()  # doctest: +SKIP
     """
 
     frame: NDArray[np.int64] = field(metadata=array(np.int64, "frame"))
@@ -93,8 +93,8 @@ class Telemetry:
     """Changes of settings: frame (the first with it), number, changes (values by name), where (None: all)."""
     attributes: dict[str, Any]
     """Plain values: layout (``Layout(**attributes["layout"])``), initial settings (TOML), methods (names of
-    the interleaved configurations), reference (slopes that were subtracted, or None), control (interaction
-    matrix and options, see `faintspot.loop.control.recorded`, or None), dropped_records, dropped_images,
+    the interleaved configurations); reference (slopes that were subtracted) and control (interaction matrix
+    and options, see `faintspot.loop.control.recorded`), each or None; dropped_records, dropped_images,
     dropped_changes, complete, ended_because."""
 
     def __repr__(self) -> str:
@@ -179,8 +179,8 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
     Examples
     --------
     >>> from faintspot.io import read_telemetry
-    >>> night = read_telemetry("night.zarr", images=False)  # doctest: +SKIP
-    >>> night.x.std(axis=0), night.latency_s.max()  # doctest: +SKIP
+    >>> recording = read_telemetry("night.zarr", images=False)  # doctest: +SKIP
+    >>> recording.x.std(axis=0), recording.latency_s.max()  # doctest: +SKIP
     """
     stored = StoredTelemetry(path)
     check_bytes(stored.path, stored.size(images=images), memory_bytes() // 2, "telemetry")

@@ -17,7 +17,7 @@ _SHAPE, _TYPE = "shape", "<f4"
 
 
 class RecordedControl(NamedTuple):
-    """What a recording tells of the control."""
+    """Control as a recording describes it."""
 
     interaction: NDArray[np.float64]
     """(2 n, commands): slopes [px] that one unit of each command adds."""

@@ -40,7 +40,7 @@ _OF_SENSOR = (
     *("commands", "control_matrix", "frame_rate_hz", "delay_frames"),
 )
 _SCALES = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
-"""What a layout knows of the telescope."""
+"""Scales of the telescope that a layout holds."""
 _WORDS = ("slope_unit", "slope_order", "loop")
 _PAIRS, _AXES = "pairs", "axes"
 _TABLES = (".npz", ".npy", ".csv", ".txt")

@@ -81,7 +81,7 @@ class LoopReport:
 
     @property
     def advice(self) -> str:
-        """What to do, in one sentence; empty if no control was compared."""
+        """Recommendation in one sentence; empty if no control was compared."""
         return advice(self.choices)
 
     def as_values(self) -> dict[str, Any]:

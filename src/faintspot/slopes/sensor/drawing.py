@@ -28,7 +28,7 @@ class Map(NamedTuple):
 
     values: NDArray[Any]
     label: str
-    """Of the colour bar, with the unit."""
+    """Label of the colour bar, with the unit."""
     title: str
     limits: tuple[float, float]
 

@@ -92,7 +92,7 @@ def learn(
         sums, count = stacked(stack, index, state, halves, draws, options, rng)
         if count.sum() < FEWEST_SPOTS:
             raise InputError(
-                f"images: expected at least {FEWEST_SPOTS} spots whose position can be told to "
+                f"images: expected at least {FEWEST_SPOTS} spots whose position can be measured to "
                 f"{_LARGEST_ERROR_PX:g} px, got {count.sum()} of {len(index)}"
             )
         state = refitted(sums, count, state, 0 < to_come <= _CHOICES, options, rng)

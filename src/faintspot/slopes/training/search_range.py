@@ -22,9 +22,9 @@ _WEIGHT_FLOOR = 1e-3  # of the flux, in electrons squared: faint wings are not k
 _ITERATIONS = 200
 _SCALES = (0.02, 1.5)  # of the fitted flux, within which the flux is sought
 _IMAGES_FOR_SCALE = 512
-_TOLD_NATS = 3.0  # log likelihood by which another range must be worse
+_DECISIVE_NATS = 3.0  # log likelihood by which another range must be worse
 _ELSEWHERE = 0.1  # share of the spots that the other hypothesis has anywhere in the window
-_NEARLY_ALL = 0.8  # of half a window: a range that cannot be told from the whole window
+_NEARLY_ALL = 0.8  # of half a window: a larger range is not distinguished from the whole window
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def _mixed(evidence: Floats, offset: float) -> _Mixed:
 def _is_measured(evidence: Floats, mixed: _Mixed, quantile: float, radii: Floats) -> bool:
     """Tell whether the images exclude spots anywhere in the window, and spots within half the range."""
     best = evidence @ mixed.weights
-    evidence_needed = min(_TOLD_NATS, -0.5 * len(best) * math.log1p(-_ELSEWHERE))
+    evidence_needed = min(_DECISIVE_NATS, -0.5 * len(best) * math.log1p(-_ELSEWHERE))
     wider = (1 - _ELSEWHERE) * best + _ELSEWHERE * evidence[:, -1]
     if quantile < _NEARLY_ALL * radii[-1] and np.log(best / wider).sum() < evidence_needed:
         return False

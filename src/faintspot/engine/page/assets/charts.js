@@ -38,7 +38,7 @@ function yTicksOf(low, high, logarithmic, inWordsOf = SHORT.format) {
 
 /**
  * Draw lines against time, seconds before now.
- * lines: [{values, colour, dash, points}], NaN: no data. marks: values; those above 0 get a tick.
+ * lines: [{values, colour, dash}], NaN: no data, crossed as other gaps are. marks: values; those above 0 get a tick.
  */
 export function drawStrip(canvas, times, seconds, lines, { from, to, logarithmic = false, marks } = {}) {
   const seen = lines.flatMap((line) => Array.from(line.values).filter(Number.isFinite))
@@ -74,13 +74,12 @@ export function drawStrip(canvas, times, seconds, lines, { from, to, logarithmic
     context.setLineDash(dash ? [3, 3] : []);
     context.lineWidth = 1.5;
     context.beginPath();
-    let drawing = false;
+    let before = -Infinity;
     for (let i = 0; i < times.length; i++) {
-      if (!Number.isFinite(values[i])) { drawing = false; continue; }
+      if (!Number.isFinite(values[i])) continue;
       const v = y(logarithmic ? Math.log10(Math.max(values[i], 1e-3)) : values[i]);
-      drawing &&= times[i] - times[i - 1] < GAP_S;
-      if (drawing) context.lineTo(x(times[i]), v); else context.moveTo(x(times[i]), v);
-      drawing = true;
+      if (times[i] - before < GAP_S) context.lineTo(x(times[i]), v); else context.moveTo(x(times[i]), v);
+      before = times[i];
     }
     context.stroke();
   }

@@ -224,7 +224,10 @@ function keyOf(kind, words) {
 
 // Charts -------------------------------------------------------------------------------------------------
 
-function showStrips({ strip: names, strip_s: seconds, flux_of: whose }, { data, shape }) {
+const METHOD_COLOURS = ["first", "second", "third", "text"];
+const LONGEST_NAME = 20;
+
+function showStrips({ strip: names, strip_s: seconds, strip_methods: methods, flux_of: whose }, { data, shape }) {
   const column = (name) => Float32Array.from({ length: shape[0] }, (_, i) => data[i * shape[1] + names.indexOf(name)]);
   const times = column("time_s");
   const last = (values) => values.findLast(Number.isFinite);
@@ -233,11 +236,20 @@ function showStrips({ strip: names, strip_s: seconds, flux_of: whose }, { data, 
     { values: longest, colour: "second", dash: true }, { values: typical, colour: "first" },
   ], { logarithmic: true, marks: column("lost") });
   say("latency-caption", "µs: typical (line), longest (dashed), lost frames (ticks)");
-  const rms = column("rms_px"), light = column("flux_e");
-  drawStrip(byId("rms"), times, seconds, [{ values: rms, colour: "first" }], { from: 0 });
-  say("rms-caption", `about the mean slopes: ${inWords(last(rms))} px`);
-  drawStrip(byId("mean-flux"), times, seconds, [{ values: light, colour: "first" }], { from: 0 });
-  say("mean-flux-caption", `${whose}, per sub-aperture: ${inWords(last(light))} e⁻`);
+  const method = column("method");
+  const byMethod = (values) => Object.entries(methods).map(([number, name], i) => (
+    { name, values: values.map((value, k) => method[k] === Number(number) ? value : NaN),
+      colour: METHOD_COLOURS[i % METHOD_COLOURS.length], dash: i >= METHOD_COLOURS.length }));
+  const show = (id, lines, text, unit) => {
+    drawStrip(byId(id), times, seconds, lines, { from: 0 });
+    byId(`${id}-caption`).replaceChildren(text, ...lines.map(({ name, values, colour }) => element("span", {
+      textContent: `${lines.length > 1 ? ` ${cut(name, LONGEST_NAME)}` : ""} ${inWords(last(values))} ${unit}`,
+      title: lines.length > 1 ? name : "", style: lines.length > 1 ? `color: ${ink[colour]}` : "" })));
+  };
+  show("rms", byMethod(column("rms_px")), "about the mean slopes:", "px");
+  const light = column("flux_e");
+  const kept = whose === "of the star" ? [{ values: light, colour: "first" }] : byMethod(light);
+  show("mean-flux", kept, `${whose}, per sub-aperture:`, "e⁻");
   const strehl = column("strehl"), some = strehl.some(Number.isFinite);
   byId("strehl-figure").hidden = !some;
   if (some) {
@@ -265,12 +277,13 @@ function showFigures() {
 }
 
 const LONGEST = 80;
+const cut = (text, longest) => text.length > longest ? `${text.slice(0, longest)}…` : text;
 
 function shortened(value) {
   const numbers = value && typeof value === "object" && !Array.isArray(value)
     ? Object.entries(value).filter(([, item]) => !Array.isArray(item)) : null;
   const text = numbers ? numbers.map(([name, item]) => `${name} ${item}`).join(", ") : JSON.stringify(value);
-  return text.length > LONGEST ? `${text.slice(0, LONGEST)}…` : text;
+  return cut(text, LONGEST);
 }
 
 function showMethods(methods) {

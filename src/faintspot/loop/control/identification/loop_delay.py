@@ -39,7 +39,7 @@ _UPDATES, _FEW_UPDATES, _POWER = 60, 15, 0.9
 _BATCH = 64  # pieces at a time
 _INDEPENDENT = 0.55  # part of half-overlapping pieces
 FEWEST_SUBAPERTURES = 3
-"""Fewer show only tip and tilt, in which vibrations cannot be told from turbulence."""
+"""Fewer show only tip and tilt, in which vibrations cannot be separated from turbulence."""
 
 
 @dataclass(frozen=True)

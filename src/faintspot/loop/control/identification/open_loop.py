@@ -74,7 +74,7 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
     Raises
     ------
     InputError
-        When the loop is not closed, too short, or the gain cannot be told.
+        When the loop is not closed, too short, or the gain cannot be measured.
     """
     if not loop.is_closed:
         raise InputError(

@@ -58,7 +58,7 @@ class LoopOfControl:
     integrator_gain: float
     sent_after_frames: int
     length_unit: str = "m"
-    """Of the winds per second."""
+    """Unit of length of the winds."""
 
     def plant(self) -> LoopPlant:
         """Return the loop for which controllers are made."""
@@ -295,7 +295,7 @@ class ObservedLoop:
     """Delay and centroid gain that are used, with their errors."""
     seen: OpenLoop
     identification: Identification | None = None
-    """Of its open-loop slopes, if made already."""
+    """Identification of its open-loop slopes, if made already."""
 
 
 def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> PredictiveControl:

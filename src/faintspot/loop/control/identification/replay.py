@@ -44,7 +44,7 @@ def replayed_frames(
     controller = make(line)
     error, covariance = np.sqrt(telemetry.variance_px2), telemetry.covariances_px2
     residuals = np.zeros_like(telemetry.open_loop_px)
-    with np.errstate(over="ignore", invalid="ignore"):  # an unstable loop leaves more than can be told
+    with np.errstate(over="ignore", invalid="ignore"):  # the residual of an unstable loop overflows
         for frame, slopes in enumerate(telemetry.open_loop_px):
             residual = slopes + interaction @ line.acting
             trust = telemetry.trust[frame]
@@ -74,7 +74,7 @@ def replayed_integrators(
     commands = np.zeros((interaction.shape[1], len(gain)))
     caused = [np.zeros((len(interaction), len(gain))) for _ in range(delay_frames)]  # by the latest commands
     squares = np.zeros((len(telemetry), len(gain)))
-    with np.errstate(over="ignore", invalid="ignore"):  # an unstable loop leaves more than can be told
+    with np.errstate(over="ignore", invalid="ignore"):  # the residual of an unstable loop overflows
         for frame, (slopes, trust) in enumerate(zip(telemetry.open_loop_px, telemetry.trust, strict=True)):
             acting, latest = caused[frame % delay_frames], caused[(frame - 1) % delay_frames]
             slopes_px = trust[:, None] * (slopes[:, None] + acting)

@@ -31,8 +31,9 @@ _MOST_DAMPING = 0.05  # that of telescopes' structures is 0.005 to 0.03
 _LEAST_DAMPING = 1e-3  # of a model: the phase of no vibration is certain for ever
 _START_DAMPING = 3e-3
 _GRID_DAMPING, _GRID_OFF = 0.08, 0.3
-"""Of a layer passing over the grid of sub-apertures: half the damping of a line fitted to its maximum, in
-sides of a sub-aperture in the sensor; largest distance from its frequency, in widths of the maximum."""
+"""Line of a layer that passes over the grid of sub-apertures: half the damping of a line fitted to its
+maximum, in sides of a sub-aperture in the sensor; largest distance from its frequency, in widths of the
+maximum."""
 
 
 @dataclass(frozen=True)

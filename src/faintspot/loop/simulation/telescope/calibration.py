@@ -188,7 +188,7 @@ def centroid_gain(
     """Return the slope that a pipeline measures for a displacement of 1 px, at the run's own flux.
 
     From `typical_spots` with the camera's noise; sub-apertures that could not be measured count as they do
-    in the loop, as 0. At least 0.05: less could not be told from none.
+    in the loop, as 0. At least 0.05: less cannot be distinguished from none.
     """
     total = 0.0
     for displaced, sign in zip(spots, (1.0, -1.0), strict=True):

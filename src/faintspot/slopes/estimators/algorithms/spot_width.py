@@ -79,7 +79,7 @@ def like_most(images: ArrayLike) -> NDArray[np.bool_]:
     """Return which lenslets show a spot like most others, and no reflection or other extended structure.
 
     Left out are lenslets whose autocorrelation is far above that of most others, as that of bright
-    structures is, or wider. Where spots are lost in the noise, only the former can be told.
+    structures is, or wider. Where spots are lost in the noise, only the former can be measured.
 
     Parameters
     ----------

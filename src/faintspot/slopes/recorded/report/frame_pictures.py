@@ -58,7 +58,7 @@ class Example:
 
     @property
     def first(self) -> Stages:
-        """What is shown."""
+        """Stages whose images are shown."""
         return next(iter(self.stages.values()))
 
     @property

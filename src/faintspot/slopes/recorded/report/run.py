@@ -1,4 +1,4 @@
-"""What a report of slopes is made of: the methods of a run, and their comparison."""
+"""Content of a report of slopes: the methods of a run, and their comparison."""
 
 from __future__ import annotations
 
