@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,6 @@ from faintspot.slopes.wavefront import Wavefront, fit_wavefront, save_wavefront
 from faintspot.slopes.wavefront.files import check_ending
 from faintspot.slopes.wavefront.fit import UNITS, total
 from faintspot.slopes.wavefront.words import mode_table, refraction_line, remarks, rms_table
-
-_MIRROR = "Mirror"
 
 
 @click.command(cls=SectionedCommand)
@@ -52,15 +50,15 @@ _MIRROR = "Mirror"
 @option(
     "--actuators",
     metavar="FILE",
-    section=_MIRROR,
+    section="Mirror",
     help="Interaction matrix, slopes for a unit of each actuator: finds the command that would flatten.",
 )
-@option("--stroke", type=float, section=_MIRROR, help="Stroke limit, in the matrix's unit.")
+@option("--stroke", type=float, section="Mirror", help="Stroke limit, in the matrix's unit.")
 @option(
     "--command",
     "command_file",
     metavar="FILE",
-    section=_MIRROR,
+    section="Mirror",
     help="File of the command, .npy or .csv.",
     show_default="beside the slopes",
 )
@@ -96,14 +94,20 @@ def command(
         check_ending(Path(name))
         if Path(name).suffix.lower() == ".fits":
             require("io", "astropy", purpose="Writing a FITS file")
-    mirror = _mirror(slopes, actuators, stroke, command_file)
+    target = Path(command_file) if command_file else derived(slopes, "_command.npy")
+    check_command_file(target)
+    if actuators is None and (stroke is not None or command_file is not None):
+        raise InputError("--stroke, --command: expected --actuators with an interaction matrix, got none")
+    interaction = None if actuators is None else read_array(actuators)
     drawing = picture_file(Path(slopes), picture, "_wavefront.png")
     run = open_run(Path(slopes))
     if run.layout is None:
         raise InputError(f"{slopes}: expected slopes with their layout ({' '.join(run.notes)})")
     given: dict[str, Any] = {name: value for name, value in scales.items() if value is not None}
     if pupil_mm is not None:
-        given["diameter_m"] = _eye_diameter_m(pupil_mm, scales["diameter_m"])
+        if "diameter_m" in given:
+            raise InputError("--pupil-mm: expected it or --diameter-m, got both")
+        given["diameter_m"] = 1e-3 * number_between("--pupil-mm", pupil_mm, 0, low_open=True)
     layout = replace(run.layout, **given)
     measured = Slopes.from_variables(run.stored.variables, keep=run.keep)
     with errors_of_options(slopes):
@@ -111,7 +115,8 @@ def command(
         if unit or wavelength_nm is not None:
             wavefront = wavefront.in_unit(unit or "nm", wavelength_nm)
         eye = None if pupil_mm is None else refraction_line(wavefront)
-    flat = None if mirror is None else mirror.flattening(measured)
+    with errors_of_options(actuators):
+        flat = None if interaction is None else flattening(measured, interaction, stroke)
     _print(wavefront, run.notes if eye is None else [eye, *run.notes])
     for name in output:
         save_wavefront(name, wavefront, dioptres=eye is not None)
@@ -120,45 +125,12 @@ def command(
         from faintspot.slopes.wavefront.figure import wavefront_figure
 
         write_picture(wavefront_figure(wavefront, layout, Path(slopes).name).figure, drawing)
-    if mirror is not None and flat is not None:
-        _flatten(mirror, flat, measured, wavefront, layout)
+    if flat is not None:
+        _write_flattening(flat, target, measured, wavefront, layout)
 
 
-def _eye_diameter_m(pupil_mm: float, diameter_m: float | None) -> float:
-    if diameter_m is not None:
-        raise InputError("--pupil-mm: expected it or --diameter-m, got both")
-    return 1e-3 * number_between("--pupil-mm", pupil_mm, 0, low_open=True)
-
-
-@dataclass(frozen=True)
-class _Mirror:
-    """Interaction matrix with the file that it is from, stroke limit, and the file of the command."""
-
-    source: str
-    interaction: Any
-    stroke: float | None
-    target: Path
-
-    def flattening(self, measured: Slopes) -> Flattening:
-        with errors_of_options(self.source):
-            return flattening(measured, self.interaction, self.stroke)
-
-
-def _mirror(
-    slopes: str, actuators: str | None, stroke: float | None, command_file: str | None
-) -> _Mirror | None:
-    """Read the interaction matrix, and refuse what does not fit, before the work."""
-    if actuators is None:
-        if stroke is not None or command_file is not None:
-            raise InputError("--stroke, --command: expected --actuators with an interaction matrix, got none")
-        return None
-    target = Path(command_file) if command_file else derived(slopes, "_command.npy")
-    check_command_file(target)
-    return _Mirror(actuators, read_array(actuators), stroke, target)
-
-
-def _flatten(
-    mirror: _Mirror, flat: Flattening, measured: Slopes, wavefront: Wavefront, layout: Layout
+def _write_flattening(
+    flat: Flattening, target: Path, measured: Slopes, wavefront: Wavefront, layout: Layout
 ) -> None:
     """Write and draw the command that would flatten the wavefront, and print what it removes."""
     moved_x, moved_y = flat.slopes_px.reshape(2, -1).astype(np.float32)
@@ -173,13 +145,12 @@ def _flatten(
     click.echo(
         f"In the fitted modes, {before} {wavefront.unit} rms of the mean wavefront become {left_over}."
     )
-    save_command(mirror.target, flat.command)
-    click.echo(f"command: {mirror.target}")
-    if can_make("picture", "report", "matplotlib", asked=False):
+    save_command(target, flat.command)
+    click.echo(f"command: {target}")
+    if can_make("picture", "report", "matplotlib"):
         from faintspot.loop.control.flattening_figure import flattening_figure
 
-        figure = flattening_figure(flat, mirror.interaction, wavefront, after, layout)
-        write_picture(figure, mirror.target.with_suffix(".png"))
+        write_picture(flattening_figure(flat, wavefront, after, layout), target.with_suffix(".png"))
 
 
 def _print(wavefront: Wavefront, notes: list[str]) -> None:

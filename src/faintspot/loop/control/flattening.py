@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,8 +25,8 @@ class Flattening:
 
     command: Floats
     """(actuators,), in the unit of the interaction matrix."""
-    slopes_px: Floats
-    """Slopes that the command adds, all x, then all y, (2 n,)."""
+    interaction: Floats
+    """(2 n, actuators)"""
     combinations: int
     """Number of combinations of actuators that are driven."""
     before_px: float
@@ -38,6 +36,11 @@ class Flattening:
     noise_px: float
     """Rms of the standard errors of the mean slopes; not finite if unknown."""
     stroke: float | None
+
+    @property
+    def slopes_px(self) -> Floats:
+        """Slopes that the command adds, all x, then all y, (2 n,)."""
+        return self.interaction @ self.command
 
     @property
     def clipped(self) -> int:
@@ -128,10 +131,9 @@ def flattening(slopes: Slopes, interaction: ArrayLike, stroke: float | None = No
     squares = np.where(valid, np.square(np.concatenate(errors, axis=1), dtype=np.float64), 0.0)
     variance = squares.sum(axis=0) / count**2
     command = _command(reconstructor, -mean[used], stroke)
-    added = matrix @ command
-    before, after = (float(np.sqrt(np.mean(values[used] ** 2))) for values in (mean, mean + added))
+    before, after = (float(np.sqrt(np.mean(values[used] ** 2))) for values in (mean, mean + matrix @ command))
     noise = float(np.sqrt(np.mean(variance[used])))
-    return Flattening(command, added, reconstructor.modes.shape[1], before, after, noise, stroke)
+    return Flattening(command, matrix, reconstructor.modes.shape[1], before, after, noise, stroke)
 
 
 def _command(reconstructor: Reconstructor, slopes: Floats, stroke: float | None) -> Floats:
@@ -150,22 +152,10 @@ def _command(reconstructor: Reconstructor, slopes: Floats, stroke: float | None)
     return np.asarray(np.clip(bounded.x, -stroke, stroke))
 
 
-def _npy(command: Floats) -> Callable[[Any], None]:
-    return lambda stream: np.save(stream, command)
-
-
-def _csv(command: Floats) -> str:
-    rows = [(number, f"{value:.9g}") for number, value in enumerate(command)]
-    return csv_text(("actuator", "command"), rows)
-
-
-_WRITERS: dict[str, Callable[[Floats], Any]] = {".npy": _npy, ".csv": _csv}
-
-
 def check_command_file(path: Path) -> None:
     """Refuse an unknown ending before the work."""
-    if path.suffix.lower() not in _WRITERS:
-        raise InputError(f"{path}: expected a name ending in {', '.join(_WRITERS)}")
+    if path.suffix.lower() not in (".npy", ".csv"):
+        raise InputError(f"{path}: expected a name ending in .npy, .csv")
 
 
 def save_command(path: str | Path, command: Floats) -> None:
@@ -178,4 +168,8 @@ def save_command(path: str | Path, command: Floats) -> None:
     """
     path = Path(path)
     check_command_file(path)
-    write_atomically(path, _WRITERS[path.suffix.lower()](command))
+    if path.suffix.lower() == ".npy":
+        write_atomically(path, lambda stream: np.save(stream, command))
+    else:
+        rows = [(number, f"{value:.9g}") for number, value in enumerate(command)]
+        write_atomically(path, csv_text(("actuator", "command"), rows))

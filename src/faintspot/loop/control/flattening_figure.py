@@ -25,15 +25,12 @@ _LEAST_APART = 0.2  # sub-apertures between neighbours: closer positions are not
 
 
 @styled
-def flattening_figure(
-    flat: Flattening, interaction: Floats, before: Wavefront, after: Wavefront, layout: Layout
-) -> Figure:
+def flattening_figure(flat: Flattening, before: Wavefront, after: Wavefront, layout: Layout) -> Figure:
     """Draw the wavefront before and after the command, and the command over actuators and pupil.
 
     Parameters
     ----------
     flat : Flattening
-    interaction : (2 n, actuators) array
     before, after : Wavefront
         Fits to the slopes, and to the slopes with those of the command.
     layout : Layout
@@ -45,13 +42,11 @@ def flattening_figure(
     for axes, wavefront, when in zip(panels, (before, after), ("measured", "with the command"), strict=True):
         wavefront_map(axes, wavefront, layout, largest=largest)
         axes.set_title(f"{when}: {float(total(wavefront.mean)):.3g} {before.unit} rms", fontsize=12)
-    places = _places(interaction, layout)
-    if places is None:
-        _bars(below.subplots(), flat)
-    else:
-        bars, pupil = below.subplots(1, 2)
-        _bars(bars, flat)
-        _map(pupil, flat, places, layout)
+    places = _places(flat.interaction, layout)
+    panels = below.subplots(1, 1 if places is None else 2, squeeze=False)[0]
+    _bars(panels[0], flat)
+    if places is not None:
+        _map(panels[1], flat, places, layout)
     figure.suptitle("Command that would flatten the mean wavefront", fontsize=14)
     return figure
 

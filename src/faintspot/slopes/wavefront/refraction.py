@@ -68,7 +68,7 @@ def refraction_error(wavefront: Wavefront) -> Refraction:
     """
     _, j0, j45 = _power_vector(wavefront, wavefront.mean)
     equivalent, error_0, error_45 = _power_vector(wavefront, wavefront.mean_standard_error)
-    half = np.maximum(np.hypot(j0, j45), np.finfo(float).tiny)
+    half = np.maximum(np.hypot(j0, j45), 1e-100)  # no division by 0
     of_half = np.hypot(j0 * error_0, j45 * error_45) / half
     axis = np.hypot(j45 * error_0, j0 * error_45) / half**2 / 2
     return Refraction(np.hypot(equivalent, of_half), 2 * of_half, np.rad2deg(axis), equivalent)
