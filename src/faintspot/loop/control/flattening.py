@@ -59,10 +59,10 @@ class Flattening:
         ]
         if np.isfinite(self.noise_px):
             lines.append(f"Noise alone leaves about {self.noise_px:.2g} px in the mean slopes.")
+        weak = "" if self.combinations == actuators else "; the slopes show the others too weakly"
         lines.append(
-            f"{self.combinations} combinations of {actuators} actuators are driven; the slopes show the "
-            f"others too weakly. The largest command is {np.abs(self.command).max():.4g}, in the unit of the "
-            "interaction matrix."
+            f"{self.combinations} combinations of {actuators} actuators are driven{weak}. The largest "
+            f"command is {np.abs(self.command).max():.4g}, in the unit of the interaction matrix."
         )
         if self.stroke is not None:
             lines.append(
