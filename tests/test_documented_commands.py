@@ -107,6 +107,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fits.writeto(folder / "flat.fits", np.ones(layout.frame_shape))
     fits.writeto(folder / "bad.fits", np.zeros(layout.frame_shape, np.uint8))
     np.save(folder / "frame.npy", mmt_frame())
+    np.save(folder / "interaction.npy", rng.normal(0.0, 0.01, (2 * len(layout), 20)))
     run(["layout", str(folder / "frames.fits"), "-o", str(folder / "found.toml")])
     return folder
 

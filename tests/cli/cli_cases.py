@@ -73,7 +73,7 @@ class Commands:
         assert result.code == 0, result.err
         return result
 
-    def refused(self, *arguments: str | Path | int, naming: tuple[str, ...] = ()) -> Result:
+    def refused(self, *arguments: str | Path | float, naming: tuple[str, ...] = ()) -> Result:
         """Run a command that must end with one line that names what is wrong, and exit code 2."""
         result = self(*arguments)
         assert result.code == 2, result

@@ -37,12 +37,13 @@ def test_table_picture_and_files(run: Commands, slopes: Path) -> None:
     assert written["unknown"] == {}
     assert written["unit"] == "nm"
     assert [mode["noll"] for mode in written["mean"]["modes"]] == list(range(2, 11))
+    assert [mode["osa"] for mode in written["mean"]["modes"]] == [2, 1, 4, 3, 5, 7, 8, 6, 9]
     np.testing.assert_allclose(written["frames"]["coefficients"], expected.coefficients)
     with Path("w.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert [row["frame"] for row in rows] == ["mean", *map(str, range(6))]
     np.testing.assert_allclose(
-        [float(row["z4_nm"]) for row in rows[1:]], expected.coefficients[:, 2], rtol=1e-6
+        [float(row["noll4_osa4_defocus_nm"]) for row in rows[1:]], expected.coefficients[:, 2], rtol=1e-6
     )
     np.testing.assert_allclose(
         [float(row["rms_without_tilt_nm"]) for row in rows[1:]], expected.rms(tilt=False), rtol=1e-6
@@ -50,6 +51,8 @@ def test_table_picture_and_files(run: Commands, slopes: Path) -> None:
     with fits.open("w.fits", checksum=True) as units:
         assert units[0].header["BUNIT"] == "nm"
         np.testing.assert_allclose(units["MODES"].data["MEAN"], expected.mean)
+        assert list(units["MODES"].data["OSA"][:3]) == [2, 1, 4]
+        assert units["MODES"].data["NAME"][2:4].tolist() == ["defocus", "astigmatism, 45 deg"]
         np.testing.assert_allclose(units["STANDARD_ERRORS"].data, expected.standard_errors)
 
 
@@ -87,6 +90,62 @@ def test_scales_of_the_configuration_are_stored(run: Commands, slopes: Path) -> 
     Path("faintspot.toml").write_text(text)
     run.ok("slopes", "frames.npy", "-o", "scaled.npz")
     assert "mean (nm)" in run.ok("wavefront", "scaled.npz").out
+
+
+def test_units_and_refraction(run: Commands, slopes: Path, no_picture: None) -> None:
+    eye = ("--pixel-scale-arcsec", 30, "--pupil-mm", 6)
+    outputs = [word for name in ("w.csv", "w.json", "w.fits") for word in ("-o", name)]
+    out = run.ok("wavefront", slopes, *eye, "--unit", "waves", "--wavelength-nm", 850, *outputs).out
+    assert "mean (waves)" in out
+    assert "850 nm" in out
+    assert "pupil of 6 mm: sphere" in out
+    run.ok("wavefront", slopes, *eye, "--unit", "um", "-o", "um.json")
+    waves, um = (parse_json(Path(name).read_text()) for name in ("w.json", "um.json"))
+    np.testing.assert_allclose(0.85 * np.array(waves["frames"]["rms"]), um["frames"]["rms"])
+    lens = waves["mean"]["refraction"]
+    assert lens == pytest.approx(um["mean"]["refraction"])
+    with Path("w.csv").open() as stream:
+        row = next(csv.DictReader(stream))
+    assert float(row["sphere_d"]) == pytest.approx(lens["sphere_d"], rel=1e-6)
+    assert float(row["noll5_osa3_astigmatism_45deg_waves"]) == pytest.approx(
+        waves["mean"]["modes"][3]["mean"], rel=1e-6
+    )
+    with fits.open("w.fits") as units:
+        assert units[0].header["CYLAXIS"] == pytest.approx(lens["axis_deg"])
+        assert units[0].header["WAVELEN"] == 850
+
+
+def test_command_that_flattens(run: Commands, slopes: Path, coarse_pictures: None) -> None:
+    np.save("mirror.npy", np.random.default_rng(1).normal(size=(32, 6)))
+    out = run.ok("wavefront", slopes, "--actuators", "mirror.npy").out
+    assert "The command removes" in out
+    assert Path("slopes_command.png").exists()
+    command = np.load("slopes_command.npy")
+    assert command.shape == (6,)
+    limit = 0.5 * float(np.abs(command).max())
+    asked = ("--actuators", "mirror.npy", "--stroke", limit, "--command", "c.csv")
+    assert "at the stroke limit" in run.ok("wavefront", slopes, *SCALES, *asked).out
+    with Path("c.csv").open() as stream:
+        clipped = [float(row["command"]) for row in csv.DictReader(stream)]
+    assert np.abs(clipped).max() == pytest.approx(limit)
+    assert Path("c.png").exists()
+
+
+def test_refused_units_and_mirrors(run: Commands, slopes: Path) -> None:
+    run.refused("wavefront", slopes, "--unit", "um", naming=("pixel_scale_arcsec",))
+    run.refused("wavefront", slopes, "--pupil-mm", 6, naming=("pixel_scale_arcsec",))
+    run.refused("wavefront", slopes, "--pupil-mm", -6, naming=("--pupil-mm", "-6"))
+    run.refused("wavefront", slopes, *SCALES, "--pupil-mm", 6, naming=("--diameter-m",))
+    run.refused("wavefront", slopes, *SCALES, "--unit", "waves", naming=("wavelength_nm",))
+    run.refused("wavefront", slopes, *SCALES, "--wavelength-nm", 500, naming=("wavelength_nm",))
+    eye = ("--pixel-scale-arcsec", 30, "--pupil-mm", 6)
+    run.refused("wavefront", slopes, *eye, "--modes", 4, naming=("modes = 4", "at least 5"))
+    run.refused("wavefront", slopes, "--stroke", 1, naming=("--actuators",))
+    np.save("mirror.npy", np.ones((6, 32)))
+    run.refused("wavefront", slopes, "--actuators", "mirror.npy", naming=("mirror.npy", "(6, 32); transpose"))
+    run.refused("wavefront", slopes, "--actuators", "no.npy", naming=("no.npy",))
+    asked = ("--actuators", "mirror.npy", "--command", "c.txt")
+    run.refused("wavefront", slopes, *asked, naming=("c.txt", ".npy, .csv"))
 
 
 def test_refused(run: Commands, slopes: Path) -> None:

@@ -7,17 +7,24 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 
-from faintspot.base.errors import InputError, errors_within
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
 from faintspot.base.extras import require
-from faintspot.cli.shared.commands import SectionedCommand, declared, option
+from faintspot.base.files import derived
+from faintspot.cli.shared.commands import SectionedCommand, declared, errors_of_options, option
+from faintspot.cli.shared.needs import can_make
 from faintspot.cli.shared.output import picture_file, write_picture
+from faintspot.io.frames import read_array
+from faintspot.loop.control.flattening import Flattening, check_command_file, flattening, save_command
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.stored_run import open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.wavefront import Wavefront, fit_wavefront, save_wavefront
 from faintspot.slopes.wavefront.files import check_ending
-from faintspot.slopes.wavefront.words import mode_table, remarks, rms_table
+from faintspot.slopes.wavefront.fit import UNITS, total
+from faintspot.slopes.wavefront.words import mode_table, refraction_line, remarks, rms_table
 
 
 @click.command(cls=SectionedCommand)
@@ -37,11 +44,39 @@ from faintspot.slopes.wavefront.words import mode_table, remarks, rms_table
     help="Number of modes, from tip and tilt on.",
     show_default="by the sensor",
 )
+@option("--unit", type=click.Choice(UNITS), help="Unit of the wavefront.", show_default="nm, if known")
+@option("--wavelength-nm", type=float, metavar="NM", help="Wavelength, for waves.")
+@option("--pupil-mm", type=float, metavar="MM", help="Diameter of an eye's pupil, for its refraction.")
+@option(
+    "--actuators",
+    metavar="FILE",
+    section="Mirror",
+    help="Interaction matrix, slopes for a unit of each actuator: finds the command that would flatten.",
+)
+@option("--stroke", type=float, section="Mirror", help="Stroke limit, in the matrix's unit.")
+@option(
+    "--command",
+    "command_file",
+    metavar="FILE",
+    section="Mirror",
+    help="File of the command, .npy or .csv.",
+    show_default="beside the slopes",
+)
 @declared(Layout, *OPTICS, sections="Telescope")
 def command(
-    slopes: str, output: tuple[str, ...], picture: str | None, modes: int | None, **scales: float | None
+    slopes: str,
+    output: tuple[str, ...],
+    picture: str | None,
+    modes: int | None,
+    unit: str | None,
+    wavelength_nm: float | None,
+    pupil_mm: float | None,
+    actuators: str | None,
+    stroke: float | None,
+    command_file: str | None,
+    **scales: float | None,
 ) -> None:
-    """Fit Zernike modes (Noll's order) to slopes, and draw the wavefront.
+    """Fit Zernike modes to slopes, draw the wavefront, and find the command that would flatten it.
 
     SLOPES is what `faintspot slopes` wrote (.zarr, .fits, .npz). Each frame is fitted by least squares over
     its valid sub-apertures; the table shows the mean, with standard errors. In nm when the pixels' scale and
@@ -51,45 +86,88 @@ def command(
     Examples:
       faintspot wavefront slopes.zarr
       faintspot wavefront slopes.zarr --pixel-scale-arcsec 0.38 --diameter-m 4.2 -o wavefront.json
+      faintspot wavefront eye.zarr --pixel-scale-arcsec 60 --pupil-mm 6 --unit um
+      faintspot wavefront slopes.zarr --actuators interaction.npy --stroke 300
+      faintspot wavefront slopes.zarr --actuators faintspot.control.npz:interaction_matrix
     """
     for name in output:
         check_ending(Path(name))
         if Path(name).suffix.lower() == ".fits":
             require("io", "astropy", purpose="Writing a FITS file")
+    target = Path(command_file) if command_file else derived(slopes, "_command.npy")
+    check_command_file(target)
+    if actuators is None and (stroke is not None or command_file is not None):
+        raise InputError("--stroke, --command: expected --actuators with an interaction matrix, got none")
+    interaction = None if actuators is None else read_array(actuators)
     drawing = picture_file(Path(slopes), picture, "_wavefront.png")
     run = open_run(Path(slopes))
     if run.layout is None:
         raise InputError(f"{slopes}: expected slopes with their layout ({' '.join(run.notes)})")
     given: dict[str, Any] = {name: value for name, value in scales.items() if value is not None}
+    if pupil_mm is not None:
+        if "diameter_m" in given:
+            raise InputError("--pupil-mm: expected it or --diameter-m, got both")
+        given["diameter_m"] = 1e-3 * number_between("--pupil-mm", pupil_mm, 0, low_open=True)
     layout = replace(run.layout, **given)
-    with errors_within(slopes):
-        measured = Slopes.from_variables(run.stored.variables, keep=run.keep)
+    measured = Slopes.from_variables(run.stored.variables, keep=run.keep)
+    with errors_of_options(slopes):
         wavefront = fit_wavefront(measured, layout, modes=modes)
-    _print(wavefront)
-    for note in run.notes:
-        click.echo(note)
+        if unit or wavelength_nm is not None:
+            wavefront = wavefront.in_unit(unit or "nm", wavelength_nm)
+        eye = None if pupil_mm is None else refraction_line(wavefront)
+    with errors_of_options(actuators):
+        flat = None if interaction is None else flattening(measured, interaction, stroke)
+    _print(wavefront, run.notes if eye is None else [eye, *run.notes])
     for name in output:
-        save_wavefront(name, wavefront)
+        save_wavefront(name, wavefront, dioptres=eye is not None)
         click.echo(name)
     if drawing is not None:
         from faintspot.slopes.wavefront.figure import wavefront_figure
 
         write_picture(wavefront_figure(wavefront, layout, Path(slopes).name).figure, drawing)
+    if flat is not None:
+        _write_flattening(flat, target, measured, wavefront, layout)
 
 
-def _print(wavefront: Wavefront) -> None:
+def _write_flattening(
+    flat: Flattening, target: Path, measured: Slopes, wavefront: Wavefront, layout: Layout
+) -> None:
+    """Write and draw the command that would flatten the wavefront, and print what it removes."""
+    moved_x, moved_y = flat.slopes_px.reshape(2, -1).astype(np.float32)
+    left = replace(measured, x=measured.x + moved_x, y=measured.y + moved_y)
+    after = fit_wavefront(left, layout, modes=len(wavefront.modes))
+    if wavefront.unit != after.unit:
+        after = after.in_unit(wavefront.unit, wavefront.wavelength_nm)
+    before, left_over = (f"{total(part.mean):.3g}" for part in (wavefront, after))
+    click.echo()
+    for line in flat.remarks():
+        click.echo(line)
+    click.echo(
+        f"In the fitted modes, {before} {wavefront.unit} rms of the mean wavefront become {left_over}."
+    )
+    save_command(target, flat.command)
+    click.echo(f"command: {target}")
+    if can_make("picture", "report", "matplotlib"):
+        from faintspot.loop.control.flattening_figure import flattening_figure
+
+        write_picture(flattening_figure(flat, wavefront, after, layout), target.with_suffix(".png"))
+
+
+def _print(wavefront: Wavefront, notes: list[str]) -> None:
     from rich.console import Console
     from rich.table import Table
 
     console = Console()
     for header, rows in (mode_table(wavefront), rms_table(wavefront)):
         table = Table(box=None, pad_edge=False)
-        words = 2 if header[0] == "mode" else 1
+        words = 2 if header[0] == "Noll" else 1
         for place, title in enumerate(header):
-            table.add_column(title, justify="left" if place < words else "right")
+            text = place < words
+            kept = text and wavefront.unit in UNITS  # the unit of pixels needs the space
+            table.add_column(title, justify="left" if text else "right", no_wrap=kept)
         for row in rows:
             table.add_row(*row)
         console.print(table)
         console.print()
-    for line in remarks(wavefront):
+    for line in (*remarks(wavefront), *notes):
         click.echo(line)

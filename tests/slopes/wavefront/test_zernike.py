@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from faintspot.slopes.wavefront.zernike import mean_gradients, mode_name, noll_to_nm, zernike
+from faintspot.slopes.wavefront.zernike import mean_gradients, mode_name, noll_to_nm, osa_index, zernike
 
 R, ANGLE = np.meshgrid(np.linspace(0, 1.3, 14), np.linspace(0, 2 * np.pi, 25))
 X, Y = R * np.cos(ANGLE), R * np.sin(ANGLE)
@@ -41,7 +41,50 @@ def test_orders_go_up_and_every_mode_comes_once() -> None:
     assert [n for n, _ in found] == sorted(n for n, _ in found)
     assert set(found) == {(n, m) for n in range(11) for m in range(-n, n + 1, 2)}
     assert mode_name(4) == "defocus"
-    assert mode_name(12) == "n = 4, m = 2"
+    assert mode_name(46) == "n = 9, m = 1"
+    assert len({mode_name(j) for j in range(1, 67)}) == 66
+
+
+# Standards for reporting the optical aberrations of eyes (Thibos et al. 2002), table 2: index, n, m.
+OSA = [(0, 0, 0), (1, 1, -1), (2, 1, 1), (3, 2, -2), (4, 2, 0), (5, 2, 2), (6, 3, -3), (7, 3, -1)]
+OSA += [(8, 3, 1), (9, 3, 3), (10, 4, -4), (11, 4, -2), (12, 4, 0), (13, 4, 2), (14, 4, 4), (15, 5, -5)]
+
+NAMES = {
+    2: "tilt along x",
+    3: "tilt along y",
+    5: "astigmatism, 45°",
+    6: "astigmatism, 0°",
+    7: "coma along y",
+    8: "coma along x",
+    9: "trefoil, sine",
+    11: "spherical",
+    12: "secondary astigmatism, 0°",
+    15: "tetrafoil, sine",
+    17: "secondary coma along y",
+    22: "secondary spherical",
+    37: "tertiary spherical",
+    45: "octafoil, sine",
+}
+
+
+def test_osa_indices_are_those_of_the_standard() -> None:
+    ours = sorted((osa_index(j), *noll_to_nm(j)) for j in range(1, 67))
+    assert ours[:16] == OSA
+    assert [index for index, _, _ in ours] == list(range(66))
+
+
+def test_indices_and_modes_are_those_of_hcipy() -> None:
+    hcipy = pytest.importorskip("hcipy")
+    grid = hcipy.CartesianGrid(hcipy.SeparatedCoords([np.linspace(-0.7, 0.7, 8)] * 2))
+    for j in range(1, 46):
+        assert hcipy.zernike_to_ansi(*noll_to_nm(j)) == osa_index(j)
+        theirs = hcipy.zernike_ansi(osa_index(j), D=2.0, grid=grid, radial_cutoff=False)
+        np.testing.assert_allclose(zernike(j, grid.x, grid.y), theirs, atol=1e-9)
+
+
+@pytest.mark.parametrize("j", NAMES)
+def test_names(j: int) -> None:
+    assert mode_name(j) == NAMES[j]
 
 
 def test_modes_are_orthonormal_over_the_disk() -> None:

@@ -2,7 +2,8 @@
 
 `commands` (delay line to the mirror), `base` (what every controller offers), `reconstructor` (slopes to
 commands), `integrator`, `kalman` (prediction), `telemetry` (open-loop slopes), `identification` (controllers
-learnt from it), `configuration` (table [control]). Beside them: `mirror_calibration`, from pokes.
+learnt from it), `configuration` (table [control]). Beside them: `mirror_calibration`, from pokes, and
+`flattening`, the command that flattens a measured wavefront.
 
 For the loops of other systems: `Recording`, `learn` and `PredictiveControl`.
 """

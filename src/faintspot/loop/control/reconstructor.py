@@ -32,6 +32,8 @@ class Reconstructor:
     """(2 n, modes)"""
     clean: Floats
     """(commands, 2 n): as `matrix`, hardly regularised, for slopes with little noise."""
+    damping: float = 0.0
+    """Weight of the square of the command in what `clean` minimises, beside the squares of the slopes."""
 
     def __call__(self, slopes: Floats) -> Floats:
         """Return the commands in the unit of the interaction matrix."""
@@ -93,15 +95,21 @@ def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) 
     driven = size * limit >= size[0]
     modes, modal_slopes = right[driven].T, left[:, driven] * size[driven]
     plain, clean = (modes @ _estimator(modal_slopes, modal_slopes, ridge) for ridge in (_RIDGE, _RIDGE_CLEAN))
-    return Reconstructor(plain, modes, modal_slopes, clean)
+    return Reconstructor(
+        plain, modes, modal_slopes, clean, _damping(modal_slopes.T @ modal_slopes, _RIDGE_CLEAN)
+    )
 
 
 def _estimator(slopes_of_modes: Floats, weighted: Floats, largest_ridge: float = _RIDGE) -> Floats:
     """Return (modes, 2 n): modes from slopes, by least squares with a ridge; `weighted_slopes` or equal."""
     normal = weighted.T @ slopes_of_modes
-    ridge = min(largest_ridge, _RIDGE_OF_MANY / len(normal))
-    normal[np.diag_indices_from(normal)] += ridge * np.trace(normal) / len(normal)
+    normal[np.diag_indices_from(normal)] += _damping(normal, largest_ridge)
     return np.asarray(np.linalg.solve(normal, weighted.T))
+
+
+def _damping(normal: Floats, largest_ridge: float) -> float:
+    """Return what to add to the diagonal of the normal equations."""
+    return float(min(largest_ridge, _RIDGE_OF_MANY / len(normal)) * np.trace(normal) / len(normal))
 
 
 def check_controllable(commands: int, slopes: int) -> None:

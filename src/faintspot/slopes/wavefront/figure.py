@@ -11,7 +11,7 @@ from faintspot.base.report.figure_data import FigureWithData
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_outlines
 from faintspot.slopes.wavefront.fit import Wavefront, total
-from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm
+from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,13 +26,13 @@ def wavefront_figure(
 ) -> FigureWithData:
     """Draw the mean wavefront over the pupil and its coefficients with standard errors."""
     several = int(np.count_nonzero(wavefront.fitted)) > 1
-    figure = new_figure(WIDTH, 9.6)
-    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(5.6, 4))[:, 0]
+    figure = new_figure(WIDTH, 11.2)
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(5.6, 5.6))[:, 0]
     subject = "mean wavefront" if several else "wavefront"
     for axes, tilt in zip(above.subplots(1, 2), (True, False), strict=True):
         rms = float(total(wavefront.mean, tilt=tilt))
         title = subject if tilt else f"{subject} without tip and tilt"
-        _map(axes, wavefront, layout, tilt=tilt)
+        wavefront_map(axes, wavefront, layout, tilt=tilt)
         axes.set_title(f"{title}: {rms:.3g} {wavefront.unit} rms", fontsize=12)
     has_higher = len(wavefront.modes) > 2
     widths = {"width_ratios": (1, max(3, min(len(wavefront.modes) / 2, 9)))} if has_higher else {}
@@ -48,12 +48,12 @@ def wavefront_figure(
         f"{subject.capitalize()} over the disk of the pupil, in the frame's directions, with the "
         "illuminated sub-apertures outlined; it increases in the direction in which spots "
         "are displaced. Below: its coefficients in "
-        "Noll's order ± standard error"
+        "Noll's order ± standard error, with the names of the modes and their indices (Noll | OSA/ANSI)"
         + (", and in grey the rms of each over the frames (motion and noise)." if several else ".")
     )
-    header = ("noll", "n", "m", "name", "coefficient", "standard_error", "rms_of_frames", "unit")
+    header = ("noll", "osa", "n", "m", "name", "coefficient", "standard_error", "rms_of_frames", "unit")
     rows = [
-        (int(j), *noll_to_nm(int(j)), mode_name(int(j)), *numbers, wavefront.unit)
+        (int(j), osa_index(int(j)), *noll_to_nm(int(j)), mode_name(int(j)), *numbers, wavefront.unit)
         for j, *numbers in zip(
             wavefront.modes,
             wavefront.mean,
@@ -65,14 +65,19 @@ def wavefront_figure(
     return FigureWithData(file, f"Wavefront of {name}", caption, figure, header, rows)
 
 
-def _map(axes: Axes, wavefront: Wavefront, layout: Layout, *, tilt: bool) -> None:
-    """Draw the mean wavefront at its position in the frame, with the illuminated sub-apertures outlined."""
+def wavefront_map(
+    axes: Axes, wavefront: Wavefront, layout: Layout, *, tilt: bool = True, largest: float = 0.0
+) -> None:
+    """Draw the mean wavefront at its position in the frame, with the illuminated sub-apertures outlined.
+
+    Colours go to `largest` on both sides; 0: to the largest value.
+    """
     from matplotlib.collections import PolyCollection
     from matplotlib.patches import Circle
 
     pupil, sheet = wavefront.pupil, wavefront.sheet(tilt=tilt)
     (x, y), radius = pupil.centre_px, pupil.radius_px
-    largest = float(np.nanmax(np.abs(sheet))) or 1.0
+    largest = largest or float(np.nanmax(np.abs(sheet))) or 1.0
     half = radius * len(sheet) / (len(sheet) - 1)  # the outermost points are on the circle
     extent = (x - half, x + half, y - half, y + half)
     image = axes.imshow(sheet, cmap=_SIGNED_COLOURS, vmin=-largest, vmax=largest, extent=extent)
@@ -104,6 +109,7 @@ def _bars(axes: Axes, wavefront: Wavefront, part: slice, several: bool) -> None:
     )
     axes.axhline(0, color="black", lw=0.8)
     axes.set_xlim(modes[0] - 0.7, modes[-1] + 0.7)
-    step = -(-len(modes) // 30)
-    axes.set_xticks(modes[::step], [f"Z{j}" for j in modes[::step]])
-    axes.tick_params(axis="x", labelsize=10)
+    step = -(-len(modes) // 45)
+    labels = [f"{mode_name(int(j))}   Z{j} | {osa_index(int(j))}" for j in modes[::step]]
+    axes.set_xticks(modes[::step], labels, rotation=90)
+    axes.tick_params(axis="x", labelsize=9)

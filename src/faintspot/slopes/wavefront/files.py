@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,15 @@ from faintspot.base.files import write_atomically
 from faintspot.base.json_text import to_json
 from faintspot.base.report.figure_data import csv_text
 from faintspot.io.optional_packages import load_fits
-from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
-from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm
+from faintspot.slopes.wavefront.fit import UNITS, Wavefront, total
+from faintspot.slopes.wavefront.refraction import refraction, refraction_error
+from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
+
+_LENS = "SPHERE", "CYLINDER", "CYLAXIS", "SPHEREQ"
+"""Keywords of FITS headers for a refraction."""
 
 
-def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
+def save_wavefront(path: str | Path, wavefront: Wavefront, *, dioptres: bool = False) -> None:
     """Write a wavefront to a file, replacing an existing one.
 
     Parameters
@@ -29,11 +34,13 @@ def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
         COEFFICIENTS and STANDARD_ERRORS (a row for each frame). A frame that could not be fitted is empty,
         null or NaN.
     wavefront : Wavefront
+    dioptres : bool
+        Whether to add the refraction of an eye, of the mean and of each frame.
 
     Raises
     ------
     InputError
-        When the ending is unknown, or the file cannot be written.
+        When the ending is unknown, the file cannot be written, or `refraction` refuses the wavefront.
     MissingExtraError
         When astropy is needed and not installed.
 
@@ -51,7 +58,7 @@ def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
     """
     path = Path(path)
     check_ending(path)
-    write_atomically(path, _WRITERS[path.suffix.lower()](wavefront))
+    write_atomically(path, _WRITERS[path.suffix.lower()](wavefront, dioptres))
 
 
 def check_ending(path: Path) -> None:
@@ -60,25 +67,42 @@ def check_ending(path: Path) -> None:
         raise InputError(f"{path}: expected a name ending in {', '.join(_WRITERS)}")
 
 
-def _csv(wavefront: Wavefront) -> str:
-    unit = "nm" if wavefront.unit == "nm" else "px_subaperture"
-    numbers = [f"z{j}" for j in wavefront.modes]
-    header = ["frame", f"rms_{unit}", f"rms_without_tilt_{unit}", *(f"{name}_{unit}" for name in numbers)]
-    header += [f"{name}_standard_error_{unit}" for name in numbers]
-    rows = [("mean", *_row(wavefront.mean, wavefront.mean_standard_error))]
-    for frame, values in enumerate(zip(wavefront.coefficients, wavefront.standard_errors, strict=True)):
-        rows.append((str(frame), *_row(*values)))
+def _csv(wavefront: Wavefront, dioptres: bool) -> str:
+    unit = wavefront.unit if wavefront.unit in UNITS else "px_subaperture"
+    names = [_column(int(j)) for j in wavefront.modes]
+    header = ["frame", f"rms_{unit}", f"rms_without_tilt_{unit}", *(f"{name}_{unit}" for name in names)]
+    header += [f"{name}_standard_error_{unit}" for name in names]
+    coefficients = np.concatenate([wavefront.mean[None], wavefront.coefficients])
+    errors = np.concatenate([wavefront.mean_standard_error[None], wavefront.standard_errors])
+    columns = [total(coefficients), total(coefficients, tilt=False), *coefficients.T, *errors.T]
+    if dioptres:
+        lens = refraction(wavefront, coefficients).values
+        header += lens
+        columns += lens.values()
+    rows = []
+    for number, values in enumerate(np.stack(columns, axis=1)):
+        cells = (f"{value:.7g}" if np.isfinite(value) else "" for value in values)
+        rows.append(("mean" if number == 0 else str(number - 1), *cells))
     return csv_text(header, rows)
 
 
-def _row(coefficients: Floats, errors: Floats) -> tuple[Any, ...]:
-    values = (total(coefficients), total(coefficients, tilt=False), *coefficients, *errors)
-    return tuple(f"{value:.7g}" if np.isfinite(value) else "" for value in values)
+def _column(j: int) -> str:
+    """Return both indices and the name of a mode as the name of a column: noll5_osa3_astigmatism_45deg."""
+    name = mode_name(j).replace("°", "deg")
+    return f"noll{j}_osa{osa_index(j)}_" + "_".join(re.findall(r"\w+", name))
 
 
-def _json(wavefront: Wavefront) -> str:
+def _json(wavefront: Wavefront, dioptres: bool) -> str:
     modes = [
-        {"noll": int(j), "n": n, "m": m, "name": mode_name(int(j)), "mean": mean, "standard_error": error}
+        {
+            "noll": int(j),
+            "osa": osa_index(int(j)),
+            "n": n,
+            "m": m,
+            "name": mode_name(int(j)),
+            "mean": mean,
+            "standard_error": error,
+        }
         for j, (n, m), mean, error in zip(
             wavefront.modes,
             (noll_to_nm(int(j)) for j in wavefront.modes),
@@ -87,7 +111,7 @@ def _json(wavefront: Wavefront) -> str:
             strict=True,
         )
     ]
-    values = {
+    values: dict[str, Any] = {
         "unit": wavefront.unit,
         "pupil_radius_m": wavefront.pupil.radius_m,
         "pupil_radius_subapertures": wavefront.pupil.radius_subapertures,
@@ -107,6 +131,12 @@ def _json(wavefront: Wavefront) -> str:
             "standard_errors": wavefront.standard_errors,
         },
     }
+    if wavefront.wavelength_nm is not None:
+        values["wavelength_nm"] = wavefront.wavelength_nm
+    if dioptres:
+        values["mean"]["refraction"] = refraction(wavefront, wavefront.mean).values
+        values["mean"]["refraction_standard_error"] = refraction_error(wavefront).values
+        values["frames"]["refraction"] = refraction(wavefront, wavefront.coefficients).values
     return to_json({**values, "unknown": _unknown(wavefront)}, indent=1)
 
 
@@ -122,9 +152,9 @@ def _unknown(wavefront: Wavefront) -> dict[str, str]:
     return reasons
 
 
-def _fits(wavefront: Wavefront) -> bytes:
+def _fits(wavefront: Wavefront, dioptres: bool) -> bytes:
     fits = load_fits()
-    unit = "nm" if wavefront.unit == "nm" else "pixel"
+    unit = wavefront.unit if wavefront.unit in UNITS else "pixel"
     primary = fits.PrimaryHDU(wavefront.sheet().astype(np.float32))
     primary.header["BUNIT"] = (
         unit,
@@ -135,9 +165,16 @@ def _fits(wavefront: Wavefront) -> bytes:
     if wavefront.pupil.radius_m is not None:
         primary.header["PUPILRAD"] = (wavefront.pupil.radius_m, "radius of the disk, m")
     primary.header["ERRFROM"] = (wavefront.errors_from, "source of the standard errors")
+    if wavefront.wavelength_nm is not None:
+        primary.header["WAVELEN"] = (wavefront.wavelength_nm, "length of a wave, nm")
+    if dioptres:
+        for key, value in zip(_LENS, refraction(wavefront, wavefront.mean).values.items(), strict=True):
+            primary.header[key] = (float(value[1]), f"{value[0]} of the mean")
     orders = np.array([noll_to_nm(int(j)) for j in wavefront.modes])
     columns = [
         fits.Column("NOLL", "J", array=wavefront.modes),
+        fits.Column("OSA", "J", array=[osa_index(int(j)) for j in wavefront.modes]),
+        fits.Column("NAME", "32A", array=[mode_name(int(j)).replace("°", " deg") for j in wavefront.modes]),
         fits.Column("N", "J", array=orders[:, 0]),
         fits.Column("M", "J", array=orders[:, 1]),
         fits.Column("MEAN", "D", unit, array=wavefront.mean),
@@ -158,4 +195,4 @@ def _fits(wavefront: Wavefront) -> bytes:
     return stream.getvalue()
 
 
-_WRITERS: dict[str, Callable[[Wavefront], str | bytes]] = {".csv": _csv, ".json": _json, ".fits": _fits}
+_WRITERS: dict[str, Callable[[Wavefront, bool], str | bytes]] = {".csv": _csv, ".json": _json, ".fits": _fits}

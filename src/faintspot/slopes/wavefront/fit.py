@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import number_between
+from faintspot.base.checks import number_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.validity import leave_out
 from faintspot.slopes.pipeline.slopes import Slopes
@@ -23,6 +23,8 @@ _HIGHEST_ORDER, _USUAL_CONDITION = 8, 20.0  # defaults; higher orders are rarely
 _TILTS = 2
 _LEAST_SHARE = 0.1  # of a sub-aperture's area in the pupil, below which its slope tells too little
 _NM_PER_ARCSEC_M = 1e9 * np.pi / (180 * 3600)
+UNITS = "nm", "um", "waves"
+"""Units of length for wavefronts."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +48,59 @@ class Wavefront:
     residual_px: Floats
     """Rms of the slopes about the fitted modes, px per axis, (n_frames,)."""
     unit: str
-    """Unit: "nm", or "px × sub-aperture" (slopes in pixels times lengths in sub-apertures)."""
+    """Unit: one of `UNITS`, or "px × sub-aperture" (slopes in pixels times lengths in sub-apertures)."""
     pupil: Pupil
     condition: float
     """Condition number of the fit with every sub-aperture that is ever valid."""
     left_out: str = ""
     """Line about the slopes that were left out; empty if there are none."""
+    wavelength_nm: float | None = None
+    """Length of a wave, for the unit "waves"."""
+
+    def in_unit(self, unit: str, wavelength_nm: float | None = None) -> Wavefront:
+        """Return the wavefront in another unit.
+
+        Parameters
+        ----------
+        unit : {"nm", "um", "waves"}
+        wavelength_nm : float, optional
+            Required for waves, and only for them.
+
+        Raises
+        ------
+        InputError
+            If the wavefront is in pixels, or wavelength and unit do not fit.
+        """
+        one_of("unit", unit, UNITS)
+        if (unit == "waves") != (wavelength_nm is not None):
+            raise InputError("wavelength_nm: expected a wavelength for the unit waves, and for no other")
+        if wavelength_nm is not None:
+            wavelength_nm = number_between("wavelength_nm", wavelength_nm, 0, low_open=True)
+        converted = replace(self, unit=unit, wavelength_nm=wavelength_nm)
+        factor = self.nm_per_unit / converted.nm_per_unit
+        return replace(
+            converted,
+            coefficients=factor * self.coefficients,
+            standard_errors=factor * self.standard_errors,
+        )
+
+    @property
+    def nm_per_unit(self) -> float:
+        """Length of the unit [nm].
+
+        Raises
+        ------
+        InputError
+            If the wavefront is in pixels.
+        """
+        lengths = {"nm": 1.0, "um": 1e3, "waves": self.wavelength_nm}
+        length = lengths.get(self.unit)
+        if length is None:
+            raise InputError(
+                "layout: expected pixel_scale_arcsec, and subaperture_m or diameter_m, for a wavefront in a "
+                "unit of length"
+            )
+        return length
 
     @property
     def fitted(self) -> NDArray[np.bool_]:

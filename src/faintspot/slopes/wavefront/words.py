@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
-from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm
+from faintspot.slopes.wavefront.fit import UNITS, Floats, Wavefront, total
+from faintspot.slopes.wavefront.refraction import refraction, refraction_error
+from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
 
 
 def mode_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
     """Return header and rows: each mode of the mean wavefront with its standard error, and its rms."""
     several = np.count_nonzero(wavefront.fitted) > 1
-    header = ["mode", "name", "n", "m", f"{'mean' if several else 'value'} ({wavefront.unit})"]
+    header = ["Noll", "name", "OSA", "n", "m", f"{'mean' if several else 'value'} ({wavefront.unit})"]
     header += ["± standard error"] + ([f"rms of frames ({wavefront.unit})"] if several else [])
     digits = _decimals(wavefront.rms_of_frames)
     rows = []
@@ -23,7 +24,7 @@ def mode_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
             f"{mean:+.{digits}f}".replace("-", "−"),
             f"{error:.{digits}f}" if np.isfinite(error) else "–",
         ]
-        rows.append([f"Z{j}", mode_name(int(j)), str(n), str(m), *values])
+        rows.append([f"Z{j}", mode_name(int(j)), str(osa_index(int(j))), str(n), str(m), *values])
         if several:
             rows[-1].append(f"{rms:.{digits}f}")
     return header, rows
@@ -50,6 +51,24 @@ def rms_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
     return [*header, "standard error", "no tip, tilt"], rows
 
 
+def refraction_line(wavefront: Wavefront) -> str:
+    """Return the refraction of an eye with the mean wavefront, with standard errors, in one sentence."""
+    value, error = refraction(wavefront, wavefront.mean), refraction_error(wavefront)
+    parts = []
+    for name, found in value.values.items():
+        words, unit = name.rsplit("_", 1)
+        digits, sign, unit = (2, "+", "D") if unit == "d" else (0, "", "°")
+        text, spread = f"{found:{sign}.{digits}f}".replace("-", "−"), error.values[name]
+        least = 10.0**-digits
+        known = f" ± {'< ' if spread < least else ''}{max(spread, least):.{digits}f}" if spread < 180 else ""
+        parts.append(f"{words.replace('_', ' ')} {text}{known} {unit}".replace(" °", "°"))
+    pupil_mm = 2e3 * float(wavefront.pupil.radius_m or 0.0)
+    return (
+        f"Refraction from the second order on a pupil of {pupil_mm:.3g} mm: {', '.join(parts)}. "
+        "The axis runs from +x (columns) towards +y (rows) of the frame."
+    )
+
+
 def remarks(wavefront: Wavefront) -> list[str]:
     """Return remarks for the reader: sizes, units, source of the errors, frames that could not be fitted."""
     pupil = wavefront.pupil
@@ -59,13 +78,16 @@ def remarks(wavefront: Wavefront) -> list[str]:
         f"Zernike modes Z{modes[0]} to Z{modes[-1]} in Noll's order on a disk of "
         f"{2 * pupil.radius_subapertures:.3g} sub-apertures{size}, fitted by least squares; condition number "
         f"{wavefront.condition:.3g}. All rms values are over the whole disk, including obscured parts. "
-        "Higher orders leak partly into the two highest fitted orders."
+        "Higher orders leak partly into the two highest fitted orders. OSA is the index in the standard of "
+        "OSA and ANSI."
     ]
-    if wavefront.unit != "nm":
+    if wavefront.unit not in UNITS:
         lines.append(
             "In pixels times sub-apertures; for nm, add pixel_scale_arcsec and subaperture_m or diameter_m "
             "to the layout (faintspot layout --pixel-scale-arcsec, --subaperture-m, --diameter-m)."
         )
+    if wavefront.unit == "waves":
+        lines.append(f"Waves have a length of {wavefront.wavelength_nm:g} nm.")
     if wavefront.errors_from == "slopes":
         noise = "The noise is computed from the slopes' standard errors."
     else:

@@ -11,19 +11,9 @@ from scipy.special import eval_jacobi
 
 Floats = NDArray[np.float64]
 
-_NAMES = {
-    1: "piston",
-    2: "tilt along x",
-    3: "tilt along y",
-    4: "defocus",
-    5: "astigmatism, 45°",
-    6: "astigmatism, 0°",
-    7: "coma along y",
-    8: "coma along x",
-    9: "trefoil, sine",
-    10: "trefoil, cosine",
-    11: "spherical",
-}
+_FOILS = "astigmatism", "trefoil", "tetrafoil", "pentafoil", "hexafoil", "heptafoil", "octafoil"
+_RANKS = "", "secondary ", "tertiary ", "quaternary "
+_HIGHEST_NAMED = 8
 
 
 def noll_to_nm(j: int) -> tuple[int, int]:
@@ -36,10 +26,29 @@ def noll_to_nm(j: int) -> tuple[int, int]:
     return n, m if j % 2 == 0 else -m
 
 
-def mode_name(j: int) -> str:
-    """Return the name of a mode up to spherical, otherwise its orders."""
+def osa_index(j: int) -> int:
+    """Return the index of mode j of Noll in the standard of OSA and ANSI (Z80.28): (n (n + 2) + m) / 2.
+
+    Both standards norm modes to a mean square of 1, so that coefficients are the same.
+    """
     n, m = noll_to_nm(j)
-    return _NAMES.get(j, f"n = {n}, m = {m}")
+    return (n * (n + 2) + m) // 2
+
+
+def mode_name(j: int) -> str:
+    """Return the name of a mode up to radial order 8, otherwise its orders."""
+    n, m = noll_to_nm(j)
+    if n < 2:
+        return ("piston", "tilt along x", "tilt along y")[j - 1]
+    if n > _HIGHEST_NAMED:
+        return f"n = {n}, m = {m}"
+    rank = (n - abs(m)) // 2
+    if m == 0:
+        return "defocus" if n == 2 else f"{_RANKS[rank - 2]}spherical"
+    if abs(m) == 1:
+        return f"{_RANKS[rank - 1]}coma along {'y' if m < 0 else 'x'}"
+    cosine, sine = ("0°", "45°") if abs(m) == 2 else ("cosine", "sine")
+    return f"{_RANKS[rank]}{_FOILS[abs(m) - 2]}, {sine if m < 0 else cosine}"
 
 
 def zernike(j: int, x: ArrayLike, y: ArrayLike) -> Floats:
