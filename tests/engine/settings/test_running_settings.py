@@ -232,7 +232,7 @@ def test_get_is_plain_and_complete(live: RunningSettings[fs.SlopePipeline]) -> N
     assert values["spot_fwhm_px"] == [2.0, None, None, None, None, None]
     assert values["estimator"] == "tv"
     assert set(live.get(["rule", "flux_e"])) == {"rule", "flux_e"}
-    assert live.get(["tolerance", "max_iterations"]) == {"tolerance": 0.02, "max_iterations": 200}
+    assert live.get(["tolerance", "max_iterations"]) == {"tolerance": 0.0, "max_iterations": 24}
     live.propose({"preset": "fast"})
     live.take(1)
     assert live.get(["tolerance", "max_iterations"]) == {"tolerance": 0.0, "max_iterations": 8}

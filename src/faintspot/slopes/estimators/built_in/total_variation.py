@@ -118,7 +118,8 @@ class TotalVariation(KeepingBrightest):
         if name == "max_iterations":
             keeps_few &= np.isnan(super().values("tolerance", n_subapertures, pixels))
         usual = [of_denoising(self.preset, keeps_few=few)[name] for few in (False, True)]
-        return np.where(np.isnan(values), np.where(keeps_few, usual[1], usual[0]), values)
+        filled = np.where(np.isnan(values), np.where(keeps_few, usual[1], usual[0]), values)
+        return filled.astype(np.asarray(usual).dtype)
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:
         """See `Estimator`."""
