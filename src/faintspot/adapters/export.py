@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.errors import InputError, errors_within
+from faintspot.base.files import check_ending
 from faintspot.io.arrays.fits_units import write_images
 from faintspot.io.optional_packages import load_fits
 from faintspot.io.references import read_reference
@@ -68,8 +69,7 @@ def export_fits(
         When astropy is not installed.
     """
     path = Path(output)
-    if path.suffix.lower() != ".fits":
-        raise InputError(f"{path}: expected a name ending in .fits")
+    check_ending(path, ".fits")
     load_fits()
     described = configuration.Configuration(configuration_file)
     control = load_control(described)

@@ -80,6 +80,12 @@ def check_file_size(path: str | Path, what: str, most: int) -> int:
     return size
 
 
+def check_ending(path: Path, *endings: str) -> None:
+    """Refuse the name of a file to write that has another ending."""
+    if path.suffix.lower() not in endings:
+        raise InputError(f"{path}: expected a name ending in {', '.join(endings)}")
+
+
 def derived(path: str | Path, ending: str) -> Path:
     """Return a path beside `path` in which `ending` replaces its known extension."""
     path = Path(path)

@@ -22,7 +22,7 @@ from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.stored_run import open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.wavefront import Wavefront, fit_wavefront, save_wavefront
-from faintspot.slopes.wavefront.files import check_ending
+from faintspot.slopes.wavefront.files import check_wavefront_file
 from faintspot.slopes.wavefront.fit import UNITS, total
 from faintspot.slopes.wavefront.words import mode_table, refraction_line, remarks, rms_table
 
@@ -91,7 +91,7 @@ def command(
       faintspot wavefront slopes.zarr --actuators faintspot.control.npz:interaction_matrix
     """
     for name in output:
-        check_ending(Path(name))
+        check_wavefront_file(Path(name))
         if Path(name).suffix.lower() == ".fits":
             require("io", "astropy", purpose="Writing a FITS file")
     target = Path(command_file) if command_file else derived(slopes, "_command.npy")

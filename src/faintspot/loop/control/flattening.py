@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
-from faintspot.base.files import write_atomically
+from faintspot.base.files import check_ending, write_atomically
 from faintspot.base.report.figure_data import csv_text
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.slopes.pipeline.slopes import Slopes
@@ -154,8 +154,7 @@ def _command(reconstructor: Reconstructor, slopes: Floats, stroke: float | None)
 
 def check_command_file(path: Path) -> None:
     """Refuse an unknown ending before the work."""
-    if path.suffix.lower() not in (".npy", ".csv"):
-        raise InputError(f"{path}: expected a name ending in .npy, .csv")
+    check_ending(path, ".npy", ".csv")
 
 
 def save_command(path: str | Path, command: Floats) -> None:

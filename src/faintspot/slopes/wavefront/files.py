@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.base.errors import InputError
-from faintspot.base.files import write_atomically
+from faintspot.base.files import check_ending, write_atomically
 from faintspot.base.json_text import to_json
 from faintspot.base.report.figure_data import csv_text
 from faintspot.io.optional_packages import load_fits
@@ -57,14 +56,13 @@ def save_wavefront(path: str | Path, wavefront: Wavefront, *, dioptres: bool = F
     >>> save_wavefront("wavefront.csv", fs.fit_wavefront(slopes, layout, modes=5))
     """
     path = Path(path)
-    check_ending(path)
+    check_wavefront_file(path)
     write_atomically(path, _WRITERS[path.suffix.lower()](wavefront, dioptres))
 
 
-def check_ending(path: Path) -> None:
+def check_wavefront_file(path: Path) -> None:
     """Refuse an unknown ending before the work."""
-    if path.suffix.lower() not in _WRITERS:
-        raise InputError(f"{path}: expected a name ending in {', '.join(_WRITERS)}")
+    check_ending(path, *_WRITERS)
 
 
 def _csv(wavefront: Wavefront, dioptres: bool) -> str:
