@@ -24,8 +24,9 @@ from benchmarks.prediction import TELEMETRY_GAIN, Case
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import CompiledIntegrator
-from faintspot.loop.control.identification.learning import KALMAN, LoopPlant, learn_controller
-from faintspot.loop.control.identification.model import ControlModel
+from faintspot.loop.control.identification.learning import learn_controller
+from faintspot.loop.control.identification.models import LoopPlant
+from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.control.identification.predictive_control import LoopOfControl, PredictiveControl
 from faintspot.loop.control.identification.relearning import relearn
 from faintspot.loop.control.kalman.compiled import CompiledKalman
@@ -239,7 +240,7 @@ def _control(across: int, rng: np.random.Generator) -> tuple[PredictiveControl, 
     dense = {"first": 1.5 * alone, "second": -0.6 * alone, "driving_px2": 0.1 * alone}
     dense |= {"variance_px2": np.ones(m), "covariance_xy_px2": np.zeros(m // 2)}
     arrays = dense if m <= _MOST_SLOPES else random_filter(cells, rng)
-    model = ControlModel(KALMAN, arrays, 0.3, 1.0, (1.0, 2.0), np.eye(commands))
+    model = Kalman(arrays, 0.3, 1.0, (1.0, 2.0), np.eye(commands))
     measured = np.array([2.0, 0.1, 1.0, 0.1, 1.0, 0.1])
     loop = _RandomLoop(interaction, np.ones(m), np.ones(m), 1.0, measured, np.zeros((0, 6)), 1.0, 0.3, 0)
     return PredictiveControl(loop, model), np.asarray(0.1 * rng.standard_normal(m))
@@ -263,9 +264,9 @@ def learning_table() -> Table:
     rate_hz = configuration.control.frame_rate_hz
     _, telemetry = case.observed(partial(plant.integrator, TELEMETRY_GAIN), *_LEARNING)
     first, rest = telemetry.part(0, _LEARNT), telemetry.part(_LEARNT, None)
-    learn_controller(KALMAN, plant, first.part(0, _LEARNT // 8), site, rate_hz)  # compile
+    learn_controller(Kalman, plant, first.part(0, _LEARNT // 8), site, rate_hz)  # compile
     begun = time.process_time()
-    learnt = learn_controller(KALMAN, plant, first, site, rate_hz)
+    learnt = learn_controller(Kalman, plant, first, site, rate_hz)
     cold = time.process_time()
     found = relearn(plant, learnt, rest, site, rate_hz, learnt.identified)
     warm = time.process_time()

@@ -22,7 +22,8 @@ from benchmarks.measuring import Row, Table
 from benchmarks.prediction import Case, Make, rivals
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.identification import learning
-from faintspot.loop.control.identification.learning import GAINS, MODAL, learn_controller
+from faintspot.loop.control.identification.learning import GAINS, learn_controller
+from faintspot.loop.control.identification.models.modal import Modal
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.simulation import LoopConfiguration
 
@@ -88,7 +89,7 @@ def _table(name: str, case: Large) -> Table:
     learnt_from = case.observed(make_telemetry, _LEARNING, case.telemetry_frames)[1]
     tuning = case.observed(make_telemetry, _TUNING, _TUNING_FRAMES * 2)[1]
     gain, integrator = case.tuned_integrator(tuning)
-    modal = learn_controller(MODAL, case.plant, learnt_from, case.site, case.rate_hz)
+    modal = learn_controller(Modal, case.plant, learnt_from, case.site, case.rate_hz)
     makes: dict[str, Make] = {INTEGRATOR: integrator, MODES: partial(modal.guarded, case.plant)}
     seconds = {INTEGRATOR: 0.0, MODES: 0.0}
     for each, most_slopes in ((NEIGHBOURS, 0), (ALL, 10**6)):

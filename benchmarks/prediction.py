@@ -23,8 +23,9 @@ from benchmarks.measuring import Row, Table
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.base import LEARNT, Controller, Expected
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.learning import GAINS, KALMAN, LoopPlant, learn_controller
-from faintspot.loop.control.identification.model import ControlModel
+from faintspot.loop.control.identification.learning import GAINS, learn_controller
+from faintspot.loop.control.identification.models import ControlModel, LoopPlant
+from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.phase import residual_phase
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
@@ -161,7 +162,7 @@ class Case:
 
     def learnt(self, telemetry: OpenLoopTelemetry, winds: str = LEARNT) -> ControlModel:
         """Return our filter."""
-        return learn_controller(KALMAN, self.plant, telemetry, self.site, self.rate_hz, winds)
+        return learn_controller(Kalman, self.plant, telemetry, self.site, self.rate_hz, winds)
 
     def telemetry(self) -> tuple[OpenLoopTelemetry, OpenLoopTelemetry]:
         """Return telemetry with an integrator, to learn from and to tune with."""

@@ -27,7 +27,7 @@ from faintspot import Calibration, Layout, Settings, SlopePipeline
 from faintspot.engine.engine import Engine
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.loop.control.configuration import Control, ControlOptions, load_control
-from faintspot.loop.control.identification.model import CONTROLS, KALMAN, POLC, ControlModel
+from faintspot.loop.control.identification.models import CONTROLS, MODELS
 from faintspot.loop.control.kalman.slope_model import SlopeModel
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.control import slope_turbulence
@@ -54,8 +54,8 @@ def _latency() -> Table:
     )
     model, noise = SlopeModel.of_covariances(covariances), np.full(len(interaction), 0.25)
     learnt: dict[str, dict[str, Any]] = {
-        POLC: {"now_px2": covariances[0], "ahead_px2": covariances[2], "gain": np.array(0.3)},
-        KALMAN: {
+        "polc": {"now_px2": covariances[0], "ahead_px2": covariances[2], "gain": np.array(0.3)},
+        "kalman": {
             "first": model.first,
             "second": model.second,
             "driving_px2": model.driving,
@@ -63,7 +63,7 @@ def _latency() -> Table:
         },
     }
     for kind, arrays in learnt.items():
-        known = ControlModel(kind, arrays, 0.3, 1.0, (1.0, 2.0), np.zeros_like(interaction.T))
+        known = MODELS[kind](arrays, 0.3, 1.0, (1.0, 2.0), np.zeros_like(interaction.T))
         control = Control(interaction, None, ControlOptions(controller=kind), known)
         rows.append(_row(CONTROLS[kind], layout, control, TARGETS_US[1]))
     return Table("realtime-commands", "From slopes to commands, us", rows)

@@ -16,7 +16,6 @@ import numpy as np
 
 from benchmarks.measuring import Row, Table
 from benchmarks.recorded_loops import Truth, drawn_cases, recorded, winds_of
-from faintspot.loop.control.identification.learning import KALMAN
 from faintspot.loop.control.identification.measured import Measured
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.simulation import LoopRecord, Method, load_loop, simulate_loop
@@ -174,7 +173,7 @@ def _of_flux(photons: float, realisation: int) -> Pairs:
     own, second = (Method("window", Settings("window"), gain=each) for each in (gain, other))
     first, *rest = (
         simulate_loop(configuration, [method], realisation=realisation)
-        for method in (own, second, replace(own, control=KALMAN))
+        for method in (own, second, replace(own, control="kalman"))
     )
     error = first.standard_error_px[first.scored] / first.centroid_gain[0]
     left = [float(np.sqrt(np.square(each.residual_nm[FRAMES // 2 :]).mean())) for each in (first, *rest)]

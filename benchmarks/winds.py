@@ -17,8 +17,7 @@ from faintspot.base.statistics import paired_mean
 from faintspot.engine.loop.successor import ControllerSuccessor, PreparedController
 from faintspot.loop.control.base import ASSUMED, WINDS, Controller
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.learning import KALMAN
-from faintspot.loop.control.identification.model import ControlModel
+from faintspot.loop.control.identification.models import ControlModel
 from faintspot.loop.control.identification.relearning import RelearntControl, relearn
 from faintspot.loop.control.kalman.choice import HANDOVER_FRAMES
 
@@ -114,7 +113,7 @@ def drifting(case: Case, learnt: ControlModel, realisation: int) -> Drifted:
             found = relearn(case.plant, running, telemetry, case.site, case.rate_hz, start)
         if run.frame % every == later and found is not None and found.is_better:
             running, line = found.learnt, CommandDelayLine(len(run.line.latest), run.line.delay_frames)
-            ready = PreparedController(KALMAN, found.learnt.guarded(case.plant, line), False, 1.0)
+            ready = PreparedController("kalman", found.learnt.guarded(case.plant, line), False, 1.0)
             successor = ControllerSuccessor(ready)
     run.strehl[:SETTLE], change[:SETTLE] = np.nan, 0.0
     largest = float((at_handover * change).max()), float((change - at_handover * change).max())

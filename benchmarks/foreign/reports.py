@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from faintspot.base.statistics import paired_mean
-from faintspot.loop.control.identification.learning import MODAL, learn_controller
-from faintspot.loop.control.identification.model import LoopPlant
+from faintspot.loop.control.identification.learning import learn_controller
+from faintspot.loop.control.identification.models import LoopPlant
+from faintspot.loop.control.identification.models.modal import Modal
 from faintspot.loop.control.identification.open_loop import measured_delay, open_loop_of, site_of_loop
 from faintspot.loop.control.identification.recording import Recording, prepared
 from faintspot.loop.control.reconstructor import make_reconstructor
@@ -25,7 +26,7 @@ def modal_matrix(recording: Recording) -> np.ndarray[Any, np.dtype[np.float64]]:
     reconstructor = make_reconstructor(loop.interaction_matrix)
     plant = LoopPlant(loop.interaction_matrix, reconstructor, max(1, round(delay.delay_frames)), _LEAK)
     slopes = open_loop_of(loop, delay).telemetry
-    model = learn_controller(MODAL, plant, slopes, site_of_loop(loop), loop.frame_rate_hz)
+    model = learn_controller(Modal, plant, slopes, site_of_loop(loop), loop.frame_rate_hz)
     modes = reconstructor.modes * model.arrays["gains"]
     return np.asarray(modes @ reconstructor.modes.T @ reconstructor.matrix / delay.gain / loop.unit)
 

@@ -67,7 +67,7 @@ class TestSequence:
         ("missing.fits", "no such file"),
         ("missing.npz:frames", "no such file"),
         ("empty.fits", "empty"),
-        ("text.txt", "HDF5 or MATLAB file or a Zarr store"),
+        ("text.txt", "MATLAB"),
         ("folder", "expected a Zarr store"),
         ("short.npy", "expected a whole .npy file"),
         ("cut.npy", "truncated"),

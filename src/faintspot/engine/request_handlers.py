@@ -13,7 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.engine.engine import Engine
 from faintspot.engine.path.pipeline_maker import PipelineMaker
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
-from faintspot.loop.control.identification.model import ControlModel
+from faintspot.loop.control.identification.models import ControlModel
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.score import load_score
 from faintspot.slopes.training.known_sodium import SODIUM

@@ -21,8 +21,9 @@ from faintspot.engine.requests.requests import ControlServer
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.loop.control.base import ASSUMED, SETTLE_FRAMES
 from faintspot.loop.control.configuration import Control, ControlOptions, save_control
-from faintspot.loop.control.identification.learning import KALMAN, learn_controller
-from faintspot.loop.control.identification.model import ControlModel, LoopPlant
+from faintspot.loop.control.identification.learning import learn_controller
+from faintspot.loop.control.identification.models import ControlModel, LoopPlant
+from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.control.identification.relearning import RelearntControl
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.slopes.pipeline import configuration as configuration_file
@@ -33,19 +34,19 @@ from faintspot.slopes.sensor.layout import Layout
 LAYOUT = Layout.grid((3, 3), pixels=8, subaperture_m=0.6)
 NOISE_PX, FRAMES = 0.3, 600
 OPEN_LOOP = telemetry(FRAMES, NOISE_PX, model=LAYERS).open_loop_px
-OPTIONS = ControlOptions(controller=KALMAN)
+OPTIONS = ControlOptions(controller="kalman")
 
 
 @pytest.fixture(scope="module")
 def model() -> ControlModel:
     frames = telemetry(500, NOISE_PX, seed=9, model=LAYERS)
-    return learn_controller(KALMAN, PLANT, frames, TURBULENCE, 1 / FRAME_S, ASSUMED)
+    return learn_controller(Kalman, PLANT, frames, TURBULENCE, 1 / FRAME_S, ASSUMED)
 
 
 def outdated(model: ControlModel) -> ControlModel:
     """Return the model of slopes that are forgotten from frame to frame."""
     arrays = {**model.arrays, "first": 0.1 * model.arrays["first"], "second": 0.0 * model.arrays["second"]}
-    return ControlModel(KALMAN, arrays, 0.4, 1.0, model.left, model.phase_of_commands)
+    return Kalman(arrays, 0.4, 1.0, model.left, model.phase_of_commands)
 
 
 class Run:
@@ -145,7 +146,7 @@ def test_a_better_filter_is_handed_to_the_engine(
     save_control(path, interaction_matrix="m.npy")
     with pytest.raises(InputError, match="expected controller"):
         BackgroundLearning(name, path, 1.0)
-    save_control(path, controller=KALMAN, model="model.npz")
+    save_control(path, controller="kalman", model="model.npz")
     run = Run(name, outdated(model))
     engine = engine_of(run)
     handlers = {
@@ -193,7 +194,7 @@ def test_it_never_learns_across_records_that_were_lost(
     configuration_file.save(path, LAYOUT)
     np.save(tmp_path / "m.npy", INTERACTION)
     model.save(tmp_path / "model.npz")
-    save_control(path, interaction_matrix="m.npy", controller=KALMAN, model="model.npz")
+    save_control(path, interaction_matrix="m.npy", controller="kalman", model="model.npz")
     run = Run(name, model, records=150)
     learning = BackgroundLearning(name, path, 180 * FRAME_S)
     run.frames(120)

@@ -18,8 +18,8 @@ from faintspot.loop.control import slope_product
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.configuration import Control, ControlOptions
-from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, KALMAN, learn_controller
-from faintspot.loop.control.identification.model import ControlModel
+from faintspot.loop.control.identification.learning import learn_controller
+from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR, MODELS, ControlModel
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.guarded import Guarded
 from faintspot.slopes.kernels.driver.products import add_slopes
@@ -41,7 +41,7 @@ class PlainControl(Control):
         if kind == INTEGRATOR:
             numbers = self.interaction, self.reconstructor, gain, self.options.leak
             return Integrator(line, *numbers, weighted=True)
-        if kind == KALMAN:
+        if kind == "kalman":
             model = self.model
             of_both = partial(model.controller, plant), partial(plant.integrator, model.plain_gain)
             return Guarded(line, self.interaction, model.phase(plant), *of_both)
@@ -51,7 +51,7 @@ class PlainControl(Control):
 
 @cache
 def learnt(kind: str) -> ControlModel:
-    return learn_controller(kind, PLANT, telemetry(200, 0.3), TURBULENCE, 1 / FRAME_S)
+    return learn_controller(MODELS[kind], PLANT, telemetry(200, 0.3), TURBULENCE, 1 / FRAME_S)
 
 
 def scaled(draw: Any, array: np.ndarray) -> np.ndarray:
@@ -80,7 +80,7 @@ def controls(draw: Any) -> Control:
         arrays = {name: scaled(draw, array) for name, array in own.arrays.items()}
         gain, factor = (draw(st.sampled_from([usual] * 20 + [*EXTREMES])) for usual in (0.4, 1.0))
         left = draw(st.sampled_from([(1.0, 2.0), (2.0, 1.0)]))
-        model = ControlModel(kind, arrays, gain, factor, left, scaled(draw, own.phase_of_commands))
+        model = MODELS[kind](arrays, gain, factor, left, scaled(draw, own.phase_of_commands))
     options = {
         "controller": kind,
         "gain": draw(st.sampled_from([0.4, 0.0, 2.0])),

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from tests.loop.control.control_cases import FRAME_S, PHASE, PLANT, TURBULENCE, telemetry
 
-from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, learn_controller
+from faintspot.loop.control.identification.learning import learn_controller
+from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR, MODELS
+from faintspot.loop.control.identification.models.modal import Modal
 from faintspot.loop.control.modal_gains import GAINS, largest_stable_gain, modal_gains
 from faintspot.loop.control.telemetry import OpenLoopTelemetry, usual_noise, without_prior
 
@@ -51,7 +53,7 @@ def test_usual_noise_gives_the_mean_information() -> None:
 @pytest.mark.parametrize("kind", [kind for kind in CONTROLS if kind != INTEGRATOR])
 def test_what_has_learnt_leaves_less(kind: str) -> None:
     """On other frames of the same air, than the integrator with the gain that is best there."""
-    learnt = learn_controller(kind, PLANT, telemetry(1200, 0.5), TURBULENCE, 1 / FRAME_S)
+    learnt = learn_controller(MODELS[kind], PLANT, telemetry(1200, 0.5), TURBULENCE, 1 / FRAME_S)
     other = telemetry(1500, 0.5, seed=6).scaled(learnt.noise_factor)
     plain = min(
         PLANT.residual(partial(PLANT.integrator, gain), other, PHASE) for gain in (0.1, 0.2, 0.3, 0.4, 0.5)
@@ -66,7 +68,7 @@ def test_gains_make_up_for_slopes_drawn_to_zero() -> None:
     frames = telemetry(600, 0.5)
     drawn = OpenLoopTelemetry(frames.open_loop_px, frames.variance_px2, np.full(frames.trust.shape, 0.8))
     whole, larger = (
-        learn_controller("modal", PLANT, each, TURBULENCE, 1 / FRAME_S).arrays["gains"]
+        learn_controller(Modal, PLANT, each, TURBULENCE, 1 / FRAME_S).arrays["gains"]
         for each in (frames, drawn)
     )
     below = larger < larger.max()

@@ -212,9 +212,9 @@ def night(
 @option("--output", "-o", default=".", metavar="FOLDER", help="Folder for faintspot.toml and matrices.")
 @option(
     "--control",
-    type=click.Choice(["integrator", "modal", "polc", "kalman"]),
+    metavar="KIND",
     default="integrator",
-    help="Control; all but the integrator learn from the simulated loop for up to a minute.",
+    help="Control: integrator, or what learns from the loop for up to a minute: modal, polc or kalman.",
 )
 @option("--frame-rate-hz", type=float, metavar="HZ", help="Frame rate.", show_default="CONFIG")
 def engine(configuration: str, output: str, control: str, frame_rate_hz: float | None) -> None:

@@ -30,9 +30,9 @@ from faintspot.cli.shared.progress import progress_bar
 @option(
     "--control",
     "kind",
-    type=click.Choice(["modal", "polc", "kalman"]),
+    metavar="KIND",
     default="kalman",
-    help="Controller that learns.",
+    help="Controller that learns: kalman, modal, polc.",
 )
 @option(
     "--winds",
@@ -94,15 +94,18 @@ def _learn_from(
     store: Path, config: str, kind: str, winds: str, layers: tuple[tuple[float, float, float], ...]
 ) -> None:
     """Learn from a recording."""
+    from faintspot.base.checks import one_of
     from faintspot.base.validity import leave_out
     from faintspot.io import read_telemetry
     from faintspot.loop.control.base import ASSUMED
     from faintspot.loop.control.configuration import load_control, prior_std_px, save_control
     from faintspot.loop.control.identification.learning import learn_controller
+    from faintspot.loop.control.identification.models import MODELS
     from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
     from faintspot.loop.telemetry.recording import recorded_loop, site_of
     from faintspot.slopes.pipeline.configuration import Configuration
 
+    model = MODELS[one_of("--control", kind, list(MODELS))]
     described = Configuration(config)
     control = load_control(described)
     if control is None:
@@ -114,7 +117,7 @@ def _learn_from(
     telemetry, rate_hz = open_loop_of(loop, delay).telemetry, loop.frame_rate_hz
     known = site_of(layout, layers), rate_hz, ASSUMED if layers else winds
     with progress_bar("Filter", "steps") as show:
-        learnt = learn_controller(kind, control.plant, telemetry, *known, progress=show)
+        learnt = learn_controller(model, control.plant, telemetry, *known, progress=show)
     path = derived(config, ".model.npz")
     replace(learnt, centroid_gain=delay.gain).save(path)
     save_control(config, controller=kind, model=path.name)

@@ -162,10 +162,10 @@ def run(
 def _learning(engine: Any, config: str) -> Any:
     """The process that learns for the engine, as a context, if it can learn and shall."""
     from faintspot.engine.background.learning import background_learning
-    from faintspot.loop.control.identification.model import KALMAN
+    from faintspot.loop.control.identification.models import predicts
 
     options = None if engine.loop is None else engine.loop.control.options
-    if options is None or options.controller != KALMAN or not options.learn_every_s:
+    if options is None or not predicts(options.controller) or not options.learn_every_s:
         return nullcontext()
     return background_learning(engine, config, options.learn_every_s, partial(click.echo, err=True))
 

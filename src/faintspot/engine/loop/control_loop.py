@@ -19,7 +19,7 @@ from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import MEAN_SQUARE, true_slopes
 from faintspot.loop.control.configuration import Control
-from faintspot.loop.control.identification.model import ControlModel
+from faintspot.loop.control.identification.models import ControlModel
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.kernels.driver.products import ProductPart
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes

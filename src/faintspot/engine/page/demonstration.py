@@ -25,7 +25,8 @@ from faintspot.engine.telemetry.numbers import MethodDifference, compared_method
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope.simulated_telescope import TRUTH
 from faintspot.loop.control.configuration import CONTROLLER, save_control
-from faintspot.loop.control.identification.model import INTEGRATOR, KALMAN
+from faintspot.loop.control.identification.models import INTEGRATOR
+from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
 from faintspot.loop.simulation.engine_files import fixed_window, write_engine_files
 from faintspot.loop.simulation.methods import Method
@@ -106,7 +107,7 @@ class LiveDemonstration:
         return {
             "brightest": f"brightest+{INTEGRATOR}",
             "window": f"estimator=window+{options}+{INTEGRATOR}",
-            f"map+{KALMAN}": f"map+{KALMAN}",
+            f"map+{Kalman.kind}": f"map+{Kalman.kind}",
         }
 
     def write_files(self) -> tuple[Path, Path]:
@@ -129,7 +130,7 @@ class LiveDemonstration:
         settings = Settings("map", prior_std_px=_PRIOR_PX, flux_e=self.photons)
         engine = self.folder / "faintspot.toml"
         save(engine, settings)
-        write_engine_files(observed, self.folder, KALMAN)
+        write_engine_files(observed, self.folder, Kalman.kind)
         save_control(engine, gain=_GAIN, centroid_gain=1.0, prediction=CONTROLLER)
         return loop, engine
 

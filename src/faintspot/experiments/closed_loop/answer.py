@@ -29,7 +29,7 @@ from faintspot.experiments.closed_loop.question import (
 )
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.methods import Knowledge
-from faintspot.loop.control.identification.learning import INTEGRATOR
+from faintspot.loop.control.identification.models import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.telescope.camera import camera_calibration

@@ -14,7 +14,7 @@ from faintspot.base.checks import number_between, numbers_between, one_of
 from faintspot.base.config.options import LIST, Options, number
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.methods import MethodKind, method_kind
-from faintspot.loop.control.identification.learning import INTEGRATOR, KALMAN
+from faintspot.loop.control.identification.models import INTEGRATOR, predicts
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
@@ -230,7 +230,7 @@ class LoopQuestion(Options):
         if self.methods is not None or self.configuration.control.mode == CLOSED:
             return {}
         reason = "its control learns from a closed loop, this one is open"
-        return {name: reason for name in _CANDIDATES if method_kind(name).control == KALMAN}
+        return {name: reason for name in _CANDIDATES if predicts(method_kind(name).control)}
 
     def _default(self) -> list[str]:
         return [name for name in _CANDIDATES if name not in self.left_out]

@@ -14,7 +14,7 @@ from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.experiments.closed_loop.figures import method_style
 from faintspot.experiments.closed_loop.question import MODEL_ERROR, PLACES
 from faintspot.experiments.planner import text as answer_text
-from faintspot.loop.control.identification.learning import INTEGRATOR
+from faintspot.loop.control.identification.models import INTEGRATOR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,35 +1,26 @@
-"""List of the file formats; add new formats here."""
+"""Formats of files: the subclasses of `FileFormat` in the modules of this folder."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
+from faintspot.base.discovery import import_modules
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_regular
-from faintspot.io.formats.csv_files import Csv
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.formats.fits_files import Fits, FitsGz
-from faintspot.io.formats.hdf5_files import Hdf5, Matlab73
-from faintspot.io.formats.image_files import Bmp, Jpeg, Png
-from faintspot.io.formats.matlab_files import Matlab
-from faintspot.io.formats.numpy_files import Npy, Npz
-from faintspot.io.formats.tiff_files import Tiff
-from faintspot.io.formats.zarr_files import Zarr
 
-FORMATS: tuple[FileFormat, ...] = (
-    Zarr(),
-    Fits(),
-    FitsGz(),
-    Npy(),
-    Npz(),
-    Tiff(),
-    Png(),
-    Bmp(),
-    Jpeg(),
-    Hdf5(),
-    Matlab73(),
-    Matlab(),
-    Csv(),
+import_modules(__name__.rpartition(".")[0])
+
+
+def _below(kind: type[FileFormat]) -> Iterator[type[FileFormat]]:
+    for below in kind.__subclasses__():
+        yield below
+        yield from _below(below)
+
+
+FORMATS: tuple[FileFormat, ...] = tuple(
+    kind() for kind in _below(FileFormat) if not kind.__name__.startswith("_")
 )
 _SIGNATURE_BYTES = 8
 

@@ -20,14 +20,14 @@ from faintspot.io.frames import read_array
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import CompiledIntegrator
-from faintspot.loop.control.identification.model import (
+from faintspot.loop.control.identification.models import (
     CONTROLS,
     INTEGRATOR,
-    KALMAN,
-    MODAL,
-    POLC,
+    MODELS,
     ControlModel,
     LoopPlant,
+    integrates,
+    predicts,
 )
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.loop.control.removed_modes import REMOVED_MODES, TIP_TILT_FOCUS, RemovedModes
@@ -201,13 +201,13 @@ class Control:
 
     def _checked_model(self) -> Any:
         kind = self.options.controller
-        if self.removed_modes and kind not in (INTEGRATOR, MODAL):
+        if self.removed_modes and not integrates(kind):
             raise InputError(
                 f"expected an integrator, as the model of {kind!r} has all modes",
                 name="removed_modes",
                 value=self.removed_modes.name,
             )
-        if kind == KALMAN and self.options.prediction == STREAM:
+        if predicts(kind) and self.options.prediction == STREAM:
             raise InputError(
                 'expected "controller", as a Kalman filter predicts itself', name="prediction", value=STREAM
             )
@@ -254,7 +254,7 @@ class Control:
     @property
     def prediction(self) -> str:
         """Source of predictions: NONE, CONTROLLER or STREAM."""
-        usual = CONTROLLER if self.options.controller == KALMAN else NONE
+        usual = CONTROLLER if predicts(self.options.controller) else NONE
         return self.options.prediction or usual
 
     def with_controller(self, kind: str) -> Control:
@@ -314,7 +314,7 @@ class Control:
             It says what is missing.
         """
         kind = kind or self.options.controller
-        if kind in (POLC, KALMAN) and calibration.read_noise_photoelectrons is None:
+        if kind in MODELS and MODELS[kind].needs_errors and calibration.read_noise_photoelectrons is None:
             raise InputError(
                 f"{TABLE}.controller = {kind!r}: expected standard errors of the slopes, which need the "
                 "camera's read noise: calibration.read_noise_e"
@@ -330,12 +330,8 @@ class Control:
         options, matrix = self.options, self.reconstructor.matrix
         if options.controller == INTEGRATOR:
             return CompiledIntegrator(line, self.controlled, matrix, options.gain, options.leak)
-        if options.controller == MODAL:
-            modes = self.reconstructor.modes
-            matrix = (modes * self.model.arrays["gains"]) @ modes.T @ matrix
-            return CompiledIntegrator(line, self.controlled, matrix, 1.0, options.leak)
-        guarded: Controller = self.model.guarded(self.plant, line)
-        return guarded
+        learnt: Controller = self.model.running(self.plant, line)
+        return learnt
 
     def rehearse(self) -> None:
         """Compile the controller and run it on test frames, the last without a valid slope.

@@ -13,14 +13,9 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.learning import (
-    INTEGRATOR,
-    KALMAN,
-    LoopPlant,
-    learn_controller,
-)
+from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.model import ControlModel
+from faintspot.loop.control.identification.models import INTEGRATOR, MODELS, ControlModel, LoopPlant
 from faintspot.loop.control.identification.open_loop import measured_delay, open_loop_of
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import Integrator
@@ -163,14 +158,13 @@ def _learnt(
 ) -> ControlModel:
     from faintspot.loop.simulation.telescope.model import prepare
 
-    if kind == KALMAN and noise_scale != 1.0:  # learning takes long
-        usual = _learnt(configuration, method, kind, 1.0, seed, simulate)
-        return usual.with_noise(noise_scale)
+    if noise_scale != 1.0:  # learning takes long
+        return _learnt(configuration, method, kind, 1.0, seed, simulate).with_noise(noise_scale)
     optics, control = prepare(configuration), configuration.control
     telemetry, gain = _telemetry(_without_assumed(configuration), method, seed, simulate)
     site = slope_turbulence(configuration, optics.sensor.layout.cells)
-    known = site, control.frame_rate_hz, control.winds, noise_scale
-    learnt = learn_controller(kind, _plant(configuration, optics), telemetry, *known)
+    known = site, control.frame_rate_hz, control.winds
+    learnt = learn_controller(MODELS[kind], _plant(configuration, optics), telemetry, *known)
     return replace(learnt, centroid_gain=gain)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
 from faintspot.loop.control.configuration import TABLE, save_control
-from faintspot.loop.control.identification.learning import INTEGRATOR, KALMAN
+from faintspot.loop.control.identification.models import INTEGRATOR, predicts
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.control import learnt_control
 from faintspot.loop.simulation.methods import PRIOR, Method
@@ -50,7 +50,7 @@ def write_engine_files(
     folder : path
         Made where there is none.
     control : str
-        Kind of control, see `control.identification.learning.CONTROLS`. All but the integrator learn from
+        Kind of control, see `control.identification.models.CONTROLS`. All but the integrator learn from
         telemetry of the simulated loop, in other turbulence, which takes up to a minute: control_model.npz.
 
     Returns
@@ -110,8 +110,8 @@ def fixed_window(configuration: LoopConfiguration, **options: Any) -> Settings:
 
 def _method(settings: Settings, psf: PSF, score: Score | None, control: str) -> Method:
     """Return the method of the simulated loop that equals the engine's."""
-    predicts = control == KALMAN and settings.estimator.takes_prior
-    if predicts and PRIOR in settings.declared() and getattr(settings, PRIOR) is None:
+    with_prior = predicts(control) and settings.estimator.takes_prior
+    if with_prior and PRIOR in settings.declared() and getattr(settings, PRIOR) is None:
         anything: dict[str, Any] = {PRIOR: 1.0}  # it becomes what the filter is sure of
         settings = settings.replace(**anything)
     return Method(
@@ -120,6 +120,6 @@ def _method(settings: Settings, psf: PSF, score: Score | None, control: str) -> 
         psf=psf,
         score=score,
         control=control,
-        predict_prior=predicts,
-        correct_gain=not predicts,
+        predict_prior=with_prior,
+        correct_gain=not with_prior,
     )

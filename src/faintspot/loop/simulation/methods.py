@@ -8,7 +8,7 @@ from typing import Any
 
 from faintspot.base.config.options import REQUIRED, TEXT, Options, number, setting
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR
+from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.psf import PSF

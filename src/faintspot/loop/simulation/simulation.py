@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.learning import INTEGRATOR
-from faintspot.loop.control.identification.model import ControlModel
+from faintspot.loop.control.identification.models import INTEGRATOR, ControlModel
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED, RunLength
 from faintspot.loop.simulation.control import learnt_control, make_controller

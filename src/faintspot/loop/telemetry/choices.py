@@ -20,10 +20,12 @@ from faintspot.base.errors import InputError
 from faintspot.base.statistics import mean_by_blocks
 from faintspot.loop.control.base import SETTLE_FRAMES
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learning import GAINS, KALMAN, MODAL, learn_controller
+from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.measured import Measured
-from faintspot.loop.control.identification.model import ControlModel, LoopPlant
+from faintspot.loop.control.identification.models import ControlModel, LoopPlant
+from faintspot.loop.control.identification.models.kalman import Kalman
+from faintspot.loop.control.identification.models.modal import Modal
 from faintspot.loop.control.identification.open_loop import OpenLoop
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.kalman.predictor import steady_covariance
@@ -130,9 +132,8 @@ def compared_choices(
     choices = [] if ran is None else [compare(AS_RUN, ran)]
     first = open_loop.telemetry.part(0, frames // 2)
     if len(open_loop.variance) <= _MOST_SLOPES:
-        modal, learnt = (
-            learn_controller(kind, plant, first, site, loop.frame_rate_hz) for kind in (MODAL, KALMAN)
-        )
+        known = plant, first, site, loop.frame_rate_hz
+        modal, learnt = learn_controller(Modal, *known), learn_controller(Kalman, *known)
         choices.append(compare(BEST, *integrators([learnt.plain_gain]), gain=learnt.plain_gain))
         gains = modal.arrays["gains"]
         modes = compare(MODES, learnt_left(modal))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from functools import cache
-from importlib import import_module
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, TypeVar
 from unittest import mock
 
+from faintspot.base.discovery import import_modules
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.faults import faults_of
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 ENTRY_POINTS = "faintspot.estimators"
 _PACKAGE = "faintspot.slopes.estimators.built_in"
-_BUILT_IN = (
+_FIRST = (
     "brightest",
     "total_variation",
     "smoothed",
@@ -31,7 +31,7 @@ _BUILT_IN = (
     "maximum_a_posteriori",
     "trained",
 )
-"""Modules of `built_in`, in the order in which estimators are listed."""
+"""Modules of `built_in` that are listed first, in this order."""
 
 Kind = TypeVar("Kind", bound="type[Estimator]")
 _kinds: dict[str, type[Estimator]] = {}
@@ -80,9 +80,7 @@ def estimators() -> dict[str, type[Estimator]]:
     ['brightest', 'tv', 'smoothed', 'centroid']
     """
     _load()
-    places = {f"{_PACKAGE}.{module}": place for place, module in enumerate(_BUILT_IN)}
-    # Independent of the order in which modules happened to be imported.
-    return dict(sorted(_kinds.items(), key=lambda item: places.get(item[1].__module__, len(places))))
+    return dict(_kinds)
 
 
 def restore(kinds: Mapping[str, type[Estimator]]) -> None:
@@ -114,9 +112,8 @@ def estimator_named(name: str) -> type[Estimator]:
 @cache
 def _load() -> None:
     """Import the built-in estimators and those of installed packages."""
-    modules = [f"{_PACKAGE}.{module}" for module in _BUILT_IN]
-    for module in modules:
-        import_module(module)
+    first = [f"{_PACKAGE}.{module}" for module in _FIRST]
+    modules = [*first, *(module for module in import_modules(_PACKAGE) if module not in first)]
     # User code that imported one of them directly has changed the order.
     places = {module: place for place, module in enumerate(modules)}
     kinds = sorted(_kinds.values(), key=lambda kind: places.get(kind.__module__, len(places)))

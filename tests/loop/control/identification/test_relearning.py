@@ -9,9 +9,10 @@ from tests.loop.control.control_cases import FRAME_S, LAYERS, PLANT, TURBULENCE,
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import ASSUMED
-from faintspot.loop.control.identification.learning import KALMAN, learn_controller
+from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.model import ControlModel
+from faintspot.loop.control.identification.models import ControlModel
+from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.control.identification.relearning import relearn
 
 RATE_HZ = 1 / FRAME_S
@@ -22,7 +23,7 @@ FRAMES = telemetry(1200, 0.3, model=LAYERS)
 def now() -> ControlModel:
     """Return a filter for the present turbulence, from other frames."""
     return learn_controller(
-        KALMAN, PLANT, telemetry(800, 0.3, seed=9, model=LAYERS), TURBULENCE, RATE_HZ, ASSUMED
+        Kalman, PLANT, telemetry(800, 0.3, seed=9, model=LAYERS), TURBULENCE, RATE_HZ, ASSUMED
     )
 
 

@@ -25,7 +25,7 @@ from tests.shared_data import ROOT
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.model import KALMAN, ControlModel
+from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.control.identification.state_space import state_space, write_matrices
 from faintspot.loop.control.kalman.local_predictor import local_filter
 
@@ -42,22 +42,20 @@ DENSE = {
 
 
 @pytest.fixture(scope="module", params=["dense", "sparse"])
-def model(request: pytest.FixtureRequest) -> ControlModel:
+def model(request: pytest.FixtureRequest) -> Kalman:
     layers = TURBULENCE.layers()
     arrays: Any = DENSE if request.param == "dense" else local_filter(layers, FRAME_S, NOISE_PX2)
-    return ControlModel(KALMAN, arrays, 0.3, 1.0, (1.0, 2.0), PHASE_OF_COMMANDS)
+    return Kalman(arrays, 0.3, 1.0, (1.0, 2.0), PHASE_OF_COMMANDS)
 
 
-def exported(model: ControlModel, path: Path) -> dict[str, Any]:
+def exported(model: Kalman, path: Path) -> dict[str, Any]:
     matrices = state_space(model, PLANT, SCALE, SIGN)
     written = {**matrices, "delay_frames": np.array(2), "largest_command": np.array(LIMIT)}
     write_matrices(path, written)
     return matrices
 
 
-def test_the_lines_of_the_manual(
-    model: ControlModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_lines_of_the_manual(model: Kalman, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     exported(model, Path("matrices.npz"))
     blocks = re.findall(r"```python\n(.*?)```", MANUAL.read_text(encoding="utf-8"), re.DOTALL)
@@ -91,7 +89,7 @@ class Shared:
 class MilkLoop:
     """Loop whose commands are those of the filter, within float32."""
 
-    def __init__(self, model: ControlModel) -> None:
+    def __init__(self, model: Kalman) -> None:
         self._line = CommandDelayLine(12, 2, LIMIT)
         self._alone, self._rows = model.controller(PLANT, self._line), iter(telemetry(100).open_loop_px)
         self.frames = 0
@@ -108,7 +106,7 @@ class MilkLoop:
 
 
 @pytest.mark.parametrize("model", ["dense"], indirect=True)
-def test_the_lines_for_milk(model: ControlModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_lines_for_milk(model: Kalman, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("astropy.io.fits")
     monkeypatch.chdir(tmp_path)
     exported(model, Path("controller.fits"))
@@ -124,7 +122,7 @@ def test_the_lines_for_milk(model: ControlModel, tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize("ending", ["npz", "mat", "fits"])
-def test_formats(model: ControlModel, tmp_path: Path, ending: str) -> None:
+def test_formats(model: Kalman, tmp_path: Path, ending: str) -> None:
     """All hold the same matrices."""
     path = tmp_path / f"matrices.{ending}"
     if ending == "fits":

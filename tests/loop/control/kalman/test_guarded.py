@@ -8,7 +8,7 @@ from tests.loop.control.control_cases import COVARIANCES, INTERACTION, PHASE, PL
 
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.model import Make
+from faintspot.loop.control.identification.models.base import Make
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.choice import EXCESS, MOST_EXCESS
 from faintspot.loop.control.kalman.guarded import Guarded

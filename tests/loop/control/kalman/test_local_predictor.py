@@ -13,9 +13,9 @@ from tests.loop.control.frozen_flow import frozen_slopes
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification import learning
-from faintspot.loop.control.identification.learning import KALMAN, learn_controller
-from faintspot.loop.control.identification.model import ControlModel
+from faintspot.loop.control.identification.learning import learn_controller
+from faintspot.loop.control.identification.models import kalman
+from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.control.kalman import local_covariance, local_model
 from faintspot.loop.control.kalman import local_predictor as local_kalman
 from faintspot.loop.control.kalman.local_model import LocalModel, at_most, neighbours_within, solve_locally
@@ -243,18 +243,18 @@ def test_it_begins_with_given_slopes_and_looks_ahead(arrays: dict[str, Any]) -> 
 
 def test_large_sensors_learn_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Learnt, saved and read again it sends the same commands, and leaves less than the integrator."""
-    monkeypatch.setattr(learning, "_MOST_SLOPES", 10)
+    monkeypatch.setattr(kalman, "_MOST_SLOPES", 10)
     frames = telemetry(600, 0.3, model=LAYERS)
     shown: list[tuple[int, int]] = []
     learnt = learn_controller(
-        KALMAN, PLANT, frames, TURBULENCE, 1 / FRAME_S, progress=lambda *each: shown.append(each)
+        Kalman, PLANT, frames, TURBULENCE, 1 / FRAME_S, progress=lambda *each: shown.append(each)
     )
     assert shown[-1][0] == shown[-1][1] == len(shown)
     assert learnt.is_local
     assert learnt.left[0] < learnt.left[1]
     path = tmp_path / "model.npz"
     learnt.save(path)
-    again = ControlModel.load(path, PLANT)
+    again = Kalman.load(path, PLANT)
     assert again.is_local
     sent = []
     for model in (learnt, again):

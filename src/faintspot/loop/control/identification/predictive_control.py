@@ -18,7 +18,8 @@ from faintspot.loop.control.identification.layers import Identification, Identif
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.measured import Measured, Wind, winds_of
-from faintspot.loop.control.identification.model import KALMAN, ControlModel, LoopPlant
+from faintspot.loop.control.identification.models import LoopPlant
+from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.control.identification.open_loop import (
     OpenLoop,
     measured_delay,
@@ -73,7 +74,7 @@ class PredictiveControl:
     called with every frame, in order. Made by `learn`; not by hand.
     """
 
-    def __init__(self, loop: LoopOfControl, model: ControlModel) -> None:
+    def __init__(self, loop: LoopOfControl, model: Kalman) -> None:
         self._loop, self._plant = loop, loop.plant()
         self.model = model
         """Model of the filter and of its fallback."""
@@ -197,7 +198,7 @@ class PredictiveControl:
         try:
             plain = {name: array.item() if array.ndim == 0 else array for name, array in values.items()}
             loop = LoopOfControl(**plain)
-            return cls(loop, ControlModel.load(path, loop.plant()))
+            return cls(loop, Kalman.load(path, loop.plant()))
         except (ValueError, TypeError, IndexError):
             raise InputError(f"{path}: expected {_CONTENTS}, got arrays of another shape") from None
 
@@ -316,7 +317,7 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> P
     )
     plant = described.plant()
     learnt = learn_controller(
-        KALMAN,
+        Kalman,
         plant,
         seen.telemetry,
         site,

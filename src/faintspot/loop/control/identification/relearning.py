@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import SETTLE_FRAMES
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learning import KALMAN, LoopPlant, learn_controller
+from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.model import ControlModel
+from faintspot.loop.control.identification.models import ControlModel, LoopPlant
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 
@@ -106,7 +106,7 @@ def relearn(
     if frames < FEWEST_FRAMES:
         raise InputError(f"telemetry: expected {FEWEST_FRAMES} frames to judge a filter, got {frames}")
     first = frames - round(JUDGED_PART * frames)
-    new = learn_controller(KALMAN, plant, telemetry.part(0, first), site, rate_hz, start=start)
+    new = learn_controller(type(running), plant, telemetry.part(0, first), site, rate_hz, start=start)
     identified, begin = new.identified, max(0, first - SETTLE_FRAMES)
     replayed = telemetry.part(begin, None)  # all have settled when the part begins that they are judged on
     phase = new.phase(plant)

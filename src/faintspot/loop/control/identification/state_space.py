@@ -14,7 +14,8 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
 from faintspot.base.npz import save_arrays
 from faintspot.io.arrays.fits_units import write_images
-from faintspot.loop.control.identification.model import ControlModel, LoopPlant
+from faintspot.loop.control.identification.models import LoopPlant
+from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.control.kalman.local_covariance import slopes_ahead, state_of_state, state_of_surprise
 
 Floats = NDArray[np.float64]
@@ -23,7 +24,7 @@ Matrices = dict[str, Any]
 _ENDINGS = (".npz", ".mat", ".fits")
 
 
-def state_space(model: ControlModel, plant: LoopPlant, scale: Floats | float, sign: float) -> Matrices:
+def state_space(model: Kalman, plant: LoopPlant, scale: Floats | float, sign: float) -> Matrices:
     """Return the matrices of a frame's command and of the next state, without the guard.
 
     With the slopes s of a frame, the commands u that the mirror holds during it, and the state x, 0 first::
@@ -39,8 +40,7 @@ def state_space(model: ControlModel, plant: LoopPlant, scale: Floats | float, si
 
     Parameters
     ----------
-    model : ControlModel
-        Kalman filter.
+    model : Kalman
     plant : LoopPlant
     scale : float or (2 n,) array
         The model's slopes in a unit of s.

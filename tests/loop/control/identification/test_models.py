@@ -13,8 +13,8 @@ from tests.loop.control.control_cases import COVARIANCES, FRAME_S, INTERACTION, 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.configuration import Control, ControlOptions
-from faintspot.loop.control.identification.learning import CONTROLS, INTEGRATOR, learn_controller
-from faintspot.loop.control.identification.model import ControlModel
+from faintspot.loop.control.identification.learning import learn_controller
+from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR, MODELS, ControlModel
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.slopes.camera.calibration import Calibration
 
@@ -24,7 +24,7 @@ FRAMES = telemetry(600, 0.3)
 
 @pytest.fixture(scope="module")
 def learnt() -> dict[str, ControlModel]:
-    return {kind: learn_controller(kind, PLANT, FRAMES, TURBULENCE, 1 / FRAME_S) for kind in KINDS}
+    return {kind: learn_controller(MODELS[kind], PLANT, FRAMES, TURBULENCE, 1 / FRAME_S) for kind in KINDS}
 
 
 def commands(controller: Any, line: CommandDelayLine, frames: int = 60) -> np.ndarray:
