@@ -180,7 +180,7 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
         program.kill()
         program.wait()
     for note in tmp_path.iterdir():
-        wait_for(lambda note=note: gone(int(note.name)))  # type: ignore[misc]
+        wait_for(lambda note=note: gone(int(note.name)))
 
 
 OWN = """

@@ -89,7 +89,7 @@ class TestLayout:
     def test_bad_arguments(self) -> None:
         beyond = [[[3.5, 3.5], [1e39, 3.5]], [[3.5, -21.0], [11.5, 3.5]]]
         assert_each_refused(
-            partial(fs.Layout, frame_shape=(8, 16), window=(8, 8), corners=[[0, 0], [0, 8]]),
+            partial(fs.Layout, frame_shape=(8, 16), window=(8, 8), corners=np.array([[0, 0], [0, 8]])),
             corners=[np.empty((0, 2)), [0, 0], [[0.5, 0]], [[np.nan, 0]], [[0, 0], [0]]],
             centres=[[[1.0, 1.0]], [[1.0, np.inf], [1, 1]], *beyond],
             cells=[[[0, 0]], [[0.5, 0], [0, 1]]],
