@@ -13,5 +13,5 @@ def wait_for(condition: Any, what: object = "", step: Any = lambda: time.sleep(0
     """Wait until something is so, or take steps until it is; fail after `LIMIT_S`."""
     end = time.monotonic() + LIMIT_S
     while not condition():
-        assert time.monotonic() < end, what
+        assert time.monotonic() < end, what() if callable(what) else what
         step()

@@ -23,9 +23,13 @@ def refused(*words: str, match: str | None = None) -> Iterator[None]:
         assert word in message, message
 
 
-def assert_each_refused(call: Callable[..., Any], name: str, values: Iterable[Any]) -> None:
-    """Expect that a call refuses each value of an argument, in one line that names it, and any number."""
-    for value in values:
-        is_number = isinstance(value, int | float) and math.isfinite(value)
-        with refused(name, f"{value:g}" if is_number else ""):
-            call(**{name: value})
+def assert_each_refused(call: Callable[..., Any], **values: Iterable[Any]) -> None:
+    """Expect that a call refuses each value of each argument, in one line that names it, and any number."""
+    for name, each in values.items():
+        for value in each:
+            is_number = isinstance(value, int | float) and math.isfinite(value)
+            try:
+                with refused(name, f"{value:g}" if is_number else ""):
+                    call(**{name: value})
+            except (AssertionError, pytest.fail.Exception) as error:
+                raise AssertionError(f"{name} = {value!r}: {error}") from error

@@ -101,15 +101,6 @@ def test_module_runs() -> None:
     assert (process.returncode, out, err) == (0, f"faintspot, version {faintspot.__version__}\n", "")
 
 
-def test_errors_of_a_process_of_its_own(tmp_path: Path) -> None:
-    process = command_line("slopes", "nix.fits", cwd=tmp_path)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 2
-    assert out == ""
-    assert err.count("\n") == 1
-    assert "nix.fits" in err
-
-
 def test_help_imports_nothing_heavy() -> None:
     """Help answers at once because nothing slow is imported, which is tested rather than its time."""
     code = (

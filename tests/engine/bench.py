@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterable
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
-from tests.patience import LIMIT_S
+from tests.patience import LIMIT_S, wait_for
 from tests.simulated import frames_of
 
 import faintspot as fs
@@ -50,10 +49,7 @@ class Bench(Closing):
         return self._ring
 
     def until(self, condition: Any) -> None:
-        end = time.monotonic() + LIMIT_S
-        while not condition():
-            assert time.monotonic() < end, self.engine.status()
-            time.sleep(0.001)
+        wait_for(condition, self.engine.status)
 
     def attached(self) -> None:
         self.until(lambda: self.engine._waiting)

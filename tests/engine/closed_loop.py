@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pyshmem
 from tests.loop.simulation.loop_cases import faint
+from tests.patience import wait_for
 
 import faintspot as fs
 from faintspot.engine.engine import Engine
@@ -94,10 +95,7 @@ class Sky:
         self.until(lambda: engine._waiting)
 
     def until(self, condition: Any) -> None:
-        end = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert time.monotonic() < end, self.running and self.running.engine.status()
-            time.sleep(1e-4)
+        wait_for(condition, lambda: self.running and self.running.engine.status(), lambda: time.sleep(1e-4))
 
     def frame(self) -> dict[str, float]:
         """Let one more frame come, and its commands; return the truth."""

@@ -20,7 +20,6 @@ import faintspot as fs
 from faintspot.cli.realtime import control as realtime_control
 from faintspot.engine.engine import Engine
 from faintspot.engine.pixels.replay import Replay
-from faintspot.engine.settings.interleaving import Interleaving
 from faintspot.engine.streams.bridge import StreamBridge
 from faintspot.io import open_frames
 from faintspot.slopes.pipeline.configuration import unpacked
@@ -61,35 +60,6 @@ def test_what_is_published(bench: Bench) -> None:
 
 def test_telemetry_says_with_which_calibration_and_spot(bench: Bench) -> None:
     assert unpacked(bench.telemetry.description["parts"]) == (CALIBRATION, None, None)
-
-
-def test_methods_take_turns() -> None:
-    """Two frames not denoised, two denoised, and again; every frame says which."""
-    data = simulated(8)
-    with Bench(interleaving=Interleaving.parse("none,tv", 2)) as bench:
-        bench.measure(data)
-        records = bench.records
-    assert records["method"].tolist() == [0, 0, 1, 1, 0, 0, 1, 1]
-    for record, frame in zip(records, data, strict=True):
-        settings = SETTINGS if record["method"] else SETTINGS.replace(estimator="brightest")
-        assert np.array_equal(np.concatenate([record["x"], record["y"]]), make(settings)(frame).vector)
-
-
-def test_settings_change_between_two_frames(bench: Bench) -> None:
-    data = simulated(4)
-    other = SETTINGS.replace(noise_std=2.5, keep_brightest=5)
-    with bench.ring() as ring:
-        bench.attached()
-        bench.send(ring, 0, data[0])
-        bench.send(ring, 1, data[1])
-        change = bench.engine.live.propose({"noise_std": 2.5, "keep_brightest": 5})
-        bench.send(ring, 2, data[2])  # was waited for already when the change was proposed, or not
-        bench.send(ring, 3, data[3])
-    at = bench.engine.live.frame_of(change)
-    assert at in (2, 3)
-    for number, frame in enumerate(data):
-        settings = other if number >= at else SETTINGS
-        assert np.array_equal(bench.slopes[number], make(settings)(frame).vector), number
 
 
 def test_source_restarts(bench: Bench) -> None:

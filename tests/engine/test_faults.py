@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.engine.bench import SETTINGS, Bench, make, simulated
-from tests.patience import LIMIT_S
 
 from faintspot.engine.path.lateness import CAUSES, INCOMPLETE
 from faintspot.engine.pixels.segment import FOLDER
@@ -150,21 +149,6 @@ def test_a_consumer_that_hangs(bench: Bench) -> None:
     assert bench.engine.counters.processed == 8
 
 
-def test_the_clock_is_set_back(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    data = simulated(2)
-    with bench.ring() as ring:
-        bench.attached()
-        bench.send(ring, 0, data[0])
-        true_time = time.time_ns
-        monkeypatch.setattr(time, "time_ns", lambda: true_time() - 10**13)
-        monkeypatch.setattr(time, "time", lambda: true_time() / 1e9 - 1e4)
-        bench.send(ring, 1, data[1])
-    records = bench.records
-    assert (np.diff(records["last_row_time_ns"]) > 0).all()
-    assert (records["published_time_ns"] > records["last_row_time_ns"]).all()
-    assert (bench.engine.latencies.as_dict()["max_us"] or 0) < LIMIT_S * 1e6
-
-
 def test_a_worker_dies(monkeypatch: pytest.MonkeyPatch) -> None:
     """One frame is dropped and counted; the thread is replaced and the loop goes on."""
     data = simulated(4)
@@ -230,25 +214,3 @@ def test_a_hundred_changes_a_second_under_load(bench: Bench) -> None:
         frame = data[record["frame"] % 8]
         expected = make(SETTINGS.replace(**changes))(frame).vector
         assert np.array_equal(np.concatenate([record["x"], record["y"]]), expected)
-
-
-def test_memory_does_not_grow(bench: Bench) -> None:
-    """Two thousand frames after the first thousand: less than 1 MB."""
-    data = simulated(4)
-
-    def send(first: int, last: int) -> None:
-        for number in range(first, last):
-            ring.publish(data[number % 4], number)
-            bench.until(lambda end=number + 1: bench.engine.counters.frames_in >= end)
-
-    with bench.ring() as ring:
-        bench.attached()
-        send(0, 1000)
-        before = resident_bytes()
-        send(1000, 3000)
-        assert resident_bytes() - before < 1e6
-
-
-def resident_bytes() -> int:
-    with open("/proc/self/statm") as statm:
-        return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")

@@ -101,6 +101,11 @@ def assert_nothing(left: dict[str, int], count: int, bytes_each: int) -> None:
     assert left["imported"] <= 3, left
 
 
+def test_frames_alone(changing: Changing) -> None:
+    """Two thousand frames take less than 1 MB."""
+    assert_nothing(changing.left_behind(lambda number: None, 2000), 0, 0)
+
+
 def test_changes_of_settings(changing: Changing) -> None:
     """A pipeline that stays takes 400 kB here; a thousand entries of the history, 1 kB each, are bounded."""
 

@@ -63,6 +63,9 @@ def test_the_clock_jumps(
     monkeypatch.setattr(time, "time_ns", lambda: true_ns() + round(jump_s * 1e9))
     assert sky.frames(30)[20:].mean() > 0.4
     check_commands(sky, files[1])
+    records = sky.records
+    assert (np.diff(records["last_row_time_ns"]) > 0).all()
+    assert (records["published_time_ns"] > records["last_row_time_ns"]).all()
     assert (sky.loop.latencies.as_dict()["max_us"] or 0) < PATIENCE_S * 1e6
 
 

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.experiments.test_running import UNITS, die, double, environment, impossible, values, wait_until
+from tests.experiments.test_running import UNITS, die, double, environment, impossible, values
+from tests.patience import wait_for
 from tests.refusals import refused
 
 from faintspot.experiments import StudySpecification, Sweep, running
@@ -196,7 +197,7 @@ def test_a_killed_client_loses_no_finished_unit(cluster: Cluster, tmp_path: Path
     command = [sys.executable, "-c", CLIENT, str(tmp_path / "units.zarr"), cluster.address]
     first = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE)
     stored = tmp_path / "units.zarr" / "done" / "c"
-    wait_until(lambda: stored.exists() and len(list(stored.iterdir())) > 2)
+    wait_for(lambda: stored.exists() and len(list(stored.iterdir())) > 2)
     first.kill()
     first.communicate()
     kept = len([chunk for chunk in stored.iterdir() if chunk.name.isdigit()])

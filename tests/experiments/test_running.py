@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.patience import wait_for
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError, MissingExtraError
@@ -82,13 +83,6 @@ def gone(process: int) -> bool:
     except ProcessLookupError:
         return True
     return False
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 120
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.1)
 
 
 def environment() -> dict[str, str]:
@@ -181,12 +175,12 @@ run_units(note_and_sleep, units, dict(), WorkerPool(2))
 def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     program = subprocess.Popen([sys.executable, "-c", CHILD.format(folder=str(tmp_path))], env=environment())
     try:
-        wait_until(lambda: len(list(tmp_path.iterdir())) == 2)
+        wait_for(lambda: len(list(tmp_path.iterdir())) == 2)
     finally:
         program.kill()
         program.wait()
     for note in tmp_path.iterdir():
-        wait_until(lambda note=note: gone(int(note.name)))  # type: ignore[misc]
+        wait_for(lambda note=note: gone(int(note.name)))
 
 
 OWN = """

@@ -97,13 +97,6 @@ def test_slopes_do_not_depend_on_the_unit_of_the_frames(folder: Path, run: Comma
 
 
 @pytest.mark.usefixtures("no_picture")
-def test_gain_goes_into_the_calibration(folder: Path, run: Commands) -> None:
-    np.save("a.npy", frames())
-    run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--gain-e-per-adu", "2", "--pixels", 16)
-    assert Calibration.load("new.toml") == Calibration(dark=100.0, gain_e_per_adu=2.0)
-
-
-@pytest.mark.usefixtures("no_picture")
 def test_dark_file(folder: Path, run: Commands) -> None:
     dark = np.random.default_rng(2).uniform(50, 150, SHAPE)
     np.save("a.npy", frames().astype(np.float32) - OFFSET_ADU + dark)

@@ -92,16 +92,25 @@ def assert_same(found: fs.Slopes, expected: fs.Slopes, index: int) -> None:
         assert np.array_equal(getattr(found, name), getattr(expected, name)[index]), name
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("name", list(SETTINGS))
-def test_same_slopes_as_the_pipeline(name: str, threads: int) -> None:
-    data, source = frames(4), Source()
+@pytest.mark.parametrize(
+    ("name", "threads", "count", "sleeps"),
+    [
+        *((name, threads, 4, False) for name in SETTINGS for threads in (1, 3)),
+        ("tv", 1, 12, True),
+        ("tv", 2, 12, True),
+    ],
+)
+def test_same_slopes_as_the_pipeline(name: str, threads: int, count: int, sleeps: bool) -> None:
+    """Also where threads sleep until rows are due."""
+    data, source, last_row = frames(count), Source(), 0
     expected = pipeline(name)(data)
+    block = (12, 0.02) if sleeps else (7, 0.0005)
     with path_of(pipeline(name), source, threads) as path:
         for number, frame in enumerate(data):
-            writer = threading.Thread(target=source.write, args=(number, frame, 7, 0.0005))
+            writer = threading.Thread(target=source.write, args=(number, frame, *block))
             writer.start()
-            assert path.measure(number)
+            assert path.measure(number, after_ns=last_row)
+            last_row = time.monotonic_ns() if sleeps else 0
             writer.join()
             path.flag_doubtful()
             assert_same(path.slopes, expected, number)
@@ -219,22 +228,6 @@ def test_flux_must_be_known_beforehand() -> None:
     automatic = fs.Settings(noise_std="auto", keep_brightest="auto", spot_fwhm_px=2.0)
     with pytest.raises(fs.InputError, match=r"settings\.flux_e"):
         FramePath(fs.SlopePipeline(LAYOUT, automatic, NOISE), source.slots, source.progress)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_threads_that_sleep_until_rows_are_due_give_the_same_slopes(threads: int) -> None:
-    data, source, sensor = frames(12), Source(), pipeline("tv")
-    expected = sensor(data)
-    with path_of(sensor, source, threads) as path:
-        last_row = 0
-        for number, frame in enumerate(data):
-            writer = threading.Thread(target=source.write, args=(number, frame, 12, 0.02))
-            writer.start()
-            assert path.measure(number, after_ns=last_row)
-            last_row = time.monotonic_ns()
-            writer.join()
-            path.flag_doubtful()
-            assert_same(path.slopes, expected, number)
 
 
 def pace_of(last_row_ns: int, margin_ns: int) -> NDArray[np.int64]:

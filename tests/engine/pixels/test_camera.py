@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from tests.refusals import refused
+from tests.refusals import assert_each_refused, refused
 from tests.simulated import frames_of
 
 from faintspot import Calibration, Layout
@@ -182,25 +183,20 @@ def test_type_of_the_frames(name: str, bits: int | None, dtype: str) -> None:
         np.testing.assert_array_equal(ring.slot(0), source.frames[0])
 
 
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"frame_rate_hz": 0}, "frame_rate_hz = 0"),
-        ({"frame_rate_hz": np.nan}, "frame_rate_hz"),
-        ({"readout_fraction": 1.1}, "readout_fraction = 1.1"),
-        ({"rows_per_block": 0}, "rows_per_block = 0"),
-        ({"rows_per_block": 25}, "rows_per_block = 25"),
-        ({"n_distinct": 0}, "n_distinct = 0"),
-        ({"flux_e": -1.0}, "flux_e = -1"),
-        ({"profile": "round"}, "profile"),
-        ({"detector": Detector(1.0, bits=8)}, "ring: expected frames of"),
-        ({"layout": Layout.grid((2, 2), pixels=8)}, "ring: expected frames of"),
-    ],
-)
-def test_bad_options(ring: PixelRing, options: dict[str, Any], text: str) -> None:
-    arguments = {"layout": LAYOUT, "frame_rate_hz": 100.0, "n_distinct": 1, **options}
-    with refused(text):
-        Camera(ring=ring, **arguments)
+def test_bad_options(ring: PixelRing) -> None:
+    good = partial(Camera, ring=ring, layout=LAYOUT, frame_rate_hz=100.0, n_distinct=1)
+    assert_each_refused(
+        good,
+        frame_rate_hz=[0, np.nan],
+        readout_fraction=[1.1],
+        rows_per_block=[0, 25],
+        n_distinct=[0],
+        flux_e=[-1.0],
+        profile=["round"],
+    )
+    for options in ({"detector": Detector(1.0, bits=8)}, {"layout": Layout.grid((2, 2), pixels=8)}):
+        with refused("ring: expected frames of"):
+            good(**options)
 
 
 def test_bad_motion_and_run(ring: PixelRing) -> None:

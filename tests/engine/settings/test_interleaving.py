@@ -17,57 +17,51 @@ from faintspot.slopes.pipeline.settings import without_denoising
 pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 
 
-def test_texts() -> None:
-    found = Interleaving.parse("none, tv,ml,noise_std=2+keep_brightest=20,set", 50)
-    assert [(method.changes, method.denoises) for method in found.methods] == [
-        ({}, False),
-        ({"estimator": "tv"}, True),
-        ({"estimator": "ml"}, True),
-        ({"noise_std": 2, "keep_brightest": 20}, True),
-        ({}, True),
-    ]
-    assert found.labels == ["none", "tv", "ml", "noise_std=2+keep_brightest=20", "set"]
+@pytest.mark.parametrize(
+    ("text", "changes", "denoises", "control"),
+    [
+        ("none", {}, False, None),
+        ("tv", {"estimator": "tv"}, True, None),
+        ("ml", {"estimator": "ml"}, True, None),
+        ("noise_std=2+keep_brightest=20", {"noise_std": 2, "keep_brightest": 20}, True, None),
+        ("set", {}, True, None),
+        ("tv:0.6", {"estimator": "tv", "noise_std": 0.6}, True, None),
+        (
+            "smoothed:0.9+keep_brightest=7",
+            {"estimator": "smoothed", "smoothing_px": 0.9, "keep_brightest": 7},
+            True,
+            None,
+        ),
+        ("tv:2+polc", {"estimator": "tv", "noise_std": 2}, True, "polc"),
+        ("integrator", {}, True, "integrator"),
+        ("kalman", {}, True, "kalman"),
+        ("set+kalman", {}, True, "kalman"),
+        ("none+search_range_px=3+modal", {"search_range_px": 3}, False, "modal"),
+        ("window+integrator", {"estimator": "window"}, True, "integrator"),
+    ],
+)
+def test_texts(text: str, changes: dict[str, Any], denoises: bool, control: str | None) -> None:
+    found = Interleaving.parse(f"none, {text},set", 50)
+    method = found.methods[1]
+    assert found.labels == ["none", text, "set"]
+    assert (method.changes, method.denoises, method.control) == (changes, denoises, control)
 
 
-def test_strengths() -> None:
-    found = Interleaving.parse("tv:0.6,smoothed:0.9+keep_brightest=7,tv:2+polc")
-    assert [method.changes for method in found.methods] == [
-        {"estimator": "tv", "noise_std": 0.6},
-        {"estimator": "smoothed", "smoothing_px": 0.9, "keep_brightest": 7},
-        {"estimator": "tv", "noise_std": 2},
-    ]
-    assert found.labels[0] == "tv:0.6"
-    assert found.methods[0].of(fs.Settings("tv", noise_std=2.0, keep_brightest=9)) == fs.Settings(
-        "tv", noise_std=0.6, keep_brightest=9
-    )
+def test_estimators_without_a_strength() -> None:
     with refused("interleave: 'ml:2'", "no strength"):
         Interleaving.parse("ml:2")
 
 
-def test_controllers_alone() -> None:
-    found = Interleaving.parse("integrator,kalman,none+search_range_px=3+modal")
-    assert [method.control for method in found.methods] == ["integrator", "kalman", "modal"]
-    assert [method.changes for method in found.methods] == [{}, {}, {"search_range_px": 3}]
-    assert [method.denoises for method in found.methods] == [True, True, False]
-
-
-def test_controllers() -> None:
-    found = Interleaving.parse("window+integrator,set+kalman,none,noise_std=2+keep_brightest=20+modal")
-    assert [method.control for method in found.methods] == ["integrator", "kalman", None, "modal"]
-    assert [method.changes for method in found.methods[:2]] == [{"estimator": "window"}, {}]
-    assert found.methods[3].changes == {"noise_std": 2, "keep_brightest": 20}
-    assert found.labels[0] == "window+integrator"
-
-
 def test_what_methods_make_of_the_settings() -> None:
     settings = fs.Settings("tv", noise_std=2.0, keep_brightest=9, search_range_px=3.0)
-    methods = Interleaving.parse("none,tv,ml,noise_std=3,set").methods
+    methods = Interleaving.parse("none,tv,ml,noise_std=3,set,tv:0.6").methods
     assert [method.of(settings) for method in methods] == [
         fs.Settings("brightest", keep_brightest=9, search_range_px=3.0),
         settings,
         fs.Settings("ml", search_range_px=3.0),
         fs.Settings("tv", noise_std=3.0, keep_brightest=9, search_range_px=3.0),
         settings,
+        fs.Settings("tv", noise_std=0.6, keep_brightest=9, search_range_px=3.0),
     ]
 
 

@@ -23,7 +23,7 @@ from click.testing import CliRunner
 from tests.engine.commands import start
 from tests.loop.simulation.loop_cases import faint, plain
 from tests.patience import wait_for
-from tests.refusals import refused
+from tests.refusals import assert_each_refused, refused
 
 import faintspot
 import faintspot as fs
@@ -264,27 +264,26 @@ def test_magnitude_and_seeing_are_converted() -> None:
     assert now.r0_m == pytest.approx((0.1007, 0.2013), rel=1e-3)  # 0.976 x 500 nm / 1 arcsec
 
 
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"photons": -1}, "photons = -1"),
-        ({"photons": None}, "photons"),
-        ({"photons": float("nan")}, "photons"),
+def test_bad_orders() -> None:
+    def ordered(**changes: Any) -> None:
+        Conditions.of(CONFIGURATION).ordered(CONFIGURATION, {"wind_factor": 3.0, **changes})
+
+    assert_each_refused(
+        ordered,
+        photons=[-1, None, float("nan")],
+        magnitude=["bright"],
+        r0_m=[0, [0.1, 0.2, 0.3], None],
+        seeing_arcsec=[0],
+        wind_factor=[-1],
+    )
+    for changes, text in (
         ({"magnitude": -30}, "photons = "),
-        ({"magnitude": "bright"}, "magnitude"),
-        ({"r0_m": 0}, "r0_m"),
-        ({"r0_m": [0.1, 0.2, 0.3]}, "r0_m"),
-        ({"r0_m": None}, "r0_m"),
-        ({"seeing_arcsec": 0}, "seeing_arcsec"),
-        ({"wind_factor": -1}, "wind_factor = -1"),
         ({"photons": 1, "magnitude": 1}, "photons and magnitude"),
         ({"r0_m": 1, "seeing_arcsec": 1}, "r0_m and seeing_arcsec"),
         ({"phtons": 1}, "phtons: unknown order; did you mean photons"),
-    ],
-)
-def test_bad_orders(changes: dict[str, Any], text: str) -> None:
-    with refused(text):
-        Conditions.of(CONFIGURATION).ordered(CONFIGURATION, {"wind_factor": 3.0, **changes})
+    ):
+        with refused(text):
+            ordered(**changes)
 
 
 def test_a_bad_order_changes_nothing(watched: Watched) -> None:

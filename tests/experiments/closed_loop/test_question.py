@@ -1,14 +1,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pytest
 from tests.experiments.loop_answer_cases import configuration
-from tests.refusals import refused
+from tests.refusals import assert_each_refused, refused
 
-import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.question import (
     PLACES,
@@ -62,22 +61,17 @@ def test_radius() -> None:
     assert LoopQuestion(configuration().replace("atmosphere", altitude_m=(0.0,) * 4)).radius is None
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"magnitudes": (8.0,)}, "magnitudes: expected a first and another last one"),
-        ({"magnitudes": (8.0, 8.0)}, "magnitudes: expected a first and another last one"),
-        ({"magnitudes": (8.0, 99.0)}, "magnitudes = 99: expected a number from -30 to 60"),
-        ({"strehl": 0.0}, "strehl = 0: expected a number above 0"),
-        ({"strehl": 1.5}, "strehl = 1.5"),
-        ({"radius_arcsec": -1}, "radius_arcsec = -1"),
-        ({"methods": ["kog"]}, "method = 'kog'"),
-        ({"methods": ["window+kalmann"]}, "control of the method = 'kalmann'"),
-    ],
-)
-def test_bad_values_are_named(values: dict[str, Any], message: str) -> None:
-    with refused(message):
-        LoopQuestion(configuration(), **values)
+def test_bad_values_are_named() -> None:
+    good = partial(LoopQuestion, configuration())
+    assert_each_refused(
+        good, magnitudes=[(8.0,), (8.0, 8.0), (8.0, 99.0)], strehl=[0.0, 1.5], radius_arcsec=[-1]
+    )
+    for methods, message in (
+        (["kog"], "method = 'kog'"),
+        (["window+kalmann"], "control of the method = 'kalmann'"),
+    ):
+        with refused(message):
+            good(methods=methods)
 
 
 def test_other_mistakes() -> None:
@@ -138,15 +132,10 @@ def test_isoplanatic_angle_of_one_layer() -> None:
     assert isoplanatic_angle_arcsec(configuration) == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((14.0, 91.0), "latitude_deg = 91"),
-        ((14.0, 90.0, "Q"), "band = 'Q'"),
-        ((25.0, 90.0), "magnitude = 25"),
-        ((math.nan, 90.0), "magnitude: expected finite"),
-    ],
-)
-def test_what_is_refused(arguments: tuple[Any, ...], message: str) -> None:
-    with pytest.raises(fs.InputError, match=message):
-        star_density(*arguments)
+def test_what_is_refused() -> None:
+    assert_each_refused(
+        partial(star_density, magnitude=14.0, latitude_deg=90.0),
+        latitude_deg=[91.0],
+        band=["Q"],
+        magnitude=[25.0, math.nan],
+    )

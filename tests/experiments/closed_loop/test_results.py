@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.experiments.result_cases import made_up_budget, made_up_magnitude
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
@@ -48,9 +49,8 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         MagnitudeResult.load(path)
     path.write_bytes(b"nothing")
-    with pytest.raises(InputError, match="expected a magnitude experiment") as error:
+    with refused("expected a magnitude experiment"):
         MagnitudeResult.load(path)
-    assert "\n" not in str(error.value)
     made_up_magnitude().save(path)
     with pytest.raises(InputError, match="expected an error budget of format 2"):
         BudgetResult.load(path)

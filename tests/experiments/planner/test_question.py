@@ -1,9 +1,10 @@
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import pytest
-from tests.refusals import refused
+from tests.refusals import assert_each_refused, refused
 
 from faintspot.experiments import Question
 from faintspot.slopes.sensor.layout import Layout
@@ -60,38 +61,30 @@ def test_width_of_a_psf_is_without_the_pixel() -> None:
     assert question.fwhm_px == pytest.approx(2.0, rel=0.02)  # linear interpolation of the half maximum
 
 
-@pytest.mark.parametrize(
-    ("changes", "naming"),
-    [
-        ({"read_noise_e": None}, "read_noise_e"),
-        ({"read_noise_e": -1.0}, "read_noise_e"),
-        ({"read_noise_e": "three"}, "read_noise_e"),
-        ({"pixels": None}, "pixels"),
-        ({"pixels": 1}, "pixels"),
-        ({"pixels": 15.5}, "pixels"),
-        ({"em_gain": 0.5}, "em_gain"),
-        ({"background_e": -0.1}, "background_e"),
-        ({"fwhm_px": None}, "fwhm_px"),
-        ({"fwhm_px": 50.0}, "fwhm_px"),
-        ({"profile": "airy"}, "profile"),
-        ({"flux_e": None}, "flux_e"),
-        ({"flux_e": 0.0}, "flux_e"),
-        ({"flux_e": 1e-3}, "flux_e"),
-        ({"magnitude": 10.0}, "expected one of them"),
-        ({"flux_e": None, "magnitude": 10.0}, "subaperture_m"),
-        ({"flux_e": None, **STAR, "magnitude": 40.0}, "magnitude"),
-        ({"r0_m": 0.1}, "subaperture_m"),
-        ({**OPTICS, "r0_m": 0.01}, "r0_m"),
-        ({**OPTICS, "r0_m": 0.1, "profile": "gaussian"}, "profile"),
-        ({"throughput": 40.0}, "throughput"),
-        ({"band": "Z"}, "band"),
-        ({"search_range_px": 9.0}, "search_range_px"),
-        ({"budget": "0.1 furlong"}, "budget"),
-        ({"budget": "-0.1"}, "budget"),
-        ({"budget": "50mas"}, "pixel_scale_arcsec"),
-        ({"layout": Layout.grid((2, 2), pixels=12)}, "pixels"),
-    ],
-)
-def test_what_cannot_be_is_named_in_one_line(changes: dict[str, Any], naming: str) -> None:
-    with refused(match=naming):
-        Question(**{**KNOWN, **changes})
+def test_what_cannot_be_is_named_in_one_line() -> None:
+    assert_each_refused(
+        partial(Question, **KNOWN),
+        read_noise_e=[None, -1.0, "three"],
+        pixels=[None, 1, 15.5],
+        em_gain=[0.5],
+        background_e=[-0.1],
+        fwhm_px=[None, 50.0],
+        profile=["airy"],
+        flux_e=[None, 0.0, 1e-3],
+        throughput=[40.0],
+        band=["Z"],
+        search_range_px=[9.0],
+        budget=["0.1 furlong", "-0.1"],
+    )
+    for naming, changes in (
+        ("expected one of them", {"magnitude": 10.0}),
+        ("subaperture_m", {"flux_e": None, "magnitude": 10.0}),
+        ("magnitude", {"flux_e": None, **STAR, "magnitude": 40.0}),
+        ("subaperture_m", {"r0_m": 0.1}),
+        ("r0_m", {**OPTICS, "r0_m": 0.01}),
+        ("profile", {**OPTICS, "r0_m": 0.1, "profile": "gaussian"}),
+        ("pixel_scale_arcsec", {"budget": "50mas"}),
+        ("pixels", {"layout": Layout.grid((2, 2), pixels=12)}),
+    ):
+        with refused(naming):
+            Question(**{**KNOWN, **changes})

@@ -1,12 +1,12 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from tests.refusals import refused
+from tests.refusals import assert_each_refused, refused
 
 import faintspot as fs
 
@@ -86,42 +86,26 @@ def test_equality() -> None:
     assert fs.Calibration() != 1
 
 
-@pytest.mark.parametrize(
-    ("words", "arguments"),
-    [
-        ("dark", {"dark": np.zeros(3)}),
-        ("dark", {"dark": np.nan}),
-        ("dark", {"dark": "dark.fits"}),
-        ("dark", {"dark": np.zeros((2, 3, 4))}),
-        ("estimated = 'dark'", {"estimated": "dark"}),
-        ("calibration.estimated", {"estimated": ["flat"]}),
-        ("flat", {"flat": 1.0}),
-        ("flat", {"flat": np.ones((3, 4), complex)}),
-        ("gain_e_per_adu = 0", {"gain_e_per_adu": 0.0}),
-        ("gain_e_per_adu", {"gain_e_per_adu": np.nan}),
-        ("gain_e_per_adu", {"gain_e_per_adu": np.ones((3, 4))}),
-        ("em_gain = -1", {"em_gain": -1.0}),
-        ("em_gain", {"em_gain": "high"}),
-        ("saturation_adu = 0", {"saturation_adu": 0}),
-        ("bad_pixels", {"bad_pixels": [1, 2]}),
-        ("bad_pixels = -1", {"bad_pixels": [[-1, 0]]}),
-        ("bad_pixels = 0.5", {"bad_pixels": [[0.5, 0]]}),
-        ("bad_pixels", {"bad_pixels": [[1, 2, 3]]}),
-        ("bad_pixels", {"bad_pixels": "hot"}),
-        ("bad_pixels", {"bad_pixels": [[1, 2], [3]]}),
-        ("bad_pixels", {"bad_pixels": np.zeros(3, bool)}),
-        ("dark (3, 4), flat (4, 3)", {"dark": np.zeros((3, 4)), "flat": np.ones((4, 3))}),
-        ("read_noise_e = -1", {"read_noise_e": np.array([[1.0, -1.0], [np.nan, 1.0]])}),
-        ("read_noise_e", {"read_noise_e": np.full((3, 4), np.nan)}),
-        ("read_noise_e", {"read_noise_e": np.full((3, 4), np.inf)}),
-        ("read_noise_e", {"read_noise_e": np.ones(4)}),
-        ("dark (3, 4), read_noise_e (4, 3)", {"dark": np.zeros((3, 4)), "read_noise_e": np.ones((4, 3))}),
-        ("bad_pixels (3, 3)", {"dark": np.zeros((3, 4)), "bad_pixels": np.zeros((3, 3), bool)}),
-    ],
-)
-def test_bad_values(words: str, arguments: dict[str, Any]) -> None:
-    with refused("calibration", words):
-        fs.Calibration(**arguments)
+def test_bad_values() -> None:
+    map_, other = np.zeros((3, 4)), np.ones((4, 3))
+    noise = [np.array([[1.0, -1.0], [np.nan, 1.0]]), np.full((3, 4), np.nan), np.full((3, 4), np.inf)]
+    assert_each_refused(
+        fs.Calibration,
+        dark=[np.zeros(3), np.nan, "dark.fits", np.zeros((2, 3, 4))],
+        estimated=["dark", ["flat"]],
+        flat=["flat.fits", np.ones((3, 4), complex)],
+        gain_e_per_adu=[0.0, np.nan, np.ones((3, 4))],
+        em_gain=[-1.0, "high"],
+        saturation_adu=[0],
+        bad_pixels=[[1, 2], [[-1, 0]], [[0.5, 0]], [[1, 2, 3]], "hot", [[1, 2], [3]], np.zeros(3, bool)],
+        read_noise_e=[*noise, np.ones(4)],
+    )
+    assert_each_refused(
+        partial(fs.Calibration, dark=map_),
+        flat=[other],
+        read_noise_e=[other],
+        bad_pixels=[np.zeros((3, 3), bool)],
+    )
 
 
 def test_maps_of_another_frame() -> None:

@@ -167,24 +167,21 @@ def test_inputs_stay_as_they_were_and_the_detector_is_immutable() -> None:
         detector.em_gain = 3.0  # type: ignore[misc]
 
 
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        ("read_noise_e", [-0.1, np.nan, [1.0, 2.0]]),
-        ("dark_e", [-1]),
-        ("background_e", [[[1.0, -1.0]]]),
-        ("em_gain", [0.5]),
-        ("gain_e_per_adu", [0, -2]),
-        ("offset_adu", [np.inf]),
-        ("bits", [0, 12.5, 33]),
-        ("full_well_e", [0]),
-        ("relative_gain", [0.0]),
-        ("blinking_pixels", [[(1, 2)]]),
-        ("hot_pixels", [[(1, 2)], 0.1, [(-1, 2, 3.0)], [(1.5, 2, 3.0)], [(1, 2, -3.0)]]),
-    ],
-)
-def test_bad_detectors_are_named_in_one_line(name: str, values: list[Any]) -> None:
-    assert_each_refused(Detector, name, values)
+def test_bad_detectors_are_named_in_one_line() -> None:
+    assert_each_refused(
+        Detector,
+        read_noise_e=[-0.1, np.nan, [1.0, 2.0]],
+        dark_e=[-1],
+        background_e=[[[1.0, -1.0]]],
+        em_gain=[0.5],
+        gain_e_per_adu=[0, -2],
+        offset_adu=[np.inf],
+        bits=[0, 12.5, 33],
+        full_well_e=[0],
+        relative_gain=[0.0],
+        blinking_pixels=[[(1, 2)]],
+        hot_pixels=[[(1, 2)], 0.1, [(-1, 2, 3.0)], [(1.5, 2, 3.0)], [(1, 2, -3.0)]],
+    )
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.refusals import assert_each_refused
 from tests.simulated import frames_of
 
-from faintspot.base.errors import InputError
 from faintspot.slopes.camera.photon_transfer import measure_detector
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.simulate import Detector
@@ -133,24 +134,19 @@ def test_constant_frames_give_no_nan() -> None:
     assert measure_detector(np.full((4, 32, 32), 7.0)).read_noise_adu == 0.0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({}, "frames, darks"),
-        ({"frames": np.zeros((1, 20, 20))}, "frames"),
-        ({"frames": np.zeros((20, 20))}, "frames"),
-        ({"darks": np.full((3, 20, 20), np.nan)}, "darks"),
-        ({"frames": np.zeros((3, 20, 20)), "darks": np.zeros((3, 20, 21))}, "darks"),
-        ({"frames": np.zeros((3, 20, 20)), "layout": LAYOUT}, "layout"),
-        ({"frames": np.zeros((3, 20, 20)), "em_gain": 0.5}, "em_gain"),
-        ({"frames": np.zeros((3, 20, 20)), "range_adu": (2.0, 1.0)}, "range_adu"),
-        ({"frames": np.zeros((3, 20, 20)), "range_adu": (5.0, 9.0)}, "range_adu"),
-        ({"frames": np.zeros((3, 20, 20)), "dark_level_adu": np.inf}, "dark_level_adu"),
-    ],
-)
-def test_wrong_values_are_refused(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        measure_detector(**arguments)
+def test_wrong_values_are_refused() -> None:
+    frames = np.zeros((3, 20, 20))
+    assert_each_refused(
+        measure_detector, frames=[None, frames[:1], frames[0]], darks=[np.full_like(frames, np.nan)]
+    )
+    assert_each_refused(
+        partial(measure_detector, frames=frames),
+        darks=[np.zeros((3, 20, 21))],
+        layout=[LAYOUT],
+        em_gain=[0.5],
+        range_adu=[(2.0, 1.0), (5.0, 9.0)],
+        dark_level_adu=[np.inf],
+    )
 
 
 def test_a_camera_that_is_stuck_has_no_gain() -> None:

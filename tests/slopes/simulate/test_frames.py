@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
-import pytest
 from tests.refusals import assert_each_refused
 
 from faintspot.slopes.simulate import Detector, sensor_frames, spots, subapertures
@@ -155,38 +155,31 @@ def test_many_frames_are_made_in_blocks() -> None:
     assert frames.sum(dtype=np.float64) == total.sum()
 
 
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        ("n", [0, 2.5]),
-        ("flux_e", [-1, [1, 2]]),
-        ("positions", [[[0, 0]], [0, 0], np.full((3, 2), np.nan)]),
-        ("position_range_px", [-1]),
-        ("profile", ["disc"]),
-        ("shape", [(4, 4, 4)]),
-        ("detector", ["ccd"]),
-        ("rng", [np.random]),
-    ],
-)
-def test_bad_subapertures_are_named_in_one_line(name: str, values: list[Any]) -> None:
-    assert_each_refused(lambda **bad: subapertures(**{"n": 3, **bad}), name, values)
+def test_bad_subapertures_are_named_in_one_line() -> None:
+    assert_each_refused(
+        partial(subapertures, 3),
+        flux_e=[-1, [1, 2]],
+        positions=[[[0, 0]], [0, 0], np.full((3, 2), np.nan)],
+        position_range_px=[-1],
+        profile=["disc"],
+        shape=[(4, 4, 4)],
+        detector=["ccd"],
+        rng=[np.random],
+    )
+    assert_each_refused(subapertures, n=[0, 2.5])
 
 
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        ("corners", [[[13, 0]], [[0, -1]], [[0.5, 0]], [0, 0]]),
-        ("window", ["8 x 8"]),
-        ("frame_shape", [(20,)]),
-        ("n_frames", [0]),
-        ("positions", [np.zeros((2, 2)), np.zeros((2, 3, 2))]),
-        ("size", [np.nan]),
-        ("detector", ["ccd"]),
-    ],
-)
-def test_bad_sensors_are_named_in_one_line(name: str, values: list[Any]) -> None:
-    usual: dict[str, Any] = {"corners": CORNERS, "window": (8, 8), "frame_shape": (20, 24), "n_frames": 4}
-    assert_each_refused(lambda **bad: sensor_frames(**{**usual, **bad}), name, values)
+def test_bad_sensors_are_named_in_one_line() -> None:
+    assert_each_refused(
+        partial(sensor_frames, corners=CORNERS, window=(8, 8), frame_shape=(20, 24), n_frames=4),
+        corners=[[[13, 0]], [[0, -1]], [[0.5, 0]], [0, 0]],
+        window=["8 x 8"],
+        frame_shape=[(20,)],
+        n_frames=[0],
+        positions=[np.zeros((2, 2)), np.zeros((2, 3, 2))],
+        size=[np.nan],
+        detector=["ccd"],
+    )
 
 
 def test_frames_of_psfs_hold_their_images() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.base.errors import InputError
@@ -80,9 +81,8 @@ def test_what_is_refused(tmp_path: Path, old: str, new: str) -> None:
     """Also a window shorter than the spot."""
     path = tmp_path / "camera.toml"
     path.write_text(FILE.replace(old, new), encoding="utf-8")
-    with pytest.raises(InputError) as error:
+    with refused():
         Question(**read_camera(path))
-    assert "\n" not in str(error.value)
 
 
 def test_not_with_other_spots() -> None:

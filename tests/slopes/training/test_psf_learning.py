@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.refusals import refused
+from tests.refusals import assert_each_refused, refused
 from tests.slopes.training.psf_cases import simulated, slope_error, true_psf
 
 from faintspot.base.errors import InputError
@@ -128,22 +129,22 @@ def test_spots_at_one_phase_teach_nothing() -> None:
         learn_psf_from_images(static(rng, 0.12), Calibration(read_noise_e=0.1), rng=rng)
 
 
-@pytest.mark.parametrize(
-    ("images", "options", "words"),
-    [
-        (np.zeros((30, 16, 16)), {}, "spots whose position"),
-        (np.ones((3, 16, 16)), {"index": [0, 1]}, "index"),
-        (np.ones((3, 16, 16)), {"rounds": 1}, "rounds"),
-        (np.ones((3, 16, 16)), {"oversampling": 3}, "oversampling"),
-        (np.ones((3, 16, 16)), {"radius_px": 99}, "radius_px"),
-        (np.ones((3, 16, 16)), {"start": -1.0}, "start"),
-        (np.ones((3, 4, 4)), {}, "6 x 6"),
-        (np.ones((16, 16)), {}, "images"),
-    ],
-)
-def test_refused_in_one_line(images: Any, options: Any, words: Any) -> None:
-    with refused(match=words):
-        learn_psf_from_images(images, **options)
+def test_refused_in_one_line() -> None:
+    assert_each_refused(
+        partial(learn_psf_from_images, np.ones((3, 16, 16))),
+        index=[[0, 1]],
+        rounds=[1],
+        oversampling=[3],
+        radius_px=[99],
+        start=[-1.0],
+    )
+    for images, words in (
+        (np.zeros((30, 16, 16)), "spots whose position"),
+        (np.ones((3, 4, 4)), "6 x 6"),
+        (np.ones((16, 16)), "images"),
+    ):
+        with refused(words):
+            learn_psf_from_images(images)
 
 
 def test_wrong_scope() -> None:

@@ -30,21 +30,6 @@ def _guarded(line: CommandDelayLine, learnt: Make, prior: np.ndarray | None = No
     return Guarded(line, INTERACTION, PHASE, learnt, partial(PLANT.integrator, 0.4), prior_std_px=prior)
 
 
-def test_nonsense_is_replaced() -> None:
-    """A hundred frames after the start the integrator has taken over, as if it had been there always."""
-    lines = [CommandDelayLine(12, 2) for _ in range(2)]
-    guarded, alone = (
-        _guarded(lines[0], partial(Runaway, interaction=INTERACTION)),
-        PLANT.integrator(0.4, lines[1]),
-    )
-    for number, slopes in enumerate(FRAMES.open_loop_px):
-        for controller, line in zip((guarded, alone), lines, strict=True):
-            controller.update(slopes + INTERACTION @ line.acting, np.full(18, 0.2))
-        if number > 100:
-            np.testing.assert_allclose(lines[0].latest, lines[1].latest, atol=1e-9)
-    assert guarded.chosen == 1
-
-
 def test_after_a_failure_the_plain_controller_continues_from_the_mirrors_commands() -> None:
     """Its own commands, made for a mirror that exists only in numbers, may be far from them."""
     line = CommandDelayLine(12, 2)

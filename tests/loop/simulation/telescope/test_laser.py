@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.base.errors import InputError
@@ -168,9 +169,8 @@ def test_text_and_shipped_configuration() -> None:
     ],
 )
 def test_what_is_refused(section: str, values: dict[str, Any]) -> None:
-    with pytest.raises(InputError) as error:
+    with refused():
         LOOP.replace(section, **values)
-    assert "\n" not in str(error.value)
 
 
 def test_what_does_not_go_together(tmp_path: Any) -> None:

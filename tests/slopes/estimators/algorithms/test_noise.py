@@ -1,10 +1,11 @@
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.refusals import refused
+from tests.refusals import assert_each_refused, refused
 from tests.slopes.estimators.algorithms.image_cases import BAD_IMAGES
 
 from faintspot.slopes.estimators.algorithms.noise import pixel_noise, suggested_strength
@@ -17,20 +18,9 @@ def test_strength_is_read_noise_and_a_quarter_of_the_photon_noise() -> None:
     assert suggested_strength([1.0, 2.0], [[0.0], [100.0]], 100).shape == (2, 2)
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments"),
-    [
-        ("read_noise_e", (-1.0, 1.0, 256)),
-        ("read_noise_e", (np.nan, 1.0, 256)),
-        ("flux_e", (1.0, -1.0, 256)),
-        ("flux_e", (1.0, "bright", 256)),
-        ("pixels", (1.0, 1.0, 0)),
-        ("pixels", (1.0, 1.0, 2.5)),
-    ],
-)
-def test_bad_strength_arguments(name: str, arguments: Any) -> None:
-    with refused(name):
-        suggested_strength(*arguments)
+def test_bad_strength_arguments() -> None:
+    good = partial(suggested_strength, read_noise_e=1.0, flux_e=1.0, pixels=256)
+    assert_each_refused(good, read_noise_e=[-1.0, np.nan], flux_e=[-1.0, "bright"], pixels=[0, 2.5])
 
 
 def test_pixel_noise_of_normal_noise() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.refusals import refused
 from tests.slopes.recorded.recorded_cases import SETTINGS, Page, sensor, simulated, two_methods
 
 from faintspot.base.errors import InputError, MissingExtraError
@@ -116,9 +117,8 @@ def test_parts_that_do_not_fit_are_refused_in_one_line() -> None:
         {"example_frame": 2},
         {"stages": {"TV": SlopePipeline(layout, SETTINGS).explain(frames)}},
     ):
-        with pytest.raises(InputError) as error:
+        with refused():
             page_of(layout, frames, **changes)
-        assert "\n" not in str(error.value)
     methods = two_methods(layout, frames)[0]
     for wrong in ([], [methods[0], methods[0]]):
         with pytest.raises(InputError, match="methods: expected"):
