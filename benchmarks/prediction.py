@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from benchmarks.measuring import Row, Table
 from faintspot.base.statistics import paired_mean
-from faintspot.loop.control.base import LEARNT, Controller, Expected
+from faintspot.loop.control.base import LEARNT, Controller, ExpectedSlopes
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.models import ControlModel, LoopPlant
@@ -103,9 +103,9 @@ class Rival(Controller):
         self._predictor = predictor
         self.begin()
 
-    def expected(self) -> Expected:
+    def expected(self) -> ExpectedSlopes:
         """See `Controller`."""
-        return Expected(self._plant.interaction @ self.line.acting, None)
+        return ExpectedSlopes(self._plant.interaction @ self.line.acting, None)
 
     def begin(self) -> None:
         """See `Controller`."""

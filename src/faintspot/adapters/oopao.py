@@ -25,7 +25,7 @@ def attach(
     settings: Settings,
     calibration: Calibration | None = None,
     **options: Unpack[SpotOptions],
-) -> Attached:
+) -> OOPAOAttachment:
     """Make an OOPAO `ShackHartmann` measure its slopes with faintspot, and recalibrate it.
 
     Reference slopes and `slopes_units` are remade (`initialize_wfs`). Interaction matrices and reconstructors
@@ -47,7 +47,7 @@ def attach(
 
     Returns
     -------
-    Attached
+    OOPAOAttachment
         `calibrating`, `measured`; `detach()` restores OOPAO's own centroiding.
 
     Raises
@@ -55,10 +55,10 @@ def attach(
     InputError
         When the sensor is of another kind, geometric or has a weighting map, or as for `ToolSlopes`.
     """
-    return Attached(wfs, settings, calibration, options)
+    return OOPAOAttachment(wfs, settings, calibration, options)
 
 
-class Attached:
+class OOPAOAttachment:
     """faintspot in an OOPAO sensor; see `attach`."""
 
     def __init__(
@@ -146,7 +146,7 @@ class _Source:
         return self._spots.measured
 
     def positions(self, image: Any) -> NDArray[np.float64]:
-        """Return positions; see `Attached._centroid`."""
+        """Return positions; see `OOPAOAttachment._centroid`."""
         images, camera = self._spots.checked(image), self.wfs.cam
         noise_free = not np.any(camera.photonNoise) and not np.any(camera.readoutNoise)
         reference, unit = self._reference() - self._first, float(self.wfs.slopes_units)

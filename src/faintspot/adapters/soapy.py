@@ -23,7 +23,7 @@ def attach(
     settings: Settings,
     calibration: Calibration | None = None,
     **options: Unpack[SpotOptions],
-) -> Attached:
+) -> SoapyAttachment:
     """Make a soapy `ShackHartmann` measure its slopes with faintspot, and remake its static slopes.
 
     Call it after `sim.aoinit()` and before `sim.makeIMat(forceNew=True)`.
@@ -44,7 +44,7 @@ def attach(
 
     Returns
     -------
-    Attached
+    SoapyAttachment
         `calibrating`, `measured`; `detach()` restores the former centroider.
 
     Raises
@@ -52,10 +52,10 @@ def attach(
     InputError
         When the sensor is of another kind, or as for `ToolSlopes`.
     """
-    return Attached(wfs, settings, calibration, options)
+    return SoapyAttachment(wfs, settings, calibration, options)
 
 
-class Attached:
+class SoapyAttachment:
     """faintspot in a soapy sensor; see `attach`."""
 
     def __init__(

@@ -56,9 +56,10 @@ def command(as_json: bool) -> None:
 
 def examine() -> list[Finding]:
     """Return versions, extras and the processor; a broken installation is a finding, not an error."""
+    system = f"{platform.system()} {platform.release()}"
     return [
         Finding("faintspot", f"{__version__} in {Path(__file__).parents[1]}"),
-        Finding("Python", f"{platform.python_version()} ({platform.system()} {platform.release()}, {platform.machine()})"),
+        Finding("Python", f"{platform.python_version()} ({system}, {platform.machine()})"),
         Finding("packages", ", ".join(f"{name} {_version(name)}" for name in _REQUIRED)),
         *(_extra(name) for name in EXTRAS),
         _processor(),

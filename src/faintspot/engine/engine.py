@@ -40,7 +40,7 @@ DEADLINE_S = 1e-3
 IMAGES_EVERY = 100
 
 
-class FrameSource(Protocol):
+class FrameInput(Protocol):
     """Source that brings frames into the ring in the engine's own thread."""
 
     def step(self) -> bool:
@@ -71,7 +71,7 @@ class Engine:
         Configurations that take turns: changes of the settings, and controllers.
     deadline_s : float
         Latency from a frame's last row beyond which slopes count as late.
-    source : FrameSource, optional
+    source : FrameInput, optional
         Brings frames into the ring in the thread that measures them, e.g. a `StreamBridge`. Default: another
         process writes into the ring.
     images_every : int
@@ -104,7 +104,7 @@ class Engine:
         threads: int = 1,
         cpus: Sequence[int] | None = None,
         interleaving: Interleaving | None = None,
-        source: FrameSource | None = None,
+        source: FrameInput | None = None,
         deadline_s: float = DEADLINE_S,
         images_every: int = IMAGES_EVERY,
         control: Control | None = None,

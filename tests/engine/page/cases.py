@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.engine.page.access import Access
-from faintspot.engine.page.batch import Batch, Picture, Source
+from faintspot.engine.page.batch import Batch, BatchSource, Picture
 from faintspot.engine.page.client_requests import ClientRequest
 from faintspot.engine.page.server import LiveServer
 from faintspot.engine.telemetry.segment import record_type
@@ -86,7 +86,9 @@ class Stop:
 
 
 def served(
-    check: Callable[[LiveServer], Awaitable[None]], source: Source | None = None, address: str = "127.0.0.1"
+    check: Callable[[LiveServer], Awaitable[None]],
+    source: BatchSource | None = None,
+    address: str = "127.0.0.1",
 ) -> LiveServer:
     """Serve a source while the check runs; return the server with what it noted."""
 
@@ -151,7 +153,7 @@ class Client:
         self._writer.close()
 
 
-def next_batch(source: Source) -> Batch:
+def next_batch(source: BatchSource) -> Batch:
     """What a source has read since it was asked before."""
     batch = source.read()
     assert batch is not None

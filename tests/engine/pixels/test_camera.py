@@ -22,7 +22,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
 from faintspot.cli.realtime.camera import camera
 from faintspot.engine.pixels import camera as camera_module
-from faintspot.engine.pixels.camera import Camera, SpotMotion, readout_type
+from faintspot.engine.pixels.camera import SimulatedCamera, SpotMotion, readout_type
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.slopes.simulate import Detector
@@ -42,8 +42,8 @@ def ring(name: str) -> Iterator[PixelRing]:
         yield made
 
 
-def small(ring: PixelRing, rate: float = 1000.0, seed: int = 3, **options: Any) -> Camera:
-    return Camera(
+def small(ring: PixelRing, rate: float = 1000.0, seed: int = 3, **options: Any) -> SimulatedCamera:
+    return SimulatedCamera(
         LAYOUT, ring, frame_rate_hz=rate, **{"n_distinct": 5, **options}, rng=np.random.default_rng(seed)
     )
 
@@ -125,7 +125,7 @@ def test_overruns_are_counted_and_left_behind(ring: PixelRing, monkeypatch: pyte
     """On a clock of its own, where each frame takes 2.5 frame times."""
     now = [0]
 
-    def publish(self: Camera, moment: int, frame: object) -> None:
+    def publish(self: SimulatedCamera, moment: int, frame: object) -> None:
         assert now[0] >= moment
         starts.append(now[0])
         now[0] += 25_000_000 if len(starts) <= 3 else 1_000_000
@@ -137,7 +137,7 @@ def test_overruns_are_counted_and_left_behind(ring: PixelRing, monkeypatch: pyte
     source = small(ring, rate=100.0)
     monkeypatch.setattr(time, "monotonic_ns", lambda: now[0])
     monkeypatch.setattr(camera_module, "_wait_until", wait_until)
-    monkeypatch.setattr(Camera, "_publish", publish)
+    monkeypatch.setattr(SimulatedCamera, "_publish", publish)
     report = source.run(6)
     assert starts == [0, 25_000_000, 50_000_000, 75_000_000, 80_000_000, 90_000_000]
     assert (report.frames, report.overruns, report.seconds) == (6, 4, 0.1)
@@ -184,7 +184,7 @@ def test_type_of_the_frames(name: str, bits: int | None, dtype: str) -> None:
 
 
 def test_bad_options(ring: PixelRing) -> None:
-    good = partial(Camera, ring=ring, layout=LAYOUT, frame_rate_hz=100.0, n_distinct=1)
+    good = partial(SimulatedCamera, ring=ring, layout=LAYOUT, frame_rate_hz=100.0, n_distinct=1)
     assert_each_refused(
         good,
         frame_rate_hz=[0, np.nan],
@@ -245,7 +245,7 @@ def test_the_camera_is_the_one_that_the_configuration_describes(
         seen.append(detector)
         raise InputError("it is known")
 
-    monkeypatch.setattr(camera_module, "Camera", enough)
+    monkeypatch.setattr(camera_module, "SimulatedCamera", enough)
     Calibration(100.0, gain_e_per_adu=0.5, em_gain=20.0, read_noise_e=30.0).save(config)
     options = ["--config", str(config), "--name", name]
     for more in ([], ["--offset-adu", "0", "--gain-e-per-adu", "2", "--em-gain", "1", "--read-noise-e", "0"]):

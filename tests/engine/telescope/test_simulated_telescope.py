@@ -35,7 +35,7 @@ from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
 from faintspot.engine.requests.requests import ControlServer, request
-from faintspot.engine.telescope.orders import Conditions
+from faintspot.engine.telescope.orders import ObservingConditions
 from faintspot.engine.telescope.simulated_telescope import TRUTH, SimulatedTelescope, commands_of
 from faintspot.loop.simulation import LoopRecord, simulate_loop
 from faintspot.loop.simulation.engine_files import write_engine_files
@@ -259,14 +259,16 @@ def test_orders_take_effect_with_an_exposure(watched: Watched) -> None:
 
 
 def test_magnitude_and_seeing_are_converted() -> None:
-    now = Conditions.of(CONFIGURATION).ordered(CONFIGURATION, {"magnitude": 10, "seeing_arcsec": [1.0, 0.5]})
+    now = ObservingConditions.of(CONFIGURATION).ordered(
+        CONFIGURATION, {"magnitude": 10, "seeing_arcsec": [1.0, 0.5]}
+    )
     assert now.photons == pytest.approx(float(CONFIGURATION.photometry.electrons(10.0)))
     assert now.r0_m == pytest.approx((0.1007, 0.2013), rel=1e-3)  # 0.976 x 500 nm / 1 arcsec
 
 
 def test_bad_orders() -> None:
     def ordered(**changes: Any) -> None:
-        Conditions.of(CONFIGURATION).ordered(CONFIGURATION, {"wind_factor": 3.0, **changes})
+        ObservingConditions.of(CONFIGURATION).ordered(CONFIGURATION, {"wind_factor": 3.0, **changes})
 
     assert_each_refused(
         ordered,

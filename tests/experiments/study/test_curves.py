@@ -9,9 +9,9 @@ from tests.experiments.study_cases import cells, dataset, power_law
 from faintspot.base.errors import InputError
 from faintspot.experiments.curves import Curve, gain_at_error, gain_at_flux
 from faintspot.experiments.methods import TV_OVER_NO_TV
-from faintspot.experiments.study.curves import Configuration, study_curves
+from faintspot.experiments.study.curves import StudyConditions, study_curves
 
-CONFIGURATION = Configuration("diffraction", 1.0, 0.1, 1.0, 1.0, 16)
+CONFIGURATION = StudyConditions("diffraction", 1.0, 0.1, 1.0, 1.0, 16)
 
 
 def gain_of(cell: object, method: str, mode: str) -> float:

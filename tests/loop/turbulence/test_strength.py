@@ -8,7 +8,7 @@ import pytest
 from tests.loop.control.frozen_flow import frozen_slopes
 
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
-from faintspot.loop.turbulence.strength import Strength, turbulence_strength
+from faintspot.loop.turbulence.strength import TurbulenceStrength, turbulence_strength
 
 CELLS = np.argwhere(np.ones((6, 6)))
 AIR = SlopeTurbulence(
@@ -30,7 +30,7 @@ def slopes() -> np.ndarray:
     return np.vstack([frozen_slopes(AIR, FRAMES // 4, 250.0, rng) for _ in range(4)])
 
 
-def found(slopes: np.ndarray, **options: float) -> Strength:
+def found(slopes: np.ndarray, **options: float) -> TurbulenceStrength:
     run = np.repeat(np.arange(4), FRAMES // 4)
     return turbulence_strength(slopes, np.zeros_like(slopes), run, AIR, **options)
 

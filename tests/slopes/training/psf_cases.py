@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.training.psf_learning import image_stack
-from faintspot.slopes.training.registration import Tables, register, start
+from faintspot.slopes.training.registration import PSFTables, register, start
 
 SHAPES: dict[str, dict[str, Any]] = {
     "diffraction": {"profile": "diffraction"},
@@ -40,6 +40,6 @@ def slope_error(psf: PSF, images: Any, positions: Any, read_noise_e: float, inde
     """Return the error R of maximum likelihood with a PSF."""
     stack = image_stack(images, Calibration(read_noise_e=read_noise_e))
     kinds = np.zeros(len(images), np.int64) if index is None else index
-    tables = Tables.of(psf, WIDEST_PX)
+    tables = PSFTables.of(psf, WIDEST_PX)
     found = register(stack, tables, kinds, start(stack, tables, kinds, psf.fwhm_px, 8.0), 8.0, 4)
     return float(np.abs(found.positions - positions).mean())

@@ -10,7 +10,7 @@ from tests.slopes.training.psf_cases import SHAPES, simulated, true_psf
 
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.training.psf_learning import image_stack
-from faintspot.slopes.training.registration import Tables, register, start
+from faintspot.slopes.training.registration import PSFTables, register, start
 
 
 def registered(psf: Any, images: Any, read_noise_e: Any, bad: Any = None) -> Any:
@@ -19,7 +19,7 @@ def registered(psf: Any, images: Any, read_noise_e: Any, bad: Any = None) -> Any
         images[bad] = np.nan
     stack = image_stack(images, Calibration(read_noise_e=read_noise_e))
     index = np.zeros(len(images), np.int64)
-    tables = Tables.of(psf, 10)
+    tables = PSFTables.of(psf, 10)
     return register(stack, tables, index, start(stack, tables, index, psf.fwhm_px, 8.0), 8.0, 5)
 
 

@@ -74,7 +74,7 @@ class Tables:
 
 
 @dataclass(frozen=True, eq=False)
-class Table(Options):
+class ConfigurationTable(Options):
     """Options that are a table of a configuration file."""
 
     @classmethod
@@ -110,7 +110,7 @@ class Table(Options):
         save_tables(path, {self.table: self.to_table()})
 
 
-Part = TypeVar("Part", bound=Table)
+Part = TypeVar("Part", bound=ConfigurationTable)
 
 
 def save_tables(path: str | Path, tables: Mapping[str, Mapping[str, Any] | None]) -> None:

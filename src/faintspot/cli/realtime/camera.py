@@ -60,7 +60,7 @@ def camera(config: str, name: str, frames: int | None, slots: int, seed: int | N
     """
     import numpy as np
 
-    from faintspot.engine.pixels.camera import Camera, SpotMotion, readout_type
+    from faintspot.engine.pixels.camera import SimulatedCamera, SpotMotion, readout_type
     from faintspot.engine.pixels.pixel_ring import PixelRing
     from faintspot.slopes.pipeline.configuration import Configuration
 
@@ -78,7 +78,7 @@ def camera(config: str, name: str, frames: int | None, slots: int, seed: int | N
     dtype = readout_type(detector)
     with PixelRing.create(name, layout.frame_shape, dtype, slots=slots) as ring:
         rng = np.random.default_rng(seed)
-        source = Camera(layout, ring, detector=detector, motion=motion, rng=rng, **options)
+        source = SimulatedCamera(layout, ring, detector=detector, motion=motion, rng=rng, **options)
         rows, columns = layout.frame_shape
         click.echo(
             f"{name}: {rows} x {columns} pixels ({dtype}), {len(layout)} sub-apertures, "

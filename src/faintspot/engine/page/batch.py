@@ -44,7 +44,7 @@ class Batch:
     """Whether earlier data belong to another engine or another part of the recording."""
 
 
-class Source(Protocol):
+class BatchSource(Protocol):
     """Interface of a source of batches."""
 
     name: str

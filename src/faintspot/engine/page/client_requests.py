@@ -54,7 +54,7 @@ class EngineRequests:
 
     def __init__(self, name: str, folder: str | Path) -> None:
         self._name, self._path = name, socket_path(name)
-        self.recording = Recording(name, Path(folder))
+        self.recording = RecordingThread(name, Path(folder))
 
     def functions(self) -> Mapping[str, ClientRequest]:
         """Return the functions of the requests, by name."""
@@ -100,7 +100,7 @@ class EngineRequests:
         return request(self._path, command, timeout_s=LENGTHY_TIMEOUT_S, **fields)
 
 
-class Recording:
+class RecordingThread:
     """Recordings, one at a time, in a separate thread.
 
     Parameters

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from faintspot.base.errors import InputError
-from faintspot.engine.page.batch import Source
+from faintspot.engine.page.batch import BatchSource
 from faintspot.engine.page.messages import packed
 from faintspot.engine.page.page_state import PageState, flag_names
 from faintspot.engine.page.pictures import FrameDrawing
@@ -22,12 +22,12 @@ class Page:
 
     Parameters
     ----------
-    source : Source
+    source : BatchSource
     tell : function
         Called with kind and message; None withdraws the last message of that kind.
     """
 
-    def __init__(self, source: Source, tell: Callable[[str, bytes | None], None]) -> None:
+    def __init__(self, source: BatchSource, tell: Callable[[str, bytes | None], None]) -> None:
         self.source, self._tell = source, tell
         self.page_state = PageState([])
         self._drawing: FrameDrawing | None = None

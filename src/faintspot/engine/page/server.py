@@ -18,7 +18,7 @@ from typing import Any
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.json_text import parse_json, to_json
 from faintspot.engine.page.access import Access
-from faintspot.engine.page.batch import Source
+from faintspot.engine.page.batch import BatchSource
 from faintspot.engine.page.client_requests import ClientRequests, answered
 from faintspot.engine.page.latest_messages import LatestMessages
 from faintspot.engine.page.messages import packed
@@ -59,7 +59,7 @@ class LiveServer:
 
     Parameters
     ----------
-    source : Source
+    source : BatchSource
     client_requests : Wishes
         Requests that clients may make.
     access : Access
@@ -75,7 +75,7 @@ class LiveServer:
 
     def __init__(
         self,
-        source: Source,
+        source: BatchSource,
         client_requests: ClientRequests,
         access: Access,
         address: str = "127.0.0.1",

@@ -227,7 +227,7 @@ class Readout(ABC):
             time.sleep(max(0, moment - time.monotonic_ns()) / 1e9)
 
 
-class Camera(Readout):
+class SimulatedCamera(Readout):
     """Camera that publishes simulated frames of a Shack-Hartmann sensor, row by row.
 
     The frames are simulated in advance and shown cyclically: frame number n is ``frames[n % n_distinct]``.

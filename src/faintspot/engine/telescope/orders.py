@@ -19,7 +19,7 @@ _LARGEST_PHOTONS = 1e9
 
 
 @dataclass(frozen=True)
-class Conditions:
+class ObservingConditions:
     """The star's flux and the turbulence.
 
     Raises
@@ -39,12 +39,12 @@ class Conditions:
         number_between("photons", self.photons, 0, _LARGEST_PHOTONS, low_open=True)
 
     @classmethod
-    def of(cls, configuration: LoopConfiguration) -> Conditions:
+    def of(cls, configuration: LoopConfiguration) -> ObservingConditions:
         """Return the configuration's own conditions."""
         r0 = configuration.atmosphere.r0_m
         return cls(configuration.photons, r0 if isinstance(r0, tuple) else (r0, r0))
 
-    def ordered(self, configuration: LoopConfiguration, changes: Mapping[str, Any]) -> Conditions:
+    def ordered(self, configuration: LoopConfiguration, changes: Mapping[str, Any]) -> ObservingConditions:
         """Return the conditions with changes, by the names of `ORDERS`.
 
         Raises

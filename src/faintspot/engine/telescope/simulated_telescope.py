@@ -20,7 +20,7 @@ from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
 from faintspot.engine.streams.command_stream import CommandStream
 from faintspot.engine.streams.shared_streams import create_stream, held
-from faintspot.engine.telescope.orders import Conditions
+from faintspot.engine.telescope.orders import ObservingConditions
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.telescope.camera import make_detector
 from faintspot.loop.simulation.telescope.model import TelescopeModel
@@ -41,7 +41,7 @@ _BETWEEN_COMPLAINTS_S = 10.0
 class Order:
     """Requested change of the observing conditions."""
 
-    conditions: Conditions
+    conditions: ObservingConditions
     frame: int = -1
     """First frame with them."""
     in_effect: threading.Event = field(default_factory=threading.Event)
@@ -116,7 +116,7 @@ class SimulatedTelescope(Readout, Closing):
             raise InputError("camera.rolling_shutter: expected 0, as this telescope knows no later commands")
         self.configuration, self.name, self._say = configuration, name, say or (lambda _: None)
         self._keep_truth = keep_truth
-        self._conditions = Conditions.of(configuration)
+        self._conditions = ObservingConditions.of(configuration)
         start = configuration.run.seed if seed is None else seed
         self.telescope_model = telescope_model = TelescopeModel(configuration, start, realisation)
         self._wind = telescope_model.atmosphere.velocity
@@ -237,7 +237,7 @@ class SimulatedTelescope(Readout, Closing):
         stamps = begun_s, float(self.commands.frame), self._conditions.photons
         return self._worker.submit(self._expose, number, time_s, self.commands.commands_nm, stamps)
 
-    def _set(self, conditions: Conditions, time_s: float) -> None:
+    def _set(self, conditions: ObservingConditions, time_s: float) -> None:
         """Change flux and turbulence; the phase screens stay where the wind has moved them."""
         atmosphere = self.telescope_model.atmosphere.blown(self._wind * conditions.wind_factor, time_s)
         self.telescope_model.atmosphere = replace(atmosphere, r0_range_m=conditions.r0_m)

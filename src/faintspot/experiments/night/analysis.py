@@ -27,7 +27,7 @@ _FEWEST_SEEN = 10  # blocks with a measured r0
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class BlockGroup:
     """Blocks that are compared with the reference."""
 
     name: str
@@ -67,7 +67,7 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Line:
+class Regression:
     """Least-squares line of Strehl ratio against measured r0."""
 
     name: str
@@ -85,22 +85,22 @@ class Line:
         )
 
 
-def groups(night: Night) -> list[Group]:
+def groups(night: Night) -> list[BlockGroup]:
     """Return what is compared with the reference: all strengths, those of the paper's column, other methods.
 
     A strength of 0 changes nothing and belongs to no group.
     """
     strength, found = night.strength_e, []
     if (strength > 0).any():
-        found.append(Group(ALL_STRENGTHS, strength > 0))
+        found.append(BlockGroup(ALL_STRENGTHS, strength > 0))
         low, high = BEST_STRENGTHS_E
         best = (strength >= low) & (strength <= high)
         if best.any():
-            found.append(Group(BEST, best))
+            found.append(BlockGroup(BEST, best))
     for number, label in enumerate(night.labels):
         rows = (night.method == number) & np.isnan(strength)
         if number != night.reference and rows.any():
-            found.append(Group(label, rows))
+            found.append(BlockGroup(label, rows))
     return found
 
 
@@ -110,13 +110,13 @@ def differences(night: Night) -> list[Difference]:
     return [difference(night, group, seeing) for group in groups(night)]
 
 
-def difference(night: Night, group: Group, seeing: Floats | None) -> Difference:
+def difference(night: Night, group: BlockGroup, seeing: Floats | None) -> Difference:
     """Return the difference of a group from the reference.
 
     Parameters
     ----------
     night : Night
-    group : Group
+    group : BlockGroup
     seeing : (B,) array, optional
         See `drift_of_r0`.
     """
@@ -190,17 +190,17 @@ def by_strength(night: Night) -> list[tuple[float, Difference]]:
         rows = best if low == low_best else (strength > low) & (strength <= high) & ~best
         if rows.sum() >= _FEWEST_ROWS:
             name = f"{low:g} to {high:g} e⁻" if math.isfinite(high) else f"above {low:g} e⁻"
-            found.append((float(strength[rows].mean()), difference(night, Group(name, rows), seeing)))
+            found.append((float(strength[rows].mean()), difference(night, BlockGroup(name, rows), seeing)))
     return found
 
 
-def lines(night: Night) -> list[Line]:
+def lines(night: Night) -> list[Regression]:
     """Return Strehl ratio against measured r0 as a line, for the reference and each group."""
-    every = [Group(night.labels[night.reference], night.method == night.reference), *groups(night)]
+    every = [BlockGroup(night.labels[night.reference], night.method == night.reference), *groups(night)]
     return [line for group in every if (line := _line(night, group)) is not None]
 
 
-def _line(night: Night, group: Group) -> Line | None:
+def _line(night: Night, group: BlockGroup) -> Regression | None:
     rows = group.rows & np.isfinite(night.r0_m + night.strehl)
     if rows.sum() < _FEWEST_ROWS or np.ptp(night.r0_m[rows]) == 0:
         return None
@@ -213,7 +213,7 @@ def _line(night: Night, group: Group) -> Line | None:
         if np.unique(r0[cycle != number]).size > 1
     ]
     correlation = float(np.corrcoef(r0, strehl)[0, 1])
-    return Line(group.name, jackknife(float(slope), without), float(intercept), correlation, len(r0))
+    return Regression(group.name, jackknife(float(slope), without), float(intercept), correlation, len(r0))
 
 
 def hours_needed(

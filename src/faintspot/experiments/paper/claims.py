@@ -9,11 +9,11 @@ import numpy as np
 
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import magnitudes
-from faintspot.experiments.curves import Curve, Gain, gain_at_error
+from faintspot.experiments.curves import Gain, gain_at_error
 from faintspot.experiments.methods import NO_TV, SMOOTHING, TV, TV_OVER_NO_TV
 from faintspot.experiments.paper import judges
-from faintspot.experiments.paper.judges import LEVEL_PX
-from faintspot.experiments.study.curves import Configuration, Finding, Verdict, study_curves
+from faintspot.experiments.paper.judges import LEVEL_PX, Curves
+from faintspot.experiments.study.curves import Judgement, StudyConditions, Verdict, study_curves
 from faintspot.experiments.study.specification import BEST
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def verdicts(dataset: xarray.Dataset, seed: int = 2015) -> list[Verdict]:
         findings = []
         for mode in (BEST, fixed_mode(dataset)):
             rng = np.random.default_rng([seed, number])
-            findings.append(Finding(mode, judge(dataset, mode, rng) if mode in modes else []))
+            findings.append(Judgement(mode, judge(dataset, mode, rng) if mode in modes else []))
         results.append(Verdict(number, text["claim"], rule, *findings))
     return results
 
@@ -63,7 +63,7 @@ _MOST_LISTED = 4
 class _Compared:
     """The gain of TV over no denoising and over Gaussian smoothing, for one configuration."""
 
-    configuration: Configuration
+    configuration: StudyConditions
     gain: Gain
     over_gaussian: Gain | None
 
@@ -96,9 +96,7 @@ def guidance(dataset: xarray.Dataset, seed: int = 2015) -> list[str]:
     return [*paragraphs, _recommendation(best)]
 
 
-def _compared(
-    curves: dict[Configuration, Curve], rng: np.random.Generator, gaussian: bool
-) -> list[_Compared]:
+def _compared(curves: Curves, rng: np.random.Generator, gaussian: bool) -> list[_Compared]:
     compared = []
     for key, curve in sorted(curves.items()):
         gain = gain_at_error(curve, LEVEL_PX, rng, **TV_OVER_NO_TV)
@@ -125,7 +123,7 @@ def _flux_gains(reference: str, gains: list[Gain]) -> str:
     return _TEXT("guidance.flux_gains", level=LEVEL_PX, reference=reference, **counts, **values)
 
 
-def _choosing_k(best: dict[Configuration, Curve], fixed: dict[Configuration, Curve], mode: str) -> list[str]:
+def _choosing_k(best: Curves, fixed: Curves, mode: str) -> list[str]:
     """Describe the gain of a good number of pixels kept, without denoising."""
     ratios = []
     for key, curve in best.items():

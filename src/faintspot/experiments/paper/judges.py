@@ -20,8 +20,8 @@ from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.experiments.study.curves import (
     KEPT_RANGE,
     Case,
-    Configuration,
     Outcome,
+    StudyConditions,
     judged,
     kept_panels,
     spread,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 _TEXT = Texts("faintspot.experiments")
-Curves = Mapping[Configuration, Curve]
+Curves = Mapping[StudyConditions, Curve]
 
 INFORMATIVE = 0.8
 LEVEL_PX = 0.15
@@ -46,7 +46,7 @@ _FAMILY_FALSE_ALARM = 0.05
 _FREE = ("size", "elongation", "pixels", "background_e", "em_gain")
 
 
-def selected(curves: Curves, **parameters: float | str) -> list[tuple[Configuration, Curve]]:
+def selected(curves: Curves, **parameters: float | str) -> list[tuple[StudyConditions, Curve]]:
     """Return curves by their parameters; others are size 1, round, 16 pixels, no background or EM."""
     standard: dict[str, float | str] = {
         "size": 1.0,
@@ -64,7 +64,7 @@ def selected(curves: Curves, **parameters: float | str) -> list[tuple[Configurat
 
 
 def largest_gain(
-    configuration: Configuration, curve: Curve, rng: np.random.Generator
+    configuration: StudyConditions, curve: Curve, rng: np.random.Generator
 ) -> tuple[float, Gain] | None:
     """Return the flux without TV with the largest gain, by the interval's lower end, and that gain.
 
@@ -297,7 +297,7 @@ def _log_change(small: Curve, large: Curve, flux_e: float, method: str) -> tuple
     return math.log(second.value / first.value), math.hypot(*errors)
 
 
-def _slope_with_noise(gains: list[tuple[Configuration, Gain]]) -> tuple[float, float]:
+def _slope_with_noise(gains: list[tuple[StudyConditions, Gain]]) -> tuple[float, float]:
     """Return the weighted least-squares slope of ln(gain) on log10(read noise), with its standard error."""
     x = np.log10([key.read_noise_e for key, _ in gains])
     y = np.log([gain.factor for _, gain in gains])
@@ -308,17 +308,17 @@ def _slope_with_noise(gains: list[tuple[Configuration, Gain]]) -> tuple[float, f
 
 
 def _level_gains(
-    group: Iterable[tuple[Configuration, Curve]], rng: np.random.Generator
-) -> list[tuple[Configuration, Gain]]:
+    group: Iterable[tuple[StudyConditions, Curve]], rng: np.random.Generator
+) -> list[tuple[StudyConditions, Gain]]:
     gains = [(key, gain_at_error(curve, LEVEL_PX, rng, **TV_OVER_NO_TV)) for key, curve in group]
     return [(key, gain) for key, gain in gains if gain is not None and gain.is_bounded]
 
 
 def _grouped(
-    curves: Iterable[tuple[Configuration, Curve]], varied: str
-) -> list[list[tuple[Configuration, Curve]]]:
+    curves: Iterable[tuple[StudyConditions, Curve]], varied: str
+) -> list[list[tuple[StudyConditions, Curve]]]:
     """Return groups of at least two curves that differ in one parameter only, by increasing value of it."""
-    groups: dict[str, list[tuple[Configuration, Curve]]] = {}
+    groups: dict[str, list[tuple[StudyConditions, Curve]]] = {}
     for key, curve in curves:
         groups.setdefault(_words_without(key, varied), []).append((key, curve))
     return [
@@ -328,11 +328,11 @@ def _grouped(
     ]
 
 
-def _shared_words(gains: list[tuple[Configuration, Gain]], varied: str) -> str:
+def _shared_words(gains: list[tuple[StudyConditions, Gain]], varied: str) -> str:
     return _words_without(gains[0][0], varied)
 
 
-def _words_without(key: Configuration, varied: str) -> str:
+def _words_without(key: StudyConditions, varied: str) -> str:
     words = {
         "size": f" of size {key.size:g}",
         "pixels": f", {key.pixels} × {key.pixels} px",

@@ -17,9 +17,9 @@ from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV, label_of
 from faintspot.experiments.paper.claims import fixed_mode
 from faintspot.experiments.paper.judges import LEVEL_PX
 from faintspot.experiments.study.curves import (
-    Configuration,
-    Finding,
+    Judgement,
     Outcome,
+    StudyConditions,
     Verdict,
     against_tv,
     study_curves,
@@ -135,7 +135,7 @@ def gains_section(dataset: xarray.Dataset) -> Section:
     return _TEXT.section("gains", _TEXT.table("gains", rows, [mode_in_words(mode) for mode in modes]))
 
 
-def gains_by_mode(dataset: xarray.Dataset) -> dict[Configuration, dict[str, Gain | None]]:
+def gains_by_mode(dataset: xarray.Dataset) -> dict[StudyConditions, dict[str, Gain | None]]:
     """Return the flux gain of TV over no denoising at R = `LEVEL_PX`, by configuration and mode.
 
     Parameters
@@ -150,7 +150,7 @@ def gains_by_mode(dataset: xarray.Dataset) -> dict[Configuration, dict[str, Gain
         without denoising does not come down to that level.
     """
     rng = np.random.default_rng(0)  # of the bootstrap: the same study gives the same page
-    table: dict[Configuration, dict[str, Gain | None]] = {}
+    table: dict[StudyConditions, dict[str, Gain | None]] = {}
     for mode in dataset["mode"].values:
         for configuration, curve in study_curves(dataset, str(mode)).items():
             gain = gain_at_error(curve, LEVEL_PX, rng, **TV_OVER_NO_TV) if curve.has(TV, NO_TV) else None
@@ -170,7 +170,7 @@ def _summary(judged: list[Verdict], fixed: str) -> str:
     return f"Of {len(judged)} claims: best k: {best}; {fixed}: {at_fixed}; both together: {together}"
 
 
-def _cell_of_mode(finding: Finding) -> TableCell:
+def _cell_of_mode(finding: Judgement) -> TableCell:
     """Return a mode's outcome and its first cases, of different outcomes where there are any."""
     shown = list({case.outcome: case for case in reversed(finding.cases)}.values())[::-1]
     shown += [case for case in finding.cases if case not in shown]

@@ -10,7 +10,7 @@ from faintspot.base.report.page import Section
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.night.verdicts import verdicts as night_verdicts
 from faintspot.experiments.paper.claims import fixed_mode, verdicts
-from faintspot.experiments.study.curves import Finding, Outcome, Verdict
+from faintspot.experiments.study.curves import Judgement, Outcome, Verdict
 
 if TYPE_CHECKING:
     import xarray
@@ -95,7 +95,7 @@ def _row(part: str, verdict: Verdict, fixed: str) -> PaperRow:
     return PaperRow(part, verdict.claim, word, condition, "; ".join(numbers))
 
 
-def _share(finding: Finding, where: str) -> str:
+def _share(finding: Judgement, where: str) -> str:
     """Return in how many cases a claim holds."""
     counts = [sum(case.outcome is outcome for case in finding.cases) for outcome in Outcome]
     holds, in_part = counts[0], counts[1]
@@ -103,7 +103,7 @@ def _share(finding: Finding, where: str) -> str:
     return f"{where}: {holds} of {len(finding.cases)} cases{part}"
 
 
-def _typical(finding: Finding) -> str:
+def _typical(finding: Judgement) -> str:
     """Return the number of the first case with the most frequent outcome, and where it was found."""
     outcomes = [case.outcome for case in finding.cases]
     case = finding.cases[outcomes.index(max(outcomes, key=outcomes.count))]

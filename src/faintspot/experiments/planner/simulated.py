@@ -26,7 +26,7 @@ SPOTS_PER_FRAME = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
+class SpotFrames:
     """Frames of one flux, and the truth."""
 
     frames: NDArray[Any]
@@ -65,20 +65,20 @@ class SimulatedSpots:
             unit_spots(question, n_frames * SPOTS_PER_FRAME, second),
         )
 
-    def exposed(self, flux_e: float, rng: np.random.Generator) -> tuple[Sample, Sample]:
+    def exposed(self, flux_e: float, rng: np.random.Generator) -> tuple[SpotFrames, SpotFrames]:
         """Return frames to choose on and frames to score on at a flux."""
         camera, (ny, nx) = self.question.detector, self.layout.window
         samples = []
         for (images, truth), noise in zip((self.choosing, self.scoring), spawn(rng, 2), strict=True):
             frames = camera.expose(flux_e * images, noise).reshape(-1, SPOTS_PER_FRAME * ny, nx)
-            samples.append(Sample(frames, truth.reshape(-1, SPOTS_PER_FRAME, 2)))
+            samples.append(SpotFrames(frames, truth.reshape(-1, SPOTS_PER_FRAME, 2)))
         return samples[0], samples[1]
 
     @cached_property
     def _pipelines(self) -> dict[str, SlopePipeline]:
         return {}
 
-    def measure(self, sample: Sample, method: Method) -> Slopes:
+    def measure(self, sample: SpotFrames, method: Method) -> Slopes:
         """Measure the spots of a sample as the user's own frames would be."""
         # What knows the spot takes time to prepare, and often has the same settings at every flux.
         key = f"{method.settings} {id(method.psf)} {id(method.score)}"
@@ -89,7 +89,7 @@ class SimulatedSpots:
         return self._pipelines[key](sample.frames)
 
     def measure_each(
-        self, sample: Sample, method: Method, name: str, values: Sequence[Any]
+        self, sample: SpotFrames, method: Method, name: str, values: Sequence[Any]
     ) -> list[tuple[NDArray[Any], NDArray[Any]]]:
         """Return x and y, (n_frames, SPOTS_PER_FRAME), for each value of one of a method's options.
 

@@ -22,7 +22,7 @@ from faintspot.experiments.methods import Knowledge, method_for_scene, score_for
 from faintspot.experiments.planner.answer import Answer, MethodResult
 from faintspot.experiments.planner.promise import Promise, check_promises
 from faintspot.experiments.planner.question import Question
-from faintspot.experiments.planner.simulated import Sample, SimulatedSpots
+from faintspot.experiments.planner.simulated import SimulatedSpots, SpotFrames
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.estimators.base import Estimator, Need
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
@@ -192,7 +192,7 @@ class _Trial:
             self._scored[step] = {}
             for name, kind in list(self._kinds.items()):
                 try:
-                    self._scored[step][name] = self._tried(kind, flux, *samples, score)
+                    self._scored[step][name] = self._tried(kind, flux, samples, score)
                 except InputError as error:
                     if name in (BrightestPixels.name, Thresholded.name):  # what all are compared with
                         raise
@@ -201,11 +201,11 @@ class _Trial:
                 self._advance(1)
 
     def _tried(
-        self, kind: type[Estimator], flux_e: float, first: Sample, second: Sample, score: TrainedScore | None
+        self, kind: type[Estimator], flux_e: float, samples: Sequence[SpotFrames], score: TrainedScore | None
     ) -> _Scored:
         """Choose an estimator's options on the first sample, and score it on the second."""
         scene, spots = self.question.scene(flux_e), self.spots
-        method = method_for_scene(kind, scene, psf=self._psf, score=score)
+        (first, second), method = samples, method_for_scene(kind, scene, psf=self._psf, score=score)
         if method.estimator.uses_flux and self.question.flux_is_known:
             method = method.with_options({"flux_e": float(f"{flux_e:.4g}")})
 

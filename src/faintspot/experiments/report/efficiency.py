@@ -11,7 +11,7 @@ from faintspot.base.report.page import Section
 from faintspot.base.report.texts import Texts
 from faintspot.base.report.words import number_or_dash
 from faintspot.experiments.methods import knows_the_spot
-from faintspot.experiments.study.curves import Configuration
+from faintspot.experiments.study.curves import StudyConditions
 from faintspot.experiments.study.specification import BEST, CORRECTED
 from faintspot.slopes.estimators.built_in.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.slopes.estimators.built_in.maximum_likelihood import MaximumLikelihood
@@ -120,9 +120,9 @@ def _methods(cells: xarray.Dataset) -> list[str]:
 
 def _in_words(cells: xarray.Dataset) -> list[str]:
     """Return each cell in one line."""
-    names = Configuration.__dataclass_fields__
+    names = StudyConditions.__dataclass_fields__
     columns = [cells[name].values.tolist() for name in names]
-    keys = [Configuration(**dict(zip(names, values, strict=True))) for values in zip(*columns, strict=True)]
+    keys = [StudyConditions(**dict(zip(names, values, strict=True))) for values in zip(*columns, strict=True)]
     fluxes = cells["flux_e"].values
     return [f"{flux:g} e-, {key.in_words()}" for flux, key in zip(fluxes, keys, strict=True)]
 

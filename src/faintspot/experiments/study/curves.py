@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, order=True)
-class Configuration:
+class StudyConditions:
     """All parameters of a cell but its flux; units as in the dataset."""
 
     profile: str
@@ -56,7 +56,7 @@ class Configuration:
         return ", ".join(words)
 
 
-def study_curves(dataset: xarray.Dataset, mode: str) -> dict[Configuration, Curve]:
+def study_curves(dataset: xarray.Dataset, mode: str) -> dict[StudyConditions, Curve]:
     """Return the curve of every configuration in a mode, from the finished cells of a study.
 
     Raises
@@ -78,13 +78,13 @@ def study_curves(dataset: xarray.Dataset, mode: str) -> dict[Configuration, Curv
     }
 
 
-def cells_by_configuration(dataset: xarray.Dataset) -> dict[Configuration, NDArray[np.int64]]:
+def cells_by_configuration(dataset: xarray.Dataset) -> dict[StudyConditions, NDArray[np.int64]]:
     """Return the indices of the finished cells of every configuration, by increasing flux."""
-    columns = {field.name: dataset[field.name].values for field in fields(Configuration)}
-    groups: dict[Configuration, list[int]] = {}
+    columns = {field.name: dataset[field.name].values for field in fields(StudyConditions)}
+    groups: dict[StudyConditions, list[int]] = {}
     for cell in np.flatnonzero(dataset["done"].values):
         values: dict[str, Any] = {name: column[cell].item() for name, column in columns.items()}
-        groups.setdefault(Configuration(**values), []).append(int(cell))
+        groups.setdefault(StudyConditions(**values), []).append(int(cell))
     flux = dataset["flux_e"].values
     return {key: np.array(sorted(cells, key=lambda cell: flux[cell])) for key, cells in groups.items()}
 
@@ -126,12 +126,12 @@ def kept_panels(dataset: xarray.Dataset, profile: str) -> list[KeptPanel]:
     fixed = f"{profile}, {pixels} × {pixels} px, ±{reach:g} px"
     low, high = _WANTED_SIGNALS_E
 
-    def nearest(configuration: Configuration, target_e: float) -> tuple[float, int]:
+    def nearest(configuration: StudyConditions, target_e: float) -> tuple[float, int]:
         flux = dataset["flux_e"].values[cells_of[configuration]]
         best = int(np.argmin(np.abs(np.log(flux / target_e))))
         return float(flux[best]), int(cells_of[configuration][best])
 
-    def panel(subject: str, named: Sequence[tuple[str, Configuration]], common: str) -> KeptPanel:
+    def panel(subject: str, named: Sequence[tuple[str, StudyConditions]], common: str) -> KeptPanel:
         """Return one cell of each configuration, at the flux nearest to the lower one that is wanted."""
         closest = [(name, *nearest(configuration, low)) for name, configuration in named]
         fluxes = {flux for _, flux, _ in closest}
@@ -249,7 +249,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Finding:
+class Judgement:
     """All cases of a claim in one mode."""
 
     mode: str
@@ -281,8 +281,8 @@ class Verdict:
     number: int
     claim: str
     rule: str
-    best: Finding
-    fixed: Finding
+    best: Judgement
+    fixed: Judgement
 
     @property
     def outcome(self) -> Outcome:

@@ -24,7 +24,7 @@ AOT_VERSION = "AOT-VERS"
 
 
 @dataclass(frozen=True)
-class Unit:
+class HeaderDataUnit:
     """One header-and-data unit (HDU); `shape` is the image's in NumPy's order, () without an image."""
 
     index: int
@@ -35,7 +35,7 @@ class Unit:
     data_start: int
 
     @classmethod
-    def of(cls, index: int, header: Any, data_start: int) -> Unit:
+    def of(cls, index: int, header: Any, data_start: int) -> HeaderDataUnit:
         """Interpret a header; a wrong one raises the exceptions of astropy."""
         compressed = bool(header.get("ZIMAGE", False))
         is_image = compressed or index == 0 or str(header["XTENSION"]).strip() == "IMAGE"
@@ -80,7 +80,7 @@ def write_images(
     write_atomically(path, stream.getvalue())
 
 
-def units_of(path: Path) -> Iterator[Unit]:
+def units_of(path: Path) -> Iterator[HeaderDataUnit]:
     """Yield the file's header-and-data units in order, skipping over the data."""
     header_type = load_fits().Header
     with open_plain_or_gzip(path) as stream:
@@ -93,7 +93,7 @@ def units_of(path: Path) -> Iterator[Unit]:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")
                     header = header_type.fromfile(stream)
-                    unit = Unit.of(index, header, stream.tell())
+                    unit = HeaderDataUnit.of(index, header, stream.tell())
             except Exception as error:  # astropy raises many kinds of errors on damaged headers
                 if index > 0:
                     return  # the end of the file, or data of no interest behind the last unit

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.json_text import parse_json, to_json
 from faintspot.base.sizes import check_bytes
-from faintspot.io.arrays.fits_units import AOT_VERSION, Unit, units_of
+from faintspot.io.arrays.fits_units import AOT_VERSION, HeaderDataUnit, units_of
 from faintspot.io.arrays.stored_array import StoredArray
 from faintspot.io.arrays.streams import (
     GZIP_SIGNATURE,
@@ -130,7 +130,7 @@ class FitsGz(Fits):
             super().write(cast(IO[bytes], compressed), slopes)
 
 
-def _find_unit(path: Path, key: str | None) -> Unit:
+def _find_unit(path: Path, key: str | None) -> HeaderDataUnit:
     """Return the first image, or the unit named `key`."""
     names = []
     for unit in units_of(path):
@@ -145,7 +145,7 @@ def _find_unit(path: Path, key: str | None) -> Unit:
     raise InputError(f"{path}: expected {wanted}, the file has only: {', '.join(names)}")
 
 
-def _image(name: str, path: Path, unit: Unit) -> StoredArray:
+def _image(name: str, path: Path, unit: HeaderDataUnit) -> StoredArray:
     """Return the image of a unit: of plain bytes, or decompressed tile by tile by astropy."""
     fits = load_fits()
     compressed_file = is_gzip(path)

@@ -9,7 +9,7 @@ import numpy as np
 from faintspot.io.stored.slopes_format import VARIABLES
 
 
-class StoredArray(NamedTuple):
+class ArrayStorage(NamedTuple):
     """Storage of an array of telemetry."""
 
     dtype: np.dtype[Any]
@@ -19,11 +19,11 @@ class StoredArray(NamedTuple):
     """Whether all recordings have it; else it is read as zeros, e.g. commands of an engine without any."""
 
 
-def array(dtype: Any, dimensions: str, units: str = "1", *, in_all: bool = True) -> dict[str, StoredArray]:
+def array(dtype: Any, dimensions: str, units: str = "1", *, in_all: bool = True) -> dict[str, ArrayStorage]:
     """Return the metadata of a field of `Telemetry`; dimensions are words."""
-    return {"stored": StoredArray(np.dtype(dtype), tuple(dimensions.split()), units, in_all)}
+    return {"stored": ArrayStorage(np.dtype(dtype), tuple(dimensions.split()), units, in_all)}
 
 
-def of_slopes(name: str, dtype: Any, *, in_all: bool = True) -> dict[str, StoredArray]:
+def of_slopes(name: str, dtype: Any, *, in_all: bool = True) -> dict[str, ArrayStorage]:
     """Return those of a quantity of each slope."""
     return array(dtype, "frame subaperture", VARIABLES[name].units, in_all=in_all)

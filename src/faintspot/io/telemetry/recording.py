@@ -23,7 +23,7 @@ from faintspot.io.arrays.zarr_store import (
 )
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
-from faintspot.io.telemetry.arrays import StoredArray, array, of_slopes
+from faintspot.io.telemetry.arrays import ArrayStorage, array, of_slopes
 
 zarr = load_zarr()
 FRAMES, IMAGES = "finished_frames", "finished_images"
@@ -129,7 +129,7 @@ class Telemetry:
         return (self.last_row_time_ns + offset) / 1e9
 
 
-ARRAYS: dict[str, StoredArray] = {
+ARRAYS: dict[str, ArrayStorage] = {
     item.name: item.metadata["stored"] for item in fields(Telemetry) if item.metadata
 }
 

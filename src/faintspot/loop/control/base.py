@@ -23,7 +23,7 @@ SETTLE_FRAMES = 200
 """Frames after which a controller has settled; predictive filters take longer than integrators."""
 
 
-class Expected(NamedTuple):
+class ExpectedSlopes(NamedTuple):
     """Predicted slopes of the next frame, the prior of an estimator."""
 
     mean_px: Floats
@@ -61,9 +61,9 @@ class Controller:
     def __init__(self, line: CommandDelayLine, interaction: Floats) -> None:
         self.line, self._interaction = line, interaction
 
-    def expected(self) -> Expected:
+    def expected(self) -> ExpectedSlopes:
         """Return the predicted slopes of this frame; here as if the latest command were right for it."""
-        return Expected(self._interaction @ (self.line.acting - self.line.latest), None)
+        return ExpectedSlopes(self._interaction @ (self.line.acting - self.line.latest), None)
 
     def begin(self) -> None:
         """Restart from the commands on the delay line, without the memory of earlier frames."""

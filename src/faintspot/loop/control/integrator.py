@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Controller, Expected
+from faintspot.loop.control.base import Controller, ExpectedSlopes
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.reconstructor import Reconstructor
 
@@ -47,11 +47,11 @@ class Integrator(Controller):
         self._reconstructor, self._gain, self._leak = reconstructor, gain, leak
         self._weighted, self._sees_mirror = weighted, sees_mirror
 
-    def expected(self) -> Expected:
+    def expected(self) -> ExpectedSlopes:
         """See `Controller`."""
-        return (
-            super().expected() if self._sees_mirror else Expected(self._interaction @ -self.line.latest, None)
-        )
+        if self._sees_mirror:
+            return super().expected()
+        return ExpectedSlopes(self._interaction @ -self.line.latest, None)
 
     def update(
         self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None

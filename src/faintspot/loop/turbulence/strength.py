@@ -32,7 +32,7 @@ _TO_R0 = 3 / 5
 
 
 @dataclass(frozen=True)
-class Strength:
+class TurbulenceStrength:
     """Fried parameter and outer scale with standard errors."""
 
     r0_m: float
@@ -51,7 +51,7 @@ def turbulence_strength(
     gain_error: float = 0.0,
     gain_spread: float = 0.0,
     outer_scale_m: float | None = None,
-) -> Strength:
+) -> TurbulenceStrength:
     """Return r0 and the outer scale.
 
     Parameters
@@ -82,7 +82,7 @@ def turbulence_strength(
     measured = [(basis, _signal(atmosphere @ basis, run)) for basis in degrees]
     usable = [(number, basis, signal) for number, (basis, signal) in enumerate(measured, 1) if signal > 0]
     if not usable:
-        return Strength(math.nan, math.nan, outer_scale_m or OUTER_SCALE_M, math.nan)
+        return TurbulenceStrength(math.nan, math.nan, outer_scale_m or OUTER_SCALE_M, math.nan)
     number, modes, signal = zip(*usable, strict=True)
     change = [_of_gain(atmosphere @ basis, residual @ basis, run) for basis in modes]
     sampling = [_sampling(atmosphere @ basis, run, value) for basis, value in zip(modes, signal, strict=True)]
@@ -93,7 +93,7 @@ def turbulence_strength(
     return _fitted(np.log(signal), theory, covariance, outer_scale_m)
 
 
-def _fitted(signal: Floats, theory: Floats, covariance: Floats, known_m: float | None) -> Strength:
+def _fitted(signal: Floats, theory: Floats, covariance: Floats, known_m: float | None) -> TurbulenceStrength:
     """Return mean and standard deviation over outer scales of the strength that fits best.
 
     `signal` and `theory` (scales, degrees) are logarithms of variances, the latter for r0 = 1 m.
@@ -112,7 +112,7 @@ def _fitted(signal: Floats, theory: Floats, covariance: Floats, known_m: float |
     error = _TO_R0 * math.sqrt(float(part @ (strength - mean) ** 2) + 1 / inverse.sum())
     r0, outer = math.exp(-_TO_R0 * mean), math.exp(scale)
     spread = math.sqrt(float(part @ (np.log(scales) - scale) ** 2))
-    return Strength(r0, r0 * math.hypot(error, _COMMON_ERROR), outer, outer * spread)
+    return TurbulenceStrength(r0, r0 * math.hypot(error, _COMMON_ERROR), outer, outer * spread)
 
 
 def _degrees(site: SlopeTurbulence) -> list[Floats]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between, numbers_between, real_array
 from faintspot.base.config.options import TEXTS, number, setting
-from faintspot.base.config.tables import Table, Tables, is_map, save_tables
+from faintspot.base.config.tables import ConfigurationTable, Tables, is_map, save_tables
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import derived
 from faintspot.base.npz import save_arrays
@@ -77,7 +77,7 @@ def _mask_or_list(name: str, value: Any) -> NDArray[Any]:
 
 
 @dataclass(frozen=True)
-class Calibration(Table, table="calibration"):
+class Calibration(ConfigurationTable, table="calibration"):
     """Conversion of raw frames to electrons: (raw - dark) * gain_e_per_adu / (em_gain * flat); immutable.
 
     Parameters

@@ -14,7 +14,7 @@ from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.camera.dark_frames import DarkPixels, dark_pixels
-from faintspot.slopes.camera.transfer_curve import Curve, Line, fit_line, halves_of, photon_transfer, within
+from faintspot.slopes.camera.transfer_curve import LineFit, TransferCurve, fit_line, photon_transfer
 from faintspot.slopes.sensor.layout import Layout
 
 Floats = NDArray[np.float64]
@@ -155,12 +155,12 @@ def measure_detector(
         if np.shape(dark.level) != stack.shape[1:]:
             raise InputError(f"darks: expected frames of {stack.shape[1:]}, got {np.shape(dark.level)}")
     everything = photon_transfer(stack, dark.level, layout)
-    curve = within(everything, range_adu)
+    curve = everything.within(range_adu)
     line = fit_line(curve)
     if darks is None:
         read_noise = _read_noise_without_darks(everything, line)
-    coarse = fit_line(within(photon_transfer(stack, dark.level, layout, order=1), range_adu))
-    halves = tuple(fit_line(half) for half in halves_of(curve))
+    coarse = fit_line(photon_transfer(stack, dark.level, layout, order=1).within(range_adu))
+    halves = tuple(fit_line(half) for half in curve.halves())
     notes.append("gain: slope of variance against mean")
     problem = _problem(line, coarse, halves)
     return _result(dark, read_noise, line, halves, multiplication, notes, problem)
@@ -199,7 +199,7 @@ def _dark_without_darks(frames: Floats, dark_level_adu: float | None) -> tuple[_
     return _Dark(level, level, noise), "dark level: darkest percent of the frames, with stray light"
 
 
-def _read_noise_without_darks(curve: Curve, line: Line | None) -> _Value:
+def _read_noise_without_darks(curve: TransferCurve, line: LineFit | None) -> _Value:
     """Estimate the read noise from the darkest pixels, less the photon noise that the line gives."""
     darkest = curve.mean <= np.quantile(curve.mean, _DARKEST_FOR_NOISE)
     # The median of a chi-squared distribution lies below its mean.
@@ -216,8 +216,8 @@ def _read_noise_without_darks(curve: Curve, line: Line | None) -> _Value:
 def _result(
     dark: _Dark,
     read_noise: _Value,
-    line: Line | None,
-    halves: tuple[Line | None, ...],
+    line: LineFit | None,
+    halves: tuple[LineFit | None, ...],
     em_gain: float,
     notes: list[str],
     problem: str | None = None,
@@ -246,7 +246,7 @@ def _result(
     )
 
 
-def _gain(line: Line | None, em_gain: float) -> _Value | None:
+def _gain(line: LineFit | None, em_gain: float) -> _Value | None:
     """Return electrons per ADU and its error: the variance in ADU is excess * em_gain * flux / gain."""
     if line is None or line.slope <= 0:
         return None
@@ -254,7 +254,7 @@ def _gain(line: Line | None, em_gain: float) -> _Value | None:
     return _Value(gain, gain * line.slope_error / line.slope)
 
 
-def _problem(line: Line | None, coarse: Line | None, halves: tuple[Line | None, ...]) -> str | None:
+def _problem(line: LineFit | None, coarse: LineFit | None, halves: tuple[LineFit | None, ...]) -> str | None:
     """Return the reason why the gain is not reliable, or None.
 
     If second derivatives of the image affect the residuals of movements, third ones may do so, too.

@@ -22,7 +22,7 @@ _ITERATIONS = 20
 _LARGEST_EXCESS = 10.0  # times the expected variance: pixels above it are ignored as flickering
 
 
-class Curve(NamedTuple):
+class TransferCurve(NamedTuple):
     """Photon-transfer curve, one point per pixel: expected variance = intercept * share + slope * flux."""
 
     variance: Floats
@@ -31,8 +31,31 @@ class Curve(NamedTuple):
     mean: Floats  # plain mean above the dark level
     degrees: float  # degrees of freedom of each variance
 
+    def within(self, range_adu: tuple[float, float] | None) -> TransferCurve:
+        """Return the pixels whose mean above the dark level is in a range (lowest, highest); None: all."""
+        if range_adu is None:
+            return self
+        limits = numbers_between("range_adu", range_adu)
+        if limits.shape != (2,) or limits[0] >= limits[1]:
+            raise InputError(f"range_adu: expected (lowest, highest), got {range_adu!r}")
+        inside = (self.mean >= limits[0]) & (self.mean <= limits[1])
+        if np.count_nonzero(inside) < 2 * _GROUPS:
+            raise InputError(f"range_adu = {range_adu!r}: expected at least {2 * _GROUPS} pixels in it")
+        return self._chosen(inside)
 
-class Line(NamedTuple):
+    def _chosen(self, pixels: NDArray[np.bool_]) -> TransferCurve:
+        variance, share, flux, mean = (values[pixels] for values in self[:4])
+        return TransferCurve(variance, share, flux, mean, self.degrees)
+
+    def halves(self) -> tuple[TransferCurve, TransferCurve]:
+        """Split the pixels so that the fainter ones have half of the flux."""
+        order = np.argsort(self.mean)
+        collected = np.cumsum(np.maximum(self.mean[order], 0.0))
+        split = self.mean[order][np.searchsorted(collected, 0.5 * collected[-1])]
+        return self._chosen(self.mean < split), self._chosen(self.mean >= split)
+
+
+class LineFit(NamedTuple):
     """Line through the points of a curve."""
 
     slope: float
@@ -40,7 +63,7 @@ class Line(NamedTuple):
     scatter: float  # mean square of bright pixels about the line, 1 for normal noise
 
 
-def photon_transfer(frames: Floats, dark_level: Any, layout: Layout | None, order: int = 2) -> Curve:
+def photon_transfer(frames: Floats, dark_level: Any, layout: Layout | None, order: int = 2) -> TransferCurve:
     """Return the variance of each pixel after removal of the common changes of its tile.
 
     The residual of a fit with orthonormal modes Q has the variance sum_j (1 - Q Q')_ij^2 v_j, which is
@@ -66,7 +89,7 @@ def photon_transfer(frames: Floats, dark_level: Any, layout: Layout | None, orde
     n = len(differences)
     # Successive differences share a frame: their squares are correlated by 1/4.
     variance, share, weighted, plain = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return Curve(variance, share, weighted, plain, n**2 / (1.5 * n - 0.5))
+    return TransferCurve(variance, share, weighted, plain, n**2 / (1.5 * n - 0.5))
 
 
 def _derivative(image: Floats, axis: int) -> Floats:
@@ -92,33 +115,7 @@ def _tiles(shape: tuple[int, ...], layout: Layout | None) -> list[tuple[slice, s
     ]
 
 
-def within(curve: Curve, range_adu: tuple[float, float] | None) -> Curve:
-    """Return the pixels whose mean above the dark level is in a range (lowest, highest); None: all."""
-    if range_adu is None:
-        return curve
-    limits = numbers_between("range_adu", range_adu)
-    if limits.shape != (2,) or limits[0] >= limits[1]:
-        raise InputError(f"range_adu: expected (lowest, highest), got {range_adu!r}")
-    inside = (curve.mean >= limits[0]) & (curve.mean <= limits[1])
-    if np.count_nonzero(inside) < 2 * _GROUPS:
-        raise InputError(f"range_adu = {range_adu!r}: expected at least {2 * _GROUPS} pixels in it")
-    return _chosen(curve, inside)
-
-
-def _chosen(curve: Curve, pixels: NDArray[np.bool_]) -> Curve:
-    variance, share, flux, mean = (values[pixels] for values in curve[:4])
-    return Curve(variance, share, flux, mean, curve.degrees)
-
-
-def halves_of(curve: Curve) -> tuple[Curve, Curve]:
-    """Split the pixels so that the fainter ones have half of the flux."""
-    order = np.argsort(curve.mean)
-    collected = np.cumsum(np.maximum(curve.mean[order], 0.0))
-    split = curve.mean[order][np.searchsorted(collected, 0.5 * collected[-1])]
-    return _chosen(curve, curve.mean < split), _chosen(curve, curve.mean >= split)
-
-
-def fit_line(curve: Curve) -> Line | None:
+def fit_line(curve: TransferCurve) -> LineFit | None:
     """Fit variance = intercept * share + slope * flux; standard errors by jackknife over groups of pixels."""
     terms = np.stack([curve.share, curve.flux], axis=1)
     n = len(terms)
@@ -144,7 +141,7 @@ def fit_line(curve: Curve) -> Line | None:
     error = math.sqrt((_GROUPS - 1) * float(np.var(without[:, 1])))
     counted = good & (curve.mean >= bright)
     scatter = np.mean(np.square(curve.variance / model - 1)[counted]) if counted.any() else 0.0
-    return Line(float(solution[1]), error, float(scatter) * curve.degrees / 2)
+    return LineFit(float(solution[1]), error, float(scatter) * curve.degrees / 2)
 
 
 def _solve(weighted: Floats, terms: Floats, variance: Floats) -> Floats:

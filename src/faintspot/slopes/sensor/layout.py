@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, number_between, numbers_between
 from faintspot.base.config.options import TEXTS, number, setting
-from faintspot.base.config.tables import Table
+from faintspot.base.config.tables import ConfigurationTable
 from faintspot.base.errors import DoubtWarning, InputError, errors_within
 from faintspot.base.sizes import check_size
 from faintspot.base.toml_files import check_keys, checked_table
@@ -38,7 +38,7 @@ _optics = partial(number, None, 0.0, _LARGEST_PX, low_open=True)
 
 
 @dataclass(frozen=True)
-class Layout(Table, table="layout"):
+class Layout(ConfigurationTable, table="layout"):
     """Positions of the sub-apertures: one window of the same size for each illuminated lenslet.
 
     Parameters

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import numbers_between
 from faintspot.base.config.options import FLAG, REQUIRED, number, setting
-from faintspot.base.config.tables import Table
+from faintspot.base.config.tables import ConfigurationTable
 from faintspot.base.errors import InputError, errors_within
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.sensor.layout import Layout
@@ -36,7 +36,7 @@ def _position(name: str, value: Any) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True, eq=False)
-class LaserSpots(Table, table="laser"):
+class LaserSpots(ConfigurationTable, table="laser"):
     """Laser guide star of a sensor.
 
     Parameters

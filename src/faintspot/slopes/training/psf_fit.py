@@ -46,7 +46,7 @@ _PRODUCTS = tuple(
 _DEVIATIONS = (0.05, 0.15, 0.5, 2.0)
 
 
-class Fit(NamedTuple):
+class PSFFit(NamedTuple):
     """A PSF on the fine grid, and the background left in the images, electrons per pixel."""
 
     plane: Floats
@@ -62,7 +62,7 @@ def spline_basis(at: Floats, radius_px: float, nodes_per_px: float) -> Floats:
     return basis
 
 
-def fit_psf(sums: Sums, form: Form, radius_px: float) -> Fit:
+def fit_psf(sums: Sums, form: Form, radius_px: float) -> PSFFit:
     """Return the PSF of a given form that fits best, point-symmetric."""
     symmetric = sums.folded(lambda plane: plane[::-1, ::-1])
     moments = core_moments(symmetric)
@@ -75,7 +75,7 @@ def fit_psf(sums: Sums, form: Form, radius_px: float) -> Fit:
     return _with_deviation(symmetric, fit, form.deviation, radius_px) if form.deviation > 0 else fit
 
 
-def held_out_loss(sums: Sums, fit: Fit) -> float:
+def held_out_loss(sums: Sums, fit: PSFFit) -> float:
     """Return the weighted square of what a fit to other spots leaves, but for a constant."""
     b = fit.background_e
     flux = sums.square * fit.plane**2 - 2 * fit.plane * (sums.product - b * sums.cross)
@@ -143,7 +143,7 @@ def _turned(sums: Sums, angle: float) -> Sums:
     return Sums(square, cross, product, sums.weight, sums.image)
 
 
-def _product(sums: Sums, form: Form, radius_px: float, angle: float, stds: Floats) -> Fit:
+def _product(sums: Sums, form: Form, radius_px: float, angle: float, stds: Floats) -> PSFFit:
     """Alternate least squares for both profiles and the background; mirror-symmetric along both axes."""
     turned = _turned(sums, angle).folded(lambda plane: plane[:, ::-1])
     if form.square:
@@ -160,10 +160,10 @@ def _product(sums: Sums, form: Form, radius_px: float, angle: float, stds: Float
         profile_y, background = _profile(_transposed(turned), profile_x, basis, nodes[1], form.bend)
     if angle == 0.0:
         plane = np.outer(profile_y, profile_x)
-        return Fit(0.5 * (plane + plane.T) if form.square else plane, background)
+        return PSFFit(0.5 * (plane + plane.T) if form.square else plane, background)
     y, x = np.meshgrid(u, u, indexing="ij")
     along = np.interp(np.cos(angle) * x + np.sin(angle) * y, u, profile_x, 0, 0)
-    return Fit(along * np.interp(np.cos(angle) * y - np.sin(angle) * x, u, profile_y, 0, 0), background)
+    return PSFFit(along * np.interp(np.cos(angle) * y - np.sin(angle) * x, u, profile_y, 0, 0), background)
 
 
 def _transposed(sums: Sums) -> Sums:
@@ -193,7 +193,7 @@ def _profile(sums: Sums, other: Floats, basis: Floats, gaussian: Floats, bend: f
     return 0.5 * (profile + profile[::-1]), float(solution[n])
 
 
-def _with_deviation(sums: Sums, fit: Fit, deviation: float, radius_px: float) -> Fit:
+def _with_deviation(sums: Sums, fit: PSFFit, deviation: float, radius_px: float) -> PSFFit:
     """Add to the product what the data say beyond it, shrunk towards nothing; point-symmetric."""
     product, background = fit
     u = offsets(len(product))
@@ -216,7 +216,7 @@ def _with_deviation(sums: Sums, fit: Fit, deviation: float, radius_px: float) ->
     coefficients = np.concatenate([first, first[-2::-1]]).reshape(n, n)
     plane = product + basis @ coefficients @ basis.T
     background = (sums.image - float((sums.cross * plane).sum())) / max(sums.weight, _TINY)
-    return Fit(0.5 * (plane + plane[::-1, ::-1]), background)
+    return PSFFit(0.5 * (plane + plane[::-1, ::-1]), background)
 
 
 def _normal_matrix(square: Floats, basis: Floats) -> Floats:

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from faintspot.base.errors import InputError
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.training.psf_fit import FIRST_FORM, Form, choose_form, fit_psf, samples_of
-from faintspot.slopes.training.registration import Floats, Registered, Stack, Tables, register, start
+from faintspot.slopes.training.registration import Floats, PSFTables, Registered, Stack, register, start
 from faintspot.slopes.training.stacking import Sums, stack_spots
 
 _START_WIDTHS_PX = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
@@ -102,7 +102,7 @@ def learn(
 
 def registered(stack: Stack, index: NDArray[np.int64], state: State, options: LearningOptions) -> State:
     """Return the state with the spots measured anew."""
-    tables = Tables.of(state.psf, options.radius_px)
+    tables = PSFTables.of(state.psf, options.radius_px)
     images = stack.without(state.background_e[index])
     spots, steps = state.spots, _LATER_STEPS
     if spots is None:
@@ -131,7 +131,7 @@ def stacked(
     count = np.bincount(index[good], minlength=len(state.psf.samples))
     sums = stack_spots(
         stack.part(good),
-        Tables.of(state.psf, options.radius_px),
+        PSFTables.of(state.psf, options.radius_px),
         index[good],
         state.spots.part(good),
         state.background_e,
@@ -156,7 +156,7 @@ def refitted(
     if choose and enough.any():
         compared = rng.permutation(np.flatnonzero(enough))[:_PSFS_COMPARED]
         form = choose_form([sums[i] for i in compared], float(count[compared].sum()), options.radius_px)
-    before = Tables.of(state.psf, options.radius_px).value.astype(np.float64)
+    before = PSFTables.of(state.psf, options.radius_px).value.astype(np.float64)
     samples, background = [], state.background_e.copy()
     for i, (first, second) in enumerate(sums):
         plane = before[i]

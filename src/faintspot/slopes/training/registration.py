@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 from faintspot.slopes.spots.psf import PSF
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 FINE = 8
 """Nodes per pixel of the tables that PSFs are read from and stacked on."""
@@ -57,7 +58,7 @@ class Stack:
 
 
 @dataclass(frozen=True)
-class Tables:
+class PSFTables:
     """PSFs and their slopes at every `FINE`-th of a pixel, with a border of zeros: (n_psfs, side, side)."""
 
     value: NDArray[np.float32]
@@ -65,7 +66,7 @@ class Tables:
     slope_y: NDArray[np.float32]
 
     @classmethod
-    def of(cls, psf: PSF, radius_px: int) -> Tables:
+    def of(cls, psf: PSF, radius_px: int) -> PSFTables:
         """Read a PSF on the fine grid, out to a radius."""
         side = 2 * radius_px + 3
         phases = np.arange(FINE) / FINE
@@ -84,7 +85,7 @@ class Tables:
         """Row and column of offset 0."""
         return int(self.value.shape[1] - 1) // 2
 
-    def cells(self, shape: tuple[int, ...], positions: Floats) -> tuple[NDArray[Any], NDArray[Any]]:
+    def cells(self, shape: tuple[int, ...], positions: Floats) -> tuple[Integers, Integers]:
         """Return row (n, ny) and column (n, nx) of the table for the pixels of spots at these positions."""
         nearest = np.rint(positions * FINE).astype(np.int64)
         rows, columns = (
@@ -132,7 +133,7 @@ class Registered:
         return drawn
 
 
-def start(stack: Stack, tables: Tables, index: NDArray[Any], fwhm_px: Floats, search_px: float) -> Registered:
+def start(stack: Stack, tables: PSFTables, index: Integers, fwhm_px: Floats, search_px: float) -> Registered:
     """Return the largest pixel of the smoothed images, with the flux its height tells."""
     n, ny, nx = stack.images.shape
     positions, flux = np.zeros((n, 2)), np.ones(n)
@@ -152,7 +153,7 @@ def start(stack: Stack, tables: Tables, index: NDArray[Any], fwhm_px: Floats, se
 
 
 def register(
-    stack: Stack, tables: Tables, index: NDArray[Any], spots: Registered, search_px: float, steps: int
+    stack: Stack, tables: PSFTables, index: Integers, spots: Registered, search_px: float, steps: int
 ) -> Registered:
     """Return positions and fluxes after that many steps of Fisher scoring from those of `spots`.
 
@@ -176,7 +177,7 @@ def weights(stack: Stack, model: NDArray[Any], flux: Floats) -> NDArray[np.float
 
 
 def _fisher_step(
-    stack: Stack, tables: Tables, kinds: NDArray[Any], spots: Registered, search_px: float
+    stack: Stack, tables: PSFTables, kinds: Integers, spots: Registered, search_px: float
 ) -> Registered:
     """One step in x, y and flux, each bounded; the covariance is that at the step's start."""
     positions, flux = spots.positions, spots.flux_e

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.slopes.training.registration import FINE, Floats, Registered, Stack, Tables, weights
+from faintspot.slopes.training.registration import FINE, Floats, PSFTables, Registered, Stack, weights
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Sums:
 
 def stack_spots(
     stack: Stack,
-    tables: Tables,
+    tables: PSFTables,
     index: NDArray[Any],
     registered: Registered,
     background_e: Floats,

@@ -8,7 +8,7 @@ import pytest
 
 from faintspot.base.json_text import plain_values
 from faintspot.loop.control.identification.measured import Measured, outer_scale_and_r0
-from faintspot.loop.turbulence.strength import Strength
+from faintspot.loop.turbulence.strength import TurbulenceStrength
 
 
 def test_interval() -> None:
@@ -25,7 +25,7 @@ def test_interval() -> None:
 
 
 def test_slopes_of_noise_alone_tell_no_r0() -> None:
-    outer, r0 = outer_scale_and_r0(Strength(math.nan, math.nan, math.nan, math.nan))
+    outer, r0 = outer_scale_and_r0(TurbulenceStrength(math.nan, math.nan, math.nan, math.nan))
     assert math.isnan(outer.value)
     assert math.isnan(r0.value)
     assert "no more than their noise" in r0.remark

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.turbulence.strength import OUTER_SCALE_M, Strength
+from faintspot.loop.turbulence.strength import OUTER_SCALE_M, TurbulenceStrength
 
 Floats = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ def wind_errors(identified: Identified) -> Floats:
     return np.hypot(identified.wind_error_m_per_s, _WIND_ERROR * identified.turbulence.subaperture_m)
 
 
-def outer_scale_and_r0(strength: Strength, known_scale_m: float | None = None) -> list[Measured]:
+def outer_scale_and_r0(strength: TurbulenceStrength, known_scale_m: float | None = None) -> list[Measured]:
     """Return the outer scale, where it is known with this value, and r0."""
     remark = f"{OUTER_SCALE_M:g} m within a factor of two was expected" if known_scale_m is None else "given"
     name, unit = R0, "m"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Expected
+from faintspot.loop.control.base import ExpectedSlopes
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.kalman.choice import CHOSEN
 from faintspot.loop.control.kalman.guarded import GuardedController
@@ -107,13 +107,13 @@ class CompiledKalman(GuardedController):
         self._held_at = -1
         """Position of the delay line at which the acting command was turned into slopes."""
 
-    def expected(self) -> Expected:
+    def expected(self) -> ExpectedSlopes:
         """See `Controller`."""
         self.complete()
         rows = self._memory.slopes
         if self._guard[CHOSEN]:
-            return Expected(rows[HELD] - rows[LATEST_PLAIN], None)
-        return Expected(rows[HELD] + rows[PREDICTED], self._std_px)
+            return ExpectedSlopes(rows[HELD] - rows[LATEST_PLAIN], None)
+        return ExpectedSlopes(rows[HELD] + rows[PREDICTED], self._std_px)
 
     def begin(self) -> None:
         """See `Controller`; open-loop slopes are assumed to equal the mirror's correction."""

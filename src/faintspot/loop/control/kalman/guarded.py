@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Controller, Expected
+from faintspot.loop.control.base import Controller, ExpectedSlopes
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.kalman.choice import (
     BLENDED,
@@ -151,11 +151,11 @@ class Guarded(GuardedController):
         self._phase, makers = phase, (learnt, plain)
         self._controllers = [make(own_line) for make, own_line in zip(makers, self._lines, strict=True)]
 
-    def expected(self) -> Expected:
+    def expected(self) -> ExpectedSlopes:
         """See `Controller`."""
         mean, std = self._controllers[self.chosen].expected()
         offset = self.line.acting - self._lines[self.chosen].acting
-        return Expected(mean + self._interaction @ offset, std)
+        return ExpectedSlopes(mean + self._interaction @ offset, std)
 
     def begin(self) -> None:
         """See `Controller`."""

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Expected
+from faintspot.loop.control.base import ExpectedSlopes
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.local_covariance import replies
@@ -103,12 +103,12 @@ class LargeGuarded(GuardedController):
         """The previous frame, while it is not complete."""
         self._restarted = True
 
-    def expected(self) -> Expected:
+    def expected(self) -> ExpectedSlopes:
         """See `Controller`."""
         self.complete()
         if self._chosen == _PLAIN:
-            return Expected(self._held - self._of_line(_PLAIN, 0), None)
-        return Expected(self._predicted, self._predictor.std_px)
+            return ExpectedSlopes(self._held - self._of_line(_PLAIN, 0), None)
+        return ExpectedSlopes(self._predicted, self._predictor.std_px)
 
     def begin(self) -> None:
         """See `Controller`; open-loop slopes are assumed to equal the mirror's correction."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Controller, Expected, Predictor
+from faintspot.loop.control.base import Controller, ExpectedSlopes, Predictor
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.loop.control.noise import add_noise
@@ -90,10 +90,10 @@ class Predictive(Controller):
         super().__init__(line, interaction)
         self.predictor, self._reconstruct, self._from_latest = predictor, reconstruct, from_latest
 
-    def expected(self) -> Expected:
+    def expected(self) -> ExpectedSlopes:
         """See `Controller`."""
         mean = self.predictor.mean_px + self._interaction @ self.line.acting
-        return Expected(mean, self.predictor.std_px)
+        return ExpectedSlopes(mean, self.predictor.std_px)
 
     def begin(self) -> None:
         """See `Controller`; open-loop slopes are assumed to equal the mirror's correction."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.base.config.tables import Table, tables_as_text
+from faintspot.base.config.tables import ConfigurationTable, tables_as_text
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.sizes import check_size
 from faintspot.base.toml_files import check_keys, check_known, checked_table, parse_file, parse_text
@@ -231,7 +231,7 @@ class LoopConfiguration:
             return cls(**{**document, **sections})
 
 
-SECTIONS: dict[str, type[Table]] = {
+SECTIONS: dict[str, type[ConfigurationTable]] = {
     "telescope": Telescope,
     "sensor": SensorParameters,
     "mirror": Mirror,

@@ -9,7 +9,7 @@ import numpy as np
 
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.config.options import LIST, number
-from faintspot.base.config.tables import Table
+from faintspot.base.config.tables import ConfigurationTable
 from faintspot.base.errors import InputError
 from faintspot.slopes.spots.sodium import SodiumProfile, integration_points
 
@@ -17,7 +17,7 @@ _STEPS = 8  # between two altitudes
 
 
 @dataclass(frozen=True)
-class Laser(Table, table="laser"):
+class Laser(ConfigurationTable, table="laser"):
     """Laser guide star: the sensor's spots are images of a sodium layer that changes with time.
 
     Raises
@@ -87,7 +87,7 @@ class Laser(Table, table="laser"):
 
 
 @dataclass(frozen=True)
-class NaturalStar(Table, table="natural_star"):
+class NaturalStar(ConfigurationTable, table="natural_star"):
     """Natural star for tip, tilt and slow focus beside a laser guide star.
 
     Its sensor sees the mean gradients over the quadrants of the pupil after the mirror, with photon noise.

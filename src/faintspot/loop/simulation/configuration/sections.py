@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from faintspot.base.config.options import FLAG, LIST, NUMBER_OR_LIST, number, setting
-from faintspot.base.config.tables import Table
+from faintspot.base.config.tables import ConfigurationTable
 from faintspot.loop.control.base import LEARNT, WINDS
 from faintspot.slopes.simulate.photometry import DEFAULT_BAND, ZERO_POINTS
 
@@ -13,7 +13,7 @@ CLOSED, OPEN = "closed", "open"
 
 
 @dataclass(frozen=True)
-class Telescope(Table, table="telescope"):
+class Telescope(ConfigurationTable, table="telescope"):
     """Pupil of the telescope."""
 
     diameter_m: float = number(4.2, 0.05, 100.0)
@@ -22,7 +22,7 @@ class Telescope(Table, table="telescope"):
 
 
 @dataclass(frozen=True)
-class SensorParameters(Table, table="sensor"):
+class SensorParameters(ConfigurationTable, table="sensor"):
     """Shack-Hartmann sensor."""
 
     subapertures: int = number(7, 1, 200, whole=True)
@@ -43,7 +43,7 @@ class SensorParameters(Table, table="sensor"):
 
 
 @dataclass(frozen=True)
-class Mirror(Table, table="mirror"):
+class Mirror(ConfigurationTable, table="mirror"):
     """Deformable mirror."""
 
     actuators: int | None = number(None, 2, 201, whole=True)
@@ -55,7 +55,7 @@ class Mirror(Table, table="mirror"):
 
 
 @dataclass(frozen=True)
-class Atmosphere(Table, table="atmosphere"):
+class Atmosphere(ConfigurationTable, table="atmosphere"):
     """Layers of frozen turbulence moved by the wind; the star is on axis, so altitudes do not matter."""
 
     r0_m: float | tuple[float, float] = number(0.15, 0.01, 1e3, kind=NUMBER_OR_LIST)
@@ -71,7 +71,7 @@ class Atmosphere(Table, table="atmosphere"):
 
 
 @dataclass(frozen=True)
-class Camera(Table, table="camera"):
+class Camera(ConfigurationTable, table="camera"):
     """The sensor's camera and the star's flux on it; as `faintspot.slopes.simulate.Detector`."""
 
     photons_per_subaperture: float | None = number(None, 0.0, 1e9, low_open=True)
@@ -95,7 +95,7 @@ class Camera(Table, table="camera"):
 
 
 @dataclass(frozen=True)
-class ControlParameters(Table, table="control"):
+class ControlParameters(ConfigurationTable, table="control"):
     """Control loop."""
 
     frame_rate_hz: float = number(250.0, 0.0, 1e5, low_open=True)
@@ -119,14 +119,14 @@ class ControlParameters(Table, table="control"):
 
 
 @dataclass(frozen=True)
-class Science(Table, table="science"):
+class Science(ConfigurationTable, table="science"):
     """Wavelength and field of the Strehl ratio, on axis."""
 
     wavelength_m: float = number(1.65e-6, 1e-7, 1e-4)
 
 
 @dataclass(frozen=True)
-class RunLength(Table, table="run"):
+class RunLength(ConfigurationTable, table="run"):
     """Length and number of runs."""
 
     frames: int = number(1500, 1, 10_000_000, whole=True)

@@ -48,7 +48,7 @@ _LIKE = 0.6
 
 
 @dataclass(frozen=True)
-class Fit:
+class LatticeFit:
     """Lattice fitted to the spots, with measurements at its nodes and their illumination.
 
     `bright` are all spots as bright as the illuminated ones, `elsewhere` those of them at no
@@ -99,7 +99,7 @@ def best_fit(
     pitch_range_px: tuple[float, float],
     illuminated_fraction: float | None,
     pupil: PupilRegion | None,
-) -> Fit | None:
+) -> LatticeFit | None:
     """Return the fit of the candidate lattice that explains the spots best, or None without one."""
     if not np.ptp(image) > 0:
         return None
@@ -131,7 +131,7 @@ def _fitted(
     lattice: Lattice,
     illuminated_fraction: float | None,
     pupil: PupilRegion | None,
-) -> Fit:
+) -> LatticeFit:
     """Fit the lattice to the spots; if some are left over, follow them from neighbour to neighbour."""
     width_px = spot_width(image, lattice)
     for _ in range(_FIT_PASSES):
@@ -164,7 +164,7 @@ def _fitted(
     return fit
 
 
-def _unclear(fit: Fit) -> str:
+def _unclear(fit: LatticeFit) -> str:
     """Return a one-line warning if the lattice explains only a part of the spots."""
     if fit.explained > _CERTAIN or fit.explained == 0:
         return ""
@@ -184,7 +184,7 @@ def _illuminated_of(
     illuminated_fraction: float | None,
     everywhere: SpotFlux,
     drift: Drift = no_drift,
-) -> Fit:
+) -> LatticeFit:
     """Decide which lenslets of a lattice are illuminated, and which bright spots belong to none of them."""
     spots = measure_nodes(image, lattice, width_px, drift)
     illuminated = find_illumination(spots, lattice, illuminated_fraction)
@@ -193,7 +193,7 @@ def _illuminated_of(
         bright = everywhere.positions[_bright(everywhere, spots, illuminated)]
         distance = as_tree(spots.positions[illuminated.nodes]).query(as_rows(bright))[0]
         elsewhere = bright[distance > _ELSEWHERE * lattice.pitch_px]
-    return Fit(lattice, width_px, spots, illuminated, bright, elsewhere, image.shape)
+    return LatticeFit(lattice, width_px, spots, illuminated, bright, elsewhere, image.shape)
 
 
 def _bright(everywhere: SpotFlux, spots: NodeFlux, illuminated: Illumination) -> NDArray[np.bool_]:

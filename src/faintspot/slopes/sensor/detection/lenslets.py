@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, number_between, one_of, real_array
 from faintspot.base.errors import InputError
-from faintspot.slopes.sensor.detection.fits import FEWEST, Fit, best_fit
+from faintspot.slopes.sensor.detection.fits import FEWEST, LatticeFit, best_fit
 from faintspot.slopes.sensor.detection.lattice import RATIOS, SMALLEST_PITCH_PX, Lattice, robust_std
 from faintspot.slopes.sensor.neighbours import as_rows, as_tree
 from faintspot.slopes.sensor.region import PupilRegion, Rectangle
@@ -139,7 +139,7 @@ def find_lenslets(
     geometries = tuple(RATIOS) if geometry == "auto" else (geometry,)
     pitch_range_px = _pitch_range(pitch_px, raw.shape)
 
-    def fitted(bad: NDArray[np.bool_]) -> tuple[NDArray[np.float64], Fit | None]:
+    def fitted(bad: NDArray[np.bool_]) -> tuple[NDArray[np.float64], LatticeFit | None]:
         image = np.where(bad, _median_of_good(raw, bad), raw)
         return image, best_fit(image, geometries, pitch_range_px, illuminated_fraction, circle)
 
@@ -244,7 +244,7 @@ def _mean_image(frames: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[np.floa
     return _robust_mean(finite_array("frame", frames))
 
 
-def _hot_on_lattice(hot: NDArray[np.bool_], fit: Fit) -> NDArray[np.bool_]:
+def _hot_on_lattice(hot: NDArray[np.bool_], fit: LatticeFit) -> NDArray[np.bool_]:
     """Return the hot pixels near nodes of a lattice, if there are so many that they must be sharp spots.
 
     Hot pixels are anywhere. Spots below 1 px look like them where the background is cut off at 0.
