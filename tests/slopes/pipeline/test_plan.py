@@ -158,7 +158,7 @@ class TestTables:
         psf, v, flux = fs.PSF.analytic(), 0.5, 40.0
         grid, spacing = spot_tables.posterior_grid(1.0, 1.9, (8, 8))
         made = spot_tables.posterior_tables(
-            psf, np.array([0]), np.array([flux]), np.array([v]), 1.0, grid, spacing, (8, 8), 16
+            psf, np.array([0]), np.array([flux]), np.array([v]), 1.0, (grid, spacing), (8, 8), 16
         )
         image = np.random.default_rng(2).poisson(psf.images([[0.2, -0.4]], (8, 8), flux)[0])
         mean = np.maximum(psf.images(grid, (8, 8), flux), 0.0)

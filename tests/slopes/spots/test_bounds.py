@@ -178,6 +178,8 @@ def test_wrong_values_are_refused() -> None:
         prior_std_px=[0.0],
     )
     assert_each_refused(cramer_rao, flux_e=[0.0])
+    with refused("psf: expected no size beside it"):
+        cramer_rao(10.0, psf=PSF.analytic(), size=1.2)
 
 
 def test_impossible_efficiencies_are_refused() -> None:

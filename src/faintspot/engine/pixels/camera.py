@@ -7,7 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +19,7 @@ from faintspot.base.sizes import check_size
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.simulate import Detector, sensor_frames
+from faintspot.slopes.spots.shapes import SpotShape
 
 _SPIN_NS = 150_000  # a sleep may overrun by this much; the last part is a busy wait
 _BETWEEN_REPORTS_NS = 100_000_000
@@ -101,6 +102,13 @@ class CameraReport:
     def frame_rate_hz(self) -> float:
         """Frames published per second."""
         return self.frames / self.seconds if self.seconds else 0.0
+
+
+class RowTimes(TypedDict, total=False):
+    """Options of a `Readout` that say when rows arrive."""
+
+    readout_fraction: float
+    rows_per_block: int
 
 
 class Readout(ABC):
@@ -245,8 +253,6 @@ class SimulatedCamera(Readout):
         Electrons per sub-aperture and frame, as for `faintspot.slopes.simulate.sensor_frames`.
     detector : Detector, optional
         Default: 1 e- read noise and nothing else.
-    Spot shape and width, as for `faintspot.slopes.spots.shapes`.
-        The spots, as for `faintspot.slopes.spots.shapes`.
     motion : SpotMotion, optional
     readout_fraction : float
         Part of the frame time in which the rows arrive one after another, 0 to 1. 0: all at once.
@@ -256,6 +262,8 @@ class SimulatedCamera(Readout):
         Number of frames that are simulated.
     rng : numpy.random.Generator, optional
         Generator of positions and noise.
+    **spot_shape
+        profile, size, elongation and angle_deg, see `faintspot.slopes.spots.shapes`.
 
     Attributes
     ----------
@@ -278,13 +286,12 @@ class SimulatedCamera(Readout):
         frame_rate_hz: float,
         flux_e: ArrayLike = 200.0,
         detector: Detector | None = None,
-        profile: str = "diffraction",
-        size: float = 1.0,
         motion: SpotMotion | None = None,
         readout_fraction: float = 0.8,
         rows_per_block: int = 4,
         n_distinct: int = 200,
         rng: np.random.Generator | None = None,
+        **spot_shape: Unpack[SpotShape],
     ) -> None:
         camera = Detector(read_noise_e=1.0) if detector is None else detector
         super().__init__(
@@ -305,11 +312,10 @@ class SimulatedCamera(Readout):
             layout.frame_shape,
             count,
             flux_e=flux_e,
-            profile=profile,
-            size=size,
             positions=moving.positions(count, len(layout), frame_rate_hz, motion_rng),
             detector=camera,
             rng=noise_rng,
+            **spot_shape,
         )
         self.frames.flags.writeable = self.truth.flags.writeable = False
 

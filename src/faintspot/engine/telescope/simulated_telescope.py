@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.camera import CameraReport, Readout, StopEvent, readout_type
+from faintspot.engine.pixels.camera import CameraReport, Readout, RowTimes, StopEvent, readout_type
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
 from faintspot.engine.streams.command_stream import CommandStream
@@ -75,16 +75,14 @@ class SimulatedTelescope(Readout, Closing):
     seed : int, optional
         Default: the configuration's.
     realisation : int
-    readout_fraction : float
-        Part of the frame time in which the rows arrive, 0 to 1.
-    rows_per_block : int, optional
-        Rows that are published together. Default: the rows of a sub-aperture.
     slots : int
         Frames in the ring.
     say : function, optional
         Called with a one-line message about the commands, and when the pace cannot be kept.
     keep_truth : function, optional
         Called with the values of `TRUTH` after each frame.
+    **rows
+        readout_fraction and rows_per_block [default: the rows of a sub-aperture], as for `Readout`.
 
     Attributes
     ----------
@@ -106,11 +104,10 @@ class SimulatedTelescope(Readout, Closing):
         *,
         seed: int | None = None,
         realisation: int = 0,
-        readout_fraction: float = 0.8,
-        rows_per_block: int | None = None,
         slots: int = 4,
         say: Callable[[str], None] | None = None,
         keep_truth: Callable[[tuple[float, ...]], None] | None = None,
+        **rows: Unpack[RowTimes],
     ) -> None:
         if configuration.camera.rolling_shutter:
             raise InputError("camera.rolling_shutter: expected 0, as this telescope knows no later commands")
@@ -129,9 +126,8 @@ class SimulatedTelescope(Readout, Closing):
                 layout.frame_shape,
                 dtype,
                 frame_rate_hz=configuration.control.frame_rate_hz,
-                readout_fraction=readout_fraction,
-                rows_per_block=layout.window[0] if rows_per_block is None else rows_per_block,
                 spins=False,  # the simulation needs the processor
+                **RowTimes({"rows_per_block": layout.window[0], **rows}),
             )
             self._frames = create_stream(f"{name}_frames", layout.frame_shape, dtype)
             undo.callback(self._frames.unlink)

@@ -278,16 +278,15 @@ def posterior_tables(
     flux_e: Floats,
     variance: Floats,
     excess: float,
-    grid: NDArray[np.float32],
-    spacing: float,
+    grid_and_spacing: tuple[NDArray[np.float32], float],
     window: tuple[int, int],
     width: int,
 ) -> PosteriorGrid:
-    """Compute the tables of the grid for each triple of a PSF, a flux and variances of the dark pixels.
+    """Compute the tables of a `posterior_grid` for triples of a PSF, a flux and variances of the dark pixels.
 
     Those are (n, ny, nx), or (n, 1, 1) where they are the same in all pixels.
     """
-    nx = window[1]
+    nx, (grid, spacing) = window[1], grid_and_spacing
     variance = np.maximum(variance, SMALLEST_VARIANCE)
     tables = np.zeros((len(flux_e), *posterior_shape(len(grid), window, width)), np.float32)
     constants = np.empty((len(flux_e), len(grid)), np.float32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
 from faintspot.slopes.camera.detector import Detector
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.shapes import image_shape, per_spot, spots
+from faintspot.slopes.spots.shapes import SpotShape, image_shape, per_spot, spots
 from faintspot.slopes.spots.speckled import LARGEST_D_OVER_R0, speckled_images
 
 _Images = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -26,15 +26,12 @@ def subapertures(
     *,
     shape: tuple[int, int] = (16, 16),
     flux_e: ArrayLike = 100.0,
-    profile: str = "diffraction",
-    size: ArrayLike = 1.0,
-    elongation: ArrayLike = 1.0,
-    angle_deg: ArrayLike = 0.0,
     position_range_px: float = 1.0,
     positions: ArrayLike | None = None,
     d_over_r0: float = 0.0,
     detector: Detector | None = None,
     rng: np.random.Generator | None = None,
+    **spot_shape: Unpack[SpotShape],
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Return noisy sub-aperture images in photo-electrons and the true positions of their spots.
 
@@ -51,8 +48,6 @@ def subapertures(
     flux_e : float or array_like, shape (n,)
         Electrons within the image of a centred spot. Farther out more flux is lost, as with a field stop;
         turbulence, which spreads the flux, increases the loss.
-    profile, size, elongation, angle_deg
-        Shape of the spots, see `faintspot.slopes.spots.shapes`.
     position_range_px : float
         True positions are uniform within plus and minus this, on each axis, px.
     positions : array_like, shape (n, 2), optional
@@ -67,6 +62,8 @@ def subapertures(
     rng : numpy.random.Generator, optional
         Generator from which separate ones for positions, noise and turbulence are spawned: the same seed
         gives the same positions for any detector and turbulence.
+    **spot_shape
+        profile, size, elongation and angle_deg, see `faintspot.slopes.spots.shapes`.
 
     Returns
     -------
@@ -97,9 +94,7 @@ def subapertures(
     phase_rng = spawn(rng, 1)[0] if turbulence else None
     truth = _true_positions(positions, position_range_px, (n, 2), position_rng)
     camera = _camera(detector)
-    spot = _values_of_spots(
-        n, (ny, nx), profile, flux_e, size=size, elongation=elongation, angle_deg=angle_deg
-    )
+    profile, spot = _values_of_spots(n, (ny, nx), flux_e, **spot_shape)
     if turbulence and (profile != "diffraction" or np.any(spot["elongation"] != 1)):
         raise InputError(f"d_over_r0 = {turbulence:g}: expected profile 'diffraction' and elongation 1")
     images = np.empty((n, ny, nx), dtype=np.float32)
@@ -129,16 +124,13 @@ def sensor_frames(
     n_frames: int,
     *,
     flux_e: ArrayLike = 100.0,
-    profile: str = "diffraction",
-    size: ArrayLike = 1.0,
-    elongation: ArrayLike = 1.0,
-    angle_deg: ArrayLike = 0.0,
     position_range_px: float = 1.0,
     positions: ArrayLike | None = None,
     psf: PSF | None = None,
     jitter_px: float = 0.0,
     detector: Detector | None = None,
     rng: np.random.Generator | None = None,
+    **spot_shape: Unpack[SpotShape],
 ) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """Return frames of a whole Shack-Hartmann sensor in ADU and the true positions of their spots.
 
@@ -157,8 +149,6 @@ def sensor_frames(
         Number of frames.
     flux_e : float or array_like, shape (n,)
         Electrons per frame within the window of a centred spot.
-    profile, size, elongation, angle_deg
-        Shape of the spots, see `faintspot.slopes.spots.shapes`; one number each or one per sub-aperture.
     position_range_px : float
         True positions are uniform within plus and minus this on each axis [px], independently in each frame.
     positions : array_like, shape (n, 2) or (n_frames, n, 2), optional
@@ -172,6 +162,9 @@ def sensor_frames(
         Default: 0.1 e- read noise and no other noise. Maps have the shape of the frame.
     rng : numpy.random.Generator, optional
         Generator from which separate ones for positions and noise are spawned.
+    **spot_shape
+        profile, size, elongation and angle_deg, see `faintspot.slopes.spots.shapes`; one number each or one
+        per sub-aperture.
 
     Returns
     -------
@@ -204,8 +197,10 @@ def sensor_frames(
     if jitter:  # spawned only if needed, as above
         truth += spawn(rng, 1)[0].normal(0.0, jitter, (n_frames, 1, 2))
     camera = _camera(detector)
-    form = {"profile": profile, "size": size, "elongation": elongation, "angle_deg": angle_deg}
-    images_of = _spots_of_psf(psf, n, window_shape, flux_e) if psf else _spots(n, window_shape, flux_e, form)
+    if psf and spot_shape:
+        raise InputError(f"psf: expected no {', '.join(spot_shape)} beside it")
+    sensor = n, window_shape, flux_e
+    images_of = _spots_of_psf(psf, *sensor) if psf else _spots(*sensor, spot_shape)
     blocks = []
     block = max(1, _BLOCK_PIXELS // max(rows * columns, pixels.size))
     for start in range(0, n_frames, block):
@@ -216,10 +211,9 @@ def sensor_frames(
     return np.concatenate(blocks), truth
 
 
-def _spots(n: int, shape: tuple[int, int], flux_e: ArrayLike, form: dict[str, Any]) -> _Images:
+def _spots(n: int, shape: tuple[int, int], flux_e: ArrayLike, spot_shape: SpotShape) -> _Images:
     """Return a function that makes the images of the spots of several frames at positions (frames, n, 2)."""
-    profile = form.pop("profile")
-    values = _values_of_spots(n, shape, profile, flux_e, **form)
+    profile, values = _values_of_spots(n, shape, flux_e, **spot_shape)
 
     def images(positions: NDArray[np.float64]) -> NDArray[np.float64]:
         repeated = {name: np.tile(value, len(positions)) for name, value in values.items()}
@@ -245,15 +239,16 @@ def _spots_of_psf(psf: PSF, n: int, shape: tuple[int, int], flux_e: ArrayLike) -
 
 
 def _values_of_spots(
-    n: int, shape: tuple[int, int], profile: str, flux_e: ArrayLike, **form: ArrayLike
-) -> dict[str, NDArray[np.float64]]:
-    """Return size, elongation, angle and whole flux of n spots with `flux_e` in their image when centred."""
+    n: int, shape: tuple[int, int], flux_e: ArrayLike, profile: str = "diffraction", **form: ArrayLike
+) -> tuple[str, dict[str, NDArray[np.float64]]]:
+    """Return profile, and size, elongation, angle and whole flux of n spots with `flux_e` in their image."""
+    form = {"size": 1.0, "elongation": 1.0, "angle_deg": 0.0, **form}
     values = {name: per_spot(name, value, n) for name, value in form.items()}
     flux = per_spot("flux_e", flux_e, n)
     kinds, which = np.unique(np.stack(list(values.values()), axis=1), axis=0, return_inverse=True)
     one_of_each = dict(zip(values, kinds.T, strict=True))
     centred = spots(np.zeros((len(kinds), 2)), shape=shape, profile=profile, **one_of_each)
-    return {**values, "flux_e": flux / centred.sum(axis=(1, 2))[which]}
+    return profile, {**values, "flux_e": flux / centred.sum(axis=(1, 2))[which]}
 
 
 def _camera(detector: Any) -> Detector:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +19,7 @@ from faintspot.slopes.camera.detector import Detector
 from faintspot.slopes.spots.derivatives import STEP_PX, images_with_derivatives
 from faintspot.slopes.spots.pixel_information import SMALLEST_MEAN_E, poisson_gaussian_information
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.shapes import image_shape, per_spot, position_array, spots
+from faintspot.slopes.spots.shapes import SpotShape, image_shape, per_spot, position_array, spots
 
 Floats = NDArray[np.float64]
 
@@ -59,10 +59,6 @@ def cramer_rao(
     flux_e: ArrayLike,
     *,
     shape: tuple[int, int] = (16, 16),
-    profile: str = "diffraction",
-    size: float = 1.0,
-    elongation: float = 1.0,
-    angle_deg: float = 0.0,
     psf: SpotImages | None = None,
     detector: Detector | None = None,
     positions: ArrayLike = (0.0, 0.0),
@@ -71,6 +67,7 @@ def cramer_rao(
     unknown_background: bool = False,
     prior_std_px: float | None = None,
     noise: str = "exact",
+    **spot_shape: Unpack[SpotShape],
 ) -> NDArray[np.float64]:
     """Return the Cramer-Rao bound on the standard error of a spot's position.
 
@@ -84,11 +81,10 @@ def cramer_rao(
         Electrons within the image of a centred spot, as in `faintspot.slopes.simulate.subapertures`; above 0.
     shape : (int, int)
         Rows and columns (ny, nx) of the image, at least 3 px each.
-    profile, size, elongation, angle_deg
-        Shape of the spot, see `faintspot.slopes.spots.shapes`. Ignored if `psf` is given.
     psf : object with a method ``images(positions, shape, flux_e)``, optional
-        PSF of the spot, such as a `faintspot.PSF`. Pixels in which it is not positive are ignored. Noise in
-        the wings of a learnt PSF increases the apparent information if the read noise is low.
+        PSF of the spot, such as a `faintspot.PSF`, instead of a shape. Pixels in which it is not positive
+        are ignored. Noise in the wings of a learnt PSF increases the apparent information if the read noise
+        is low.
     detector : Detector, optional
         Detector that defines the noise; mean background and dark current are known unless
         `unknown_background`. Quantisation counts as read noise of 1/12 ADU squared; full well and
@@ -109,6 +105,8 @@ def cramer_rao(
         electrons. "gaussian": sum over pixels of (dm/dx)^2 / variance, which is lower at low flux and equal
         at high flux. With a multiplication register both are the latter, with twice the photon noise. This
         is not a strict bound if single electrons can be distinguished and counted.
+    **spot_shape
+        profile, size, elongation and angle_deg, see `faintspot.slopes.spots.shapes`.
 
     Returns
     -------
@@ -138,9 +136,10 @@ def cramer_rao(
         prior = number_between("prior_std_px", prior_std_px, 0.0, low_open=True)
     points = _positions(positions, position_range_px)
     if psf is None:
-        form = {"profile": profile, "size": size, "elongation": elongation, "angle_deg": angle_deg}
-        render = functools.partial(spots, shape=(ny, nx), **form)  # type: ignore[arg-type]
-        step = 0.01 * number_between("size", size, 0.0, low_open=True)
+        render = functools.partial(spots, shape=(ny, nx), **spot_shape)
+        step = 0.01 * number_between("size", spot_shape.get("size", 1.0), 0.0, low_open=True)
+    elif spot_shape:
+        raise InputError(f"psf: expected no {', '.join(spot_shape)} beside it")
     else:
         render = functools.partial(psf.images, shape=(ny, nx))
         step = STEP_PX

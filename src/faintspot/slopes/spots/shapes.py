@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,15 @@ FWHM_TO_STD = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 
 _BLOCK_PIXELS = 1 << 15  # pixels processed at a time: the temporary arrays stay in the cache
 _RIGHT_ANGLE_TOLERANCE_DEG = 1e-9
+
+
+class SpotShape(TypedDict, total=False):
+    """Options of `spots` that shape a spot."""
+
+    profile: str
+    size: ArrayLike
+    elongation: ArrayLike
+    angle_deg: ArrayLike
 
 
 class _Profile(NamedTuple):

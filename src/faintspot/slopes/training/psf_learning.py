@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,6 +52,14 @@ class LearntPSF:
     """Standard errors of the positions, (n, 2)."""
 
 
+class PSFOptions(TypedDict, total=False):
+    """Options of `checked_options`."""
+
+    oversampling: int
+    radius_px: int | None
+    rounds: int
+
+
 def learn_psf(
     frames: ArrayLike,
     layout: Layout,
@@ -59,11 +67,9 @@ def learn_psf(
     *,
     scope: str | ArrayLike = "sensor",
     start: PSF | float | None = None,
-    oversampling: int = 4,
-    radius_px: int | None = None,
-    rounds: int = 8,
     rng: np.random.Generator | None = None,
     progress: Callable[[float], object] | None = None,
+    **options: Unpack[PSFOptions],
 ) -> PSF:
     """Learn the PSF of a sensor from recorded frames; nothing else needs to be known about the spots.
 
@@ -87,15 +93,12 @@ def learn_psf(
         sub-apertures with the same number.
     start : PSF or float, optional
         The PSF to begin with, or a spot's full width at half maximum, px. Default: measured.
-    oversampling : {2, 4, 8}
-        Nodes per pixel of the result.
-    radius_px : int, optional
-        Beyond it the PSF is zero. Default: half the smaller side of the windows.
-    rounds : int
-        At least 4.
     rng : numpy.random.Generator, optional
     progress : callable, optional
         Called with the fraction done.
+    **options
+        oversampling: nodes per pixel of the result, 2, 4 or 8 [default: 4]. radius_px: beyond it the PSF is
+        zero [default: half the smaller side of the windows]. rounds: at least 4 [default: 8].
 
     Returns
     -------
@@ -126,7 +129,7 @@ def learn_psf(
     """
     calibration = Calibration() if calibration is None else calibration
     stack = frame_stack(frames, layout, calibration)
-    options = checked_options(layout.window, oversampling, radius_px, rounds)
+    checked = checked_options(layout.window, **options)
     regions = _regions(scope, len(layout))
     usable, left_out = usable_subapertures(np.asarray(frames), layout, calibration)
     if left_out:
@@ -135,8 +138,8 @@ def learn_psf(
     numbers[usable] = np.unique(regions[usable], return_inverse=True)[1]
     n_frames = len(stack.images) // len(layout)
     stack, index = stack.part(np.tile(usable, n_frames)), np.tile(numbers[usable], n_frames)
-    learnt = _learn(stack, index, start, options, rng, progress)
-    return PSF(learnt.psf.samples, oversampling, None if len(learnt.psf.samples) == 1 else numbers)
+    learnt = _learn(stack, index, start, checked, rng, progress)
+    return PSF(learnt.psf.samples, checked.oversampling, None if len(learnt.psf.samples) == 1 else numbers)
 
 
 def learn_psf_from_images(
@@ -145,12 +148,10 @@ def learn_psf_from_images(
     *,
     index: ArrayLike | None = None,
     start: PSF | float | None = None,
-    oversampling: int = 4,
-    radius_px: int | None = None,
     search_range_px: float | None = None,
-    rounds: int = 8,
     rng: np.random.Generator | None = None,
     progress: Callable[[float], object] | None = None,
+    **options: Unpack[PSFOptions],
 ) -> LearntPSF:
     """Learn PSFs from a stack of images of single spots, as `learn_psf` does from frames.
 
@@ -163,7 +164,7 @@ def learn_psf_from_images(
         Which PSF each spot has, from 0. Default: all have one.
     search_range_px : float, optional
         Largest distance of a spot from the image's centre along an axis. Default: half the image.
-    start, oversampling, radius_px, rounds, rng, progress
+    start, rng, progress, **options
         As in `learn_psf`.
 
     Returns
@@ -195,8 +196,8 @@ def learn_psf_from_images(
         if numbers.shape != (n,):
             raise InputError(f"index: expected one number for each of {n} images, got shape {numbers.shape}")
     shape = (stack.images.shape[1], stack.images.shape[2])
-    options = checked_options(shape, oversampling, radius_px, rounds)
-    return _learn(stack, numbers, start, _within(options, search_range_px), rng, progress)
+    checked = _within(checked_options(shape, **options), search_range_px)
+    return _learn(stack, numbers, start, checked, rng, progress)
 
 
 def _within(options: LearningOptions, search_range_px: float | None) -> LearningOptions:
@@ -289,7 +290,7 @@ def _stack(windows: NDArray[Any], maps: NDArray[Any], calibration: Calibration, 
 
 
 def checked_options(
-    window: tuple[int, int], oversampling: int, radius_px: int | None = None, rounds: int = 8
+    window: tuple[int, int], oversampling: int = 4, radius_px: int | None = None, rounds: int = 8
 ) -> LearningOptions:
     """Return how to learn, checked."""
     side = min(window)

@@ -152,8 +152,7 @@ class _Plan(LikelihoodPlan):
             kinds[:, 1],
             self.pixel_variance[kinds[:, 3].astype(np.int64)] + (kinds[:, 2] * kinds[:, 1])[:, None, None],
             sensor.excess_noise,
-            self._grid,
-            self._spacing,
+            (self._grid, self._spacing),
             sensor.window,
             sensor.width,
         )
