@@ -40,6 +40,15 @@ def save_map(path: str | Path, wavefront: Wavefront, layout: Layout, zonal: Zona
         When the ending is unknown or the file cannot be written.
     MissingExtraError
         When astropy is needed and not installed.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> from faintspot.slopes.wavefront import save_map
+    >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5)
+    >>> frame = np.random.default_rng(1).poisson(5.0, layout.frame_shape)
+    >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frame)
+    >>> save_map("map.csv", fs.fit_wavefront(slopes, layout, modes=5), layout)
     """
     path = Path(path)
     check_map_file(path)

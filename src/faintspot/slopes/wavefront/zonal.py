@@ -128,7 +128,7 @@ def zonal_map(slopes: Slopes, layout: Layout) -> ZonalMap:
     >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frames)
     >>> found = zonal_map(slopes, layout)
     >>> print(f"{np.ptp(found.values):.0f} nm between the outermost of 7 sub-apertures")
-    2656 nm between the outermost of 7 sub-apertures
+    2685 nm between the outermost of 7 sub-apertures
     """
     flags = np.atleast_2d(slopes.flags)
     if flags.ndim != 2 or flags.shape[1] != len(layout):
