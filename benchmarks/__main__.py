@@ -43,10 +43,20 @@ _ORDER = (
     "winds",
     "large_sensors",
     "layouts",
+    "wavefronts",
     "startup",
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
-LONG = {"guard", "realtime_sustained", "telemetry", "recorded_tip_tilt", "winds", "large_sensors", "layouts"}
+LONG = {
+    "guard",
+    "realtime_sustained",
+    "telemetry",
+    "recorded_tip_tilt",
+    "winds",
+    "large_sensors",
+    "layouts",
+    "wavefronts",
+}
 """Run only when named, or with --full: 5 minutes to an hour each, one with a recording of its own."""
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _FOLDER = click.option(

@@ -12,7 +12,7 @@ from faintspot import Layout
 from faintspot.base.json_text import parse_json
 from faintspot.io import read_slopes
 from faintspot.slopes.pipeline.slopes import Slopes
-from faintspot.slopes.wavefront import fit_wavefront
+from faintspot.slopes.wavefront import fit_wavefront, zonal_map
 
 SCALES = ("--pixel-scale-arcsec", 0.4, "--diameter-m", 4.2)
 
@@ -129,6 +129,71 @@ def test_command_that_flattens(run: Commands, slopes: Path, coarse_pictures: Non
         clipped = [float(row["command"]) for row in csv.DictReader(stream)]
     assert np.abs(clipped).max() == pytest.approx(limit)
     assert Path("c.png").exists()
+
+
+def test_zonal_map_and_its_files(run: Commands, slopes: Path, coarse_pictures: None) -> None:
+    out = run.ok(
+        "wavefront", slopes, *SCALES, "--zonal", "--unit", "um", "--map", "m.csv", "--map", "m.fits"
+    ).out
+    assert "zonal map minus modes" in out
+    assert (slopes.parent / "slopes_wavefront_zonal.png").exists()
+    layout = Layout.grid((4, 4), pixels=8, pixel_scale_arcsec=0.4, diameter_m=4.2)
+    expected = zonal_map(Slopes.from_variables(read_slopes(slopes).variables), layout).in_unit("um")
+    with fits.open("m.fits", checksum=True) as units:
+        np.testing.assert_allclose(units["ZONAL"].data, expected.sheet, rtol=1e-6)
+        np.testing.assert_allclose(units["SUBAPERTURES"].data["ZONAL"], expected.values)
+        assert units["ZONAL"].header["BUNIT"] == "um"
+        last = units["ZONAL"].header["CRVAL1"] + 200 * units["ZONAL"].header["CDELT1"]
+        assert last == pytest.approx(31.5)  # the edge of the last of 32 pixels
+        known = np.isfinite(units["ZONAL"].data)
+    with Path("m.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == np.count_nonzero(known)
+    assert list(rows[0]) == ["x_px", "y_px", "modes_um", "zonal_um", "standard_error_um", "part"]
+    np.testing.assert_allclose([float(row["zonal_um"]) for row in rows], expected.sheet[known], rtol=1e-6)
+
+
+def test_map_of_the_modes(run: Commands, slopes: Path, no_picture: None) -> None:
+    run.ok("wavefront", slopes, "--map", "m.csv", "--map", "m.fits")
+    with fits.open("m.fits") as units:
+        assert [unit.name for unit in units[1:]] == ["MODES"]
+    assert Path("m.csv").read_text().startswith("x_px,y_px,modes_px_subaperture\n")
+
+
+def test_difference_of_two_recordings(run: Commands, slopes: Path, no_picture: None) -> None:
+    asked = ("--zonal", "--modes", 2, "-o", "w.json")
+    run.ok("wavefront", slopes, "--minus", slopes, *asked)
+    nothing = parse_json(Path("w.json").read_text())["mean"]
+    assert nothing["rms"] == pytest.approx(0, abs=1e-6)
+    np.save("moved.npy", np.roll(np.load("frames.npy"), 1, axis=2))
+    run.ok("slopes", "moved.npy", "-o", "moved.npz")
+    run.ok("wavefront", "moved.npz", "--minus", slopes, *asked)
+    moved = parse_json(Path("w.json").read_text())["mean"]
+    alone = fit_wavefront(
+        Slopes.from_variables(read_slopes(slopes).variables), Layout.grid((4, 4), pixels=8), modes=2
+    )
+    assert moved["modes"][0]["mean"] == pytest.approx(1.0, abs=0.1)  # Z2 = 2 x on a radius of 2
+    # Both have about the same error.
+    error = moved["modes"][0]["standard_error"]
+    assert error == pytest.approx(np.sqrt(2) * alone.mean_standard_error[0], rel=0.3)
+    # Another reference changes the slopes, not the places of spots in the frame.
+    run.ok("slopes", "moved.npy", "--reference", slopes, "-o", "again.npz")
+    run.ok("wavefront", "again.npz", "--minus", slopes, *asked)
+    again = parse_json(Path("w.json").read_text())["mean"]
+    assert again["modes"][0]["mean"] == pytest.approx(moved["modes"][0]["mean"], abs=0.02)
+
+
+def test_refused_maps_and_differences(run: Commands, slopes: Path) -> None:
+    run.refused("wavefront", slopes, "--map", "m.png", naming=("m.png", ".csv, .fits"))
+    run.refused("wavefront", slopes, "--minus", "nothing.npz", naming=("nothing.npz",))
+    text = CONFIGURATION.replace("[4, 4]", "[2, 2]")
+    assert text != CONFIGURATION
+    Path("other.toml").write_text(text)
+    np.save("other.npy", simulated(2)[:, :16, :16])
+    run.ok("slopes", "other.npy", "-c", "other.toml", "-o", "other.npz")
+    run.refused(
+        "wavefront", slopes, "--minus", "other.npz", naming=("other.npz", "16 sub-apertures", "same --config")
+    )
 
 
 def test_refused_units_and_mirrors(run: Commands, slopes: Path) -> None:

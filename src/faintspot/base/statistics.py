@@ -288,6 +288,12 @@ def student(degrees: int, comparisons: int = 1) -> float:
     return float(stdtrit(degrees, 1 - (1 - _LEVEL) / 2 / comparisons))
 
 
+def rms(values: Floats) -> float:
+    """Return the root mean square of the values that are not NaN; NaN when there is none."""
+    kept = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(kept**2))) if kept.size else np.nan
+
+
 def magnitudes(flux_ratio: float) -> float:
     """Return a flux ratio in magnitudes."""
     return float(2.5 * np.log10(flux_ratio))

@@ -19,12 +19,22 @@ from faintspot.cli.shared.output import picture_file, write_picture
 from faintspot.io.frames import read_array
 from faintspot.loop.control.flattening import Flattening, check_command_file, flattening, save_command
 from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.recorded.difference import difference
 from faintspot.slopes.recorded.stored_run import open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
-from faintspot.slopes.wavefront import Wavefront, fit_wavefront, save_wavefront
+from faintspot.slopes.wavefront import Wavefront, ZonalMap, fit_wavefront, save_map, save_wavefront, zonal_map
 from faintspot.slopes.wavefront.files import check_wavefront_file
-from faintspot.slopes.wavefront.fit import UNITS, total
-from faintspot.slopes.wavefront.words import mode_table, refraction_line, remarks, rms_table
+from faintspot.slopes.wavefront.fit import total
+from faintspot.slopes.wavefront.map_files import check_map_file
+from faintspot.slopes.wavefront.units import UNITS
+from faintspot.slopes.wavefront.words import (
+    mode_table,
+    refraction_line,
+    remarks,
+    rms_table,
+    zonal_remarks,
+    zonal_table,
+)
 
 
 @click.command(cls=SectionedCommand)
@@ -43,6 +53,15 @@ from faintspot.slopes.wavefront.words import mode_table, refraction_line, remark
     metavar="N",
     help="Number of modes, from tip and tilt on.",
     show_default="by the sensor",
+)
+@option("--zonal", is_flag=True, help="Also reconstruct the wavefront without modes, for any pupil.")
+@option("--minus", metavar="SLOPES", help="Slopes of a recording whose mean wavefront is subtracted.")
+@option(
+    "--map",
+    "maps",
+    metavar="FILE",
+    multiple=True,
+    help="Map of the mean wavefront to write, .csv or .fits; may be repeated.",
 )
 @option("--unit", type=click.Choice(UNITS), help="Unit of the wavefront.", show_default="nm, if known")
 @option("--wavelength-nm", type=float, metavar="NM", help="Wavelength, for waves.")
@@ -68,6 +87,9 @@ def command(
     output: tuple[str, ...],
     picture: str | None,
     modes: int | None,
+    zonal: bool,
+    minus: str | None,
+    maps: tuple[str, ...],
     unit: str | None,
     wavelength_nm: float | None,
     pupil_mm: float | None,
@@ -87,13 +109,17 @@ def command(
       faintspot wavefront slopes.zarr
       faintspot wavefront slopes.zarr --pixel-scale-arcsec 0.38 --diameter-m 4.2 -o wavefront.json
       faintspot wavefront eye.zarr --pixel-scale-arcsec 60 --pupil-mm 6 --unit um
+      faintspot wavefront slopes.zarr --zonal --map map.fits
+      faintspot wavefront warm.zarr --minus cold.zarr
       faintspot wavefront slopes.zarr --actuators interaction.npy --stroke 300
       faintspot wavefront slopes.zarr --actuators faintspot.control.npz:interaction_matrix
     """
     for name in output:
         check_wavefront_file(Path(name))
-        if Path(name).suffix.lower() == ".fits":
-            require("io", "astropy", purpose="Writing a FITS file")
+    for name in maps:
+        check_map_file(Path(name))
+    if any(Path(name).suffix.lower() == ".fits" for name in output + maps):
+        require("io", "astropy", purpose="Writing a FITS file")
     target = Path(command_file) if command_file else derived(slopes, "_command.npy")
     check_command_file(target)
     if actuators is None and (stroke is not None or command_file is not None):
@@ -109,24 +135,52 @@ def command(
             raise InputError("--pupil-mm: expected it or --diameter-m, got both")
         given["diameter_m"] = 1e-3 * number_between("--pupil-mm", pupil_mm, 0, low_open=True)
     layout = replace(run.layout, **given)
-    measured = Slopes.from_variables(run.stored.variables, keep=run.keep)
+    measured, other = Slopes.from_variables(run.stored.variables, keep=run.keep), None
+    if minus is not None:
+        measured, other = difference(run, open_run(Path(minus)))
     with errors_of_options(slopes):
         wavefront = fit_wavefront(measured, layout, modes=modes)
+        surface = zonal_map(measured, layout) if zonal else None
+    if other is not None:
+        with errors_of_options(minus):
+            wavefront, surface = _with_error_of(other, layout, wavefront, surface)
+    with errors_of_options(slopes):
         if unit or wavelength_nm is not None:
-            wavefront = wavefront.in_unit(unit or "nm", wavelength_nm)
+            asked = unit or "nm", wavelength_nm
+            wavefront = wavefront.in_unit(*asked)
+            surface = None if surface is None else surface.in_unit(*asked)
         eye = None if pupil_mm is None else refraction_line(wavefront)
     with errors_of_options(actuators):
         flat = None if interaction is None else flattening(measured, interaction, stroke)
-    _print(wavefront, run.notes if eye is None else [eye, *run.notes])
+    _print(wavefront, surface, run.notes if eye is None else [eye, *run.notes])
     for name in output:
         save_wavefront(name, wavefront, dioptres=eye is not None)
         click.echo(name)
+    for name in maps:
+        save_map(name, wavefront, layout, surface)
+        click.echo(name)
     if drawing is not None:
-        from faintspot.slopes.wavefront.figure import wavefront_figure
+        from faintspot.slopes.wavefront.figure import wavefront_figure, zonal_figure
 
-        write_picture(wavefront_figure(wavefront, layout, Path(slopes).name).figure, drawing)
+        title = Path(slopes).name + ("" if minus is None else f" minus {Path(minus).name}")
+        write_picture(wavefront_figure(wavefront, layout, title).figure, drawing)
+        if surface is not None:
+            target_picture = drawing.with_stem(f"{drawing.stem}_zonal")
+            write_picture(zonal_figure(surface, wavefront, layout, title).figure, target_picture)
     if flat is not None:
         _write_flattening(flat, target, measured, wavefront, layout)
+
+
+def _with_error_of(
+    other: Slopes, layout: Layout, wavefront: Wavefront, surface: ZonalMap | None
+) -> tuple[Wavefront, ZonalMap | None]:
+    """Return wavefronts from which others were subtracted, with the errors of both."""
+    fitted = fit_wavefront(other, layout, modes=len(wavefront.modes))
+    wavefront = replace(wavefront, other_standard_error=fitted.mean_standard_error)
+    if surface is not None:
+        errors = np.hypot(surface.standard_errors, zonal_map(other, layout).standard_errors)
+        surface = replace(surface, standard_errors=errors)
+    return wavefront, surface
 
 
 def _write_flattening(
@@ -153,12 +207,16 @@ def _write_flattening(
         write_picture(flattening_figure(flat, wavefront, after, layout), target.with_suffix(".png"))
 
 
-def _print(wavefront: Wavefront, notes: list[str]) -> None:
+def _print(wavefront: Wavefront, surface: ZonalMap | None, notes: list[str]) -> None:
     from rich.console import Console
     from rich.table import Table
 
     console = Console()
-    for header, rows in (mode_table(wavefront), rms_table(wavefront)):
+    tables, lines = [mode_table(wavefront), rms_table(wavefront)], remarks(wavefront)
+    if surface is not None:
+        tables.append(zonal_table(surface, wavefront))
+        lines += zonal_remarks(surface, wavefront)
+    for header, rows in tables:
         table = Table(box=None, pad_edge=False)
         words = 2 if header[0] == "Noll" else 1
         for place, title in enumerate(header):
@@ -169,5 +227,5 @@ def _print(wavefront: Wavefront, notes: list[str]) -> None:
             table.add_row(*row)
         console.print(table)
         console.print()
-    for line in (*remarks(wavefront), *notes):
+    for line in (*lines, *notes):
         click.echo(line)

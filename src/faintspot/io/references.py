@@ -67,10 +67,12 @@ def _mean_positions(path: Path, slopes: StoredSlopes) -> NDArray[np.float64]:
         raise InputError(f"{path}: expected valid slopes to take as reference, found none")
     sums = [np.sum(slopes.variables[name], axis=0, where=valid, dtype=np.float64) for name in ("x", "y")]
     means: NDArray[np.float64] = np.stack(sums, axis=1) / np.maximum(count, 1)[:, np.newaxis]
-    before: NDArray[np.float64] = np.asarray(
-        slopes.attributes.get("reference", np.zeros_like(means)), np.float64
-    )
-    if before.ndim == 1:
-        before = before.reshape(2, -1).T
-    means += before
+    means += subtracted_reference(slopes)
     return means
+
+
+def subtracted_reference(slopes: StoredSlopes) -> NDArray[np.float64]:
+    """Return the reference that was subtracted from slopes, (n, 2), px from each sub-aperture's centre."""
+    zero = np.zeros((slopes.variables["x"].shape[1], 2))
+    reference: NDArray[np.float64] = np.asarray(slopes.attributes.get("reference", zero), np.float64)
+    return reference.reshape(2, -1).T if reference.ndim == 1 else reference

@@ -243,12 +243,6 @@ def _successive(method: MeasuredSlopes, valid: NDArray[np.bool_]) -> NDArray[np.
     return are_valid
 
 
-def rms(values: Floats) -> float:
-    """Return the root mean square of the values that are not NaN; NaN when there is none."""
-    kept = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(kept**2))) if kept.size else np.nan
-
-
 def median(values: Floats) -> float:
     """Return the median of the values that are not NaN; NaN when there is none."""
     kept = values[np.isfinite(values)]

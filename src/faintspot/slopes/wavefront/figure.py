@@ -1,4 +1,4 @@
-"""Figure of a wavefront: maps with and without tip and tilt, and its coefficients."""
+"""Figures of a wavefront: maps with and without tip and tilt, its coefficients, and a zonal map."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ import numpy as np
 
 from faintspot.base.report.drawing import FLUX_GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
 from faintspot.base.report.figure_data import FigureWithData
+from faintspot.base.statistics import rms
+from faintspot.slopes.sensor.drawing import Map, subaperture_map
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.pupil import lenslet_outlines
-from faintspot.slopes.wavefront.fit import Wavefront, total
+from faintspot.slopes.sensor.pupil import Pupil, lenslet_outlines
+from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
+from faintspot.slopes.wavefront.zonal import ZonalMap, compared
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,13 +75,49 @@ def wavefront_map(
 
     Colours go to `largest` on both sides; 0: to the largest value.
     """
+    sheet = wavefront.sheet(tilt=tilt)
+    _map(axes, sheet, wavefront.pupil, layout, wavefront.unit, largest=largest)
+
+
+@styled
+def zonal_figure(zonal: ZonalMap, wavefront: Wavefront, layout: Layout, name: str) -> FigureWithData:
+    """Draw a zonal map, the wavefront of the modes, their difference, and standard errors."""
+    figure = new_figure(WIDTH, 10.4)
+    panels = figure.subplots(2, 2).ravel()
+    sheets = compared(zonal, wavefront)
+    largest = max(float(np.nanmax(np.abs(sheet))) for sheet in list(sheets.values())[:2])
+    for axes, (title, sheet), limit in zip(panels, sheets.items(), (largest, largest, 0.0), strict=False):
+        _map(axes, sheet, zonal.pupil, layout, zonal.unit, largest=limit, reach=zonal.reach)
+        axes.set_title(f"{title}: {rms(sheet):.3g} {zonal.unit} rms", fontsize=12)
+    error, largest = rms(zonal.standard_errors), float(np.nan_to_num(zonal.standard_errors).max())
+    title = f"standard error: {error:.3g} {zonal.unit} rms" if error > 0 else "standard error: unknown"
+    shown = Map(zonal.standard_errors, zonal.unit, title, (0.0, largest or 1.0))
+    subaperture_map(panels[3], layout, shown)
+    figure.suptitle(name, fontsize=14)
+    caption = "Mean wavefront without modes (zonal), of the fitted modes, and the first minus the second."
+    header = ("row", "column", "part", "value", "standard_error", "unit")
+    values = zonal.parts.tolist(), zonal.values.tolist(), zonal.standard_errors.tolist()
+    rows = [(*cell, *own, zonal.unit) for cell, *own in zip(layout.cells.tolist(), *values, strict=True)]
+    return FigureWithData("zonal", f"Zonal map of {name}", caption, figure, header, rows)
+
+
+def _map(
+    axes: Axes,
+    sheet: Floats,
+    pupil: Pupil,
+    layout: Layout,
+    unit: str,
+    *,
+    largest: float = 0.0,
+    reach: float = 1.0,
+) -> None:
+    """Draw a map whose outermost points are `reach` radii of the pupil from its centre."""
     from matplotlib.collections import PolyCollection
     from matplotlib.patches import Circle
 
-    pupil, sheet = wavefront.pupil, wavefront.sheet(tilt=tilt)
     (x, y), radius = pupil.centre_px, pupil.radius_px
     largest = largest or float(np.nanmax(np.abs(sheet))) or 1.0
-    half = radius * len(sheet) / (len(sheet) - 1)  # the outermost points are on the circle
+    half = reach * radius * len(sheet) / (len(sheet) - 1)  # the outermost points are within the image
     extent = (x - half, x + half, y - half, y + half)
     image = axes.imshow(sheet, cmap=_SIGNED_COLOURS, vmin=-largest, vmax=largest, extent=extent)
     if len(layout) <= _MOST_OUTLINED:
@@ -87,10 +126,10 @@ def wavefront_map(
             PolyCollection(outlines, facecolors="none", edgecolors="#00000030", linewidths=0.6)
         )
     axes.add_patch(Circle((x, y), radius, fill=False, color="black", lw=0.8))
-    reach = 1.12 * radius
-    axes.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal")
+    margin = 1.12 * reach * radius
+    axes.set(xlim=(x - margin, x + margin), ylim=(y - margin, y + margin), aspect="equal")
     axes.set(xlabel="column (px)", ylabel="row (px)")
-    colour_bar(axes, image, wavefront.unit)
+    colour_bar(axes, image, unit)
 
 
 def _bars(axes: Axes, wavefront: Wavefront, part: slice, several: bool) -> None:

@@ -14,8 +14,9 @@ from faintspot.base.files import check_ending, write_atomically
 from faintspot.base.json_text import to_json
 from faintspot.base.report.figure_data import csv_text
 from faintspot.io.optional_packages import load_fits
-from faintspot.slopes.wavefront.fit import UNITS, Wavefront, total
+from faintspot.slopes.wavefront.fit import Wavefront, total
 from faintspot.slopes.wavefront.refraction import refraction, refraction_error
+from faintspot.slopes.wavefront.units import UNITS
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
 
 _LENS = "SPHERE", "CYLINDER", "CYLAXIS", "SPHEREQ"

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import number_between, one_of
+from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.validity import leave_out
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, lit_outlines, pupil_of
+from faintspot.slopes.wavefront.units import POINTS, OfLength, unit_of
 from faintspot.slopes.wavefront.zernike import mean_gradients, zernike
 
 Floats = NDArray[np.float64]
@@ -22,13 +24,10 @@ LARGEST_CONDITION = 100.0
 _HIGHEST_ORDER, _USUAL_CONDITION = 8, 20.0  # defaults; higher orders are rarely needed
 _TILTS = 2
 _LEAST_SHARE = 0.1  # of a sub-aperture's area in the pupil, below which its slope tells too little
-_NM_PER_ARCSEC_M = 1e9 * np.pi / (180 * 3600)
-UNITS = "nm", "um", "waves"
-"""Units of length for wavefronts."""
 
 
 @dataclass(frozen=True)
-class Wavefront:
+class Wavefront(OfLength):
     """Zernike coefficients of the wavefront in one frame or several.
 
     The wavefront is the optical path difference minus its mean; it increases in the direction of the spots'
@@ -48,7 +47,7 @@ class Wavefront:
     residual_px: Floats
     """Rms of the slopes about the fitted modes, px per axis, (n_frames,)."""
     unit: str
-    """Unit: one of `UNITS`, or "px × sub-aperture" (slopes in pixels times lengths in sub-apertures)."""
+    """Unit: one of `units.UNITS`, or "px × sub-aperture" (slopes in pixels, lengths in sub-apertures)."""
     pupil: Pupil
     condition: float
     """Condition number of the fit with every sub-aperture that is ever valid."""
@@ -57,50 +56,10 @@ class Wavefront:
     wavelength_nm: float | None = None
     """Length of a wave, for the unit "waves"."""
 
-    def in_unit(self, unit: str, wavelength_nm: float | None = None) -> Wavefront:
-        """Return the wavefront in another unit.
+    other_standard_error: Floats | None = None
+    """Standard error of a mean wavefront that was subtracted, (k,)."""
 
-        Parameters
-        ----------
-        unit : {"nm", "um", "waves"}
-        wavelength_nm : float, optional
-            Required for waves, and only for them.
-
-        Raises
-        ------
-        InputError
-            If the wavefront is in pixels, or wavelength and unit do not fit.
-        """
-        one_of("unit", unit, UNITS)
-        if (unit == "waves") != (wavelength_nm is not None):
-            raise InputError("wavelength_nm: expected a wavelength for the unit waves, and for no other")
-        if wavelength_nm is not None:
-            wavelength_nm = number_between("wavelength_nm", wavelength_nm, 0, low_open=True)
-        converted = replace(self, unit=unit, wavelength_nm=wavelength_nm)
-        factor = self.nm_per_unit / converted.nm_per_unit
-        return replace(
-            converted,
-            coefficients=factor * self.coefficients,
-            standard_errors=factor * self.standard_errors,
-        )
-
-    @property
-    def nm_per_unit(self) -> float:
-        """Length of the unit [nm].
-
-        Raises
-        ------
-        InputError
-            If the wavefront is in pixels.
-        """
-        lengths = {"nm": 1.0, "um": 1e3, "waves": self.wavelength_nm}
-        length = lengths.get(self.unit)
-        if length is None:
-            raise InputError(
-                "layout: expected pixel_scale_arcsec, and subaperture_m or diameter_m, for a wavefront in a "
-                "unit of length"
-            )
-        return length
+    _amounts: ClassVar[tuple[str, ...]] = "coefficients", "standard_errors", "other_standard_error"
 
     @property
     def fitted(self) -> NDArray[np.bool_]:
@@ -121,7 +80,7 @@ class Wavefront:
             error: Floats = self.standard_errors[self.fitted][0]
         else:
             error = kept.std(axis=0, ddof=1) / np.sqrt(len(kept))
-        return error
+        return error if self.other_standard_error is None else np.hypot(error, self.other_standard_error)
 
     @property
     def rms_of_frames(self) -> Floats:
@@ -133,17 +92,19 @@ class Wavefront:
         """Return the rms of each frame's wavefront over the disk, (n_frames,)."""
         return total(self.coefficients, tilt=tilt)
 
-    def sheet(self, *, points: int = 201, tilt: bool = True) -> Floats:
+    def sheet(self, *, points: int = POINTS, tilt: bool = True, reach: float = 1.0) -> Floats:
         """Return the mean wavefront as a map over the disk, (points, points), NaN outside.
 
         Parameters
         ----------
         points : int
-            Points along the diameter; rows go along y, columns along x, the outermost at the disk's edge.
+            Points along the map; rows go along y, columns along x.
         tilt : bool
             Whether to include tip and tilt.
+        reach : float
+            Distance of the outermost points from the centre, in radii of the disk.
         """
-        line = np.linspace(-1, 1, points)
+        line = np.linspace(-reach, reach, points)
         y, x = np.meshgrid(line, line, indexing="ij")
         inside = np.hypot(x, y) <= 1
         sheet = np.full((points, points), np.nan)
@@ -212,7 +173,7 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     if not illuminated.any():
         raise InputError("slopes: expected valid sub-apertures to fit a wavefront, found none")
     gradients, condition = _chosen_gradients(modes, outlines, illuminated)
-    unit, scale = _unit(layout, pupil)
+    unit, scale = unit_of(layout, pupil)
     errors = np.concatenate(
         [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
     )
@@ -267,13 +228,6 @@ def _chosen_gradients(
         f"modes = {count}: {n} valid sub-apertures cannot separate so many (condition number "
         f"{condition:.3g}, expected at most {LARGEST_CONDITION:g}); use fewer"
     )
-
-
-def _unit(layout: Layout, pupil: Pupil) -> tuple[str, float]:
-    """Return the unit of coefficients, and its value for one pixel times the disk's radius."""
-    if layout.pixel_scale_arcsec is None or pupil.radius_m is None:
-        return "px × sub-aperture", pupil.radius_subapertures
-    return "nm", layout.pixel_scale_arcsec * pupil.radius_m * _NM_PER_ARCSEC_M
 
 
 def _condition(gradients: Floats) -> float:

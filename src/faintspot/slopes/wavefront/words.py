@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from faintspot.slopes.wavefront.fit import UNITS, Floats, Wavefront, total
+from faintspot.base.statistics import rms
+from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
 from faintspot.slopes.wavefront.refraction import refraction, refraction_error
+from faintspot.slopes.wavefront.units import UNITS
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
+from faintspot.slopes.wavefront.zonal import ZonalMap, compared
 
 
 def mode_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
@@ -16,7 +19,7 @@ def mode_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
     header += ["± standard error"] + ([f"rms of frames ({wavefront.unit})"] if several else [])
     digits = _decimals(wavefront.rms_of_frames)
     rows = []
-    for j, mean, error, rms in zip(
+    for j, mean, error, of_frames in zip(
         wavefront.modes, wavefront.mean, wavefront.mean_standard_error, wavefront.rms_of_frames, strict=True
     ):
         n, m = noll_to_nm(int(j))
@@ -26,7 +29,7 @@ def mode_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
         ]
         rows.append([f"Z{j}", mode_name(int(j)), str(osa_index(int(j))), str(n), str(m), *values])
         if several:
-            rows[-1].append(f"{rms:.{digits}f}")
+            rows[-1].append(f"{of_frames:.{digits}f}")
     return header, rows
 
 
@@ -110,6 +113,46 @@ def remarks(wavefront: Wavefront) -> list[str]:
         )
     scatter = float(np.sqrt(np.mean(wavefront.residual_px[wavefront.fitted] ** 2)))
     lines.append(f"The slopes scatter about the fitted modes by {scatter:.3g} px rms per axis.")
+    return lines
+
+
+def zonal_table(zonal: ZonalMap, wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows: rms over the sub-apertures of a zonal map, the modes and their difference."""
+    rows = []
+    sheets = compared(zonal, wavefront), compared(zonal, wavefront, tilt=False)
+    values = [[rms(sheet) for sheet in part.values()] for part in sheets]
+    digits = _decimals(np.array(values))
+    for name, *numbers in zip(sheets[0], *values, strict=True):
+        rows.append([name, *(f"{number:.{digits}f}" for number in numbers), ""])
+    error = rms(zonal.standard_errors)
+    rows[0][-1] = f"{error:.{digits}f}" if np.isfinite(error) else "–"
+    header = f"rms over the sub-apertures ({zonal.unit})"
+    return [header, "with tip, tilt", "no tip, tilt", "standard error"], rows
+
+
+_ERRORS = {
+    "frames": "come from the scatter over frames, as if frames were independent",
+    "slopes": "are computed from those of the slopes",
+    "residuals": "are estimated from the residuals of the slopes, which have no standard errors",
+}
+
+
+def zonal_remarks(zonal: ZonalMap, wavefront: Wavefront) -> list[str]:
+    """Return remarks for the reader: method, errors, parts without a common piston, what was left out."""
+    sizes = np.bincount(zonal.parts[zonal.parts >= 0])
+    lines = [
+        "Zonal map: a smooth surface through the slopes, without modes. Its standard errors "
+        f"{_ERRORS[zonal.errors_from]}. They are relative to the mean, without structure finer than a "
+        f"sub-aperture. The slopes scatter about the surface by {zonal.residual_px:.3g} px rms per axis."
+    ]
+    if len(sizes) > 1:
+        listed = ", ".join(map(str, sizes[:6])) + (", ..." if len(sizes) > 6 else "")
+        lines.append(
+            f"The pupil has {len(sizes)} parts without a common edge ({listed} sub-apertures). Slopes do not "
+            "show steps between them: the mean of each part is set to 0 (the modes' too, in the comparison)."
+        )
+    if zonal.left_out not in ("", wavefront.left_out):
+        lines.append(f"Of the zonal map {zonal.left_out}.")
     return lines
 
 

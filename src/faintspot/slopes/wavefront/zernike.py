@@ -88,14 +88,31 @@ def mean_gradients(modes: ArrayLike, outlines: Floats) -> Floats:
     """
     numbers = [int(j) for j in np.asarray(modes)]
     highest = max(noll_to_nm(j)[0] for j in numbers)
-    nodes, weights = np.polynomial.legendre.leggauss((highest + 2) // 2)
-    edges = np.roll(outlines, -1, axis=1) - outlines
-    points = outlines[:, :, None] + edges[:, :, None] * (0.5 * (nodes + 1))[:, None]
-    normals = np.stack([edges[..., 1], -edges[..., 0]])  # as long as the edges
-    cross = outlines[..., 0] * edges[..., 1] - outlines[..., 1] * edges[..., 0]
-    areas = 0.5 * cross.sum(axis=1)
+    points, weights, normals, areas = edge_points(outlines, (highest + 2) // 2)
     gradients = np.empty((2, len(outlines), len(numbers)))
     for column, j in enumerate(numbers):
-        along_edges = zernike(j, points[..., 0], points[..., 1]) @ (0.5 * weights)
+        along_edges = zernike(j, points[..., 0], points[..., 1]) @ weights
         gradients[..., column] = (normals * along_edges).sum(axis=-1) / areas
     return gradients
+
+
+def edge_points(outlines: Floats, count: int) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return points at which to integrate over the edges of polygons (n, corners, 2), by Gauss-Legendre.
+
+    Returns
+    -------
+    points : (n, corners, count, 2) array
+        Points along the edges.
+    weights : (count,) array
+        Weights of the points of an edge; their sum is 1.
+    normals : (2, n, corners) array
+        Outward normals x and y, as long as the edges.
+    areas : (n,) array
+        Areas of the polygons.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    edges = np.roll(outlines, -1, axis=1) - outlines
+    points = outlines[:, :, None] + edges[:, :, None] * (0.5 * (nodes + 1))[:, None]
+    normals = np.stack([edges[..., 1], -edges[..., 0]])
+    cross = outlines[..., 0] * edges[..., 1] - outlines[..., 1] * edges[..., 0]
+    return points, 0.5 * weights, normals, 0.5 * cross.sum(axis=1)

@@ -13,7 +13,7 @@ from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import POSITIONS, Report, Section, Table, configuration_section
 from faintspot.base.report.texts import Texts
 from faintspot.base.report.words import percentage
-from faintspot.base.statistics import Estimate
+from faintspot.base.statistics import Estimate, rms
 from faintspot.slopes.recorded.report import frame_pictures, maps
 from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.statistics import (
@@ -24,7 +24,6 @@ from faintspot.slopes.recorded.statistics import (
     flux_gain,
     jitter,
     median,
-    rms,
     slope_error,
 )
 from faintspot.slopes.sensor.layout import Layout
