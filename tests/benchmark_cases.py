@@ -1,7 +1,5 @@
 """Made-up results of benchmarks: nothing is timed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from benchmarks.measuring import Row, Table

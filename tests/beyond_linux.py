@@ -7,8 +7,6 @@ the modules. The script imports every module of faintspot that should work there
 an argument.
 """
 
-from __future__ import annotations
-
 import builtins
 import contextlib
 import functools

@@ -4,8 +4,6 @@ Hypothesis has no deadline, because the first call of a kernel compiles it;
 `pytest --hypothesis-profile=thorough` looks 40 times harder.
 """
 
-from __future__ import annotations
-
 import multiprocessing.process
 import os
 import signal

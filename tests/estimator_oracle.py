@@ -8,8 +8,6 @@ Cases near a decision that rounding may turn (two pixels that tie for the start,
 singular matrix) have a margin below MARGIN and are not compared.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -3,8 +3,6 @@
 Written from the definitions, not from the kernels, so that a mistake in one does not hide in the other.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Any

@@ -4,8 +4,6 @@ Written from the formulas, not from the kernels. Positions are px from the image
 everything else that an estimator may know.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cache

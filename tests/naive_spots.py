@@ -1,7 +1,5 @@
 """The effective PSF in plain NumPy: a cubic spline, or what tables make of it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

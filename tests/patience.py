@@ -1,7 +1,5 @@
 """How long tests wait for other processes and threads."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Random sensors, and what it means that slopes equal the oracle's."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Refusals: errors of one line that name what was wrong."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager

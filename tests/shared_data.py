@@ -1,7 +1,5 @@
 """Where tests find the files of the project, and real frames and reference values that are not part of it."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Simulated frames of a layout."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from faintspot.slopes.sensor.layout import Layout

@@ -1,7 +1,5 @@
 """The benchmarks' rivals do the same work as faintspot; nothing here is timed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

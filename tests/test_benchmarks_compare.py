@@ -1,7 +1,5 @@
 """What changed between two runs is told from noise; nothing is timed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Results of benchmarks survive being written and read, and an interrupted run keeps what was finished."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from types import ModuleType

@@ -1,7 +1,5 @@
 """What is not real time imports and works without what only Linux has; real time says that it needs Linux."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Every cache of the package has a name here and a bound."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Every block of Python in README and docs runs, with what its page takes for granted; tables are whole."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

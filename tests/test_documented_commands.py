@@ -1,7 +1,5 @@
 """Every command of README and docs is one that faintspot has, and those that need nothing but frames run."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -1,7 +1,5 @@
 """Every estimator's kernel equals the oracle, whatever shares its group, its frame or its threads."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import product

@@ -1,7 +1,5 @@
 """Images and settings that no estimator expects: nothing raises, nothing is NaN, no flux is flagged."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """The benchmark of foreign loops runs; nothing is asserted of who wins."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """constraints.txt pins what the package, its extras and its dependency groups require."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 

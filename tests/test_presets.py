@@ -3,8 +3,6 @@
 At the full noise as strength, where few iterations do worst.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

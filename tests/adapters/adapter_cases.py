@@ -1,7 +1,5 @@
 """What the tests of all adapters share: spots without noise, and whether a tool is there."""
 
-from __future__ import annotations
-
 import importlib.util
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A small sensor with a calibration that is not trivial, and frames of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

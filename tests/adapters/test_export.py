@@ -1,7 +1,5 @@
 """Exported weights and matrices: slopes and commands follow from the file alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

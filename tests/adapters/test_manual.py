@@ -1,7 +1,5 @@
 """The scripts in the manual of other tools run as they stand, but for a shorter recording."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """pyRTC's whole loop: frames of a stream as its sensor, and the files for its manager."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from typing import Any

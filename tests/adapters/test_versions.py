@@ -1,7 +1,5 @@
 """Each adapter says once that a tool has another version than was tested."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import re
 import warnings

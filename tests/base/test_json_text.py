@@ -1,7 +1,5 @@
 """One writer of JSON, whose text every strict reader accepts."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

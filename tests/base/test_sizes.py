@@ -1,7 +1,5 @@
 """Absurd sizes are refused in one line, before they take memory or time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The slope error R and what else describes slopes, against what is known in closed form."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which slopes are left out, and the line that says so."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

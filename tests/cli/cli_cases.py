@@ -1,7 +1,5 @@
 """A small sensor, its frames and ways to run the command line, for the tests of the commands."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

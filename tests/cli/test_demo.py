@@ -1,7 +1,5 @@
 """faintspot demo: it runs, again too, and what it leaves is what the other commands would make."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`faintspot doctor`: whatever is installed, it answers, and says what to do about what is missing."""
 
-from __future__ import annotations
-
 import json
 import sys
 

@@ -1,7 +1,5 @@
 """faintspot export: weights and matrices as FITS."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The command line as a whole: help, version, what is unknown, and how quickly it answers."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Ctrl-C ends what waits in compiled code, where Python's own handlers do not run."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

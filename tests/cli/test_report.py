@@ -1,7 +1,5 @@
 """faintspot report: the command; the page itself is tested with its own room."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

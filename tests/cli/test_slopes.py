@@ -1,7 +1,5 @@
 """faintspot slopes: every format in and out, equal to the pipeline, exact options, clean output."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

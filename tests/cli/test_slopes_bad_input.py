@@ -1,7 +1,5 @@
 """faintspot slopes with what is wrong: one line, exit code 2, nothing that looks like a result."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

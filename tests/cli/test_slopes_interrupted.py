@@ -1,7 +1,5 @@
 """faintspot slopes, killed or interrupted in mid-run and started again: as if nothing had happened."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """faintspot study: runs, goes on after kill -9, and says in one line what is wrong."""
 
-from __future__ import annotations
-
 import subprocess
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """faintspot telemetry of a running engine: it is recorded first, and the recording is kept where asked."""
 
-from __future__ import annotations
-
 import json
 import secrets
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Layout on a flat frame, then slopes and wavefront of others: right values, and lost spots are left out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An engine that runs in a thread of the test, a camera that the test plays, and what is published."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterable
 from typing import Any

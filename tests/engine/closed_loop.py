@@ -4,8 +4,6 @@ Each frame is read out while the exposure of the next one, which has begun with 
 commands are waited for. So those computed from frame k act in frame k + 2, however busy the machine is.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from pathlib import Path

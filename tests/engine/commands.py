@@ -1,7 +1,5 @@
 """Commands in processes of their own, which run this checkout."""
 
-from __future__ import annotations
-
 import multiprocessing
 import multiprocessing.process
 import os

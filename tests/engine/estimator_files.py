@@ -1,7 +1,5 @@
 """Python files with an estimator, "mine", for a running engine to load."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from textwrap import dedent, indent
 

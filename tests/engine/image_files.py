@@ -1,7 +1,5 @@
 """Streams of ImageStreamIO put together byte by byte, from the offsets of its public header."""
 
-from __future__ import annotations
-
 import ctypes
 import mmap
 import struct

@@ -1,7 +1,5 @@
 """What the tests of telemetry write: every number tells its frame."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any, Self
 

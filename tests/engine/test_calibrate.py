@@ -1,7 +1,5 @@
 """faintspot realtime calibrate: with a simulated telescope at its own pace, through the streams."""
 
-from __future__ import annotations
-
 import shutil
 import threading
 from collections.abc import Iterator

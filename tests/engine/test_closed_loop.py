@@ -1,7 +1,5 @@
 """Frame to command: the loop that an engine closes is the one that is simulated, and what can go wrong."""
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Sources of frames end in order when they are interrupted, and leave nothing behind."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Estimators and controllers take turns in a closed loop: no jump, and telemetry says whose turn it was."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Camera, engine and consumer as three processes: slopes are those of the pipeline, bit for bit."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

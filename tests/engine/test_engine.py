@@ -1,7 +1,5 @@
 """The engine between a pixel ring and its streams: every frame once and bit for bit."""
 
-from __future__ import annotations
-
 import io
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What cameras, consumers and clocks do wrong: the loop goes on, and says what happened."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

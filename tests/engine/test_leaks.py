@@ -4,8 +4,6 @@ The garbage collector is off, as it is while frames come. FAINTSPOT_LEAK_TIMES=5
 changes: 10,000 of settings, 1000 of estimators and of cameras take a few minutes.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import sys

@@ -1,7 +1,5 @@
 """What goes wrong around a closed loop: clocks, a stream of commands that is taken away, a full disk."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

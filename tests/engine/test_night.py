@@ -1,7 +1,5 @@
 """A short night from end to end: telescope, engine, recorder, and what telemetry says of the methods."""
 
-from __future__ import annotations
-
 import threading
 import time
 from pathlib import Path

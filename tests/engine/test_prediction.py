@@ -1,7 +1,5 @@
 """What estimators are told: a prior, from the engine's controller or from outside, and the mean flux."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace

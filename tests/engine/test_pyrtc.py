@@ -1,7 +1,5 @@
 """pyRTC, in a process of its own, with the engine in its loop: its frames in, its loop on our slopes."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess

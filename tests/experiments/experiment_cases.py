@@ -1,7 +1,5 @@
 """A small loop, for the tests of the experiments: a 1.8 m telescope with 4 x 4 sub-apertures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

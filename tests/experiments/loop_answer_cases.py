@@ -1,7 +1,5 @@
 """Answers for closed loops that are made up, so that their statistics are known."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Nights whose differences are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Questions and answers for the tests of the planner."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Results of closed-loop experiments, small or made up, for tests of what is made of them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import faintspot as fs

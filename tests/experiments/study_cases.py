@@ -1,7 +1,5 @@
 """Small synthetic studies with known curves, in the form that a run of a study has."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

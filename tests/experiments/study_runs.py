@@ -1,7 +1,5 @@
 """A study that takes a second, and what the tests of runs ask of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import xarray

@@ -1,7 +1,5 @@
 """Curves of R against the flux, and what follows from them, with intervals."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

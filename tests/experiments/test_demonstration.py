@@ -1,7 +1,5 @@
 """The demonstration: its choices are scored on other frames, and its physics is the sensor's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The built-in study of the estimators: its cells, its figures, its tables."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path

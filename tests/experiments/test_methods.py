@@ -1,7 +1,5 @@
 """Methods: estimators made for a scene, by their own word."""
 
-from __future__ import annotations
-
 import pytest
 
 from faintspot import PSF

@@ -1,7 +1,5 @@
 """The paper's study: its cells and its report."""
 
-from __future__ import annotations
-
 import pytest
 
 from faintspot.base.errors import InputError

@@ -1,7 +1,5 @@
 """Units give the same results whoever does them, however often they are interrupted."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The store of finished units: whole ones or none, and nobody else's."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -4,8 +4,6 @@ Every part runs in a process of its own, whose memory is limited, so that a segm
 huge allocation is a finding with a seed. `--part kernels --seed 123 --minutes 0` repeats one.
 """
 
-from __future__ import annotations
-
 import argparse
 import faulthandler
 import importlib

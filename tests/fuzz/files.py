@@ -1,7 +1,5 @@
 """Damaged files of every format: a result, or an InputError in one line."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import tempfile

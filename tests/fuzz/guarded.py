@@ -1,7 +1,5 @@
 """Arrays that touch a page which nobody may read or write: one element too far ends the process."""
 
-from __future__ import annotations
-
 import ctypes
 import mmap
 from typing import Any

@@ -4,8 +4,6 @@ Slopes must be those of the same frames in ordinary memory, bit by bit, and fini
 must be those of the oracle.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What everything at the door does with what it cannot use."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A few seconds of fuzzing; `make fuzz` runs as long as one likes."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Public functions and safety rules with any values: a result, or an InputError in one line."""
 
-from __future__ import annotations
-
 import ipaddress
 import socket
 import warnings

@@ -1,7 +1,5 @@
 """Files of frames in every format: the subjects of `FrameFormatTests`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

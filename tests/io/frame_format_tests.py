@@ -1,7 +1,5 @@
 """Tests that every format of frames must pass."""
 
-from __future__ import annotations
-
 import sys
 import tracemalloc
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Slopes to be written and checked, and the formats that `SlopeFormatTests` runs through."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

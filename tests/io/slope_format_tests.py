@@ -1,7 +1,5 @@
 """Tests that every format of slopes must pass."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

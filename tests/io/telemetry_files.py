@@ -1,7 +1,5 @@
 """Telemetry of a small sensor, for the tests of its files."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

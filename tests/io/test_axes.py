@@ -1,7 +1,5 @@
 """Which axis of a cube counts the frames."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 from tests.io.frame_files import FRAME_FILES, FrameFile
 from tests.io.frame_format_tests import FrameFormatTests

@@ -1,7 +1,5 @@
 """Numbers that are missing, and sources that begin anew."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames of several files as one sequence, whole arrays, and refused files of no particular format."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

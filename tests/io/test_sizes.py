@@ -1,7 +1,5 @@
 """Sizes that files state are limited: refused in one line before the memory is used."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import sys
 import tracemalloc
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Options as they are declared: what they may be, everywhere and for each sub-aperture."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import FrozenInstanceError, dataclass
 from typing import Any

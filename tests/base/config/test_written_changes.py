@@ -1,7 +1,5 @@
 """What people write is understood, or refused in one line; and quickly."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Drawing: places of sub-apertures, limits of colours, files."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

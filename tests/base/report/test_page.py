@@ -1,7 +1,5 @@
 """One page made of sections: everything is in it, escaped, and nothing from elsewhere."""
 
-from __future__ import annotations
-
 import base64
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Plots of lines: what is drawn, and limits that are left to the data."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

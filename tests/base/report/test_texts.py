@@ -1,7 +1,5 @@
 """The texts of pages: each is asked for by a module that reads its file; sentences, cells and columns."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Frames with light that is no spot: reflections, a background that varies, a colour mosaic."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """faintspot layout --bin: large windows and colour mosaics, from frames to slopes in the camera's pixels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """faintspot layout: from a frame to a configuration that faintspot slopes accepts, and a picture."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """faintspot layout where the frame shows more than spots: settings, slopes, and what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

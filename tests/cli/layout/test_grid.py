@@ -1,7 +1,5 @@
 """faintspot layout --grid: quad cells from frames to slopes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """faintspot realtime send and status, with an engine in the process of the test."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

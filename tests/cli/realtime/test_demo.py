@@ -1,7 +1,5 @@
 """faintspot realtime demo: it shows a loop, ends what it has started, and says what each method gained."""
 
-from __future__ import annotations
-
 import signal
 import threading
 import time

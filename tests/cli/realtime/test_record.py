@@ -1,7 +1,5 @@
 """faintspot realtime record and export: files, what is said, and errors in one line."""
 
-from __future__ import annotations
-
 import secrets
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What takes long says why, what does not says nothing."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Without extras, commands say at their start what they need, and those that can do their job do it."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

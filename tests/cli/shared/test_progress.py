@@ -1,7 +1,5 @@
 """The progress bar on standard error, in a terminal, in a file and in a notebook."""
 
-from __future__ import annotations
-
 import sys
 from importlib.machinery import ModuleSpec
 from types import ModuleType

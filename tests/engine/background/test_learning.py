@@ -1,7 +1,5 @@
 """Learning beside an engine: what is better is handed over, and the loop goes on whatever happens to it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Following a sodium layer beside an engine: its spots are handed over, and the engine measures with them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

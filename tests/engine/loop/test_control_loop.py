@@ -1,7 +1,5 @@
 """A mirror never gets a command that is not a finite number, whatever the files of [control] hold."""
 
-from __future__ import annotations
-
 from functools import cache, partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The guard against a window's slopes: those of spots that have left it are small."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The page in a real browser: Chromium as the distribution has it, without a window."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import threading

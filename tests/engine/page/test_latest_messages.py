@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import asyncio
 
 from faintspot.engine.page.latest_messages import LatestMessages

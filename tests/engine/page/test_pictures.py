@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 from tests.engine.page.cases import LAYOUT, N, records, unpacked
 

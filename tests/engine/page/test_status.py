@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import faintspot as fs
 from faintspot.engine.page.status import settings_rows
 from faintspot.slopes.pipeline.settings import SharedOptions

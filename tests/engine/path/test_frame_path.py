@@ -1,7 +1,5 @@
 """Slopes of frames that arrive row by row: those of the pipeline, bit for bit."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Causes of late frames."""
 
-from __future__ import annotations
-
 import mmap
 
 from faintspot.engine.path.lateness import (

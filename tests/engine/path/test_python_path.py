@@ -1,7 +1,5 @@
 """An estimator in NumPy in the engine: the pipeline's slopes, and no fault beyond its frame."""
 
-from __future__ import annotations
-
 import gc
 import threading
 import time

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 
 from faintspot.engine.path.slope_prior import SlopePrior

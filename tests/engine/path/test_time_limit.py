@@ -1,7 +1,5 @@
 """Calls that may never come back."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest

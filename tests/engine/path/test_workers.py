@@ -1,7 +1,5 @@
 """Long-lived threads: every share once, sleep, death."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The simulated camera: what it publishes is what was simulated, in order, at its rate; it stops and ends."""
 
-from __future__ import annotations
-
 import signal
 import threading
 import time

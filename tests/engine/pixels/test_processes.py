@@ -1,7 +1,5 @@
 """Which processes live."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import time

@@ -1,7 +1,5 @@
 """Recorded frames as a source: the frames of the files, in order, at the rate, and an end in order."""
 
-from __future__ import annotations
-
 import gzip
 import signal
 import sys

@@ -1,7 +1,5 @@
 """The segment of a pixel ring: what is not one, or not whole, or not private, is refused in one line."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Processes that end with the one that has started them."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Scheduling of the engine's process."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

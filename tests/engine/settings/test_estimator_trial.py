@@ -1,7 +1,5 @@
 """Whatever a file with estimators does in its trial, this process goes on and is told in one line."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from pathlib import Path

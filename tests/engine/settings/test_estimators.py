@@ -1,7 +1,5 @@
 """Estimators of files in a running engine: in, out, and given up when they fail; no frame is missing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

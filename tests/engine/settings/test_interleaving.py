@@ -1,7 +1,5 @@
 """Methods: what their texts mean, and whose turn it is."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

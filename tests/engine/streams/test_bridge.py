@@ -1,7 +1,5 @@
 """The bridge from a stream to a pixel ring: every frame whole, and all that can happen to a stream."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -1,7 +1,5 @@
 """Streams of ImageStreamIO: read and written as the offsets of its header say, or refused."""
 
-from __future__ import annotations
-
 import os
 import struct
 import threading

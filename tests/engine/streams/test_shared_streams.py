@@ -1,7 +1,5 @@
 """Other users, and what was left behind, cannot hold up a publisher or have files made elsewhere."""
 
-from __future__ import annotations
-
 import ctypes.util
 import errno
 import fcntl

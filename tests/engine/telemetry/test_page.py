@@ -1,7 +1,5 @@
 """The page of recorded telemetry, from a store whose lost frames and differences are known."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The recorder: what the engine wrote is in the store, whatever ends the recording."""
 
-from __future__ import annotations
-
 import errno
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """The telemetry ring: records come whole and in order, and what a slow reader loses is counted."""
 
-from __future__ import annotations
-
 import multiprocessing
 import time
 from multiprocessing.synchronize import Event

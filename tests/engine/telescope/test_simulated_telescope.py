@@ -4,8 +4,6 @@ Each `run(1)` publishes a frame while the exposure of the next one, which has be
 acts when does not depend on how busy the machine is.
 """
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The search for the best options."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

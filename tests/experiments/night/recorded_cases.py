@@ -1,7 +1,5 @@
 """Stores of telemetry as the engine's recorder writes them, with methods that alternate."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A night from a recording: what differs between methods is found, and what cannot be used is refused."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

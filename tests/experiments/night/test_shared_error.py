@@ -1,7 +1,5 @@
 """Errors that all blocks of a method share, such as that of its centroid gain."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Verdicts: each claim is decided by the numbers, both ways."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any

@@ -1,7 +1,5 @@
 """The figures of a study: what is drawn, and its numbers."""
 
-from __future__ import annotations
-
 import csv
 import io
 from typing import Any

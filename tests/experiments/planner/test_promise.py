@@ -1,7 +1,5 @@
 """What tune promises, against frames with a known truth."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The report page of a study: complete, self-contained, honest about what is missing."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import asdict
 from html.parser import HTMLParser

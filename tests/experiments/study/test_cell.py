@@ -1,7 +1,5 @@
 """One cell: choices on one half, scores on the other, and the reference values of an independent program."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What the methods do to the images, against the public functions and SciPy."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Curves of R against signal, and the flux gain with its confidence interval."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.experiments.study_cases import cells, dataset, power_law

@@ -1,7 +1,5 @@
 """Estimators as methods of a study: at the bound where they should be, with errors that they know."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterator
 from dataclasses import replace

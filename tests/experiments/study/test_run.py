@@ -1,7 +1,5 @@
 """Runs give the same results whoever does the work, in whatever order, however often they are interrupted."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Specifications: what they list, and one line for what is wrong with them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """HDF5, MATLAB and image files: tests beyond those of every format."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A format that somebody adds passes the tests of all formats."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import IO, Any

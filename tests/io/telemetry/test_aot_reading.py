@@ -1,7 +1,5 @@
 """AOT files are read: our own bit for bit, others as far as they say what is needed, or one line."""
 
-from __future__ import annotations
-
 import shlex
 import shutil
 from collections.abc import Callable

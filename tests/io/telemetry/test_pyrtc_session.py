@@ -1,7 +1,5 @@
 """Sessions of pyRTC's telemetry, as its files are laid out."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Telemetry in files: what was written is read back, and what is not telemetry is refused."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

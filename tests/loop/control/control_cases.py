@@ -1,7 +1,5 @@
 """A small loop for the tests of control: 3 x 3 sub-apertures, a mirror that makes any slopes, two layers."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from faintspot.loop.control.identification.models import LoopPlant

@@ -1,7 +1,5 @@
 """Oscillators driven by white noise."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Slopes of frozen turbulence as a sum of many plane waves: an oracle that shares nothing with the theory."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence

@@ -1,7 +1,5 @@
 """Compiled control is the plain one, and keeps the stroke."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.loop.control.control_cases import ERRORS, INTERACTION

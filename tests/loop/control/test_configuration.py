@@ -1,7 +1,5 @@
 """[control] of faintspot.toml: what is refused, in one line that says where."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

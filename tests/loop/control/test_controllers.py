@@ -1,7 +1,5 @@
 """What every controller must do: one suite, and a class for each controller."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

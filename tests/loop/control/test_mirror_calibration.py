@@ -1,7 +1,5 @@
 """Pokes of a mirror: what they find is true within its errors, and what cannot be is refused."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any

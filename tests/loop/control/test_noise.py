@@ -1,7 +1,5 @@
 """Noise with covariances of x and y, against whole matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

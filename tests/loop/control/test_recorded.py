@@ -1,7 +1,5 @@
 """Control in recordings."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tip, tilt and focus removed from slopes: exactly, for valid slopes only, in the matrix and in the loop."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

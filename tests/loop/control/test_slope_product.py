@@ -1,7 +1,5 @@
 """A product that is begun while slopes arrive is the whole product, whatever the slopes turn out to be."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Configurations of the tests of the loop: the default telescope, with air that does not change."""
 
-from __future__ import annotations
-
 import faintspot as fs
 from faintspot.loop.simulation import LoopConfiguration, Method
 from faintspot.loop.simulation.configuration.sections import Camera

@@ -1,7 +1,5 @@
 """Rolling shutter: rows see turbulence and mirror of their own time."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.loop.simulation.loop_cases import faint, plain, quiet

@@ -1,7 +1,5 @@
 """Closed loops of methods that alternate, whose residual phase and centroid gains are known."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

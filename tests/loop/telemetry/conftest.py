@@ -1,7 +1,5 @@
 """Fixtures for the tests of telemetry."""
 
-from __future__ import annotations
-
 import pytest
 from tests.cli.cli_cases import Commands
 

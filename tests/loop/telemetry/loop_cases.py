@@ -1,7 +1,5 @@
 """A recorded loop whose turbulence, noise, delay and gain are known."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Turns of methods, and their residual phase."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Turbulence against time."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Recordings of loops from files of several formats, and files that are wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

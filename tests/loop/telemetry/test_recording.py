@@ -1,7 +1,5 @@
 """Learning from a recording: its open-loop slopes are those that the loop had, and what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

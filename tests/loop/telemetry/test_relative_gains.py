@@ -1,7 +1,5 @@
 """Centroid gains of alternating methods relative to one another."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

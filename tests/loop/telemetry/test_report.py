@@ -1,7 +1,5 @@
 """What a recording of a loop tells: within its errors of a truth that is known, and what it does not tell."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

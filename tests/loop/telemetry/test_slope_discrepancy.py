@@ -1,7 +1,5 @@
 """Turned and stretched slopes are told from those of wavefronts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Background between spots: a known one comes back, and only one that matters is told."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

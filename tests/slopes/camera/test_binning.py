@@ -1,7 +1,5 @@
 """Binned frames and their calibration."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from faintspot import Calibration

@@ -1,7 +1,5 @@
 """Gains of even and odd rows and columns are seen in wide spots, and sharp ones are not taken for them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Noise of each pixel and blinking pixels of simulated cameras whose values are known."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ Statistical tests are two-sided at 4.9 standard errors, a false-alarm rate of 1e
 Gaussian (they are: 2,000 pixels or more). Seeds are fixed, so a test passes for good or fails for good.
 """
 
-from __future__ import annotations
-
 from dataclasses import FrozenInstanceError
 from typing import Any
 

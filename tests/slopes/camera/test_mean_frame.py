@@ -1,7 +1,5 @@
 """Mean of the finite values of each pixel."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from faintspot.slopes.camera.mean_frame import MeanFrame

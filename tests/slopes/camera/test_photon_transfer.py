@@ -1,7 +1,5 @@
 """Read noise and gain of simulated detectors whose values are known, and of a real camera."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

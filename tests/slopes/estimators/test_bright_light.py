@@ -1,7 +1,5 @@
 """No light makes the gain of an estimator one with which a loop would diverge."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

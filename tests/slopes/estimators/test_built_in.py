@@ -1,7 +1,5 @@
 """Every built-in estimator, and the example's own one, passes the tests that a plug-in can inherit."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import sys

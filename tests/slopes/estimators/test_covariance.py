@@ -1,7 +1,5 @@
 """The stated 2 x 2 covariance of a slope's error, for elongated and rotated spots of a laser guide star."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The page of the configuration includes the options of every estimator."""
 
-from __future__ import annotations
-
 from tests.shared_data import ROOT
 
 from faintspot.slopes.estimators.documentation import all_tables

@@ -1,7 +1,5 @@
 """Estimators in NumPy: whatever `locate` does, a frame has slopes or flags, and errors are one line."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

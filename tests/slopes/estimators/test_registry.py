@@ -1,7 +1,5 @@
 """Which estimators are known, and how others become known."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

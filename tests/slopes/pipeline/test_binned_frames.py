@@ -1,7 +1,5 @@
 """Slopes in binned frames, in the camera's pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.refusals import refused

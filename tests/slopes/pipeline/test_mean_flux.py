@@ -1,7 +1,5 @@
 """The running mean of the flux, and pipelines that are told it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

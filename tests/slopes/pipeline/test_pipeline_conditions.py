@@ -1,7 +1,5 @@
 """The pipeline under bad conditions, at every size, and against published slope errors."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

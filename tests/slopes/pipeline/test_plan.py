@@ -1,7 +1,5 @@
 """What an estimator lacks is said in one line; measured flux, configuration files and tables."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 from typing import Any

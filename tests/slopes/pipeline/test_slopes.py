@@ -1,7 +1,5 @@
 """Slopes of frames say what they are."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames of small sensors give the same slopes one at a time as in a block."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Few tests need pictures drawn, none in fine detail."""
 
-from __future__ import annotations
-
 import pytest
 
 

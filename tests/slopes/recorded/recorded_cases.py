@@ -1,7 +1,5 @@
 """A small simulated sensor measured in two ways, and a reader of pages, for the tests of reports."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from typing import Any

@@ -1,7 +1,5 @@
 """Settings to begin with: not worse than a fixed window, on spots they were not chosen on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

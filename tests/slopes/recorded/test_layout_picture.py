@@ -1,7 +1,5 @@
 """The picture of a layout on its frame."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recorded frames to slopes: blocks, resuming, what the output says about its origin."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

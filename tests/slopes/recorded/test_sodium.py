@@ -1,7 +1,5 @@
 """Sodium profile of recorded frames: found from a single layer, written by the command, and reported."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

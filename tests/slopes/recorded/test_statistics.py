@@ -1,7 +1,5 @@
 """The numbers of a report equal plain NumPy on each sub-aperture's valid frames."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames of simulated sensors: what is known about each is chosen, not found."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Layouts of frames whose spots an aberration moves far from their lattice, and what is said of the rest."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Grids whose place is known: windows, and which cells are illuminated."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

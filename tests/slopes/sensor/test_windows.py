@@ -1,7 +1,5 @@
 """Windows lie on the spots, do not overlap, and are as large as a pitch of whole pixels allows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Stacks of sub-apertures and whole sensor frames: truth, light, reproducibility, reference errors."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The Cramer-Rao bound: closed forms, limits, a fit that reaches it; photon efficiency."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """Fixed weights: their checks, their file, and the best linear estimate."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Spots of laser guide stars: closed formulas, their images, and those of OOPAO and SPECULA."""
 
-from __future__ import annotations
-
 import importlib
 from typing import Any
 

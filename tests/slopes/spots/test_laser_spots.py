@@ -1,7 +1,5 @@
 """Laser guide stars in the planner: [laser] of the camera file, spots that are tuned on, what is written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """PSFs: analytic ones are those of the simulation, and what is saved comes back."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The trained score: what it accepts, how it is stored, and what its passes compute."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Spots: flux, position and width against numerical integration and against their definitions."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Sodium profiles: their convention, their moments and their checks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

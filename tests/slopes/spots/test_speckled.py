@@ -1,7 +1,5 @@
 """Speckled spots: without turbulence, against Kolmogorov theory, and inside simulated sub-apertures."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

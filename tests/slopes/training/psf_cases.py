@@ -1,7 +1,5 @@
 """Simulated spots for the tests of learning a PSF, and the error of maximum likelihood with one."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

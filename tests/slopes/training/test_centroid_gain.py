@@ -1,7 +1,5 @@
 """Centroid gains from spots that are moved."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Learning a PSF from images alone: as good as the true one, and honest where it cannot be."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

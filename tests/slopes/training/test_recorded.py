@@ -1,7 +1,5 @@
 """Training on recorded frames: splitting of the photons, errors against training with a truth."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

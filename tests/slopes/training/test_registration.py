@@ -1,7 +1,5 @@
 """Registration: unbiased, with honest errors, and deaf to bad pixels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Training on simulated spots: its errors, its classes and kinds, what it refuses."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

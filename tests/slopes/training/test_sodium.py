@@ -1,7 +1,5 @@
 """Sodium profiles learnt from mean images: exact without noise, near the truth with it, and checked."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

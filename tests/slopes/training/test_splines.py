@@ -1,7 +1,5 @@
 """The basis of a trained score's tables."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

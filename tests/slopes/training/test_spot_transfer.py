@@ -1,7 +1,5 @@
 """Gain and read noise of simulated cameras whose spots move by more than photon transfer allows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

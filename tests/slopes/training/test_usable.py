@@ -1,7 +1,5 @@
 """Sub-apertures without a spot of their own are left out of what is learnt from frames, and it is said."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

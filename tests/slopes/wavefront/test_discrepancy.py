@@ -1,7 +1,5 @@
 """The part of slopes that no wavefront can cause."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Wavefronts against phases that are known: single modes, and screens of turbulence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

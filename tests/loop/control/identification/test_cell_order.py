@@ -1,7 +1,5 @@
 """Orders of sub-apertures that do not fit the interaction matrix."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.loop.telemetry.loop_cases import CELLS, CORNERS

@@ -1,7 +1,5 @@
 """Delay and centroid gain of a loop, from its slopes and commands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Quantities measured from telemetry: intervals, and quantities that are not known."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """What was learnt is the same after it was in a file, and goes on from any mirror without a jump."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Geometry and gaps of recorded loops."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

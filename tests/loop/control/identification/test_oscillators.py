@@ -1,7 +1,5 @@
 """Tip and tilt of a single sub-aperture: oscillators in place of winds."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

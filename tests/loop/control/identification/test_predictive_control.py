@@ -1,7 +1,5 @@
 """Predictive control of a loop whose matrix has the wrong gain, from a recording alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

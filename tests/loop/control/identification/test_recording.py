@@ -1,7 +1,5 @@
 """Conventions of recorded loops: sign, rows and unit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A filter learnt again is taken if it is better on frames that it has not seen, and not otherwise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Replays in one product or in compiled code are those of the controllers themselves."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Vibrations: lines in the spectra of tip, tilt and focus, told from broad maxima."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

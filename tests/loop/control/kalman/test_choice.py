@@ -1,7 +1,5 @@
 """Choice of the controller that drives the mirror, by measured residuals."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The compiled Kalman filter is the one written in NumPy, with the integrator that guards it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from typing import Any

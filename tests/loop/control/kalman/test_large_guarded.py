@@ -1,7 +1,5 @@
 """The guarded filter of large sensors is `Guarded` with the same two controllers."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

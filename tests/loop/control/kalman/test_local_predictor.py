@@ -1,7 +1,5 @@
 """The filter for large sensors, against the one in which all slopes interact and against loops."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

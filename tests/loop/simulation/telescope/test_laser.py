@@ -1,7 +1,5 @@
 """A loop on a laser guide star: images, low orders of a natural star, a profile that is followed."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

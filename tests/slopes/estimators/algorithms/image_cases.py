@@ -1,7 +1,5 @@
 """Images and messages that the tests of the estimators share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The automatic settings against a coarse search, and how they go with flux, noise and window."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """The noise estimate and the suggested strength on simulated spots with known noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.simulated import frames_of

@@ -1,7 +1,5 @@
 """Width and flux of spots by their autocorrelation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.refusals import refused

@@ -1,7 +1,5 @@
 """Correlation with a reference image: against a direct search, on elongated spots and extended sources."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A cache that cannot be written or read ends nothing, and says so once."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any

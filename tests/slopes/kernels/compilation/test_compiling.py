@@ -1,7 +1,5 @@
 """What Python calls becomes machine code with all that it calls; what kernels call does not alone."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

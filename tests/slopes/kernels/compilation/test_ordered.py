@@ -1,7 +1,5 @@
 """Numbers for other processes: written and read in order, also where processors do not keep it themselves."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Any

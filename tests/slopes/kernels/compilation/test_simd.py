@@ -1,7 +1,5 @@
 """The vector type: every operation equals NumPy's on each lane."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Subnormal numbers are 0 while a thread measures, and what they were afterwards."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 

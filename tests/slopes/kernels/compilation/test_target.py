@@ -1,7 +1,5 @@
 """Kernels use what the processor has that Numba compiles for, which may be less than this machine's."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

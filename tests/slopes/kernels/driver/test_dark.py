@@ -1,7 +1,5 @@
 """Windows without flux are found from their pixels in bright frames, and in means of frames."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

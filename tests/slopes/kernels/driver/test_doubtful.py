@@ -1,7 +1,5 @@
 """Spots that their window cuts, or that are unlike all their neighbours, are flagged; others are not."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What pictures are made of: windows in place, chosen sub-apertures, positions, files."""
 
-from __future__ import annotations
-
 import matplotlib
 import numpy as np
 from tests.slopes.recorded.recorded_cases import SETTINGS, sensor, simulated

@@ -1,7 +1,5 @@
 """Maps over all frames: what is cut says so, and legends lie beside the data."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

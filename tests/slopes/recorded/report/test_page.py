@@ -1,7 +1,5 @@
 """The report page: complete, self-contained, and honest about what is missing."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Noise and centroid gain of methods from their slopes alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The report of slopes in files: rebuilt from what they say, and what is missing is said."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path

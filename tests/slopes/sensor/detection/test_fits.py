@@ -1,7 +1,5 @@
 """The lattice chosen is that of the spots, not one that is coarser, finer or of another geometry."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks.layouts import verdict

@@ -1,7 +1,5 @@
 """Which lenslets are lit, on simulated sensors that differ in all that a finder might take for granted."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
