@@ -85,7 +85,7 @@ class ZarrStore:
         fingerprint: str,
         units: Sequence[str],
         *,
-        attributes: Mapping[str, Any] | None = None,
+        attributes: Mapping[str, object] | None = None,
         template: xarray.Dataset | None = None,
         overwrite: bool = False,
     ) -> None:
@@ -180,7 +180,7 @@ def _attributes(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _check_path(path: Path, attributes: Mapping[str, Any], *, overwrite: bool) -> None:
+def _check_path(path: Path, attributes: Mapping[str, object], *, overwrite: bool) -> None:
     """Refuse to write where there is anything but this experiment, or where `overwrite` another one."""
     kind = attributes[_KIND]
     if not path.absolute().parent.is_dir():
@@ -226,7 +226,7 @@ def _chunk(array: Any, values: NDArray[Any]) -> NDArray[Any]:
     return chunk
 
 
-def _plain(values: Any) -> NDArray[Any]:
+def _plain(values: object) -> NDArray[Any]:
     """Return NumPy's own texts for those of Zarr."""
     array = np.asarray(values)
     return np.asarray(array.tolist(), dtype=np.str_) if array.dtype.kind in "TO" else array

@@ -41,7 +41,7 @@ def create_writer(
     *,
     n_frames: int,
     n_subapertures: int,
-    attributes: Mapping[str, Any],
+    attributes: Mapping[str, object],
     coordinates: Mapping[str, NDArray[Any]],
     resume: bool = True,
     overwrite: bool = False,
@@ -197,7 +197,7 @@ def _read(path: Path, read: Callable[[Path], _Result]) -> _Result:
 
 
 def _checked_run(
-    n_frames: int, n_subapertures: int, attributes: Mapping[str, Any], coordinates: Mapping[str, Any]
+    n_frames: int, n_subapertures: int, attributes: Mapping[str, object], coordinates: Mapping[str, object]
 ) -> RecordingHeader:
     """Check the description of the run and convert it to the stored form."""
     frames = int(number_between("n_frames", n_frames, 1, integer=True))

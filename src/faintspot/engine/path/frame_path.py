@@ -106,7 +106,7 @@ class _Groups:
         frame: tuple[int, int],
         progress: Progress,
         waiting: tuple[NDArray[np.int64], NDArray[np.int64]],
-        after: tuple[Any, ...],
+        after: tuple[object, ...],
         part: ProductPart = NO_PRODUCT,
         rehearse: Rehearsal | None = None,
     ) -> bool:
@@ -342,7 +342,7 @@ class FramePath:
         share: int,
         frame: tuple[int, int],
         progress: Progress,
-        after: tuple[Any, ...],
+        after: tuple[object, ...],
         part: ProductPart = NO_PRODUCT,
         rehearse: Rehearsal | None = None,
     ) -> bool:

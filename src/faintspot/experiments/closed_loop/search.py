@@ -185,7 +185,7 @@ def with_integrator(kind: MethodKind) -> MethodKind:
     return replace(kind, control=INTEGRATOR)
 
 
-def _is_scale(values: Sequence[Any]) -> bool:
+def _is_scale(values: Sequence[object]) -> bool:
     """Return whether an option's values are positive numbers, between which it may be."""
     return all(isinstance(value, float) and value > 0 for value in values)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -127,7 +128,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **st
     return Question(**{**stated, **values, **parts}, facts=(*earlier, *facts))
 
 
-def _check_stated(layout: Layout, stated: dict[str, Any]) -> None:
+def _check_stated(layout: Layout, stated: Mapping[str, object]) -> None:
     """Refuse wrong values before anything is measured: those not stated are assumed for it."""
     assumed: dict[str, Any] = {"read_noise_e": 1.0, "layout": layout}
     if stated.get("psf") is None and stated.get("laser") is None:
@@ -137,7 +138,7 @@ def _check_stated(layout: Layout, stated: dict[str, Any]) -> None:
     Question(**{**assumed, **stated})
 
 
-def _check_flux(stack: NDArray[Any], dark: Any, layout: Layout, gain: float) -> None:
+def _check_flux(stack: NDArray[Any], dark: object, layout: Layout, gain: float) -> None:
     """Refuse spots so bright that photon noise plays no part."""
     flux_e = gain * float(np.median(layout.images(stack.mean(axis=0) - dark).sum(axis=(-2, -1))))
     if flux_e > LARGEST_FLUX_E:
@@ -147,7 +148,7 @@ def _check_flux(stack: NDArray[Any], dark: Any, layout: Layout, gain: float) -> 
         )
 
 
-def _stack(name: str, value: Any) -> NDArray[Any]:
+def _stack(name: str, value: object) -> NDArray[Any]:
     array = finite_array(name, value, minimum_dimensions=2)
     if array.ndim > 3:
         raise InputError(f"{name}: expected (n, h, w) or (h, w), got shape {array.shape}")

@@ -145,7 +145,7 @@ class Plan:
         """Return the compiled function that sums their flux."""
         return self._direct(self.prepared.flux_kernel, frames)
 
-    def _direct(self, kernel: Any, frames: NDArray[Any]) -> Direct:
+    def _direct(self, kernel: object, frames: NDArray[Any]) -> Direct:
         key = kernel, frames.dtype.char
         if key not in self._kernels:
             self._kernels[key] = Direct(kernel)

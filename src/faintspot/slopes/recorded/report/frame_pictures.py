@@ -106,7 +106,7 @@ def whole_sensor(example: Example) -> Figure:
     return figure
 
 
-def _sheet_bars(axes: list[Axes], shown: Mapping[str, Any], one_unit: bool) -> None:
+def _sheet_bars(axes: list[Axes], shown: Mapping[str, object], one_unit: bool) -> None:
     """Put colour bars beside the panels: electrons at the right end, ADU beside the raw frame."""
     two_rows = len(axes) == 4
     if not one_unit:
