@@ -197,7 +197,7 @@ class _Frames:
         """Close the stream."""
         self._follower.close()
 
-    def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+    def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> str:
         fits = shape == self._shape and dtype.kind in "iuf"
         return "" if fits else f"frames of {self._shape[0]} x {self._shape[1]} (wfs.height, wfs.width)"
 

@@ -146,7 +146,7 @@ class ZarrStore:
                 f"{self.path}: cannot be read: the store is damaged ({one_line(error)}): delete it"
             ) from None
 
-    def _new_array(self, name: str, values: NDArray[Any]) -> Any:
+    def _new_array(self, name: str, values: NDArray[np.generic]) -> Any:
         text = values.dtype.kind in "UT"
         empty: Any = "" if text else np.zeros((), values.dtype)[()]
         return self._group.create_array(
@@ -216,7 +216,7 @@ def _create(zarr: Any, path: Path, attributes: dict[str, Any], template: xarray.
     hidden.rename(path)
 
 
-def _chunk(array: Any, values: NDArray[Any]) -> NDArray[Any]:
+def _chunk(array: Any, values: NDArray[np.generic]) -> NDArray[Any]:
     """Return one row of an array; what a smaller result does not fill stays "not there"."""
     shape = (1, *array.shape[1:])
     if shape[1:] == values.shape:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ def create_writer(
     n_frames: int,
     n_subapertures: int,
     attributes: Mapping[str, object],
-    coordinates: Mapping[str, NDArray[Any]],
+    coordinates: Mapping[str, NDArray[np.generic]],
     resume: bool = True,
     overwrite: bool = False,
 ) -> SlopeWriter:

@@ -345,6 +345,6 @@ def _indices(where: int | Sequence[int] | NDArray[Any]) -> NDArray[np.int64]:
     return numbers_between("where", array, 0, 2**31, integer=True).astype(np.int64)
 
 
-def _locked(array: NDArray[Any]) -> NDArray[Any]:
+def _locked(array: NDArray[np.generic]) -> NDArray[Any]:
     array.flags.writeable = False
     return array

@@ -207,7 +207,7 @@ class SimulatedTelescope(Readout, Closing):
         self._last = self._underway.result()
         return self._last.pixels
 
-    def _publish(self, moment: int, frame: NDArray[Any]) -> None:
+    def _publish(self, moment: int, frame: NDArray[np.generic]) -> None:
         """Read out one frame while the exposure of the next one begins."""
         number, exposure = self._next, self._last
         assert exposure is not None

@@ -216,7 +216,7 @@ def smoothed(
     return results
 
 
-def stored(result: Mapping[str, NDArray[Any]]) -> Tuned:
+def stored(result: Mapping[str, NDArray[np.generic]]) -> Tuned:
     """Return what `tune` found."""
     return Tuned(parse_json(str(result["choice"])), float(result["strehl"]))
 

@@ -197,7 +197,7 @@ def example_subapertures(stages: Stages) -> dict[str, int]:
     return chosen
 
 
-def assembled(layout: Layout, images: NDArray[Any]) -> Floats:
+def assembled(layout: Layout, images: NDArray[np.generic]) -> Floats:
     """Return the windows' images (n, ny, nx) at their places; NaN between them."""
     start = layout.corners.min(axis=0)
     height, width = layout.corners.max(axis=0) - start + np.array(layout.window)

@@ -262,7 +262,7 @@ def _hot_on_lattice(hot: NDArray[np.bool_], fit: LatticeFit) -> NDArray[np.bool_
     return spots
 
 
-def _robust_mean(frames: NDArray[Any]) -> NDArray[np.float64]:
+def _robust_mean(frames: NDArray[np.generic]) -> NDArray[np.float64]:
     """Return the mean of a cube from at most 12 group means, without the two extremes of each pixel."""
     if frames.ndim == 2:
         return frames.astype(np.float64)
