@@ -269,7 +269,7 @@ class ToolSlopes:
         if self._flux is not None and self._frames % _FOLLOW_EVERY == 0:
             self.pipeline = self.pipeline.with_flux(self._flux)
 
-    def _calibrated(self, frame: Any) -> Slopes:
+    def _calibrated(self, frame: object) -> Slopes:
         """Measure a noise-free frame at the calibration flux."""
         pipeline, calibration = self.pipeline, self.pipeline.calibration
         layout = pipeline.layout

@@ -72,14 +72,14 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
     def __init__(
         self,
         mla_grid: Any,
-        mla_index: Any,
+        mla_index: object,
         estimation_subapertures: ArrayLike | None = None,
         *,
         settings: Settings,
         calibration: Calibration | None = None,
-        detector_grid: Any = None,
+        detector_grid: object = None,
         pixels: int | None = None,
-        predict: Any = None,
+        predict: object = None,
         **options: Unpack[AdapterOptions],
     ) -> None:
         check_version("HCIPy", "hcipy", TESTED)
@@ -99,7 +99,7 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         self.measured = ToolSlopes(layout, settings, calibration, unit_per_px=pitch, **options)
         self._predict, self._slopes = predict, None
 
-    def estimate(self, images: Any) -> Any:
+    def estimate(self, images: object) -> Any:
         """Measure the slopes of an image.
 
         Parameters
@@ -148,14 +148,14 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         return np.asarray(image).reshape(self._frame_shape)
 
 
-def _points(grid: Any) -> NDArray[Any]:
+def _points(grid: object) -> NDArray[Any]:
     """Return the coordinates of a grid's points, (n, 2)."""
     if not isinstance(grid, hcipy.Grid) or grid.ndim != 2:
         raise InputError(f"mla_grid: expected a two-dimensional hcipy.Grid, got {type(grid).__name__}")
     return np.asarray(grid.as_("cartesian").points)
 
 
-def _checked_grid(source: Any) -> Any:
+def _checked_grid(source: object) -> Any:
     """Return a regular two-dimensional Cartesian grid, given itself or as that of a field."""
     grid = source if isinstance(source, hcipy.Grid) else getattr(source, "grid", None)
     if grid is None:
@@ -178,7 +178,7 @@ def _checked_side(pixels: int) -> int:
     return int(number_between("pixels", pixels, SMALLEST_WINDOW, LARGEST_WINDOW, integer=True))
 
 
-def _measured(mla_index: Any, mask: ArrayLike | None, whole: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _measured(mla_index: object, mask: ArrayLike | None, whole: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the numbers of the lenslets to measure; `whole` marks windows on the detector."""
     if mask is None:
         numbers = np.unique(finite_array("mla_index", mla_index).astype(np.int64))

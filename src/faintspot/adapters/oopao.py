@@ -21,7 +21,7 @@ _LEAST_UNIT = 1e-6  # smallest unit of OOPAO's slopes; a tilt of one pixel gives
 
 
 def attach(
-    wfs: Any,
+    wfs: object,
     settings: Settings,
     calibration: Calibration | None = None,
     **options: Unpack[SpotOptions],
@@ -119,12 +119,12 @@ class OOPAOAttachment:
         """Measurement of each source, with `last` slopes (px), `standard_errors` and `flux`."""
         return tuple(source.slopes for source in self._sources)
 
-    def _integrate(self, src: Any, sh_data: Any) -> Any:
+    def _integrate(self, src: object, sh_data: object) -> Any:
         """Run OOPAO's own step, which calls `centroid`, and note its source."""
         self._current = next((s for s in self._sources if s.data is sh_data), self._sources[0])
         return self._own(src, sh_data)
 
-    def _centroid(self, image: Any, threshold: float = 0.01) -> NDArray[np.float64]:
+    def _centroid(self, image: object, threshold: float = 0.01) -> NDArray[np.float64]:
         """Return positions as OOPAO does: (n, 2) px from the first pixel, along rows, then along columns."""
         return self._current.positions(image)
 

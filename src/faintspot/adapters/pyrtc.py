@@ -78,7 +78,7 @@ def slopes_process() -> Any:
             self.measuring = _Measuring(conf)
             super().__init__(conf)
 
-        def _compute_slopes_shwfs(self, image: Any) -> NDArray[np.float32]:
+        def _compute_slopes_shwfs(self, image: object) -> NDArray[np.float32]:
             """Return slopes as pyRTC's centroiders do: (2 N, N) px, the x map above the y map."""
             return self.measuring.maps(self, image, tool.open_stream)
 
@@ -122,7 +122,7 @@ def camera() -> Any:
             if self.following.next_into(self.data):
                 super().expose()
 
-        def close(self, *arguments: Any, **options: Any) -> None:
+        def close(self, *arguments: object, **options: object) -> None:
             """Close the sensor and the stream."""
             super().close(*arguments, **options)
             self.following.close()
@@ -197,7 +197,7 @@ class _Frames:
         """Close the stream."""
         self._follower.close()
 
-    def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+    def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> str:
         fits = shape == self._shape and dtype.kind in "iuf"
         return "" if fits else f"frames of {self._shape[0]} x {self._shape[1]} (wfs.height, wfs.width)"
 
@@ -231,7 +231,7 @@ class _Measuring:
             raise InputError("slopes: no frame has been measured yet; measure one first")
         return self._tool
 
-    def maps(self, process: Any, image: Any, open_stream: Any) -> NDArray[np.float32]:
+    def maps(self, process: Any, image: Any, open_stream: object) -> NDArray[np.float32]:
         """Measure an image; return maps with slopes of pyRTC's valid sub-apertures only."""
         n = int(process.num_regions)
         valid = _mapped("valid_sub_aps", process.valid_sub_aps, n).astype(bool)
@@ -301,7 +301,7 @@ class _Measuring:
         return maps
 
 
-def _mapped(name: str, values: Any, n: int) -> NDArray[Any]:
+def _mapped(name: str, values: object, n: int) -> NDArray[Any]:
     """Return a checked pyRTC map for n x n sub-apertures, x above y."""
     array = np.asarray(values)
     if array.shape != (2 * n, n):

@@ -19,7 +19,7 @@ TESTED = "0.15.0"
 
 
 def attach(
-    wfs: Any,
+    wfs: object,
     settings: Settings,
     calibration: Calibration | None = None,
     **options: Unpack[SpotOptions],

@@ -48,7 +48,7 @@ class Spots:
         settings: Settings,
         calibration: Calibration | None,
         *,
-        predict: Any = None,
+        predict: object = None,
         rows_first: bool = False,
         **options: Unpack[AdapterOptions],
     ) -> None:
@@ -58,7 +58,7 @@ class Spots:
         self.measured = ToolSlopes(layout, settings, calibration, **options)
         self._slopes: NDArray[np.float64] | None = None
 
-    def checked(self, images: Any) -> NDArray[Any]:
+    def checked(self, images: object) -> NDArray[Any]:
         """Return a tool's images after checking their number and size.
 
         Raises

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from faintspot.base.errors import InputError
 
 
-def spawn(rng: Any, count: int) -> list[np.random.Generator]:
+def spawn(rng: object, count: int) -> list[np.random.Generator]:
     """Return `count` independent generators spawned from `rng`.
 
     With separate generators, switching one source of randomness on or off does not change the draws of the

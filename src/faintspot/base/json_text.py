@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 
-def to_json(value: Any, *, indent: int | None = None, exact: bool = False) -> str:
+def to_json(value: object, *, indent: int | None = None, exact: bool = False) -> str:
     """Return JSON text that every reader accepts.
 
     Parameters
@@ -31,7 +31,7 @@ def to_json(value: Any, *, indent: int | None = None, exact: bool = False) -> st
     return json.dumps(plain_values(value, exact=exact), indent=indent, allow_nan=False)
 
 
-def plain_values(value: Any, *, exact: bool = False) -> Any:
+def plain_values(value: object, *, exact: bool = False) -> Any:
     """Return a value as JSON allows it; parameters and errors are those of `to_json`."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()

@@ -61,7 +61,7 @@ def parse_text(text: str, where: str) -> dict[str, Any]:
 
 def check_keys(
     prefix: str,
-    table: Mapping[str, Any],
+    table: Mapping[str, object],
     known: Iterable[str],
     *,
     required: Iterable[str] = (),
@@ -105,7 +105,7 @@ def check_known(prefix: str, name: str, known: Iterable[str], what: str = "key")
         raise InputError(f"unknown {what}; {hint}", name=f"{prefix}{name}")
 
 
-def checked_table(where: str, value: Any) -> dict[str, Any]:
+def checked_table(where: str, value: object) -> dict[str, Any]:
     """Return a value that must be a table.
 
     Raises

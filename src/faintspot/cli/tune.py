@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -81,7 +81,7 @@ def command(
     picture: str | None,
     seed: int,
     overwrite: bool,
-    **options: Any,
+    **options: object,
 ) -> None:
     """Recommend an estimator and settings for a camera and a star, or for a recording.
 
@@ -162,7 +162,7 @@ def answer_table(answer: Answer) -> Table:
     return table
 
 
-def _given(camera: str | None, options: dict[str, Any]) -> dict[str, Any]:
+def _given(camera: str | None, options: Mapping[str, object]) -> dict[str, Any]:
     """Return what is known: the options, and the file where they say nothing."""
     chosen = {name: value for name, value in options.items() if value is not None}
     if "magnitude" in chosen and "flux_e" in chosen:

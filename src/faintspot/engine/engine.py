@@ -230,7 +230,7 @@ class Engine:
             raise
 
     def renew_spots(
-        self, make_pipeline: Callable[[Settings], SlopePipeline], changes: Mapping[str, Any]
+        self, make_pipeline: Callable[[Settings], SlopePipeline], changes: Mapping[str, object]
     ) -> Change:
         """Replace what pipelines know of the spots; `changes` names it. For one thread at a time.
 

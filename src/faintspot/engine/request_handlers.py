@@ -51,18 +51,18 @@ def _set(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
 
 
-def _interleave(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+def _interleave(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, Any]:
     every = int(number_between("every", fields.get("every", _USUAL_TURN), 1, integer=True))
     change = engine.interleave(_text(fields, "methods"), every)
     return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
 
 
-def _stop(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+def _stop(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, Any]:
     engine.stop()
     return {}
 
 
-def _take_learnt(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+def _take_learnt(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, Any]:
     """Note what was learnt beside the engine, and take the new model, if one is handed over."""
     learning: dict[str, Any] = {"found": _text(fields, "found"), "unix_time_s": time.time(), "taken": False}
     engine.learning = learning
@@ -79,7 +79,7 @@ def _take_learnt(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     return {}
 
 
-def _take_spots(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+def _take_spots(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, Any]:
     """Measure with the PSF and the fixed weights of a sodium profile from the next frame on."""
     sodium = fields.get("sodium")
     if not isinstance(sodium, Mapping):
@@ -94,14 +94,14 @@ def _take_spots(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
 
 
-def _text(fields: dict[str, Any], name: str) -> str:
+def _text(fields: Mapping[str, object], name: str) -> str:
     value = fields.get(name)
     if not isinstance(value, str) or not value:
         raise InputError(f"{name} = {value!r:.80}: expected a text")
     return value
 
 
-def loop_command(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+def loop_command(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, Any]:
     """Open or close the loop, change its gain or flatten the mirror; return the loop's part of the status.
 
     Raises

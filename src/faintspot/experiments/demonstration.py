@@ -128,7 +128,7 @@ def compare(
 
 
 def choose(
-    layout: Layout, candidates: list[Settings], frames: NDArray[Any], truth: NDArray[np.float64]
+    layout: Layout, candidates: list[Settings], frames: NDArray[np.generic], truth: NDArray[np.float64]
 ) -> Scored:
     """Choose the settings with the smallest R on the first half of the frames; score them on the other."""
     half = len(frames) // 2

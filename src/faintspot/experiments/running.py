@@ -271,12 +271,12 @@ def _cluster(scheduler: str, say: Callable[[str], None]) -> Iterator[Any]:
     from joblib._dask import DaskDistributedBackend
 
     class Backend(DaskDistributedBackend):  # type: ignore[misc]
-        def submit(self, func: Any, callback: Any = None) -> Any:
+        def submit(self, func: object, callback: Any = None) -> Any:
             future = super().submit(func, callback)
             future.add_done_callback(lambda done: done.exception() and callback(done.exception()))
             return future
 
-        def retrieve_result_callback(self, out: Any) -> Any:
+        def retrieve_result_callback(self, out: object) -> Any:
             if isinstance(out, BaseException):  # Dask's own, not a unit's
                 raise BrokenProcessPool(str(out))
             return super().retrieve_result_callback(out)

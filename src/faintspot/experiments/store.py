@@ -85,7 +85,7 @@ class ZarrStore:
         fingerprint: str,
         units: Sequence[str],
         *,
-        attributes: Mapping[str, Any] | None = None,
+        attributes: Mapping[str, object] | None = None,
         template: xarray.Dataset | None = None,
         overwrite: bool = False,
     ) -> None:
@@ -146,7 +146,7 @@ class ZarrStore:
                 f"{self.path}: cannot be read: the store is damaged ({one_line(error)}): delete it"
             ) from None
 
-    def _new_array(self, name: str, values: NDArray[Any]) -> Any:
+    def _new_array(self, name: str, values: NDArray[np.generic]) -> Any:
         text = values.dtype.kind in "UT"
         empty: Any = "" if text else np.zeros((), values.dtype)[()]
         return self._group.create_array(
@@ -180,7 +180,7 @@ def _attributes(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _check_path(path: Path, attributes: Mapping[str, Any], *, overwrite: bool) -> None:
+def _check_path(path: Path, attributes: Mapping[str, object], *, overwrite: bool) -> None:
     """Refuse to write where there is anything but this experiment, or where `overwrite` another one."""
     kind = attributes[_KIND]
     if not path.absolute().parent.is_dir():
@@ -216,7 +216,7 @@ def _create(zarr: Any, path: Path, attributes: dict[str, Any], template: xarray.
     hidden.rename(path)
 
 
-def _chunk(array: Any, values: NDArray[Any]) -> NDArray[Any]:
+def _chunk(array: Any, values: NDArray[np.generic]) -> NDArray[Any]:
     """Return one row of an array; what a smaller result does not fill stays "not there"."""
     shape = (1, *array.shape[1:])
     if shape[1:] == values.shape:
@@ -226,7 +226,7 @@ def _chunk(array: Any, values: NDArray[Any]) -> NDArray[Any]:
     return chunk
 
 
-def _plain(values: Any) -> NDArray[Any]:
+def _plain(values: object) -> NDArray[Any]:
     """Return NumPy's own texts for those of Zarr."""
     array = np.asarray(values)
     return np.asarray(array.tolist(), dtype=np.str_) if array.dtype.kind in "TO" else array

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,8 +41,8 @@ def create_writer(
     *,
     n_frames: int,
     n_subapertures: int,
-    attributes: Mapping[str, Any],
-    coordinates: Mapping[str, NDArray[Any]],
+    attributes: Mapping[str, object],
+    coordinates: Mapping[str, NDArray[np.generic]],
     resume: bool = True,
     overwrite: bool = False,
 ) -> SlopeWriter:
@@ -197,7 +197,7 @@ def _read(path: Path, read: Callable[[Path], _Result]) -> _Result:
 
 
 def _checked_run(
-    n_frames: int, n_subapertures: int, attributes: Mapping[str, Any], coordinates: Mapping[str, Any]
+    n_frames: int, n_subapertures: int, attributes: Mapping[str, object], coordinates: Mapping[str, object]
 ) -> RecordingHeader:
     """Check the description of the run and convert it to the stored form."""
     frames = int(number_between("n_frames", n_frames, 1, integer=True))

@@ -72,7 +72,7 @@ class Option:
     kind: str = ""
     check: Callable[[str, Any], Any] | None = None
 
-    def checked(self, name: str, value: Any) -> Any:
+    def checked(self, name: str, value: object) -> Any:
         """Return the checked value; scalars become plain Python values, sequences read-only arrays.
 
         Raises
@@ -131,7 +131,7 @@ class Option:
             raise InputError("expected one value or one per sub-aperture", name=name, value=value) from None
         return _locked(np.array(names))
 
-    def _checked_numbers(self, name: str, value: Any) -> NDArray[Any]:
+    def _checked_numbers(self, name: str, value: object) -> NDArray[Any]:
         try:
             return numbers_between(
                 name, value, self.low, self.high, integer=self.whole, low_open=self.low_open
@@ -164,12 +164,12 @@ def option(default: Any, meaning: str, **bounds: Any) -> Any:
     return field(default=default, metadata={"option": Option(meaning, **bounds)})
 
 
-def setting(default: Any, meaning: str = "", **bounds: Any) -> Any:
+def setting(default: object, meaning: str = "", **bounds: object) -> Any:
     """Declare an option that has one value for the whole sensor; see `option`."""
     return option(default, meaning, per_subaperture=False, **bounds)
 
 
-def number(default: Any, low: float, high: float, meaning: str = "", **bounds: Any) -> Any:
+def number(default: object, low: float, high: float, meaning: str = "", **bounds: object) -> Any:
     """Declare a number from `low` to `high`, or None if that is its default; see `option`."""
     return setting(default, meaning, low=low, high=high, **bounds)
 
@@ -202,7 +202,7 @@ class Options:
     table: ClassVar[str] = ""
     """Table of a configuration file that holds the options; messages begin with it."""
 
-    def __init_subclass__(cls, table: str = "", **named: Any) -> None:
+    def __init_subclass__(cls, table: str = "", **named: object) -> None:
         super().__init_subclass__(**named)
         cls.table = table or cls.table
 
@@ -267,7 +267,7 @@ class Options:
             return np.array([value.others.get(i, default) for i in range(n_subapertures)])
         return np.full(n_subapertures, self.default_of(name, pixels) if value is None else value)
 
-    def replaced(self, changes: Mapping[str, Any], where: Any = None) -> Self:
+    def replaced(self, changes: Mapping[str, object], where: Any = None) -> Self:
         """Return a copy with some values changed, everywhere or in some sub-apertures (indices or a mask).
 
         Raises
@@ -282,7 +282,7 @@ class Options:
             values[name] = value if where is None else self._changed_at(name, _indices(where), value)
         return type(self)(**values)
 
-    def _changed_at(self, name: str, selected: NDArray[np.int64], value: Any) -> Any:
+    def _changed_at(self, name: str, selected: NDArray[np.int64], value: object) -> Any:
         """Replace the values of the selected sub-apertures."""
         declared, old = self.declared()[name], getattr(self, name)
         if not declared.per_subaperture:
@@ -324,12 +324,12 @@ def check_lengths(*parts: Options) -> None:
         raise InputError(f"settings: expected arrays of one length, got {sizes}")
 
 
-def is_auto(value: Any) -> bool:
+def is_auto(value: object) -> bool:
     """Return whether an option is chosen automatically."""
     return isinstance(value, str) and value == AUTO
 
 
-def _same(a: Any, b: Any) -> bool:
+def _same(a: object, b: object) -> bool:
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         return isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b)
     return bool(a == b)
@@ -345,6 +345,6 @@ def _indices(where: int | Sequence[int] | NDArray[Any]) -> NDArray[np.int64]:
     return numbers_between("where", array, 0, 2**31, integer=True).astype(np.int64)
 
 
-def _locked(array: NDArray[Any]) -> NDArray[Any]:
+def _locked(array: NDArray[np.generic]) -> NDArray[Any]:
     array.flags.writeable = False
     return array

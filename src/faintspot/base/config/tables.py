@@ -44,7 +44,7 @@ class Tables:
         If the file cannot be read, is not TOML, or has an unknown table.
     """
 
-    def __init__(self, path: str | Path, tables: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, path: str | Path, tables: Mapping[str, object] | None = None) -> None:
         self.path = path = Path(path)
         if tables is None:
             tables = parse_file(path, if_missing=f"`faintspot layout FRAME -o {path.name}` makes one")
@@ -83,7 +83,7 @@ class ConfigurationTable(Options):
         return Tables(path).part(cls)
 
     @classmethod
-    def from_table(cls, values: Mapping[str, Any], path: Path | None = None) -> Self:
+    def from_table(cls, values: Mapping[str, object], path: Path | None = None) -> Self:
         """Make the object that a table describes; messages name `path`, if there is one.
 
         Raises
@@ -137,7 +137,7 @@ def save_tables(path: str | Path, tables: Mapping[str, Mapping[str, Any] | None]
     write_atomically(path, tomlkit.dumps(document))
 
 
-def tables_as_text(tables: Mapping[str, Any]) -> str:
+def tables_as_text(tables: Mapping[str, object]) -> str:
     """Return tables, and values outside of them, as TOML text."""
     import tomlkit
 
@@ -147,7 +147,7 @@ def tables_as_text(tables: Mapping[str, Any]) -> str:
     return tomlkit.dumps(document)
 
 
-def per_subaperture(where: str, value: Any) -> Any:
+def per_subaperture(where: str, value: object) -> Any:
     """Return { default = 2.5, 4 = 3.0 } as values of some sub-apertures and a default for the others.
 
     Raises
@@ -167,14 +167,14 @@ def per_subaperture(where: str, value: Any) -> Any:
     return PerSubaperture(value.get("default"), others)
 
 
-def is_map(value: Any) -> bool:
+def is_map(value: object) -> bool:
     """Return whether a value is an image rather than rows of positions."""
     return (
         isinstance(value, np.ndarray) and value.ndim == 2 and (value.shape[1] != 2 or value.dtype.kind != "i")
     )
 
 
-def _toml_table(values: Mapping[str, Any]) -> Any:
+def _toml_table(values: Mapping[str, object]) -> Any:
     import tomlkit
 
     table = tomlkit.table()
@@ -183,7 +183,7 @@ def _toml_table(values: Mapping[str, Any]) -> Any:
     return table
 
 
-def _toml_value(value: Any) -> Any:
+def _toml_value(value: object) -> Any:
     import tomlkit
 
     if isinstance(value, PerSubaperture):

@@ -41,15 +41,15 @@ class Texts:
         """Return a text or a table as the file has it."""
         return reduce(lambda table, key: table[key], name.split("."), self._tables)
 
-    def __call__(self, name: str, record: Any = None, /, **values: object) -> str:
+    def __call__(self, name: str, record: object = None, /, **values: object) -> str:
         """Return a text with values, and the attributes or items of a record, filled in."""
         return _filled(self[name], _Scope(values, record))
 
-    def lines(self, name: str, record: Any = None, /, **values: object) -> list[str]:
+    def lines(self, name: str, record: object = None, /, **values: object) -> list[str]:
         """Return the sentences of a text, each by itself, that are not left out."""
         return [text for sentence in self[name] if (text := _filled(sentence, _Scope(values, record)))]
 
-    def facts(self, name: str, record: Any = None, /, **values: object) -> dict[str, str]:
+    def facts(self, name: str, record: object = None, /, **values: object) -> dict[str, str]:
         """Return the texts of a table that are not left out, by name."""
         every = {key: _filled(text, _Scope(values, record)) for key, text in self[name].items()}
         return {key: text for key, text in every.items() if text}
@@ -69,7 +69,7 @@ class Texts:
         return FigureWithData(short, title, caption, figure, columns or self[name].get("columns", ()), rows)
 
     def table(
-        self, name: str, records: Iterable[Any], columns: Sequence[str] = (), /, **values: object
+        self, name: str, records: Iterable[object], columns: Sequence[str] = (), /, **values: object
     ) -> Table:
         """Return a table with its caption and the header: declared columns, then those given.
 
@@ -112,7 +112,7 @@ class Texts:
 class _Scope(dict[str, Any]):
     """Values by name; other names are those of a record's attributes or items."""
 
-    def __init__(self, values: Mapping[str, object], record: Any) -> None:
+    def __init__(self, values: Mapping[str, object], record: object) -> None:
         super().__init__(values)
         self._record = record
 

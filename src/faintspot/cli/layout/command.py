@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -295,7 +296,7 @@ def _accept(target: Path, accept: bool, frames: tuple[str, ...]) -> None:
     click.echo(f"{target}: {'accepted: ' + '; '.join(layout.doubts) if layout.doubts else 'no doubts'}")
 
 
-def _found(description: str, mean: NDArray[np.float64], options: dict[str, Any]) -> FoundLayout:
+def _found(description: str, mean: NDArray[np.float64], options: Mapping[str, object]) -> FoundLayout:
     """Find the layout, and say in an error where, and which option changes it."""
     bad = np.isnan(mean)
     with errors_of_options(description):

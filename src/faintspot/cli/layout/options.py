@@ -82,7 +82,7 @@ def calibration(target: Path, given: Mapping[str, Any]) -> Calibration:
     return replace(known, **changes)
 
 
-def kept_calibration(calibration: Calibration, given: Mapping[str, Any]) -> list[str]:
+def kept_calibration(calibration: Calibration, given: Mapping[str, object]) -> list[str]:
     """Return a line on what an existing configuration states and was not given now."""
     kept = [
         f"{name} {plain(value) if not is_map(getattr(calibration, name)) else 'map'}"
@@ -133,7 +133,7 @@ def flat_field(text: str) -> NDArray[np.float64]:
     return np.asarray(flat / flat[usable].mean())
 
 
-def plain(value: Any) -> str:
+def plain(value: object) -> str:
     """Format a number to three digits, never as 6.7e+02; return other values unchanged."""
     if not isinstance(value, float | int):
         return str(value)

@@ -29,7 +29,7 @@ _output = option(
 )
 
 
-def _compared(command: Callable[..., Any]) -> Callable[..., Any]:
+def _compared(command: Callable[..., object]) -> Callable[..., Any]:
     """Add the options of every comparison."""
     return CONFIGURATION(QUICK(_output(experiment_options(command))))
 

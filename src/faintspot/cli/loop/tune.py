@@ -75,7 +75,7 @@ def tune(
     overwrite: bool,
     workers: int | None,
     scheduler: str | None,
-    **options: Any,
+    **options: object,
 ) -> None:
     """Recommend an estimator and a control for a closed loop.
 

@@ -103,7 +103,7 @@ def _range_in_words(kind: Any) -> str:
     return ", ".join(part for part in (least, most) if part)
 
 
-def option(*names: str, **attributes: Any) -> Decorator:
+def option(*names: str, **attributes: object) -> Decorator:
     """Return `click.option` with the default shown and a metavar in place of the name of a Python type.
 
     Parameters
@@ -154,7 +154,7 @@ def declared(
         Default in words, if it is not that of the class.
     """
 
-    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+    def add(command: Callable[..., object]) -> Callable[..., Any]:
         defaults = kind.defaults()
         for name, what in reversed(kind.declared().items()):
             if name not in (names or (name,)) or not what.meaning:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import click
@@ -20,7 +21,7 @@ def asked(name: str, command: str, kind: str = ENGINE, /, **fields: Any) -> dict
     return request(socket_path(name, kind), command, **fields)
 
 
-def asked_at_length(name: str, command: str, **fields: Any) -> dict[str, Any]:
+def asked_at_length(name: str, command: str, **fields: object) -> dict[str, Any]:
     """Ask for a change, for which the engine may compile."""
     reason = "waiting: the engine goes on, and compiles what this machine has not used yet"
     timer = threading.Timer(PATIENCE_S, click.echo, [reason], {"err": True})
@@ -32,7 +33,7 @@ def asked_at_length(name: str, command: str, **fields: Any) -> dict[str, Any]:
         timer.cancel()
 
 
-def loop_in_words(loop: dict[str, Any]) -> str:
+def loop_in_words(loop: Mapping[str, object]) -> str:
     """Describe the state of a loop."""
     if loop["state"] == "none":
         return "no loop: the engine makes no commands"

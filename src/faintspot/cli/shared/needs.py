@@ -38,7 +38,7 @@ def _check_first(command: click.Command, check: Callable[[str], None]) -> None:
     assert work is not None
 
     @wraps(work)
-    def checked(*arguments: Any, **options: Any) -> Any:
+    def checked(*arguments: object, **options: object) -> Any:
         check(click.get_current_context().command_path)
         return work(*arguments, **options)
 

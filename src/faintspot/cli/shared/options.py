@@ -25,7 +25,7 @@ def name_option(what: str) -> Option:
 ENGINE_NAME = name_option("Name of the engine.")
 
 
-def which_frames(**options: Any) -> Option:
+def which_frames(**options: object) -> Option:
     """Return --key and --time-axis: which array of a file holds frames, and how."""
     key = option("--key", metavar="NAME", help="Which array to read of files that hold several.", **options)
     time_axis = option(

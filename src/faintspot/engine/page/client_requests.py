@@ -70,7 +70,7 @@ class EngineRequests:
         """End a recording."""
         self.recording.stop()
 
-    def _set(self, request: dict[str, Any]) -> Mapping[str, Any]:
+    def _set(self, request: Mapping[str, object]) -> Mapping[str, Any]:
         """Change settings: "changes" (a list of NAME=VALUE) and "subapertures" ("" for all)."""
         texts, where = request.get("changes"), request.get("subapertures") or ""
         if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
@@ -84,19 +84,19 @@ class EngineRequests:
         reply = self._ask("set", changes=changes, where=indices)
         return {"text": since(reply["frame"])}
 
-    def _interleave(self, request: dict[str, Any]) -> Mapping[str, Any]:
+    def _interleave(self, request: Mapping[str, object]) -> Mapping[str, Any]:
         """Interleave configurations as `faintspot realtime send methods=METHODS`."""
         reply = self._ask("interleave", methods=request.get("methods"), every=request.get("every"))
         return {"text": since(reply.get("frame"))}
 
-    def _loop(self, request: dict[str, Any]) -> Mapping[str, Any]:
+    def _loop(self, request: Mapping[str, object]) -> Mapping[str, Any]:
         """Control the loop: "action" open, close, flat or gain, with "gain"."""
         fields = {name: request[name] for name in ("action", "gain") if request.get(name) is not None}
         loop = self._ask("loop", **fields)["loop"]
         gain = "" if loop.get("gain") is None else f", gain {loop['gain']:g}"
         return {"text": f"{loop['state']}{gain}"}
 
-    def _ask(self, command: str, **fields: Any) -> dict[str, Any]:
+    def _ask(self, command: str, **fields: object) -> dict[str, Any]:
         return request(self._path, command, timeout_s=LENGTHY_TIMEOUT_S, **fields)
 
 
@@ -117,7 +117,7 @@ class RecordingThread:
         self._thread: threading.Thread | None = None
         self._status: dict[str, Any] = {"running": False}
 
-    def start(self, file: Any) -> Mapping[str, Any]:
+    def start(self, file: object) -> Mapping[str, Any]:
         """Start a recording to a new store.
 
         Raises

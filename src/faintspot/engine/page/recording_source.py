@@ -113,7 +113,7 @@ class RecordingSource:
         """Return the functions of the requests, by name."""
         return {"play": self._play}
 
-    def _play(self, request: dict[str, Any]) -> Mapping[str, Any]:
+    def _play(self, request: Mapping[str, object]) -> Mapping[str, Any]:
         """Move to "position_s", play or pause ("playing"), and set the "speed"."""
         position, speed, playing = (request.get(name) for name in ("position_s", "speed", "playing"))
         if position is not None:

@@ -130,7 +130,7 @@ class LiveServer:
             await self._http.close_all_connections()
             self._looking.shutdown()
 
-    def tell(self, kind: str, values: Mapping[str, Any]) -> None:
+    def tell(self, kind: str, values: Mapping[str, object]) -> None:
         """Set the message of a kind, from any thread."""
         self._tell(kind, packed(kind, values))
 
@@ -198,7 +198,7 @@ class _Guarded(RequestHandler):
             self.set_header(name, value)
         self.clear_header("Server")
 
-    def write_error(self, status_code: int, **_: Any) -> None:
+    def write_error(self, status_code: int, **_: object) -> None:
         """Send the status code only."""
         self.set_header("Content-Type", "text/plain")
         self.finish(f"{status_code}\n")
@@ -267,7 +267,7 @@ class Client(_Guarded, WebSocketHandler):
             self.close(_NOT_ALLOWED)
         await asyncio.sleep(_PAUSE_S)
 
-    async def _greeted(self, request: dict[str, Any]) -> dict[str, Any]:
+    async def _greeted(self, request: Mapping[str, object]) -> dict[str, Any]:
         """Admit a client with the rights of its token."""
         token, access = request.get("token"), self.server.access
         is_known = request.get("do") == "hello" and access.knows(token)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from faintspot.base.errors import InputError
@@ -62,7 +62,7 @@ class StatusPoller:
             self._version = version
 
 
-def settings_rows(values: dict[str, Any]) -> list[dict[str, Any]]:
+def settings_rows(values: Mapping[str, object]) -> list[dict[str, Any]]:
     """Return settings as rows of a form: name, value as text, meaning, permitted range, choices.
 
     Parameters
@@ -86,7 +86,7 @@ def settings_rows(values: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def _as_text(value: Any) -> str:
+def _as_text(value: object) -> str:
     """Format a value as for `faintspot realtime send`; long lists are abbreviated to both ends."""
     if value is None:
         return "none"

@@ -77,7 +77,7 @@ class _Groups:
     def __init__(
         self,
         pipeline: SlopePipeline,
-        slots: Sequence[NDArray[Any]] | NDArray[Any],
+        slots: Sequence[NDArray[np.generic]] | NDArray[np.generic],
         groups: tuple[int, int],
         shares: int,
         prior: SlopePrior | None,
@@ -106,7 +106,7 @@ class _Groups:
         frame: tuple[int, int],
         progress: Progress,
         waiting: tuple[NDArray[np.int64], NDArray[np.int64]],
-        after: tuple[Any, ...],
+        after: tuple[object, ...],
         part: ProductPart = NO_PRODUCT,
         rehearse: Rehearsal | None = None,
     ) -> bool:
@@ -169,7 +169,7 @@ class FramePath:
     def __init__(
         self,
         pipeline: SlopePipeline,
-        slots: Sequence[NDArray[Any]] | NDArray[Any],
+        slots: Sequence[NDArray[np.generic]] | NDArray[np.generic],
         progress: Progress,
         *,
         workers: Workers | None = None,
@@ -342,7 +342,7 @@ class FramePath:
         share: int,
         frame: tuple[int, int],
         progress: Progress,
-        after: tuple[Any, ...],
+        after: tuple[object, ...],
         part: ProductPart = NO_PRODUCT,
         rehearse: Rehearsal | None = None,
     ) -> bool:
@@ -366,7 +366,7 @@ class FramePath:
             groups.settings[row] = std**-2.0
         self.prior_std_px = np.tile(std, 2) if np.isfinite(std).all() else None
 
-    def _check(self, slots: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
+    def _check(self, slots: Sequence[NDArray[np.generic]] | NDArray[np.generic]) -> None:
         """Refuse slots that the kernels cannot read, and settings that need the frame's own flux."""
         shape = self.pipeline.layout.frame_shape
         for slot in slots:

@@ -6,7 +6,7 @@ import ctypes
 import threading
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.faults import one_line
@@ -15,7 +15,7 @@ Result = TypeVar("Result")
 _TRIAL = "faintspot-trial"
 
 
-def call_within(limit_s: float, name: str, function: Callable[..., Result], *arguments: Any) -> Result:
+def call_within(limit_s: float, name: str, function: Callable[..., Result], *arguments: object) -> Result:
     """Call a function in a thread of its own and return what it returns.
 
     Parameters

@@ -147,7 +147,7 @@ class Readout(ABC):
         self,
         ring: PixelRing,
         shape: tuple[int, int],
-        dtype: np.dtype[Any],
+        dtype: np.dtype[np.generic],
         *,
         frame_rate_hz: float,
         readout_fraction: float = 0.8,
@@ -218,7 +218,7 @@ class Readout(ABC):
             progress(published)
         return CameraReport(published, self.overruns, (time.monotonic_ns() - start) / 1e9, self.late)
 
-    def _publish(self, moment: int, frame: NDArray[Any]) -> None:
+    def _publish(self, moment: int, frame: NDArray[np.generic]) -> None:
         """Read out one frame that starts at `moment`."""
         ring = self._ring
         slot = ring.begin(self._next)

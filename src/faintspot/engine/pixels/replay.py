@@ -24,7 +24,7 @@ _LOOK_S = 0.05  # between two checks of the stop event while waiting for the dis
 _NAP_S = 5e-4  # between two checks of the engine's progress
 
 
-def ring_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
+def ring_type(dtype: np.dtype[np.generic]) -> np.dtype[Any]:
     """Return the type in which frames are sent to the engine: uint16 stays, other types become float32.
 
     Raises

@@ -77,7 +77,7 @@ class Segment(Closing):
     writer: ClassVar[str]
 
     @classmethod
-    def contents(cls, description: Mapping[str, Any]) -> tuple[int, dict[str, tuple[np.dtype[Any], int]]]:
+    def contents(cls, description: Mapping[str, object]) -> tuple[int, dict[str, tuple[np.dtype[Any], int]]]:
         """Return the number of cells, and the type and number of places of each ring."""
         raise NotImplementedError
 
@@ -113,7 +113,7 @@ class Segment(Closing):
         yield offset
 
     @classmethod
-    def _created(cls, name: str, description: Mapping[str, Any]) -> Self:
+    def _created(cls, name: str, description: Mapping[str, object]) -> Self:
         """Create a segment; one of that name whose creator has died is replaced.
 
         Raises

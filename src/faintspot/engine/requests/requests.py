@@ -43,7 +43,7 @@ _PAUSE_S = 0.1  # when the system has no file descriptor left
 _LOOK_S = 0.1  # between two looks whether it is to close
 
 
-def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fields: Any) -> dict[str, Any]:
+def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fields: object) -> dict[str, Any]:
     """Send a request to a running engine and return its reply.
 
     Parameters
@@ -222,7 +222,7 @@ class _Listener(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
             for connection in self.connections:
                 _end(connection, socket.SHUT_RD)
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
+    def handle_error(self, request: object, client_address: object) -> None:
         """Print nothing: a connection that fails is closed."""
 
 
@@ -274,7 +274,7 @@ def _answer(handler: Handler, fields: dict[str, Any]) -> bytes:
         return _encoded(_refusal(f"{type(error).__name__}: {error}"))
 
 
-def _encoded(message: Mapping[str, Any], *, exact: bool = False) -> bytes:
+def _encoded(message: Mapping[str, object], *, exact: bool = False) -> bytes:
     return to_json(message, exact=exact).encode() + b"\n"
 
 
@@ -292,7 +292,7 @@ def _parsed_request(line: bytes) -> dict[str, Any]:
     return message
 
 
-def changes_of(fields: dict[str, Any]) -> dict[str, Any]:
+def changes_of(fields: Mapping[str, object]) -> dict[str, Any]:
     """Return the new values of a request, by name.
 
     Raises

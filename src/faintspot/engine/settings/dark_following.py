@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,7 +47,7 @@ class DarkFollower:
         self.changes = 0
         """Number of changes of `dark`."""
 
-    def take(self, frames: NDArray[Any]) -> None:
+    def take(self, frames: NDArray[np.generic]) -> None:
         """Add a part of a frame (1, h, w) to the means; for the engine's thread."""
         if not self._test.box:
             return

@@ -171,13 +171,13 @@ def is_built_in(estimator: Estimator) -> bool:
 class _WritableMemory:
     """Memory of an array, declared writable; one class for all, because classes need garbage collection."""
 
-    def __init__(self, array: NDArray[Any]) -> None:
+    def __init__(self, array: NDArray[np.generic]) -> None:
         self._array = array
         interface = array.__array_interface__
         self.__array_interface__ = {**interface, "data": (interface["data"][0], False)}
 
 
-def writable_view(array: NDArray[Any]) -> NDArray[Any]:
+def writable_view(array: NDArray[np.generic]) -> NDArray[Any]:
     """Return a writable array of the same memory, of the type that kernels are compiled for.
 
     The kernels do not write to it; this avoids compiling each of them again for read-only memory.

@@ -137,7 +137,7 @@ class RunningSettings(Generic[Prepared]):
         """Free replaced settings, which takes time; for any thread but the engine's."""
         self._replaced.clear()
 
-    def propose(self, changes: Mapping[str, Any], where: Sequence[int] | None = None) -> Change:
+    def propose(self, changes: Mapping[str, object], where: Sequence[int] | None = None) -> Change:
         """Check a change as a whole and prepare it, for the engine to take before its next frame.
 
         Parameters
@@ -171,7 +171,7 @@ class RunningSettings(Generic[Prepared]):
                 settings.values(name, len(layout), layout.pixels)
             return self._offered(settings, copy.deepcopy(dict(changes)), indices)
 
-    def renew(self, changes: Mapping[str, Any]) -> Change:
+    def renew(self, changes: Mapping[str, object]) -> Change:
         """Prepare the same settings again because something else has changed, named in `changes`.
 
         Raises

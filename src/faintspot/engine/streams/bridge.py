@@ -13,7 +13,6 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -199,6 +198,6 @@ class StreamBridge:
         self._ring = PixelRing.create(self.name, (rows, columns), dtype, slots=self._slots)
 
 
-def _incompatible(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+def _incompatible(shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> str:
     """Return the expected shape and type, or "" if these are frames."""
     return "" if len(shape) == 2 and dtype.kind in "iuf" else "frames (rows, columns) of real numbers"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,7 +99,7 @@ class CommandStream:
         taken = self.counters.taken
         return f"the mirror {'keeps its last commands' if taken else 'stays flat'}"
 
-    def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+    def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> str:
         """Return the expected shape and type, or "" if these are the mirror's commands."""
         expected = self.commands_nm.shape
         return "" if shape == expected and dtype.kind in "iuf" else f"{expected} real numbers, nm"

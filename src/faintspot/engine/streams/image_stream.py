@@ -151,7 +151,7 @@ class ImageStream:
                 Semaphore(self._mapped.semaphore(self._turn)).wait(_NAP_S)
         return True
 
-    def read(self, out: NDArray[Any] | None = None, limit_s: float = 0.0) -> Publication | None:
+    def read(self, out: NDArray[np.generic] | None = None, limit_s: float = 0.0) -> Publication | None:
         """Return the newest publication, or None when no complete one can be read in time."""
         mapped, end = self._mapped, time.monotonic() + limit_s
         target = np.empty(self.shape, self.dtype) if out is None else out
@@ -219,7 +219,7 @@ class ImageStreamWriter:
         log = Semaphore(self._mapped.address + self._mapped.places.log_semaphore)
         self._semaphores = [*(Semaphore(self._mapped.semaphore(each)) for each in range(SEMAPHORES)), log]
 
-    def publish(self, values: NDArray[Any], number: int) -> None:
+    def publish(self, values: NDArray[np.generic], number: int) -> None:
         """Publish the values of a frame."""
         mapped, fields = self._mapped, self._mapped.fields
         mapped.writing[...] = 1
@@ -259,7 +259,7 @@ class ImageStreamWriter:
                 f"{self.path}: this stream cannot be made: {places.total} bytes ({error.strerror})"
             ) from None
 
-    def _head(self, dtype: np.dtype[Any]) -> NDArray[Any]:
+    def _head(self, dtype: np.dtype[np.generic]) -> NDArray[Any]:
         """Return the metadata of a new stream."""
         head = np.zeros((), METADATA)
         code = next(code for code, each in TYPES.items() if np.dtype(each) == dtype)

@@ -97,6 +97,6 @@ class PredictionStream:
         with contextlib.suppress(Exception):
             self._follower.close()
 
-    def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+    def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> str:
         """Return what was expected, or "" if these can be predictions."""
         return "" if shape == self._values.shape and dtype.kind == "f" else f"{self._values.shape} floats"

@@ -48,7 +48,7 @@ class Stream(Protocol):
     def wait(self, after: int, limit_s: float) -> bool:
         """Wait up to `limit_s` until more than `after` publications exist; return whether they do."""
 
-    def read(self, out: NDArray[Any] | None = None, limit_s: float = 0.0) -> Publication | None:
+    def read(self, out: NDArray[np.generic] | None = None, limit_s: float = 0.0) -> Publication | None:
         """Return the newest publication, or None when no complete one can be read in time."""
 
     def close(self) -> None:
@@ -120,7 +120,7 @@ class PyshmemStream:
             return bool(source.count != after)
         return True
 
-    def read(self, out: NDArray[Any] | None = None, limit_s: float = 0.0) -> Publication | None:
+    def read(self, out: NDArray[np.generic] | None = None, limit_s: float = 0.0) -> Publication | None:
         """See `Stream`."""
         try:
             publication = self._source.read_publication(out=out, timeout=limit_s)
@@ -278,7 +278,7 @@ class Follower:
             self.say(f"{' x '.join(map(str, source.shape))} {self._holds} ({source.dtype}), {source.maker}")
         return source
 
-    def take(self, limit_s: float, out: NDArray[Any] | None = None) -> Publication | None:
+    def take(self, limit_s: float, out: NDArray[np.generic] | None = None) -> Publication | None:
         """Return the newest publication if it is new, and complete within `limit_s`; see `Stream.read`."""
         source, counters = self.source, self.counters
         if source is None or source.count == self.seen:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -95,6 +94,6 @@ class StreamOut:
         self._follower.say(f"passed on as isio:{self._writer.path}")
 
 
-def _incompatible(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+def _incompatible(shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> str:
     """Return the expected shape and type, or "" if this is a vector from the engine."""
     return "" if len(shape) == 1 and dtype == np.float32 else "a vector of float32"

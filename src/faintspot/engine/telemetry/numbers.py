@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,7 +166,7 @@ def change_rows(telemetry: Telemetry) -> Sequence[tuple[int, float, str, str]]:
     return rows
 
 
-def _shortened(value: Any) -> str:
+def _shortened(value: object) -> str:
     """Return a value as text; of a table, such as a sodium profile, what is no list."""
     text = str(value)
     if isinstance(value, Mapping):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -200,7 +200,7 @@ class Recorder:
             self._write({})
             self._written_at = time.monotonic()
 
-    def _write(self, attributes: dict[str, Any]) -> None:
+    def _write(self, attributes: Mapping[str, object]) -> None:
         """Write the buffered data."""
         start = time.monotonic()
         records, images = self._records.taken(), self._images.taken()

@@ -104,7 +104,7 @@ class TelemetryRing(Segment):
         commands: int = 0,
         reference: ArrayLike | None = None,
         parts: Mapping[str, str] | None = None,
-        control: Mapping[str, Any] | None = None,
+        control: Mapping[str, object] | None = None,
         records: int | None = None,
         image_slots: int | None = None,
     ) -> TelemetryRing:
@@ -233,7 +233,7 @@ class TelemetryRing(Segment):
         ring.count(written + 1)
 
     def write_change(
-        self, frame: int, number: int, changes: Mapping[str, Any], where: Sequence[int] | None
+        self, frame: int, number: int, changes: Mapping[str, object], where: Sequence[int] | None
     ) -> None:
         """Write a change of settings that has taken effect.
 

@@ -44,7 +44,7 @@ class ObservingConditions:
         r0 = configuration.atmosphere.r0_m
         return cls(configuration.photons, r0 if isinstance(r0, tuple) else (r0, r0))
 
-    def ordered(self, configuration: LoopConfiguration, changes: Mapping[str, Any]) -> ObservingConditions:
+    def ordered(self, configuration: LoopConfiguration, changes: Mapping[str, object]) -> ObservingConditions:
         """Return the conditions with changes, by the names of `ORDERS`.
 
         Raises
@@ -72,7 +72,7 @@ class ObservingConditions:
         return replace(self, **new)
 
 
-def _two_ends(name: str, value: Any, low: float, high: float) -> tuple[float, float]:
+def _two_ends(name: str, value: object, low: float, high: float) -> tuple[float, float]:
     """Return a single number twice, or a pair unchanged."""
     ends = numbers_between(name, value, low, high)
     if ends.size not in (1, 2) or ends.ndim > 1:

@@ -165,7 +165,7 @@ class SimulatedTelescope(Readout, Closing):
         with held(self._frames, self._truth):
             return super().run(n_frames, stop, progress)
 
-    def order(self, changes: dict[str, Any]) -> Order:
+    def order(self, changes: Mapping[str, object]) -> Order:
         """Change conditions from the next exposure on; see `telescope_orders.ORDERS`.
 
         Raises
@@ -207,7 +207,7 @@ class SimulatedTelescope(Readout, Closing):
         self._last = self._underway.result()
         return self._last.pixels
 
-    def _publish(self, moment: int, frame: NDArray[Any]) -> None:
+    def _publish(self, moment: int, frame: NDArray[np.generic]) -> None:
         """Read out one frame while the exposure of the next one begins."""
         number, exposure = self._next, self._last
         assert exposure is not None
@@ -265,7 +265,7 @@ class SimulatedTelescope(Readout, Closing):
 def commands_of(telescope: SimulatedTelescope) -> dict[str, Handler]:
     """Return the commands of the control channel: status and set."""
 
-    def change(fields: dict[str, Any]) -> Mapping[str, Any]:
+    def change(fields: Mapping[str, object]) -> Mapping[str, Any]:
         order = telescope.order(changes_of(fields))
         frame = order.frame if order.in_effect.wait(EFFECT_TIMEOUT_S) else None
         return {"frame": frame, "conditions": asdict(order.conditions)}

@@ -185,7 +185,7 @@ def with_integrator(kind: MethodKind) -> MethodKind:
     return replace(kind, control=INTEGRATOR)
 
 
-def _is_scale(values: Sequence[Any]) -> bool:
+def _is_scale(values: Sequence[object]) -> bool:
     """Return whether an option's values are positive numbers, between which it may be."""
     return all(isinstance(value, float) and value > 0 for value in values)
 
@@ -216,7 +216,7 @@ def smoothed(
     return results
 
 
-def stored(result: Mapping[str, NDArray[Any]]) -> Tuned:
+def stored(result: Mapping[str, NDArray[np.generic]]) -> Tuned:
     """Return what `tune` found."""
     return Tuned(parse_json(str(result["choice"])), float(result["strehl"]))
 

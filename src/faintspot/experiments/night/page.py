@@ -109,7 +109,7 @@ def night_summary(night: Night) -> dict[str, Any]:
     }
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Return a value for JSON: numbers to six digits, estimates with their intervals; None is not known."""
     if isinstance(value, Estimate):
         return _plain_estimate(value)
@@ -235,7 +235,7 @@ def _facts(night: Night) -> Mapping[str, str]:
     )
 
 
-def _plain_record(record: Any, names: Mapping[str, str]) -> dict[str, Any]:
+def _plain_record(record: object, names: Mapping[str, str]) -> dict[str, Any]:
     return {name: plain(getattr(record, attribute)) for name, attribute in names.items()}
 
 

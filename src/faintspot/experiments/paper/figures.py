@@ -231,7 +231,7 @@ def _range_of(axis: str, values: Any) -> tuple[float | None, float | None]:
 
 
 def _over_k(
-    dataset: xarray.Dataset, cell: int, label: str, colour: Any
+    dataset: xarray.Dataset, cell: int, label: str, colour: object
 ) -> tuple[list[Line], list[list[Any]]]:
     """Return R of a cell against the number of pixels kept as lines and as rows; circles are those chosen."""
     lines, rows = [], []

@@ -48,7 +48,7 @@ def parameters_of(dataset: xarray.Dataset, cells: Sequence[int]) -> list[dict[st
     return [{name: column[cell].item() for name, column in columns.items()} for cell in cells]
 
 
-def parameter_in_words(name: str, value: Any) -> str:
+def parameter_in_words(name: str, value: object) -> str:
     """Return a cell's parameter with its unit."""
     standard, words = _TEXT["standard_parameters"].get(name, (None, ""))
     return str(words) if value == standard else str(_TEXT[f"parameters.{name}"]).format(value)

@@ -227,7 +227,7 @@ def frames_to_check(layout: Layout) -> int:
     return max(_FEWEST_FRAMES, spots // len(layout))
 
 
-def images_e(frames: NDArray[Any], layout: Layout, calibration: Calibration) -> Floats:
+def images_e(frames: NDArray[np.generic], layout: Layout, calibration: Calibration) -> Floats:
     """Return the images (n_frames, n, ny, nx) of frames in photo-electrons."""
     dark, electrons_per_adu = layout.images(calibration.maps(layout.frame_shape))
     images: Floats = (layout.images(frames) - dark) * electrons_per_adu

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -335,7 +336,7 @@ class Question(Options):
 
     # Checks -----------------------------------------------------------------------------------------
 
-    def _put(self, name: str, value: Any) -> None:
+    def _put(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
 
     def _needed(self, name: str, meaning: str) -> Any:
@@ -464,7 +465,7 @@ def read_camera(path: str | Path) -> dict[str, Any]:
     return values
 
 
-def _layout(path: str | Path, content: dict[str, Any]) -> Layout:
+def _layout(path: str | Path, content: Mapping[str, object]) -> Layout:
     check_keys(f"{path}: layout.", content, ["grid"], required=["grid"])
     grid = checked_table(f"{path}: layout.grid", content["grid"])
     check_keys(f"{path}: layout.grid.", grid, GRID_KEYS, required=("shape", "pixels"))

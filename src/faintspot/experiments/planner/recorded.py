@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -127,7 +128,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **st
     return Question(**{**stated, **values, **parts}, facts=(*earlier, *facts))
 
 
-def _check_stated(layout: Layout, stated: dict[str, Any]) -> None:
+def _check_stated(layout: Layout, stated: Mapping[str, object]) -> None:
     """Refuse wrong values before anything is measured: those not stated are assumed for it."""
     assumed: dict[str, Any] = {"read_noise_e": 1.0, "layout": layout}
     if stated.get("psf") is None and stated.get("laser") is None:
@@ -137,7 +138,7 @@ def _check_stated(layout: Layout, stated: dict[str, Any]) -> None:
     Question(**{**assumed, **stated})
 
 
-def _check_flux(stack: NDArray[Any], dark: Any, layout: Layout, gain: float) -> None:
+def _check_flux(stack: NDArray[np.generic], dark: object, layout: Layout, gain: float) -> None:
     """Refuse spots so bright that photon noise plays no part."""
     flux_e = gain * float(np.median(layout.images(stack.mean(axis=0) - dark).sum(axis=(-2, -1))))
     if flux_e > LARGEST_FLUX_E:
@@ -147,7 +148,7 @@ def _check_flux(stack: NDArray[Any], dark: Any, layout: Layout, gain: float) -> 
         )
 
 
-def _stack(name: str, value: Any) -> NDArray[Any]:
+def _stack(name: str, value: object) -> NDArray[Any]:
     array = finite_array(name, value, minimum_dimensions=2)
     if array.ndim > 3:
         raise InputError(f"{name}: expected (n, h, w) or (h, w), got shape {array.shape}")
@@ -205,7 +206,7 @@ def _calibration(
 
 
 def _measured(
-    stack: NDArray[Any], darks: NDArray[Any] | None, layout: Layout, em_gain: float
+    stack: NDArray[np.generic], darks: NDArray[np.generic] | None, layout: Layout, em_gain: float
 ) -> DetectorMeasurement | None:
     """Camera properties measured in the frames; None where they are too few."""
     usable_darks = None if darks is None or len(darks) < 2 else darks[: max(2, _DARK_PIXELS // darks[0].size)]
@@ -230,7 +231,7 @@ def _measured_on_spots(stack: NDArray[Any], dark: Any, layout: Layout, em_gain: 
     return measured if measured.problem is None else measured.problem
 
 
-def _some(frames: NDArray[Any], layout: Layout) -> NDArray[Any]:
+def _some(frames: NDArray[np.generic], layout: Layout) -> NDArray[Any]:
     """Frames from all of a recording, as many as hold enough spots."""
     count = min(len(frames), max(1, _SPOTS_TO_LEARN_FROM // len(layout)))
     sample: NDArray[Any] = frames[np.linspace(0, len(frames) - 1, count).round().astype(int)]

@@ -209,7 +209,7 @@ class _Trial:
         if method.estimator.uses_flux and self.question.flux_is_known:
             method = method.with_options({"flux_e": float(f"{flux_e:.4g}")})
 
-        def badness(choice: Choice, name: str, values: Sequence[Any]) -> list[float]:
+        def badness(choice: Choice, name: str, values: Sequence[object]) -> list[float]:
             measured = spots.measure_each(first, method.with_options(choice), name, values)
             return [corrected_badness(x, y, first.truth) for x, y in measured]
 

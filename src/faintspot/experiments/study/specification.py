@@ -27,7 +27,7 @@ _MOST_CELLS = 100_000
 _RANGE_KEYS = ("from", "to", "points", "spacing")
 
 
-def _checked_sweeps(name: str, values: Any) -> tuple[Sweep, ...]:
+def _checked_sweeps(name: str, values: object) -> tuple[Sweep, ...]:
     sweeps = tuple(values) if isinstance(values, Iterable) else ()
     if not sweeps or not all(isinstance(sweep, Sweep) for sweep in sweeps):
         raise InputError(f"expected at least one sweep, got {values!r}", name=name)
@@ -39,7 +39,7 @@ def _checked_sweeps(name: str, values: Any) -> tuple[Sweep, ...]:
     return sweeps
 
 
-def _checked_estimators(name: str, values: Any) -> tuple[str, ...]:
+def _checked_estimators(name: str, values: object) -> tuple[str, ...]:
     return tuple(one_of(name, each, list(estimators())) for each in strings_of(name, values))
 
 
@@ -227,7 +227,7 @@ def _sweep(name: str, table: Any) -> Sweep:
     return Sweep(name, **values)
 
 
-def _spread(where: str, parameter: str, table: dict[str, Any]) -> list[float]:
+def _spread(where: str, parameter: str, table: Mapping[str, object]) -> list[float]:
     """Return the numbers of { from = 10, to = 1000, points = 9, spacing = "log" }."""
     check_keys(f"{where}.", table, _RANGE_KEYS, required=("from", "to", "points"))
     if parameter not in RANGES:

@@ -183,7 +183,7 @@ def _values(where: str, name: str, values: Any) -> tuple[Any, ...]:
     return tuple(dict.fromkeys(checked_numbers(where, items, RANGES[name])))
 
 
-def checked_numbers(where: str, items: Any, bounds: Option) -> list[Any]:
+def checked_numbers(where: str, items: object, bounds: Option) -> list[Any]:
     """Return plain numbers within the bounds, or raise InputError."""
     kind = {"low_open": bounds.low_open, "integer": bounds.whole}
     array = numbers_between(where, items, bounds.low, bounds.high, **kind)

@@ -14,7 +14,7 @@ EQUAL_COLOURS = "red, green and blue are equal, and read as grey"
 """Note about such an image."""
 
 
-def grey(name: str, values: NDArray[Any], *, selectable: bool = True) -> NDArray[Any]:
+def grey(name: str, values: NDArray[np.generic], *, selectable: bool = True) -> NDArray[Any]:
     """Return the first of equal channels (..., h, w, 2 to 4); the second or fourth may be transparency.
 
     Raises
@@ -37,6 +37,6 @@ def grey(name: str, values: NDArray[Any], *, selectable: bool = True) -> NDArray
     return np.ascontiguousarray(first[..., 0])
 
 
-def one_channel(values: NDArray[Any], name: str) -> NDArray[Any]:
+def one_channel(values: NDArray[np.generic], name: str) -> NDArray[Any]:
     """Return the channel of this name of an image (h, w, 2 to 4)."""
     return np.ascontiguousarray(values[..., min(CHANNELS.index(name), values.shape[-1] - 2)])

@@ -46,7 +46,7 @@ class StoredArray(Closing):
         self,
         name: str,
         shape: tuple[int, ...],
-        dtype: np.dtype[Any],
+        dtype: np.dtype[np.generic],
         open_array: OpenArray,
         *,
         note: str = "",
@@ -64,7 +64,7 @@ class StoredArray(Closing):
         cls,
         name: str,
         shape: tuple[int, ...],
-        dtype: np.dtype[Any],
+        dtype: np.dtype[np.generic],
         load: Callable[[], NDArray[Any]],
         **options: Any,
     ) -> StoredArray:

@@ -61,7 +61,7 @@ class StreamedArray:
         self,
         stream: IO[bytes],
         offset: int,
-        dtype: np.dtype[Any],
+        dtype: np.dtype[np.generic],
         shape: tuple[int, ...],
         *,
         compressed: bool = False,

@@ -76,7 +76,7 @@ def holds_telemetry(path: Path) -> bool:
         return False
 
 
-def replace_attributes(path: Path, changed: Mapping[str, Any]) -> None:
+def replace_attributes(path: Path, changed: Mapping[str, object]) -> None:
     """Replace attributes of a group in one step, which the store's own setter does not guarantee."""
     metadata = parse_json((path / "zarr.json").read_text(encoding="utf-8"))
     metadata["attributes"].update(changed)

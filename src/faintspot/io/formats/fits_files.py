@@ -190,14 +190,14 @@ class _Scaling:
     blank: int | None
 
     @classmethod
-    def of(cls, name: str, header: Any, stored_type: np.dtype[Any]) -> _Scaling:
+    def of(cls, name: str, header: Any, stored_type: np.dtype[np.generic]) -> _Scaling:
         try:
             blank = int(header["BLANK"]) if "BLANK" in header and stored_type.kind != "f" else None
             return cls(float(header.get("BSCALE", 1.0)), float(header.get("BZERO", 0.0)), blank)
         except Exception as error:  # cards are parsed on access and may be broken
             raise InputError(f"{name}: BSCALE, BZERO and BLANK must be numbers ({one_line(error)})") from None
 
-    def __call__(self, stored: NDArray[Any]) -> NDArray[Any]:
+    def __call__(self, stored: NDArray[np.generic]) -> NDArray[Any]:
         if self.blank is None and self.scale == 1.0 and self.zero == 0.0:
             return stored
         bits = 8 * stored.itemsize
@@ -217,7 +217,7 @@ class _Scaling:
         return values
 
 
-def _write_image(stream: IO[bytes], name: str, values: NDArray[Any], units: str, comment: str) -> None:
+def _write_image(stream: IO[bytes], name: str, values: NDArray[np.generic], units: str, comment: str) -> None:
     """Write one image extension; FITS stores bool as bytes."""
     stored = values.view(np.uint8) if values.dtype == np.bool_ else values
     fits = load_fits()

@@ -166,7 +166,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     return {item.filename.removesuffix(".npy"): item for item in members}
 
 
-def _pieces(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
+def _pieces(array: NDArray[np.generic]) -> Iterator[NDArray[Any]]:
     """Yield an array in pieces of bounded size along its first axis."""
     if not array.shape:
         yield array

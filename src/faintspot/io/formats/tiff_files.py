@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -112,7 +112,7 @@ def _array(name: str, path: Path, chosen: list[Any], numbers: list[int]) -> Stor
 class _Pages:
     """Pages that are decompressed individually."""
 
-    def __init__(self, path: Path, pages: list[Any]) -> None:
+    def __init__(self, path: Path, pages: Sequence[object]) -> None:
         self._path, self._pages = path, pages
 
     def __getitem__(self, part: slice) -> NDArray[Any]:

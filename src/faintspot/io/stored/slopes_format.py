@@ -120,7 +120,7 @@ def check_memory(path: Path, n_frames: int, n_subapertures: int) -> None:
     check_bytes(path, n_frames * n_subapertures * slope_bytes, most_slopes_bytes(), "slopes")
 
 
-def unit_of(name: str, attributes: Mapping[str, Any]) -> str:
+def unit_of(name: str, attributes: Mapping[str, object]) -> str:
     """Return the unit of a variable in a file with these attributes."""
     return VARIABLES[name].units.replace("px", str(attributes.get("unit", "px")))
 
@@ -229,7 +229,7 @@ def with_absent(variables: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def json_values(name: str, value: Mapping[str, Any]) -> dict[str, Any]:
+def json_values(name: str, value: Mapping[str, object]) -> dict[str, Any]:
     """Return a mapping as plain JSON values: NumPy numbers, arrays and paths are converted."""
     try:
         values: dict[str, Any] = plain_values(value, exact=True)

@@ -78,7 +78,7 @@ class SlopeWriter(Closing):
         """Return the number of frames, stored or waiting: the next block starts there."""
         return self._stored + sum(len(block["x"]) for block in self._waiting)
 
-    def append(self, start: int, block: Mapping[str, NDArray[Any]]) -> None:
+    def append(self, start: int, block: Mapping[str, NDArray[np.generic]]) -> None:
         """Add frames `start`, `start` + 1 ...: every variable of `VARIABLES`, (n, n_subapertures).
 
         Variables with a default may be omitted.

@@ -104,7 +104,7 @@ class SlopeStore:
         """Return stored frames."""
         return {name: read_items(self._path, array, start, stop) for name, array in self._arrays.items()}
 
-    def write(self, start: int, variables: Mapping[str, NDArray[Any]]) -> None:
+    def write(self, start: int, variables: Mapping[str, NDArray[np.generic]]) -> None:
         """Store whole chunks."""
         for name, values in variables.items():
             array = self._arrays[name]

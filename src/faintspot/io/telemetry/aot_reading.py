@@ -7,7 +7,7 @@ positions are counted from 0, slopes are in px from the centre of a sub-aperture
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -267,7 +267,7 @@ def _loop(loops: list[Any], n: int) -> dict[str, Any]:
     }
 
 
-def _number(owner: Any, name: str) -> float | None:
+def _number(owner: object, name: str) -> float | None:
     """Return a positive number, or None."""
     value = None if owner is None else getattr(owner, name)
     return float(value) if value is not None and np.isfinite(value) and value > 0 else None
@@ -290,7 +290,7 @@ def _layout(sensor: Any, n: int, size: tuple[int, int] | None) -> dict[str, Any]
     return {"frame_shape": size, "window": (window, window), "corners": corners, "cells": cells}
 
 
-def _cells(sensor: Any, n: int) -> NDArray[np.int64] | None:
+def _cells(sensor: object, n: int) -> NDArray[np.int64] | None:
     """Return row and column of the sub-apertures, (n, 2); None without a mask."""
     mask = _data_of(sensor, "subaperture_mask")
     if mask is None:
@@ -312,7 +312,7 @@ def _reference(sensor: Any, n: int) -> NDArray[np.float64] | None:
     return finite_array("ref_measurements", values).astype(np.float64).reshape(-1)
 
 
-def _interaction(loops: list[Any], n: int) -> NDArray[np.float64] | None:
+def _interaction(loops: Sequence[object], n: int) -> NDArray[np.float64] | None:
     """Return the interaction matrix, (2 n, commands)."""
     values = _data_of(loops[0], "interaction_matrix", n, 2, "commands") if loops else None
     if values is None:
@@ -321,7 +321,7 @@ def _interaction(loops: list[Any], n: int) -> NDArray[np.float64] | None:
     return matrix
 
 
-def _data_of(owner: Any, name: str, *shape: int | str) -> Any:
+def _data_of(owner: object, name: str, *shape: int | str) -> Any:
     """Return an image's data in native byte order, or None; of this shape, in which words are any number."""
     image = None if owner is None else getattr(owner, name)
     if image is None or image.data is None:

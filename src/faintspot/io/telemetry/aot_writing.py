@@ -126,7 +126,7 @@ def _metadata(telemetry: Telemetry) -> list[Any]:
     ]
 
 
-def _sensor(telemetry: Telemetry, source: Any, estimator: str | None) -> Any:
+def _sensor(telemetry: Telemetry, source: object, estimator: str | None) -> Any:
     """Return the Shack-Hartmann sensor with its measurements."""
     import aotpy
 

@@ -24,6 +24,6 @@ def array(dtype: Any, dimensions: str, units: str = "1", *, in_all: bool = True)
     return {"stored": ArrayStorage(np.dtype(dtype), tuple(dimensions.split()), units, in_all)}
 
 
-def of_slopes(name: str, dtype: Any, *, in_all: bool = True) -> dict[str, ArrayStorage]:
+def of_slopes(name: str, dtype: object, *, in_all: bool = True) -> dict[str, ArrayStorage]:
     """Return those of a quantity of each slope."""
     return array(dtype, "frame subaperture", VARIABLES[name].units, in_all=in_all)

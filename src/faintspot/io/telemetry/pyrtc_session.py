@@ -60,7 +60,7 @@ def read_session(path: Path) -> dict[str, Any]:
     }
 
 
-def _array(path: Path, record: Any, kind: str) -> NDArray[Any]:
+def _array(path: Path, record: object, kind: str) -> NDArray[Any]:
     name = record.get(f"{kind}_file") if isinstance(record, dict) else None
     if not isinstance(name, str):
         raise InputError(f"{path}: {_MANIFEST} names no {kind}_file; record it with pyRTC 2.1 or later")

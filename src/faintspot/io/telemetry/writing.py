@@ -48,7 +48,7 @@ class TelemetryStore:
         path: str | Path,
         record_type: np.dtype[np.void],
         image_type: np.dtype[np.void],
-        attributes: Mapping[str, Any],
+        attributes: Mapping[str, object],
     ) -> None:
         self.path = Path(path)
         if self.path.exists():
@@ -63,7 +63,7 @@ class TelemetryStore:
         with zarr.config.set({"array.write_empty_chunks": True}):
             self._arrays: dict[str, Any] = dict(group.arrays())
 
-    def append(self, records: NDArray[Any], images: NDArray[Any], attributes: Mapping[str, Any]) -> None:
+    def append(self, records: NDArray[Any], images: NDArray[Any], attributes: Mapping[str, object]) -> None:
         """Append records and images and replace attributes; on return they are in the store.
 
         Raises
@@ -85,7 +85,7 @@ class TelemetryStore:
         self.frames, self.images = frames, images_there
 
 
-def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mapping[str, Any]) -> None:
+def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mapping[str, object]) -> None:
     """Create the store under a hidden name and rename it, so that it never appears incomplete."""
     hidden = path.with_name(f".{path.name}.new")
     shutil.rmtree(hidden, ignore_errors=True)

@@ -398,7 +398,7 @@ def _of_table(configuration: Configuration, values: Mapping[str, Any]) -> Contro
         return Control(arrays[INTERACTION], arrays.get(REFERENCE), options, file, centres)
 
 
-def _read(path: Path, name: str, location: Any) -> NDArray[Any]:
+def _read(path: Path, name: str, location: object) -> NDArray[Any]:
     """Read an array from the file that the table names, relative to the configuration."""
     if not isinstance(location, str):
         raise InputError(f"expected the name of a file, found {location!r:.80}", name=f"{TABLE}.{name}")
@@ -406,7 +406,7 @@ def _read(path: Path, name: str, location: Any) -> NDArray[Any]:
         return read_array(f"{path.parent / location}")
 
 
-def save_control(path: str | Path, **values: Any) -> None:
+def save_control(path: str | Path, **values: object) -> None:
     """Write values into [control] of a configuration file; the rest of the file stays.
 
     Raises

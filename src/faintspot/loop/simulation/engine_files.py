@@ -102,7 +102,7 @@ def write_engine_files(
     return path
 
 
-def fixed_window(configuration: LoopConfiguration, **options: Any) -> Settings:
+def fixed_window(configuration: LoopConfiguration, **options: object) -> Settings:
     """Return settings of a fixed window for the configuration's star, with other options of the estimator."""
     width = float(f"{WINDOW_WIDTH * configuration.scene.seen_fwhm_px:.3g}")
     return Settings("window", window_fwhm_px=width, flux_e=configuration.photons, **options)

@@ -18,7 +18,7 @@ PRIOR = "prior_std_px"
 """Option of estimators whose prior the loop sets: standard deviation from the predicted position."""
 
 
-def _checked_settings(name: str, value: Any) -> Settings:
+def _checked_settings(name: str, value: object) -> Settings:
     if not isinstance(value, Settings):
         raise InputError(f"expected Settings, got {type(value).__name__}", name=name)
     return value

@@ -120,7 +120,7 @@ def system_numbers(path: Path) -> dict[str, float]:
     return _numbers(_system_values(path))
 
 
-def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+def _numbers(values: Mapping[str, object]) -> dict[str, float]:
     return {key: option.checked(key, values[key]) for key, option in NUMBERS.items() if key in values}
 
 
@@ -188,7 +188,7 @@ def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
 
 
 def control_of(
-    attributes: Mapping[str, Any], configuration: str | Path | None = None
+    attributes: Mapping[str, object], configuration: str | Path | None = None
 ) -> RecordedControl | None:
     """Return the control of an engine's recording, from a configuration file or as recorded.
 
@@ -291,7 +291,7 @@ def _usable(slopes: Floats, flags: NDArray[np.uint8] | None) -> tuple[Floats, st
     return np.where(np.tile(valid, 2), slopes, np.nan), left_out
 
 
-def _timing(values: dict[str, Any], frames: int, rate: float | None) -> tuple[NDArray[np.int64], float]:
+def _timing(values: Mapping[str, object], frames: int, rate: float | None) -> tuple[NDArray[np.int64], float]:
     """Return frame numbers and the frame rate."""
     time, frame = values.get("time_s"), values.get("frame")
     if frame is not None:

@@ -27,7 +27,7 @@ _GAINS = 1e-9, 1e9
 _LARGEST_READ_NOISE_E, _LARGEST_BACKGROUND_E, _LARGEST_ADU = 1e6, 1e9, 1e30
 
 
-def _map(name: str, value: Any) -> NDArray[np.float64]:
+def _map(name: str, value: object) -> NDArray[np.float64]:
     """Return a private, read-only copy of a map, which may contain NaN."""
     array = real_array(name, value).astype(np.float64)
     if array.ndim != 2:
@@ -36,13 +36,13 @@ def _map(name: str, value: Any) -> NDArray[np.float64]:
     return array
 
 
-def _scalar_or_map(name: str, value: Any) -> Any:
+def _scalar_or_map(name: str, value: object) -> Any:
     if real_array(name, value).ndim == 0:
         return number_between(name, value, -_LARGEST_ADU, _LARGEST_ADU)
     return _map(name, value)
 
 
-def _read_noise(name: str, value: Any) -> Any:
+def _read_noise(name: str, value: object) -> Any:
     """Return a number, or a map whose values are in range or NaN, not all of them NaN."""
     if real_array(name, value).ndim == 0:
         return number_between(name, value, 0.0, _LARGEST_READ_NOISE_E)
@@ -54,7 +54,7 @@ def _read_noise(name: str, value: Any) -> Any:
     return noise
 
 
-def _mask_or_list(name: str, value: Any) -> NDArray[Any]:
+def _mask_or_list(name: str, value: object) -> NDArray[Any]:
     """Return a boolean mask, or rows and columns as (n, 2) int64."""
     try:
         array = np.array(value)
@@ -201,7 +201,7 @@ class Calibration(ConfigurationTable, table="calibration"):
         return cls.from_table(Tables(path).tables.get(cls.table, {}), Path(path))
 
     @classmethod
-    def from_table(cls, values: Mapping[str, Any], path: Path | None = None) -> Calibration:
+    def from_table(cls, values: Mapping[str, object], path: Path | None = None) -> Calibration:
         """Return the calibration in a table, with the maps in the files that it names."""
         with errors_within(path):
             read = {key: _map_or_value(path or Path(), key, value) for key, value in values.items()}
@@ -305,7 +305,7 @@ def read_map(key: str, location: str | Path) -> NDArray[Any]:
     return np.asarray((array != 0) | ~np.isfinite(array))
 
 
-def _map_or_value(path: Path, key: str, value: Any) -> Any:
+def _map_or_value(path: Path, key: str, value: object) -> Any:
     """Read the map named in a configuration file, relative to that file."""
     if key not in _MAPS or not isinstance(value, str):
         return value

@@ -20,7 +20,7 @@ LARGEST_MEAN_E = 1e12
 _LEVELS = ("read_noise_e", "dark_e", "background_e", "relative_gain")  # numbers or maps
 
 
-def _number_or_map(name: str, value: Any) -> float | NDArray[np.float64]:
+def _number_or_map(name: str, value: object) -> float | NDArray[np.float64]:
     """Return a level >= 0: a number, or a read-only map of shape (ny, nx)."""
     level: NDArray[np.float64] = numbers_between(name, value, 0, LARGEST_MEAN_E)
     if level.ndim == 0:
@@ -31,7 +31,7 @@ def _number_or_map(name: str, value: Any) -> float | NDArray[np.float64]:
     return level
 
 
-def _single_pixels(name: str, value: Any) -> tuple[tuple[int, int, float], ...]:
+def _single_pixels(name: str, value: object) -> tuple[tuple[int, int, float], ...]:
     """Return hot or blinking pixels as (row, column, electrons)."""
     if not isinstance(value, Sequence | np.ndarray):
         raise InputError(f"{name}: expected a list of (row, column, electrons), got {value!r}")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +18,7 @@ class MeanFrame:
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._total, self._count = np.zeros(shape), np.zeros(shape, np.int64)
 
-    def add(self, block: NDArray[Any]) -> None:
+    def add(self, block: NDArray[np.generic]) -> None:
         """Add frames, (n, h, w)."""
         finite = np.isfinite(block)
         self._total += np.where(finite, block, 0).sum(axis=0, dtype=np.float64)

@@ -166,7 +166,7 @@ def measure_detector(
     return _result(dark, read_noise, line, halves, multiplication, notes, problem)
 
 
-def _frames(name: str, value: Any) -> Floats:
+def _frames(name: str, value: object) -> Floats:
     frames: Floats = finite_array(name, value, minimum_dimensions=3).astype(np.float64)
     if frames.ndim != 3 or len(frames) < 2 or min(frames.shape[1:]) < 4:
         raise InputError(f"{name}: expected at least 2 frames of 4 x 4 pixels or more, got {frames.shape}")

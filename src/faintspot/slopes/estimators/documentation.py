@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 from faintspot.base.config.options import Option, Options
 from faintspot.slopes.estimators.base import Estimator, Need
@@ -70,7 +69,7 @@ def _plain(number: float) -> str:
     return f"{int(number)}" if number == int(number) and number < 1e9 else f"{number:g}"
 
 
-def _default(value: Any) -> str:
+def _default(value: object) -> str:
     if value is None:
         return ""
     return f'"{value}"' if isinstance(value, str) else f"{value:g}"

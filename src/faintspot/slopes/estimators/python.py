@@ -25,7 +25,7 @@ _TYPICAL_FLUX_E = 300.0
 _AT_SEARCH_LIMIT = np.uint8(SubapertureFlag.AT_SEARCH_LIMIT)
 
 
-def _limited(away: NDArray[Any], table: NDArray[np.float32], flags: NDArray[np.uint8]) -> NDArray[Any]:
+def _limited(away: NDArray[np.generic], table: NDArray[np.float32], flags: NDArray[np.uint8]) -> NDArray[Any]:
     """Clip slopes (n, 2) to the search range, and set the flags (n,) of the valid ones that were clipped."""
     reach = table[groups.RANGE]
     at_limit = np.abs(away).max(axis=1) >= reach - groups.LIMIT_ROUNDING_PX

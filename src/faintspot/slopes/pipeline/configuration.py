@@ -47,7 +47,7 @@ class Configuration(Tables):
         As for `Tables`; parts also if their table is missing, or has an unknown key or an invalid value.
     """
 
-    def __init__(self, path: str | Path, tables: Mapping[str, Any] | None = None, **parts: Any) -> None:
+    def __init__(self, path: str | Path, tables: Mapping[str, object] | None = None, **parts: object) -> None:
         super().__init__(path, tables)
         vars(self).update(parts)
 
@@ -118,7 +118,7 @@ class Configuration(Tables):
             flux = settings.values("flux_e", len(layout), layout.pixels)
             return matched_filter(self.psf, layout, self.calibration, flux)
 
-    def _named_file(self, values: Mapping[str, Any], known: tuple[str, ...]) -> Path:
+    def _named_file(self, values: Mapping[str, object], known: tuple[str, ...]) -> Path:
         """Return the file that a table names, relative to the configuration file."""
         check_keys("", values, known)
         name = values.get("file")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from statistics import NormalDist
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +70,7 @@ class MeanLight:
             light_test(layout, maps, box / _BOX_OF_FWHM, boxes=2) for box in (usual, 2 * usual + 1) if usual
         ]
 
-    def significances(self, mean: NDArray[Any]) -> NDArray[np.float32]:
+    def significances(self, mean: NDArray[np.generic]) -> NDArray[np.float32]:
         """Return the significance of each window's flux in a mean frame (h, w) [ADU], (n,), over the limit.
 
         It is below 1 in dark windows, and infinite in windows too small for a test. NaN marks pixels without

@@ -45,7 +45,7 @@ def packed_calibration(layout: Layout, maps: NDArray[np.float32], width: int) ->
     return _packed(layout.images(maps), width)
 
 
-def _packed(windows: NDArray[Any], width: int) -> NDArray[np.float32]:
+def _packed(windows: NDArray[np.generic], width: int) -> NDArray[np.float32]:
     """Return windows of several maps (k, n, ny, nx) as (n_groups, pixels, k, W)."""
     count, n = windows.shape[:2]
     n_groups = -(-n // width)
@@ -137,15 +137,15 @@ class Plan:
         """Function that allocates the scratch memory of the estimator's kernel."""
         return self._arguments()[2]
 
-    def kernel(self, frames: NDArray[Any]) -> Direct:
+    def kernel(self, frames: NDArray[np.generic]) -> Direct:
         """Return the compiled function that measures groups of frames of this dtype."""
         return self._direct(self.prepared.kernel, frames)
 
-    def flux_kernel(self, frames: NDArray[Any]) -> Direct:
+    def flux_kernel(self, frames: NDArray[np.generic]) -> Direct:
         """Return the compiled function that sums their flux."""
         return self._direct(self.prepared.flux_kernel, frames)
 
-    def _direct(self, kernel: Any, frames: NDArray[Any]) -> Direct:
+    def _direct(self, kernel: object, frames: NDArray[np.generic]) -> Direct:
         key = kernel, frames.dtype.char
         if key not in self._kernels:
             self._kernels[key] = Direct(kernel)

@@ -88,7 +88,7 @@ class Settings:
     """Estimator of the spot positions."""
     _shared: SharedOptions
 
-    def __init__(self, estimator: str | Estimator = "tv", **options: Any) -> None:
+    def __init__(self, estimator: str | Estimator = "tv", **options: object) -> None:
         if isinstance(estimator, Estimator):
             foreign = [name for name in options if name not in self.SHARED]
             if foreign:
@@ -107,7 +107,7 @@ class Settings:
         put(self, "_shared", SharedOptions(**{k: v for k, v in options.items() if k in self.SHARED}))
         check_lengths(chosen, self._shared)
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"Settings are immutable: use settings.replace({name}=...)")
 
     def __getattr__(self, name: str) -> Any:
@@ -121,7 +121,7 @@ class Settings:
     def __getstate__(self) -> dict[str, Any]:
         return dict(vars(self))
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: Mapping[str, object]) -> None:
         vars(self).update(state)
 
     def __eq__(self, other: object) -> bool:
@@ -214,7 +214,7 @@ class Settings:
             check_option(name, type(self.estimator))
         return self._of(self.estimator.replaced(specific, where), self._shared.replaced(shared, where))
 
-    def _with_estimator(self, estimator: str | Estimator, **options: Any) -> Settings:
+    def _with_estimator(self, estimator: str | Estimator, **options: object) -> Settings:
         if isinstance(estimator, Estimator):
             return self._of(estimator, self._shared.replaced(options))
         kept = {
@@ -280,11 +280,11 @@ def _times(value: Any, scale: float, *, whole: bool) -> Any:
     return (np.maximum(np.rint(scaled), 1).astype(int) if whole else scaled).tolist()
 
 
-def _plain_values(values: Mapping[str, Any]) -> dict[str, Any]:
+def _plain_values(values: Mapping[str, object]) -> dict[str, Any]:
     return {key: per_subaperture(key, value) for key, value in values.items()}
 
 
-def _without_none(values: Mapping[str, Any]) -> dict[str, Any]:
+def _without_none(values: Mapping[str, object]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 

@@ -211,7 +211,7 @@ class SlopePipeline:
         rounded = np.exp(step * np.rint(np.log(flux_e) / step))
         return self.with_settings(self.settings.replace(flux_e=np.broadcast_to(rounded, planned_e.shape)))
 
-    def with_dark(self, mean: NDArray[Any]) -> SlopePipeline:
+    def with_dark(self, mean: NDArray[np.generic]) -> SlopePipeline:
         """Return the same pipeline for frames of this mean: what has no flux in it is dark in all of them.
 
         A single frame shows which sub-apertures are dark only if its spots are bright. The mean of all frames
@@ -303,7 +303,7 @@ class SlopePipeline:
                 return measure(frame)
         return self._run(self._checked(frame), _camera_type(frame), prior, explain=False)[0]
 
-    def _small_frames(self, dtype: np.dtype[Any]) -> SmallFrames | None:
+    def _small_frames(self, dtype: np.dtype[np.generic]) -> SmallFrames | None:
         """Return the calling thread's own way to measure frames of a small sensor; None if it is not one."""
         plan, lanes, window = self.plan, self._lanes, self.layout.window
         groups = -(-len(self.layout) // lanes.width)
@@ -338,8 +338,8 @@ class SlopePipeline:
 
     def _run(
         self,
-        array: NDArray[Any],
-        dtype: np.dtype[Any],
+        array: NDArray[np.generic],
+        dtype: np.dtype[np.generic],
         prior: ArrayLike | Slopes | None,
         explain: bool,
     ) -> tuple[Slopes, NDArray[np.float32]]:
@@ -394,7 +394,7 @@ class SlopePipeline:
         scratch = np.empty(self._scratch_size, np.float32)
         self._checks[frames.dtype](self.light_test, frames, results, self.plan.expected, scratch)
 
-    def source(self, frames: NDArray[Any], dtype: DTypeLike) -> Source:
+    def source(self, frames: NDArray[np.generic], dtype: DTypeLike) -> Source:
         """Return the frames in the form that kernels read.
 
         Parameters
@@ -425,12 +425,12 @@ class SlopePipeline:
 
 
 @cache
-def _checks(dtype: np.dtype[Any], lanes: Lanes) -> Direct:
+def _checks(dtype: np.dtype[np.generic], lanes: Lanes) -> Direct:
     """Return `check_slopes` for frames of a type, and windows whose pixels are in so many lanes."""
     return Direct(check_slopes)
 
 
-def kernel_frames(array: NDArray[Any]) -> NDArray[Any]:
+def kernel_frames(array: NDArray[np.generic]) -> NDArray[Any]:
     """Return frames in the form that kernels read: (n, h, w), contiguous, uint16 or float32."""
     if array.dtype in _KERNEL_TYPES and array.flags.c_contiguous and array.dtype.isnative:
         return array if array.ndim == 3 else array[None]

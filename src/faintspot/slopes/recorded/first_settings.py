@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +58,7 @@ class FirstSettings:
     response: float = 1.0
 
 
-def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[Any]) -> FirstSettings:
+def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[np.generic]) -> FirstSettings:
     """Choose settings from a few frames of typical flux; they follow the unit of the frames.
 
     Spots of the width, flux, noise and displacements that the frames show are simulated. The settings of the

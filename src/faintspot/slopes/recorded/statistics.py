@@ -185,7 +185,7 @@ def valid_in_all(methods: Sequence[MeasuredSlopes]) -> NDArray[np.bool_]:
     return valid
 
 
-def jitter(x: NDArray[Any], y: NDArray[Any], valid: NDArray[np.bool_]) -> Jitter:
+def jitter(x: NDArray[np.generic], y: NDArray[np.generic], valid: NDArray[np.bool_]) -> Jitter:
     """Return the scatter over the valid frames of positions (n_frames, n_subapertures)."""
     columns = []
     for block in column_blocks(*x.shape):
@@ -303,20 +303,20 @@ def column_blocks(n_frames: int, n_subapertures: int) -> Iterator[slice]:
         yield slice(start, start + step)
 
 
-def mean_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
+def mean_over_valid(values: NDArray[np.generic], valid: NDArray[np.bool_]) -> Floats:
     """Return the mean of each column's valid values."""
     sums: Floats = np.sum(values, axis=0, where=valid, dtype=np.float64)
     return _divide(sums, valid.sum(axis=0))
 
 
-def std_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
+def std_over_valid(values: NDArray[np.generic], valid: NDArray[np.bool_]) -> Floats:
     """Return the standard deviation (n - 1) of each column's valid values; NaN below two of them."""
     mean = mean_over_valid(values, valid)
     squares: Floats = np.sum(np.square(values - np.nan_to_num(mean)), axis=0, where=valid)
     return np.sqrt(_divide(squares, valid.sum(axis=0) - 1))
 
 
-def median_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
+def median_over_valid(values: NDArray[np.generic], valid: NDArray[np.bool_]) -> Floats:
     """Return the median of each column's valid values."""
     ordered: Floats = np.sort(np.where(valid, values.astype(np.float64), np.inf), axis=0)
     count = valid.sum(axis=0)

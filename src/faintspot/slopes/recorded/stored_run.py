@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -137,7 +137,7 @@ def _rebuild(store: StoredRun) -> None:
     store.laser = _of_the_spot(store, "laser", lambda path: configuration.Configuration(path).laser)
 
 
-def _of_the_spot(store: StoredRun, name: str, load: Callable[[str], Any]) -> Any:
+def _of_the_spot(store: StoredRun, name: str, load: Callable[[str], object]) -> Any:
     """Read the PSF or the score of the run; a missing file is reported when it is needed."""
     attributes = store.stored.attributes
     file, original = (str(attributes.get(key, "")) for key in (f"{name}_file", "configuration_file"))
@@ -152,12 +152,12 @@ def _of_the_spot(store: StoredRun, name: str, load: Callable[[str], Any]) -> Any
     return None
 
 
-def _is_map(value: Any) -> bool:
+def _is_map(value: object) -> bool:
     """Whether the stored text has a description in place of a map."""
     return isinstance(value, str) and value.startswith("map of")
 
 
-def _original_calibration(store: StoredRun, stored_table: dict[str, Any]) -> Calibration | None:
+def _original_calibration(store: StoredRun, stored_table: Mapping[str, object]) -> Calibration | None:
     """Read a calibration with maps from the configuration file of the run, if it is still the same."""
     original = store.stored.attributes.get("configuration_file")
     if not original or not Path(str(original)).exists():

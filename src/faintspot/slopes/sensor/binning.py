@@ -24,7 +24,7 @@ def magnified_layout(layout: Layout, factor: int, frame_shape: tuple[int, int]) 
     return _scaled(layout, factor, frame_shape=frame_shape, bin=factor)
 
 
-def scaled_points(points: Any, scale: float) -> NDArray[np.float64]:
+def scaled_points(points: object, scale: float) -> NDArray[np.float64]:
     """Return points in pixels of another size; pixel i is centred at i."""
     return np.asarray((np.asarray(points, np.float64) + 0.5) * scale - 0.5)
 

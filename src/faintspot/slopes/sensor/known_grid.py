@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +55,8 @@ def find_illuminated(
     pixels: int | tuple[int, int] | None = None,
     has_dark: bool = False,
     illuminated_fraction: float | None = None,
-    pupil: Any = None,
-    roi: Any = None,
+    pupil: object = None,
+    roi: object = None,
 ) -> KnownGrid:
     """Find the illuminated sub-apertures of a grid that fills a frame, from their flux.
 
@@ -103,7 +102,7 @@ def find_illuminated(
 
 
 def _whole_grid(
-    frame_shape: tuple[int, ...], shape: tuple[int, int], pixels: int | tuple[int, int] | None, roi: Any
+    frame_shape: tuple[int, ...], shape: tuple[int, int], pixels: int | tuple[int, int] | None, roi: object
 ) -> Layout:
     """Return the layout of all cells."""
     part = Rectangle.given(roi, frame_shape)

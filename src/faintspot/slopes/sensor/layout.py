@@ -158,7 +158,7 @@ class Layout(ConfigurationTable, table="layout"):
         """Return the number of sub-apertures."""
         return len(self.corners)
 
-    def __getitem__(self, chosen: Any) -> Layout:
+    def __getitem__(self, chosen: object) -> Layout:
         """Return the layout of some of the sub-apertures, in the given order.
 
         Parameters
@@ -344,7 +344,7 @@ class Layout(ConfigurationTable, table="layout"):
         )
 
     @classmethod
-    def from_table(cls, values: Mapping[str, Any], path: Path | None = None) -> Layout:
+    def from_table(cls, values: Mapping[str, object], path: Path | None = None) -> Layout:
         """Return the layout in a table, which may contain the arguments of `grid`; warn of unsettled doubts.
 
         Raises
@@ -387,7 +387,7 @@ class Layout(ConfigurationTable, table="layout"):
         return rows, self.corners[:, 1, None, None] + np.arange(self.window[1])
 
 
-def _rows_of_two(name: str, value: Any) -> NDArray[Any]:
+def _rows_of_two(name: str, value: object) -> NDArray[Any]:
     array = finite_array(name, value)
     if array.ndim != 2 or array.shape[1] != 2:
         raise InputError(f"{name}: expected shape (n, 2), got {array.shape}")

@@ -21,7 +21,7 @@ class PupilRegion:
     inner: float
 
     @classmethod
-    def given(cls, value: Any) -> PupilRegion:
+    def given(cls, value: object) -> PupilRegion:
         """Return the region (x, y, radius) or (x, y, radius, inner radius); raise InputError if invalid."""
         numbers = numbers_between("pupil", value)
         if numbers.ndim != 1 or len(numbers) not in (3, 4):
@@ -51,7 +51,7 @@ class Rectangle:
     y1: int
 
     @classmethod
-    def given(cls, value: Any, shape: tuple[int, ...]) -> Rectangle:
+    def given(cls, value: object, shape: tuple[int, ...]) -> Rectangle:
         """Return the rectangle (x0, y0, x1, y1), or the frame for None; raise InputError if outside."""
         if value is None:
             return cls(0, 0, shape[1], shape[0])

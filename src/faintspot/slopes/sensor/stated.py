@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ def with_stated(
     *,
     pitch_px: float | None = None,
     angle_deg: float | None = None,
-    centre: Any = None,
+    centre: object = None,
     fit: Sequence[str] = (),
 ) -> tuple[LensletGrid, tuple[str, ...]]:
     """Return the lenslets with the lattice as stated; windows stay where they are.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +9,7 @@ from faintspot.base.checks import numbers_between
 from faintspot.base.errors import InputError
 
 
-def chosen_index(chosen: Any, length: int) -> NDArray[np.int64]:
+def chosen_index(chosen: object, length: int) -> NDArray[np.int64]:
     """Return the numbers of the selected sub-apertures."""
     if isinstance(chosen, slice):
         index = np.arange(length)[chosen]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ SMALLEST_WINDOW, LARGEST_WINDOW = 2, 64
 _ABSURD = 2**31  # beyond which a whole number may not fit its type
 
 
-def window_size(name: str, value: Any, factor: int = 1) -> tuple[int, int]:
+def window_size(name: str, value: object, factor: int = 1) -> tuple[int, int]:
     """Return height and width of a window, from one number or two; its frames are binned by `factor`."""
     window, largest = pair_of_numbers(name, value, -_ABSURD, _ABSURD), LARGEST_WINDOW * factor
     if max(window) > largest:
@@ -30,7 +29,7 @@ def window_size(name: str, value: Any, factor: int = 1) -> tuple[int, int]:
     return window
 
 
-def pair_of_numbers(name: str, value: Any, low: float, high: float) -> tuple[int, int]:
+def pair_of_numbers(name: str, value: object, low: float, high: float) -> tuple[int, int]:
     """Return two whole numbers, from one or two."""
     array = numbers_between(name, value, low, high, integer=True)
     if array.ndim > 1 or array.size not in (1, 2):

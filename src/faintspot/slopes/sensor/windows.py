@@ -53,7 +53,7 @@ def find_windows(
     move_windows: bool = False,
     pitch_px: float | None = None,
     angle_deg: float | None = None,
-    centre: Any = None,
+    centre: object = None,
     fit: Sequence[str] = (),
     **options: Any,
 ) -> Windows:

@@ -251,7 +251,7 @@ def _values_of_spots(
     return profile, {**values, "flux_e": flux / centred.sum(axis=(1, 2))[which]}
 
 
-def _camera(detector: Any) -> Detector:
+def _camera(detector: object) -> Detector:
     """Return the detector; the default has 0.1 e- read noise and no other noise."""
     if detector is None:
         return Detector(read_noise_e=0.1)
@@ -261,7 +261,7 @@ def _camera(detector: Any) -> Detector:
 
 
 def _true_positions(
-    positions: Any, position_range_px: float, shape: tuple[int, ...], rng: np.random.Generator
+    positions: object, position_range_px: float, shape: tuple[int, ...], rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Return the given positions, or uniform random ones, with shape (..., n, 2)."""
     half = number_between("position_range_px", position_range_px, 0)
@@ -273,7 +273,7 @@ def _true_positions(
     return np.broadcast_to(given, shape).copy()
 
 
-def _window_pixels(corners: Any, window: tuple[int, int], frame: tuple[int, int]) -> NDArray[np.int64]:
+def _window_pixels(corners: object, window: tuple[int, int], frame: tuple[int, int]) -> NDArray[np.int64]:
     """Return the flat frame index of each window's pixels, shape (n, ny * nx)."""
     first: NDArray[np.int64] = numbers_between("corners", corners, 0, 2**31, integer=True)
     if first.ndim != 2 or first.shape[1] != 2:

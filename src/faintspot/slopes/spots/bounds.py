@@ -277,7 +277,7 @@ def _bracket(slope_error: Any, smallest: float, largest: float, start: float) ->
     return low, high
 
 
-def _positions(positions: Any, position_range_px: float | None) -> Floats:
+def _positions(positions: object, position_range_px: float | None) -> Floats:
     """Return positions (m, 2); for a range, the nodes of a regular grid that represents it."""
     if position_range_px is None:
         array = np.asarray(positions)
@@ -300,7 +300,7 @@ def _with_derivatives(render: Any, positions: Floats, step: float) -> _Spot:
     return _Spot(np.where(illuminated, image, 0.0), along_x * illuminated, along_y * illuminated)
 
 
-def _noise(detector: Any, shape: tuple[int, int], exact: bool) -> _Noise:
+def _noise(detector: object, shape: tuple[int, int], exact: bool) -> _Noise:
     """Return the noise of each pixel in photo-electrons, flattened."""
     if detector is None:
         detector = Detector(read_noise_e=0.1)

@@ -314,7 +314,7 @@ class FixedWeights(NpzFile):
 
     @classmethod
     def _unbiased(
-        cls, maps: Floats, spot: Floats, along_x: Floats, along_y: Floats, index: Any
+        cls, maps: Floats, spot: Floats, along_x: Floats, along_y: Floats, index: object
     ) -> FixedWeights:
         """Combine three maps per kind so that x, y and flux of a spot that moves little are right."""
         n, ny, nx = spot.shape

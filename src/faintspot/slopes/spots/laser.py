@@ -247,7 +247,7 @@ class LaserGuideStar:
             images[block] = (across.swapaxes(2, 3) @ (flux[:, None] * along)).sum(axis=0)
         return images
 
-    def _pixels(self, shape: Any, positions: Any) -> tuple[Floats, Floats, Floats]:
+    def _pixels(self, shape: object, positions: object) -> tuple[Floats, Floats, Floats]:
         """Return the places of rows and columns [px], and checked positions (n, 2)."""
         sides = image_shape("shape", shape)
         where = np.zeros((len(self), 2)) if positions is None else position_array(positions)

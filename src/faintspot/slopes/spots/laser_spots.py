@@ -28,7 +28,7 @@ _BEYOND_PX = 3.0  # of the window, to which PSFs reach
 _LONGEST_S = 1e6
 
 
-def _position(name: str, value: Any) -> NDArray[np.float64]:
+def _position(name: str, value: object) -> NDArray[np.float64]:
     position = numbers_between(name, value, -_FARTHEST_M, _FARTHEST_M)
     if position.shape != (2,):
         raise InputError(f"expected x and y, got shape {position.shape}", name=name)
@@ -76,7 +76,7 @@ class LaserSpots(ConfigurationTable, table="laser"):
     follow_time_constant_s: float = number(4.0, 0.0, _LONGEST_S, low_open=True)
 
     @classmethod
-    def from_table(cls, values: Mapping[str, Any], path: Path | None = None) -> Self:
+    def from_table(cls, values: Mapping[str, object], path: Path | None = None) -> Self:
         """Read the table of a file; `profile` is the name of a file of `SodiumProfile.save` beside it.
 
         Raises

@@ -298,7 +298,7 @@ def smoothed_peak(
     return np.stack([centres_x[column], centres_y[row]], axis=1)
 
 
-def _spread(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _spread(name: str, value: object, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Return a writable copy of finite numbers, broadcast to a shape."""
     array = finite_array(name, value).astype(np.float64)
     try:
@@ -307,7 +307,7 @@ def _spread(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64
         raise InputError(f"{name}: shape {array.shape} does not broadcast to {shape}") from None
 
 
-def _kinds_of_subapertures(index: Any, n_kinds: int) -> NDArray[np.int64]:
+def _kinds_of_subapertures(index: object, n_kinds: int) -> NDArray[np.int64]:
     kinds = numbers_between("score.index", index, 0, n_kinds - 1, integer=True).astype(np.int64)
     if kinds.ndim != 1:
         raise InputError(f"score.index: expected shape (n_subapertures,), got {kinds.shape}")

@@ -171,7 +171,7 @@ def spots(
     return images
 
 
-def image_shape(name: str, shape: Any) -> tuple[int, int]:
+def image_shape(name: str, shape: object) -> tuple[int, int]:
     """Return (rows, columns) as two integers of at least 1, or raise an InputError."""
     checked = numbers_between(name, shape, 1, 1 << 20, integer=True)
     if checked.shape != (2,):
@@ -180,7 +180,7 @@ def image_shape(name: str, shape: Any) -> tuple[int, int]:
     return int(checked[0]), int(checked[1])
 
 
-def position_array(positions: Any) -> Floats:
+def position_array(positions: object) -> Floats:
     """Return positions as float64 of shape (n, 2), or raise an InputError."""
     checked = finite_array("positions", positions).astype(np.float64)
     if checked.ndim != 2 or checked.shape[1] != 2:
@@ -188,7 +188,7 @@ def position_array(positions: Any) -> Floats:
     return checked
 
 
-def per_spot(name: str, value: Any, n_spots: int, low: float = -np.inf) -> Floats:
+def per_spot(name: str, value: object, n_spots: int, low: float = -np.inf) -> Floats:
     """Return one finite number >= `low` for each spot, shape (n_spots,), or raise an InputError."""
     checked = numbers_between(name, value, low)
     if checked.shape not in ((), (n_spots,)):
@@ -197,7 +197,7 @@ def per_spot(name: str, value: Any, n_spots: int, low: float = -np.inf) -> Float
 
 
 def _spot_shapes(
-    positions: Any, flux_e: Any, size: Any, elongation: Any, angle_deg: Any, kind: _Profile
+    positions: object, flux_e: object, size: object, elongation: object, angle_deg: object, kind: _Profile
 ) -> _Shapes:
     """Check the parameters of the spots and compute their widths."""
     checked = position_array(positions)

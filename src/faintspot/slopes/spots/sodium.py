@@ -80,7 +80,7 @@ class SodiumProfile(NpzFile):
         return cls.peaks([mean_m], [fwhm_m], [1.0], bins=bins)
 
     @classmethod
-    def peaks(cls, means_m: Any, fwhms_m: Any, fractions: Any, *, bins: int = 41) -> SodiumProfile:
+    def peaks(cls, means_m: object, fwhms_m: object, fractions: object, *, bins: int = 41) -> SodiumProfile:
         """Return the sum of several Gaussian layers.
 
         Parameters

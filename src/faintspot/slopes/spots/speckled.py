@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -168,12 +168,12 @@ def speckled_images(
     return images * flux[:, None, None], displaced
 
 
-def _per_image_d_over_r0(value: Any, n: int) -> Floats:
+def _per_image_d_over_r0(value: object, n: int) -> Floats:
     checked = numbers_between("d_over_r0", value, 0.0, LARGEST_D_OVER_R0)
     return per_spot("d_over_r0", checked, n, 0.0)
 
 
-def _outer_scale(value: Any) -> float:
+def _outer_scale(value: object) -> float:
     """Return the outer scale in units of d, or infinity."""
     if value is None:
         return math.inf

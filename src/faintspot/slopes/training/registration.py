@@ -169,7 +169,7 @@ def register(
     return Registered.joined(parts)
 
 
-def weights(stack: Stack, model: NDArray[Any], flux: Floats) -> NDArray[np.float32]:
+def weights(stack: Stack, model: NDArray[np.generic], flux: Floats) -> NDArray[np.float32]:
     """Return one over the variance of every pixel under a model of the flux; 0 in bad pixels."""
     floor = (stack.variance_e2 + _WEIGHT_FLOOR * flux).astype(np.float32)
     result = 1 / (floor[:, None, None] + np.float32(stack.excess_noise) * np.maximum(model, 0))

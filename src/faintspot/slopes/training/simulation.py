@@ -286,7 +286,7 @@ def flux_classes(flux_e: ArrayLike) -> Floats:
 
 
 def _checked_training(
-    detector: Any,
+    detector: object,
     flux_e: ArrayLike,
     position_range_px: float,
     search_range_px: float | None,
@@ -308,7 +308,7 @@ def _checked_training(
     )
 
 
-def _turbulence(d_over_r0: Any, profile: str, spot_shapes: Floats) -> float:
+def _turbulence(d_over_r0: object, profile: str, spot_shapes: Floats) -> float:
     strength = number_between("d_over_r0", d_over_r0, 0.0, LARGEST_D_OVER_R0)
     if strength and (profile != "diffraction" or np.any(spot_shapes[:, 1] != 1)):
         raise InputError(f"d_over_r0 = {strength:g}: expected profile 'diffraction' and elongation 1")

@@ -53,7 +53,7 @@ class Sums:
 def stack_spots(
     stack: Stack,
     tables: PSFTables,
-    index: NDArray[Any],
+    index: NDArray[np.generic],
     registered: Registered,
     background_e: Floats,
     halves: NDArray[np.bool_],

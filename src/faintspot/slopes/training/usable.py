@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +20,7 @@ _DOUBTFUL = (SubapertureFlag.TOO_MANY_BAD_PIXELS, *KEEPABLE.values())
 
 
 def usable_subapertures(
-    frames: NDArray[Any], layout: Layout, calibration: Calibration
+    frames: NDArray[np.generic], layout: Layout, calibration: Calibration
 ) -> tuple[NDArray[np.bool_], str]:
     """Return which sub-apertures show spots, (n,), and the line that says which are left out.
 

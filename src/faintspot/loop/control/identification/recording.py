@@ -272,7 +272,7 @@ def _steps_on_slopes(loop: Recording) -> tuple[Floats, Floats]:
     return np.array(correlations), np.array(regressions)
 
 
-def cells_of(stated: Any, n: int) -> NDArray[np.int64]:
+def cells_of(stated: object, n: int) -> NDArray[np.int64]:
     """Return row and column of n sub-apertures, from a list, a mask, or (None) a full square.
 
     Raises

@@ -78,7 +78,7 @@ class LargeGuarded(GuardedController):
         interaction: Floats,
         reconstructor: Reconstructor,
         phase_of_commands: Floats,
-        arrays: Mapping[str, Any],
+        arrays: Mapping[str, object],
         plain_gain: float,
         leak: float,
         **options: Any,

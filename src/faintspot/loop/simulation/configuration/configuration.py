@@ -86,7 +86,7 @@ class LoopConfiguration:
         _check_flux(self.camera)
         _check_sampling(self)
 
-    def replace(self, section: str, **values: Any) -> LoopConfiguration:
+    def replace(self, section: str, **values: object) -> LoopConfiguration:
         """Return the configuration with some values of one section changed.
 
         Raises

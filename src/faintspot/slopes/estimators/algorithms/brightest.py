@@ -87,7 +87,7 @@ def brightest_pixels(images: ArrayLike, keep: ArrayLike, *, rule: str = "subtrac
     lanes = lanes_for(flat.dtype)
     subtract = 0.0 if rule == "threshold" else 1.0
 
-    def job(start: int, stop: int, scratch: tuple[Any, ...]) -> None:
+    def job(start: int, stop: int, scratch: tuple[object, ...]) -> None:
         subtract_stack(lanes, flat, rank, subtract, start, stop, scratch, result)
 
     run_groups(job, -(-len(flat) // lanes.width), lanes, (ny, nx))

@@ -45,7 +45,7 @@ def centre_of_gravity(images: ArrayLike) -> NDArray[Any]:
     positions = np.empty((len(flat), 2), stack.dtype)
     lanes = lanes_for(flat.dtype)
 
-    def job(start: int, stop: int, scratch: tuple[Any, ...]) -> None:
+    def job(start: int, stop: int, scratch: tuple[object, ...]) -> None:
         centroid_stack(lanes, flat, ny, nx, start, stop, scratch, positions)
 
     run_groups(job, -(-len(flat) // lanes.width), lanes, (ny, nx))

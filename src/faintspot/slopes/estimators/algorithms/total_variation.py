@@ -174,7 +174,7 @@ def tv_denoise(
     lanes = lanes_for(flat.dtype)
     begin = flat_start_table(ny, nx, flat.dtype)
 
-    def job(start: int, stop: int, scratch: tuple[Any, ...]) -> None:
+    def job(start: int, stop: int, scratch: tuple[object, ...]) -> None:
         denoise_stack(
             lanes,
             flat,

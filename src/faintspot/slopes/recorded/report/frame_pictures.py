@@ -106,7 +106,7 @@ def whole_sensor(example: Example) -> Figure:
     return figure
 
 
-def _sheet_bars(axes: list[Axes], shown: Mapping[str, Any], one_unit: bool) -> None:
+def _sheet_bars(axes: list[Axes], shown: Mapping[str, object], one_unit: bool) -> None:
     """Put colour bars beside the panels: electrons at the right end, ADU beside the raw frame."""
     two_rows = len(axes) == 4
     if not one_unit:
@@ -197,7 +197,7 @@ def example_subapertures(stages: Stages) -> dict[str, int]:
     return chosen
 
 
-def assembled(layout: Layout, images: NDArray[Any]) -> Floats:
+def assembled(layout: Layout, images: NDArray[np.generic]) -> Floats:
     """Return the windows' images (n, ny, nx) at their places; NaN between them."""
     start = layout.corners.min(axis=0)
     height, width = layout.corners.max(axis=0) - start + np.array(layout.window)

@@ -89,7 +89,7 @@ def _maps(image: NDArray[np.float64], largest_pitch_px: float) -> Iterator[tuple
         level, factor = _binned(level), 2 * factor
 
 
-def _binned(image: NDArray[Any]) -> NDArray[Any]:
+def _binned(image: NDArray[np.generic]) -> NDArray[Any]:
     """Return the mean of 2 x 2 pixels; an odd last row or column is left out."""
     ny, nx = image.shape[0] // 2, image.shape[1] // 2
     return np.asarray(image[: 2 * ny, : 2 * nx].reshape(ny, 2, nx, 2).mean(axis=(1, 3)))

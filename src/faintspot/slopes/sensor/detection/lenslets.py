@@ -71,14 +71,14 @@ class LensletGrid:
 
 
 def find_lenslets(
-    frame: Any,
+    frame: object,
     *,
     geometry: str = "auto",
     pitch_px: float | None = None,
-    bad_pixels: Any = None,
+    bad_pixels: object = None,
     illuminated_fraction: float | None = None,
-    pupil: Any = None,
-    roi: Any = None,
+    pupil: object = None,
+    roi: object = None,
 ) -> LensletGrid:
     """Find the lenslet grid in a frame without prior knowledge of the sensor.
 
@@ -218,7 +218,7 @@ def _be(count: int) -> str:
     return "is" if count == 1 else "are"
 
 
-def _checked(frame: Any, bad_pixels: Any) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+def _checked(frame: object, bad_pixels: object) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """Return frame or frames and a mask of bad pixels, where the frame may be NaN."""
     frames = real_array("frame", frame, minimum_dimensions=2)
     if frames.ndim > 3:
@@ -262,7 +262,7 @@ def _hot_on_lattice(hot: NDArray[np.bool_], fit: LatticeFit) -> NDArray[np.bool_
     return spots
 
 
-def _robust_mean(frames: NDArray[Any]) -> NDArray[np.float64]:
+def _robust_mean(frames: NDArray[np.generic]) -> NDArray[np.float64]:
     """Return the mean of a cube from at most 12 group means, without the two extremes of each pixel."""
     if frames.ndim == 2:
         return frames.astype(np.float64)

@@ -143,13 +143,13 @@ class ControlModel:
         """Return the controller for a running loop."""
         return self.guarded(plant, line)
 
-    def guarded(self, plant: LoopPlant, line: CommandDelayLine, **options: Any) -> GuardedController:
+    def guarded(self, plant: LoopPlant, line: CommandDelayLine, **options: object) -> GuardedController:
         """Return the learnt controller with the integrator beside it; options are those of the guard."""
         learnt, plain = partial(self.controller, plant), partial(plant.integrator, self.plain_gain)
         options = self.of_guard(options)
         return Guarded(line, plant.interaction, self.phase(plant), learnt, plain, **options)
 
-    def of_guard(self, options: Mapping[str, Any]) -> dict[str, Any]:
+    def of_guard(self, options: Mapping[str, object]) -> dict[str, Any]:
         """Return options of the guard with those that the model sets."""
         return {
             **options,
@@ -195,7 +195,7 @@ class ControlModel:
         """(m,): standard deviations of the predicted slopes; None if unknown."""
         return None
 
-    def save(self, path: str | Path, others: Mapping[str, Any] = MappingProxyType({})) -> None:
+    def save(self, path: str | Path, others: Mapping[str, object] = MappingProxyType({})) -> None:
         """Write the model to a NumPy file (.npz), with other arrays beside it.
 
         Raises
@@ -243,7 +243,7 @@ class ControlModel:
         self._checked({**self.arrays, **numbers}, plant)
 
     @classmethod
-    def _checked(cls, arrays: Mapping[str, Any], plant: LoopPlant) -> dict[str, Floats]:
+    def _checked(cls, arrays: Mapping[str, object], plant: LoopPlant) -> dict[str, Floats]:
         """Return a model's arrays as float64, with checked shapes and ranges."""
         ranges = {**_RANGES, **cls.ranges_for(plant)}
         numbers = {
