@@ -44,6 +44,7 @@ _ORDER = (
     "large_sensors",
     "layouts",
     "wavefronts",
+    "yardstick",
     "startup",
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
@@ -56,6 +57,7 @@ LONG = {
     "large_sensors",
     "layouts",
     "wavefronts",
+    "yardstick",
 }
 """Run only when named, or with --full: 5 minutes to an hour each, one with a recording of its own."""
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
