@@ -30,6 +30,7 @@ _ORDER = (
     "realtime_guard",
     "guard",
     "validity",
+    "following",
     "telemetry",
     "recorded_tip_tilt",
     "live_page",
@@ -50,6 +51,7 @@ _ORDER = (
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
 LONG = {
     "guard",
+    "following",
     "realtime_sustained",
     "telemetry",
     "recorded_tip_tilt",

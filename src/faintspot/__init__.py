@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from faintspot.slopes.estimators.algorithms.centroid import centre_of_gravity as centre_of_gravity
     from faintspot.slopes.estimators.algorithms.total_variation import Denoised as Denoised
     from faintspot.slopes.estimators.algorithms.total_variation import tv_denoise as tv_denoise
+    from faintspot.slopes.pipeline.following import SpotFollower as SpotFollower
     from faintspot.slopes.pipeline.images import measure_images as measure_images
     from faintspot.slopes.pipeline.mean_flux import MeanFlux as MeanFlux
     from faintspot.slopes.pipeline.settings import Settings as Settings
@@ -63,6 +64,7 @@ _HOMES = {
     "SlopePipeline": "faintspot.slopes.pipeline.slope_pipeline",
     "Slopes": "faintspot.slopes.pipeline.slopes",
     "SodiumProfile": "faintspot.slopes.spots.sodium",
+    "SpotFollower": "faintspot.slopes.pipeline.following",
     "Stages": "faintspot.slopes.pipeline.slopes",
     "SubapertureFlag": "faintspot.base.flags",
     "TrainedScore": "faintspot.slopes.spots.score",

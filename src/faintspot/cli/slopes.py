@@ -57,6 +57,11 @@ from faintspot.slopes.recorded import Summary, measure_recorded
     "faint stars.",
 )
 @option(
+    "--follow",
+    is_flag=True,
+    help="Follow spots out of their windows, up to 1.5 pitches of a smooth aberration.",
+)
+@option(
     "--keep",
     type=NAMES,
     metavar="limited,unlike",
@@ -100,6 +105,9 @@ def command(
     0 then), at their search limit, cut by their window, or unlike all neighbours; --keep changes that. A
     .zarr store opens with xarray.open_zarr.
 
+    With --follow the window of each lenslet moves with its spot, and slopes may be larger than a window.
+    Lost spots (without flux) and crossing ones (unlike all neighbours) are not valid.
+
     \b
     Examples:
       faintspot slopes night1.fits night2.fits.gz -c faintspot.toml -o slopes.zarr
@@ -107,6 +115,7 @@ def command(
       faintspot slopes night1.fits -o slopes.zarr --preset fast
       faintspot slopes night1.fits -o ml.zarr --estimator ml --set model_error=0.1
       faintspot slopes night1.fits -o window.zarr --estimator window --mean-flux
+      faintspot slopes aberrated.fits -o followed.zarr --follow
       faintspot slopes cube.npz --key frames -o slopes.csv
     """
     _check_format(output)

@@ -1,5 +1,6 @@
 """Slope pipeline. Read in this order.
 
 `settings`, `plan` (tables computed before the first frame), `slope_pipeline`, `slopes` (results), `images`
-(stacks of images), `configuration` (faintspot.toml), `mean_flux`; `labelled` (slopes for other packages).
+(stacks of images), `following` (windows that follow their spots), `configuration` (faintspot.toml),
+`mean_flux`; `labelled` (slopes for other packages).
 """

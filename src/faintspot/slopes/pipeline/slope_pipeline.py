@@ -301,7 +301,7 @@ class SlopePipeline:
             measure: SmallFrames | None = small[frame.dtype]
             if measure is not None:
                 return measure(frame)
-        return self._run(self._checked(frame), _camera_type(frame), prior, explain=False)[0]
+        return self._run(self.checked(frame), _camera_type(frame), prior, explain=False)[0]
 
     def _small_frames(self, dtype: np.dtype[np.generic]) -> SmallFrames | None:
         """Return the calling thread's own way to measure frames of a small sensor; None if it is not one."""
@@ -319,7 +319,7 @@ class SlopePipeline:
 
         For estimators that use the calibrated image directly, the later images are equal to it.
         """
-        array = self._checked(frame)
+        array = self.checked(frame)
         slopes, stages = self._run(array, _camera_type(frame), prior, explain=True)
         stages = stages.reshape(3, *slopes.x.shape, *self.binned_layout.window)
         if self.layout.bin > 1:
@@ -327,7 +327,8 @@ class SlopePipeline:
         calibrated, denoised, background = stages
         return Stages(self.layout.images(array), calibrated, denoised, background, slopes)
 
-    def _checked(self, frame: ArrayLike) -> NDArray[Any]:
+    def checked(self, frame: ArrayLike) -> NDArray[Any]:
+        """Return one or several frames as an array; raise InputError if they do not fit the layout."""
         array = real_array("frame", frame, minimum_dimensions=2)
         if array.ndim > 3 or array.shape[-2:] != self.layout.frame_shape:
             height, width = self.layout.frame_shape

@@ -75,7 +75,7 @@ def _layout_figure(
     figure = new_figure(side, min(max(0.9 * side * n_rows / n_columns, 3.0), 2 * side) + 0.9)
     axes = figure.subplots()
     smooth = "nearest" if max(array.shape) <= _MOST_PIXELS else "antialiased"
-    image = axes.imshow(array, cmap="gray", norm=_stretch(array, inside), interpolation=smooth)
+    image = axes.imshow(array, cmap="gray", norm=asinh_stretch(array, inside), interpolation=smooth)
     colour_bar(axes, image, "frame's units")
     points = 72 * side * 0.85 * layout.window[1] / n_columns  # a window's width in points
     boxes, line = _window_outlines(layout), min(max(points / 14, 0.2), 0.9)  # lines never hide the spots
@@ -116,7 +116,7 @@ def _layout_figure(
     return figure
 
 
-def _stretch(array: Floats, inside: Floats) -> FuncNorm:
+def asinh_stretch(array: Floats, inside: Floats) -> FuncNorm:
     """Return an asinh stretch around the sky level, in units of its noise; blind to hot and bad pixels."""
     from matplotlib.colors import FuncNorm
 

@@ -24,6 +24,7 @@ from faintspot.io.stored.slopes_format import UNITS, pixels_in, scaled_positions
 from faintspot.io.telemetry.aot_reading import is_aot, read_aot
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration
+from faintspot.slopes.pipeline.following import SpotFollower
 from faintspot.slopes.pipeline.labelled import layout_coordinates
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
 from faintspot.slopes.pipeline.settings import with_preset, without_denoising
@@ -34,6 +35,8 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
+
+_FOLLOWED_FRAMES = 32  # of a block, one after the other: for the progress bar
 
 _LOOKS_FOR_FLUX, _FRAMES_FOR_FLUX = 20, 50  # stretches of frames over the whole recording
 
@@ -86,6 +89,7 @@ def measure_recorded(
     changes: Mapping[str, Any] | None = None,
     unit: str = "px",
     mean_flux: bool = False,
+    follow: bool = False,
     keep: Sequence[str] = (),
     reference: NDArray[Any] | str | Path | None = None,
     key: str | None = None,
@@ -121,6 +125,9 @@ def measure_recorded(
     mean_flux : bool
         Tell the estimator the mean flux of every sub-aperture over the recording, instead of letting it take
         that of each frame: better where the star is faint and steady; see `faintspot.MeanFlux`.
+    follow : bool
+        Follow spots out of their windows, see `faintspot.SpotFollower`; not together with `mean_flux`. When
+        resumed, the frames before are measured again, to find the spots.
     keep : sequence of {"limited", "unlike"}
         Doubtful slopes that stay valid: those at their search limit or cut by their window, and those unlike
         all neighbours.
@@ -146,6 +153,8 @@ def measure_recorded(
         When a file cannot be read or written, or frames and configuration do not fit together.
     """
     kept = kept_flags(keep)
+    if follow and mean_flux:
+        raise InputError("follow (--follow) and mean_flux (--mean-flux): expected one of them, got both")
     described, origin, stored_reference = _configured(configuration_file, frames, key)
     layout, settings, calibration = described.layout, described.settings, described.calibration
     if changes:
@@ -178,7 +187,7 @@ def measure_recorded(
             pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
         if mean_flux:
             pipeline = _with_mean_flux(pipeline, source)
-        attributes = _attributes(pipeline, source, frames, described, key, unit, keep)
+        attributes = _attributes(pipeline, source, frames, described, key, unit, keep, follow)
         if time_axis is not None:
             attributes["source_time_axis"] = time_axis
         factor = pixels_in(one_of("unit", unit, UNITS), attributes)
@@ -186,12 +195,14 @@ def measure_recorded(
             attributes["reference"] = np.asarray(positions).tolist()
             if isinstance(reference, str | Path):
                 attributes["reference_file"] = str(reference)
-        pipeline = pipeline.with_dark(seen.mean)
+        with errors_within(configuration_file):
+            measure = SpotFollower(pipeline) if follow else pipeline.with_dark(seen.mean)
         summary = Summary(source.n_frames, len(layout), origin=origin, doubtful=bool(layout.doubts))
         summary.saturation_adu = saturation_adu
         if positions is None:
             summary.reference = reference_in_words(layout.fitted)
-        size = block_frames or max(1, _BLOCK_BYTES // (4 * source.shape[0] * source.shape[1]))
+        most = _FOLLOWED_FRAMES if follow else _BLOCK_BYTES // (4 * source.shape[0] * source.shape[1])
+        size = block_frames or max(1, most)
         with create_writer(
             output,
             n_frames=source.n_frames,
@@ -200,14 +211,17 @@ def measure_recorded(
             coordinates=layout_coordinates(layout),
             overwrite=overwrite,
         ) as writer:
-            summary.resumed_at = writer.finished()
-            for start, block in source.blocks(summary.resumed_at, source.n_frames, size):
-                slopes = replace(pipeline(block), keep=kept)
-                writer.append(start, scaled_positions(slopes.variables, factor))
-                summary.add(slopes)
-                if progress is not None:
-                    progress(start + len(block), source.n_frames)
-    prepared = pipeline.plan.prepared
+            summary.resumed_at = done = writer.finished()
+            again = [(0, done)] if follow and done < source.n_frames else []
+            for first, last in [*again, (done, source.n_frames)]:
+                for start, block in source.blocks(first, last, size):
+                    slopes = replace(measure(block), keep=kept)
+                    if start >= done:
+                        writer.append(start, scaled_positions(slopes.variables, factor))
+                        summary.add(slopes)
+                    if progress is not None:
+                        progress(start + len(block), source.n_frames)
+    prepared = measure.plan.prepared
     summary.failed_frames, summary.failure = prepared.faults, prepared.fault
     return summary
 
@@ -299,6 +313,7 @@ def _attributes(
     key: str | None,
     unit: str,
     keep: Sequence[str],
+    follow: bool,
 ) -> dict[str, Any]:
     """Return the attributes of the output; the fingerprint decides whether a run may be continued."""
     text = configuration.to_text(pipeline.layout, pipeline.settings, pipeline.calibration)
@@ -310,6 +325,7 @@ def _attributes(
         str(key),
         *([] if unit == "px" else [unit]),
         *sorted(keep),
+        *(["follow"] if follow else []),
         *paths,
         *(_version(split_location(path)[0]) for path in frames),
         str((source.n_frames, source.shape, source.dtype)),
@@ -327,6 +343,7 @@ def _attributes(
         "sources": paths,
         "source_key": key or "",
         "keep": sorted(keep),
+        **({"followed": True} if follow else {}),
         "faintspot_version": __version__,
         "fingerprint": state.hexdigest(),
     }

@@ -62,6 +62,11 @@ class StoredRun:
         return kept_flags(self.stored.attributes.get("keep", ()))
 
     @property
+    def followed(self) -> bool:
+        """Whether its spots were followed out of their windows."""
+        return bool(self.stored.attributes.get("followed", False))
+
+    @property
     def text(self) -> str:
         """The configuration."""
         return str(self.stored.attributes.get("configuration", ""))

@@ -15,6 +15,7 @@ from faintspot.base.report.texts import Texts
 from faintspot.slopes.estimators.base import Step
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slopes import Slopes, Stages
+from faintspot.slopes.recorded.report.followed_picture import Followed
 from faintspot.slopes.recorded.statistics import (
     Floats,
     Jitter,
@@ -111,6 +112,8 @@ class SlopesRun:
         Which pictures of the frame are drawn.
     slopes : mapping of Slopes
         Slopes by method, whose wavefronts are shown.
+    followed : Followed, optional
+        Spots that were followed, which are shown in place of the stages.
 
     Raises
     ------
@@ -126,6 +129,7 @@ class SlopesRun:
     why_no_stages: str = "Not drawn: no frame was given."
     steps: Sequence[Step] = TotalVariation.steps_shown
     slopes: Mapping[str, Slopes] = field(default_factory=dict)
+    followed: Followed | None = None
 
     def __post_init__(self) -> None:
         names = [method.name for method in self.methods]

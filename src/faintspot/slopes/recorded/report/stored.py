@@ -17,6 +17,7 @@ from faintspot.io import open_frames
 from faintspot.io.frames import FrameSource
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slopes import Slopes, Stages
+from faintspot.slopes.recorded.report.followed_picture import Followed, farthest_frame
 from faintspot.slopes.recorded.report.page import slopes_report
 from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.report.sodium_section import sodium_section_of_frames
@@ -62,7 +63,11 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
     methods, notes = _methods(stores)
     total = np.where(methods[0].valid, methods[0].flux, 0.0).sum(axis=1)
     example_frame = int(np.argsort(total, kind="stable")[(len(total) - 1) // 2])
-    stages, reason = _example(stores, methods, example_frame, frames, notes)
+    followed, stages = None, dict[str, Stages]()
+    if any(store.followed for store in stores):
+        followed, reason = _followed(first, frames)
+    else:
+        stages, reason = _example(stores, methods, example_frame, frames, notes)
     if any(word in reason for word in _SAID_FIRST):
         notes.append(reason)
     slopes = {
@@ -70,7 +75,7 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
         for store, method in zip(stores, methods, strict=True)
     }
     steps = (first.estimator or TotalVariation).steps_shown
-    run = SlopesRun(methods, first.layout, stages, None, example_frame, reason, steps, slopes)
+    run = SlopesRun(methods, first.layout, stages, None, example_frame, reason, steps, slopes, followed)
     return slopes_report(
         run,
         title=f"Slopes of {' and '.join(store.path.name for store in stores)}",
@@ -190,6 +195,19 @@ def _example(
     except InputError as error:
         return {}, f"Not drawn: {error}."
     return stages, ""
+
+
+def _followed(store: StoredRun, frames: Sequence[str | Path] | None) -> tuple[Followed | None, str]:
+    """Return the spots that were followed and the frame of their picture; or why there is none."""
+    slopes = Slopes.from_variables(store.stored.variables, keep=store.keep)
+    number = farthest_frame(slopes)
+    n = slopes.x.shape[1]
+    reference = np.asarray(store.stored.attributes.get("reference", np.zeros((n, 2))))
+    reference = reference.reshape(n, 2) if reference.ndim == 2 else reference.reshape(2, n).T
+    try:
+        return Followed(_frame(store, number, frames), number, slopes, reference), ""
+    except InputError as error:
+        return None, f"Not drawn: {error}."
 
 
 def _source(store: StoredRun, frames: Sequence[str | Path] | None) -> FrameSource:

@@ -74,7 +74,7 @@ def follow(
     """
     for _ in range(3):
         cells = lattice.cells_inside(shape, -REACH * lattice.pitch_px)
-        of_node = _matched(spots, lattice, cells)
+        of_node = matched_spots(spots, lattice.positions(cells), lattice.neighbours(cells), lattice.pitch_px)
         used = of_node >= 0
         if np.count_nonzero(used) < 4:
             return None
@@ -87,23 +87,38 @@ def follow(
     return lattice.canonical(shape), FollowedDrift(nodes, found - nodes, lattice.pitch_px)
 
 
-def _matched(spots: NDArray[np.complex128], lattice: Lattice, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index of the spot of each node, -1 if there is none."""
-    nodes = lattice.positions(cells)
-    neighbours = lattice.neighbours(cells)
+def matched_spots(
+    spots: NDArray[np.complex128],
+    nodes: NDArray[np.complex128],
+    neighbours: NDArray[np.int64],
+    pitch_px: float,
+    start: NDArray[np.complex128] | complex = 0.0,
+) -> NDArray[np.int64]:
+    """Return the index of the spot of each node, -1 if there is none.
+
+    Parameters
+    ----------
+    spots, nodes : complex arrays (m,), (n,)
+        Positions, x + 1j * y [px].
+    neighbours : (n, k) array of int
+        Table that `neighbours_of` returns.
+    pitch_px : float
+    start : complex or complex array (n,)
+        Displacements near which the matching starts [px].
+    """
     tree = as_tree(spots)
-    distance, nearest = tree.query(as_rows(nodes))
-    matched = np.where(distance < _START * lattice.pitch_px, nearest, -1)
-    matched = _agreeing(spots[matched] - nodes, matched, neighbours, _AGREE * lattice.pitch_px)
+    distance, nearest = tree.query(as_rows(nodes + start))
+    matched = np.where(distance < _START * pitch_px, nearest, -1)
+    matched = _agreeing(spots[matched] - nodes - start, matched, neighbours, _AGREE * pitch_px)
     for _ in range(_ROUNDS):
         used = matched >= 0
         if not used.any():
             break
-        drift = FollowedDrift(nodes[used], spots[matched[used]] - nodes[used], lattice.pitch_px)
+        drift = FollowedDrift(nodes[used], spots[matched[used]] - nodes[used], pitch_px)
         reached = used | np.append(used, False)[neighbours].any(axis=1)
         distance, nearest = tree.query(as_rows(nodes + drift(nodes)))
-        near = reached & (distance < _NEAR * lattice.pitch_px)
-        before, matched = matched, _each_once(np.where(near, nearest, -1), distance)
+        near = reached & (distance < _NEAR * pitch_px)
+        before, matched = matched, each_once(np.where(near, nearest, -1), distance)
         if np.array_equal(before, matched):
             break
     return matched
@@ -125,7 +140,7 @@ def _agreeing(
     return np.where(part == np.bincount(part[matched >= 0], minlength=1).argmax(), matched, -1)
 
 
-def _each_once(matched: NDArray[np.int64], distance: NDArray[np.float64]) -> NDArray[np.int64]:
+def each_once(matched: NDArray[np.int64], distance: NDArray[np.float64]) -> NDArray[np.int64]:
     """Assign a spot claimed by several nodes to the one with the nearest expected position."""
     order = np.lexsort((distance, matched))
     again = np.zeros(len(matched), dtype=bool)

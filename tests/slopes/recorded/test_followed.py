@@ -1,0 +1,86 @@
+"""Recordings whose spots leave their windows: command, resuming, report, wavefront."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from benchmarks.following import Case, Recording, recording
+from tests.cli.cli_cases import Commands
+from tests.slopes.recorded.recorded_cases import Page
+
+import faintspot as fs
+from faintspot.io import read_slopes
+from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.recorded import measure_recorded
+from faintspot.slopes.recorded.report.stored import report_of_stored
+
+
+@pytest.fixture
+def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Recording:
+    """Write frames and configuration."""
+    monkeypatch.chdir(tmp_path)
+    made = recording(3001, Case(frames=12, order=2))
+    pipeline = made.pipeline()
+    np.save("frames.npy", made.frames)
+    Path("faintspot.toml").write_text(
+        configuration.to_text(pipeline.layout, pipeline.settings, pipeline.calibration)
+    )
+    return made
+
+
+@pytest.mark.parametrize("name", ["s.zarr", "s.npz", "s.fits"])
+def test_the_command_follows(record: Recording, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("zarr")
+    pytest.importorskip("astropy")
+    run = Commands(capsys)
+    run.ok("slopes", "frames.npy", "-o", name, "--follow")
+    stored, expected = read_slopes(name), fs.SpotFollower(record.pipeline())(record.frames)
+    assert stored.attributes["followed"]
+    for variable, values in expected.variables.items():
+        np.testing.assert_array_equal(stored.variables[variable], values)
+    assert np.abs(expected.x).max() > 20  # a pitch, which is a window
+    # The wavefront is that of the true displacements: all of them are low modes.
+    wavefront = fs.fit_wavefront(expected, record.layout, modes=6)
+    truth = fs.Slopes(**{**vars(expected), "x": record.truth[..., 0], "y": record.truth[..., 1]})
+    np.testing.assert_allclose(
+        wavefront.coefficients, fs.fit_wavefront(truth, record.layout, modes=6).coefficients, atol=0.05
+    )
+    run.ok("wavefront", name, "-o", "w.csv")
+
+
+def test_resumed_it_is_the_same(record: Recording) -> None:
+    pytest.importorskip("zarr")
+
+    def stop(finished: int, total: int) -> None:
+        if finished >= 8:
+            raise KeyboardInterrupt
+
+    options: dict[str, Any] = {"follow": True, "block_frames": 4}
+    with pytest.raises(KeyboardInterrupt):
+        measure_recorded(["frames.npy"], "faintspot.toml", "s.zarr", progress=stop, **options)
+    summary = measure_recorded(["frames.npy"], "faintspot.toml", "s.zarr", **options)
+    assert (summary.resumed_at, summary.measured) == (8, 4 * len(record.layout))
+    expected = fs.SpotFollower(record.pipeline())(record.frames)
+    np.testing.assert_array_equal(read_slopes("s.zarr").variables["x"], expected.x)
+    with pytest.raises(fs.InputError, match="another run"):
+        measure_recorded(["frames.npy"], "faintspot.toml", "s.zarr")
+
+
+def test_the_report_has_the_paths(record: Recording) -> None:
+    measure_recorded(["frames.npy"], "faintspot.toml", "s.npz", follow=True)
+    report = report_of_stored(["s.npz"])
+    text = Page(report).text
+    assert "Spots followed out of their windows" in text
+    assert "largest valid displacement is 1." in text
+    Path("frames.npy").unlink()
+    assert "Not drawn: " in Page(report_of_stored(["s.npz"])).text
+
+
+def test_what_is_refused(record: Recording, capsys: pytest.CaptureFixture[str]) -> None:
+    run = Commands(capsys)
+    run.refused("slopes", "frames.npy", "--follow", "--mean-flux", naming=("--follow", "--mean-flux"))
+    Path("faintspot.toml").write_text(Path("faintspot.toml").read_text().replace("pitch_px", "# pitch_px"))
+    run.refused("slopes", "frames.npy", "--follow", naming=("faintspot.toml", "pitch_px"))
