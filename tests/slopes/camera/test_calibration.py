@@ -89,7 +89,7 @@ def test_bad_values() -> None:
     noise = [np.array([[1.0, -1.0], [np.nan, 1.0]]), np.full((3, 4), np.nan), np.full((3, 4), np.inf)]
     assert_each_refused(
         fs.Calibration,
-        dark=[np.zeros(3), np.nan, "dark.fits", np.zeros((2, 3, 4))],
+        dark=[np.zeros(3), np.nan, "dark.fits", np.zeros((2, 3, 4)), [[1, True]]],
         estimated=["dark", ["flat"]],
         flat=["flat.fits", np.ones((3, 4), complex)],
         gain_e_per_adu=[0.0, np.nan, np.ones((3, 4))],

@@ -30,6 +30,12 @@ class TestGrid:
         assert len(layout) == len(illuminated)
         assert len(layout) == count
 
+    def test_truth_values_are_no_numbers(self) -> None:
+        for name in ("corners", "centres", "cells"):
+            values: dict[str, Any] = {"corners": [[0, 0]], name: [[1, True]]}
+            with pytest.raises(fs.InputError, match=f"layout.{name} = .*got true or false"):
+                fs.Layout((16, 16), (8, 8), **values)
+
     def test_places(self) -> None:
         layout = fs.Layout.grid((2, 3), pixels=(4, 6), pitch=(5, 8), origin=(1, 2))
         assert layout.corners.tolist() == [[1, 2], [1, 10], [1, 18], [6, 2], [6, 10], [6, 18]]

@@ -94,6 +94,7 @@ def telescope(
     if write_config is not None:
         click.echo(f"{name}: {write_engine_files(observed, write_config, control)} written")
     say = partial(click.echo, err=True)
+    options = {key: value for key, value in options.items() if value is not None}
     options["say"] = lambda line: say(f"{name}: {line}")
     with ExitStack() as files:
         if strehl is not None:

@@ -29,6 +29,9 @@ _LARGEST_READ_NOISE_E, _LARGEST_BACKGROUND_E, _LARGEST_ADU = 1e6, 1e9, 1e30
 
 def _map(name: str, value: object) -> NDArray[np.float64]:
     """Return a private, read-only copy of a map, which may contain NaN."""
+    rows = [row for row in value if isinstance(row, list)] if isinstance(value, list) else []
+    if any(isinstance(item, bool) for row in rows for item in row):
+        raise InputError("expected numbers, got true or false", name=name)
     array = real_array(name, value).astype(np.float64)
     if array.ndim != 2:
         raise InputError(f"expected shape (h, w), got {array.shape}", name=name)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.config.options import TEXTS, number, setting
 from faintspot.base.config.tables import ConfigurationTable
 from faintspot.base.errors import DoubtWarning, InputError, errors_within
@@ -388,7 +388,7 @@ class Layout(ConfigurationTable, table="layout"):
 
 
 def _rows_of_two(name: str, value: object) -> NDArray[Any]:
-    array = finite_array(name, value)
+    array = numbers_between(name, value)
     if array.ndim != 2 or array.shape[1] != 2:
         raise InputError(f"{name}: expected shape (n, 2), got {array.shape}")
     return array

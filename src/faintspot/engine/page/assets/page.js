@@ -240,8 +240,8 @@ function showStrips({ strip: names, strip_s: seconds, strip_methods: methods, fl
   const byMethod = (values) => Object.entries(methods).map(([number, name], i) => (
     { name, values: values.map((value, k) => method[k] === Number(number) ? value : NaN),
       colour: METHOD_COLOURS[i % METHOD_COLOURS.length], dash: i >= METHOD_COLOURS.length }));
-  const show = (id, lines, text, unit) => {
-    drawStrip(byId(id), times, seconds, lines, { from: 0 });
+  const show = (id, lines, text, unit, limits = { from: 0 }) => {
+    drawStrip(byId(id), times, seconds, lines, limits);
     byId(`${id}-caption`).replaceChildren(text, ...lines.map(({ name, values, colour }) => element("span", {
       textContent: `${lines.length > 1 ? ` ${cut(name, LONGEST_NAME)}` : ""} ${inWords(last(values))} ${unit}`,
       title: lines.length > 1 ? name : "", style: lines.length > 1 ? `color: ${ink[colour]}` : "" })));
@@ -253,8 +253,8 @@ function showStrips({ strip: names, strip_s: seconds, strip_methods: methods, fl
   const strehl = column("strehl"), some = strehl.some(Number.isFinite);
   byId("strehl-figure").hidden = !some;
   if (some) {
-    drawStrip(byId("strehl"), times, seconds, [{ values: strehl, colour: "third" }], { from: 0, to: 1 });
-    say("strehl-caption", `true, from the simulated telescope: ${inWords(last(strehl), 2)}, ${inWords(last(column("rms_nm")))} nm rms`);
+    const rms = `(last ${inWords(last(column("rms_nm")))} nm rms)`;
+    show("strehl", byMethod(strehl), `true, from the simulated telescope ${rms}:`, "", { from: 0, to: 1 });
   }
 }
 
