@@ -91,6 +91,16 @@ class HcipyLoop(SteppedLoop):
                 path_m += (layer.phase_for(IMAGING_M) * IMAGING_M / (2 * np.pi)).astype(np.float32)
         return paths_m
 
+    def image(self, path_m: NDArray[np.float32]) -> Floats:
+        """Return the frame of a wavefront without noise."""
+        frame = self._example.image(self._example.noiseless, path_m, self._photons)
+        return np.asarray(frame.shaped, np.float64)
+
+    def wavefronts(self, paths_m: Any) -> Floats:
+        """Return wavefronts that are NaN outside the pupil."""
+        lit = np.asarray(self._example.pupil) > 0.5
+        return np.where(lit, paths_m, np.nan).reshape(len(paths_m), *self._example.grid.shape)
+
     def begin(self, seed: int) -> None:
         """See `SteppedLoop`."""
         np.random.seed(seed)  # noqa: NPY002 - HCIPy's detectors draw from this one

@@ -165,12 +165,24 @@ class OopaoLoop(SteppedLoop):
             )
         return paths_m
 
+    def wavefronts(self, paths_m: Any) -> Floats:
+        """Return wavefronts that are NaN outside the pupil."""
+        return np.where(self._pupil, paths_m, np.float32(np.nan))
+
     def begin(self, seed: int) -> None:
         """See `SteppedLoop`."""
         camera = self._wfs.cam
         camera.photonNoise, camera.readoutNoise = True, self._case.read_noise_e
         camera.random_state_photon_noise = np.random.RandomState(seed)
         camera.random_state_readout_noise = np.random.RandomState(seed + 1000)
+
+    def image(self, path_m: NDArray[np.float32]) -> Floats:
+        """Return the frame of a wavefront without noise; lenslets moved, as x and y are swapped in them."""
+        self._wfs.cam.photonNoise, self._wfs.cam.readoutNoise = False, 0
+        self._measured(np.zeros(self._mirror.nValidAct), path_m)
+        frame, number = np.array(self._wfs.cam.frame), self._case.lenslets
+        side = len(frame) // number
+        return frame.reshape(number, side, number, side).transpose(2, 1, 0, 3).reshape(frame.shape)
 
     def frame(self, path_m: NDArray[np.float32], command: Floats) -> tuple[Floats, float]:
         """See `SteppedLoop`."""

@@ -101,6 +101,19 @@ class SoapyLoop(SteppedLoop):
             screen[:] = atmosphere.moveScrns()  # always the same array
         return screens
 
+    def image(self, path_m: NDArray[np.float32]) -> Floats:
+        """Return the frame of some screens without noise."""
+        self._sensor.config.photonNoise, self._sensor.config.eReadNoise = False, 0.0
+        self._sensor.frame(np.asarray(path_m, np.float64))
+        return np.array(self._sensor.wfsDetectorPlane, np.float64)
+
+    def wavefronts(self, paths_m: Any) -> Floats:
+        """Return wavefronts that are NaN outside the pupil, m."""
+        total, side = 1e-9 * np.asarray(paths_m).sum(axis=1), self._system.config.sim.pupilSize
+        first, margin = (total.shape[-1] - side) // 2, (len(self._pupil) - side) // 2
+        lit = self._pupil[margin : margin + side, margin : margin + side]
+        return np.where(lit, total[:, first : first + side, first : first + side], np.nan)
+
     def begin(self, seed: int) -> None:
         """See `SteppedLoop`."""
         np.random.seed(seed + 1000)  # noqa: NPY002 - soapy draws its noise from this one

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.foreign.base import SETTLE_FRAMES, Control, ForeignLoop, Observed
+from benchmarks.foreign.base import SETTLE_FRAMES, Control, Floats, ForeignLoop, Observed
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 _QUANTUM_EFFICIENCY = 0.01 / 40.0
 """For an electron a lenslet: the star's brightness is that of the example."""
+_LONG_SCREEN = 4096  # points: 246 m, so that no layer comes round again
 _SEEING_TO_R0 = 0.9759 * 500e-9
 """m rad: SPECULA's own product of seeing and r0."""
 
@@ -117,3 +118,39 @@ class SpeculaLoop(ForeignLoop):
             np.array(noted.commands),
             np.array(noted.predicting),
         )
+
+
+def open_loop(seed: int, frames: int) -> tuple[Floats, Floats]:
+    """Return noiseless frames of an open loop, and wavefronts that are NaN outside the pupil, m."""
+    system = example("specula_loop")
+    speeds, directions = (list(values) for values in zip(*SpeculaLoop.winds, strict=True))
+    ran = system.run(
+        {
+            **system.SYSTEM,
+            "wind_speed": system.constant(speeds),
+            "wind_direction": system.constant(directions),
+            "noted": {
+                "class": "NotedFrames",
+                "inputs": {"in_pixels": "detector.out_pixels", "in_ef": "prop.out_star_ef"},
+            },
+        },
+        {
+            "main_override": {
+                "total_time": frames * 0.004,
+                "add_modules": ["benchmarks.foreign.specula_objects"],
+            },
+            "atmo_override": {
+                "seed": seed,
+                "heights": [0.0] * 3,
+                "Cn2": [0.5, 0.3, 0.2],
+                "pixel_phasescreens": _LONG_SCREEN,
+            },
+            "prop_override": {
+                "inputs": {"atmo_layer_list": "atmo.layer_list", "common_layer_list": ["pupilstop"]}
+            },
+            "detector_override": {"photon_noise": False, "readout_noise": False},
+            "remove": ["slopec", "rec", "control", "dm", "psf"],
+        },
+    ).objs["noted"]
+    lit = np.asarray(ran.amplitude) > 0
+    return np.array(ran.frames), np.where(lit, ran.paths_m, np.nan)

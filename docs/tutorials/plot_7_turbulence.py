@@ -136,6 +136,6 @@ for shift, name, label in (
 axes.legend(loc="lower right", frameon=False)
 
 # %%
-# Both estimates follow the rise and agree with each other. In the middle they are above the truth by more
-# than their intervals: what crosses the pupil within 3 s is a small sample of the turbulence, here a weak
-# one. What else limits r0, and the accuracy on frames of another simulator: :doc:`/guide/turbulence`.
+# Both estimates follow the rise and agree with each other. What crosses the pupil within 3 s is a small
+# sample of the turbulence, as the intervals say. What else limits r0, and the accuracy on frames of other
+# simulators: :doc:`/guide/turbulence`.

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, increasing, one_of, real_array
 from faintspot.base.errors import InputError, errors_within
+from faintspot.base.flags import SubapertureFlag
 from faintspot.base.npz import read_arrays
 from faintspot.base.toml_files import check_keys, parse_file
 from faintspot.base.validity import leave_out
+from faintspot.io import StoredSlopes
 from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.frames import read_array
 from faintspot.io.references import holds_slopes
@@ -43,6 +45,9 @@ _SCALES = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
 """Scales of the telescope that a layout holds."""
 _WORDS = ("slope_unit", "slope_order", "loop")
 _PAIRS, _AXES = "pairs", "axes"
+_LEAST_RESPONSE = 0.3  # of the median, of slopes that are used
+_GAIN_ERROR, _NONLINEAR = 0.02, 0.1  # relative errors of the gain: of all, and of small responses
+_OF_LOST = 5.0  # relative error of the gain over the share of slopes at their limit
 _TABLES = (".npz", ".npy", ".csv", ".txt")
 
 
@@ -211,7 +216,8 @@ def _of_slopes(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected slopes with their layout ({' '.join(run.notes)})")
     if layout.geometry != "square":
         raise InputError(f"{path}: expected a square array of lenslets, got a {layout.geometry} one")
-    x, y = (run.stored.variables[axis].astype(np.float64) for axis in "xy")
+    slopes, gain_error = _proportional(run.stored)
+    x, y = np.split(slopes, 2, axis=1)
     angle = math.radians(layout.angle_deg)
     along, across = math.cos(angle) * x + math.sin(angle) * y, math.cos(angle) * y - math.sin(angle) * x
     values: dict[str, Any] = {
@@ -220,8 +226,26 @@ def _of_slopes(path: Path) -> dict[str, Any]:
         "slope_unit": "px",
         "cells": layout.cells,
         "loop": "open",
+        "gain_error": gain_error,
     }
     return values | {name: scale for name in _SCALES if (scale := getattr(layout, name)) is not None}
+
+
+def _proportional(stored: StoredSlopes) -> tuple[Floats, float]:
+    """Return slopes (frames, 2 n) divided by their response, NaN where that is low, and its relative error.
+
+    Of estimators whose slopes are not linear in the pixels no response is known: it is taken to be 1. Slopes
+    lost at the edges of their windows are the largest ones, so that those left vary too little.
+    """
+    slopes = np.hstack([stored.variables[axis] for axis in "xy"]).astype(np.float64)
+    lost = _OF_LOST * float((stored.variables["flags"] & SubapertureFlag.AT_SEARCH_LIMIT != 0).mean())
+    if "response" not in stored.attributes:
+        return slopes, math.hypot(_GAIN_ERROR, lost)
+    response = np.asarray(stored.attributes["response"], np.float64)
+    low = response < _LEAST_RESPONSE * max(float(np.median(response)), 0.0)
+    slopes = np.where(low, np.nan, slopes / np.where(low, 1.0, response))
+    nonlinear = _NONLINEAR * (1 - min(float(np.median(response)), 1.0))
+    return slopes, math.hypot(_GAIN_ERROR, nonlinear, lost)
 
 
 def _of_aot(path: Path) -> dict[str, Any]:

@@ -166,7 +166,7 @@ def _loop(report: LoopReport) -> LoopDelay:
     is_still = loop.commands is None or not np.ptp(loop.commands, axis=0).any()
     if not loop.is_closed or (is_still and loop.commands is not None):
         part.missing = "The loop was open: it has no delay and no gain to measure."
-        return LoopDelay(1.0, 0.0, 1.0, 0.0)
+        return LoopDelay(1.0, 0.0, 1.0, loop.gain_error or 0.0)
     if loop.commands is None or loop.interaction_matrix is None:
         absent = "commands" if loop.commands is None else "an interaction or control matrix"
         why = f"The recording has no {absent}: its open-loop slopes are unknown."
@@ -270,7 +270,7 @@ def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> Id
     if loop.subaperture_m is None:
         part.missing = "Without subaperture_m (or diameter_m) neither r0 nor winds are known."
         return identification
-    strength = _strength(loop, open_loop, delay, replace(site, averaged=identified.turbulence.averaged))
+    strength = _strength(loop, open_loop, delay, replace(identified.turbulence, r0_m=site.r0_m))
     part.values += strength
     part.values += _winds(identified, next(value for value in strength if value.name == R0))
     return identification
@@ -293,17 +293,20 @@ def _strength(
         gain_error=delay.gain_error / delay.gain,
         gain_spread=_GAIN_SPREAD * abs(1 - delay.gain),
         outer_scale_m=loop.outer_scale_m,
+        frame_rate_hz=loop.frame_rate_hz,
     )
     outer, r0 = outer_scale_and_r0(strength, loop.outer_scale_m)
     if not loop.is_closed:
-        r0 = replace(r0, remark="for a centroid gain of 1, which only a loop shows")
-    values = [outer, r0, *_image_motion(open_loop, site)]
+        r0 = replace(r0, remark=f"for a centroid gain of 1 ± {delay.gain_error:.2g}")
+    values = [outer, r0, *_image_motion(open_loop, site, loop.frame_rate_hz, delay.gain_error / delay.gain)]
     seeing = 0.98 * R0_WAVELENGTH_M / strength.r0_m / ARCSEC
     relative = strength.r0_error_m / strength.r0_m
     return [*values, Measured("seeing at 500 nm", "arcsec", seeing, seeing * relative, "0.98 λ / r0", True)]
 
 
-def _image_motion(open_loop: OpenLoop, site: SlopeTurbulence) -> list[Measured]:
+def _image_motion(
+    open_loop: OpenLoop, site: SlopeTurbulence, rate_hz: float, gain_error: float
+) -> list[Measured]:
     """Return r0 as a seeing monitor measures it, from the sub-apertures that were measured in most frames."""
     measured = open_loop.telemetry.trust > 0
     kept = measured.mean(axis=0).reshape(2, -1).min(axis=0) > _MOSTLY
@@ -312,9 +315,10 @@ def _image_motion(open_loop: OpenLoop, site: SlopeTurbulence) -> list[Measured]:
     if len(slopes) < _FEWEST_FOR_MOTION:
         return []
     site = replace(site, positions_m=site.positions_m[kept])
-    motion = differential_image_motion(slopes, open_loop.variance[columns], site)
+    r0, error = differential_image_motion(slopes, open_loop.variance[columns], site, rate_hz)
+    error = math.hypot(error, 6 / 5 * gain_error * r0)
     remark = "as of a seeing monitor, for an infinite outer scale"
-    return [Measured("r0 at 500 nm from differential image motion", "m", *motion, remark, True)]
+    return [Measured("r0 at 500 nm from differential image motion", "m", r0, error, remark, True)]
 
 
 def _winds(identified: Identified, r0: Measured) -> list[Measured]:

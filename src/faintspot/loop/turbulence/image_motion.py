@@ -8,23 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.turbulence.strength import sampled
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 
 Floats = NDArray[np.float64]
 
 _APART = (1.5, 3.5)  # sub-apertures: nearer ones see the same tilt, in farther ones the outer scale shows
-_BLOCKS = 8  # in time, whose scatter is the error
 _SQUARES = 0.02  # of r0: a square is not quite a disc of its area
 
 
 def differential_image_motion(
-    atmosphere_px: Floats, noise_px2: Floats, site: SlopeTurbulence
+    atmosphere_px: Floats, noise_px2: Floats, site: SlopeTurbulence, frame_rate_hz: float
 ) -> tuple[float, float]:
     """Return r0 at 500 nm and its standard error, m; NaN if the slopes vary no more than their noise.
 
     Tip and tilt, vibrations included, cancel in differences. An infinite outer scale is assumed: one of 10 m
-    makes r0 14 % too large with sub-apertures of 0.6 m, one of 25 m 4 %. The error is the scatter between
-    eighths of the recording.
+    makes r0 14 % too large with sub-apertures of 0.6 m, one of 25 m 4 %. The error follows from how much
+    of the turbulence has crossed the pupil, see `faintspot.loop.turbulence.strength.sampled`.
 
     Parameters
     ----------
@@ -33,7 +33,8 @@ def differential_image_motion(
     noise_px2 : (2 n,) array
         Variance of their noise.
     site : SlopeTurbulence
-        Geometry, with `averaged`; its strength, outer scale and winds are not used.
+        Geometry, with `averaged`, and winds; its strength is not used.
+    frame_rate_hz : float
 
     Notes
     -----
@@ -47,20 +48,14 @@ def differential_image_motion(
     # (scale / wavelength)^2 sum of variances = sum of coefficients D^(-1/3) r0^(-5/3)
     unit = (site.pixel_scale_rad / R0_WAVELENGTH_M) ** 2 / expected
 
-    def strength(rows: Floats) -> float:
-        variance = sum(float(np.var(rows[:, i] - rows[:, j])) for i, j in zip(first, second, strict=True))
-        return unit * (variance - noise)
-
-    whole = strength(atmosphere_px)
-    if not whole > 0:
+    pairs = np.eye(len(noise_px2))[first] - np.eye(len(noise_px2))[second]
+    apart = atmosphere_px[:, first] - atmosphere_px[:, second]
+    lost, variance = sampled([pairs.T], site, len(atmosphere_px) / frame_rate_hz)
+    strength = unit * (float(apart.var(axis=0).sum()) - noise) / (1 - float(lost[0]))
+    if not strength > 0:
         return math.nan, math.nan
-    mean = atmosphere_px.mean(axis=0)
-    blocks = [
-        strength(np.vstack([block - mean, mean - block])) for block in np.array_split(atmosphere_px, _BLOCKS)
-    ]
-    r0 = whole ** (-3 / 5)
-    relative = 3 / 5 * float(np.std(blocks, ddof=1)) / math.sqrt(_BLOCKS) / whole
-    return r0, r0 * math.hypot(relative, _SQUARES)
+    r0 = strength ** (-3 / 5)
+    return r0, r0 * math.hypot(3 / 5 * math.sqrt(float(variance[0, 0])), _SQUARES)
 
 
 def _pairs(site: SlopeTurbulence) -> tuple[NDArray[np.int64], NDArray[np.int64], float]:

@@ -8,6 +8,7 @@ each degree by its errors. Tip and tilt, which vibrations change, are left out.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -29,6 +30,7 @@ _GAIN_STEP = 0.05
 _COMMON_ERROR = 0.03  # of r0: centroids of speckled, partly illuminated spots are not quite mean gradients
 _ERROR_OF_DEGREE = 0.01  # of r0, for each degree: averaging within a sub-aperture
 _TO_R0 = 3 / 5
+_LAGS, _MOST_LOST = 20, 0.8  # of `sampled`: nodes of its integrals, and a limit
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,7 @@ def turbulence_strength(
     gain_error: float = 0.0,
     gain_spread: float = 0.0,
     outer_scale_m: float | None = None,
+    frame_rate_hz: float | None = None,
 ) -> TurbulenceStrength:
     """Return r0 and the outer scale.
 
@@ -62,13 +65,16 @@ def turbulence_strength(
     run : (frames,) array of int
         Frames with the same number are consecutive.
     site : SlopeTurbulence
-        Geometry; its strength, outer scale and winds are not used.
+        Geometry, and winds if `frame_rate_hz` is given; its strength is not used.
     gain_error : float
         Relative standard error of the centroid gain.
     gain_spread : float
         Relative standard deviation between centroid gains of different spatial scales.
     outer_scale_m : float, optional
         Outer scale, where it is known; else 25 m within a factor of two are expected.
+    frame_rate_hz : float, optional
+        Frames per second, where the winds are known: they tell how much of the turbulence has crossed the
+        pupil, see `sampled`. Default: from the autocorrelation of the slopes, too short for slow turbulence.
     """
     n = len(site.positions_m)
     kept = np.arange(n)[:: math.ceil(n / _MOST_SUBAPERTURES)]
@@ -86,11 +92,15 @@ def turbulence_strength(
     number, modes, signal = zip(*usable, strict=True)
     change = [_of_gain(atmosphere @ basis, residual @ basis, run) for basis in modes]
     sampling = [_sampling(atmosphere @ basis, run, value) for basis, value in zip(modes, signal, strict=True)]
+    of_signal, of_noise = np.array(sampling).T
+    covariance, lost = np.diag(of_signal), np.zeros(len(modes))
+    if frame_rate_hz is not None:
+        lost, covariance = sampled(modes, site, len(atmosphere) / frame_rate_hz)
     of_degree = _ERROR_OF_DEGREE / _TO_R0 * np.array(number)
-    covariance = np.diag(sampling + np.square(gain_spread * np.array(change)) + np.square(of_degree))
+    covariance += np.diag(of_noise + np.square(gain_spread * np.array(change)) + np.square(of_degree))
     covariance += gain_error**2 * np.outer(change, change)
     theory = expected[:, np.array(number) - 1]
-    return _fitted(np.log(signal), theory, covariance, outer_scale_m)
+    return _fitted(np.log(signal / (1 - lost)), theory, covariance, outer_scale_m)
 
 
 def _fitted(signal: Floats, theory: Floats, covariance: Floats, known_m: float | None) -> TurbulenceStrength:
@@ -176,8 +186,8 @@ def _of_gain(atmosphere: Floats, residual: Floats, run: NDArray[np.int64]) -> fl
     return math.log(max(low, 1e-3 * abs(high)) / high) / (2 * _GAIN_STEP) if high > 0 else 1.0
 
 
-def _sampling(modes: Floats, run: NDArray[np.int64], signal: float) -> float:
-    """Return the relative variance of `_signal` of Gaussian modes with the measured autocorrelation."""
+def _sampling(modes: Floats, run: NDArray[np.int64], signal: float) -> tuple[float, float]:
+    """Return the relative variance of `_signal` of Gaussian modes: of their autocorrelation, and of noise."""
     frames, count = len(modes), modes.shape[1]
     transformed = np.fft.rfft(modes, 2 * frames, axis=0)
     products = np.fft.irfft((transformed * transformed.conj()).real, 2 * frames, axis=0)
@@ -186,5 +196,40 @@ def _sampling(modes: Floats, run: NDArray[np.int64], signal: float) -> float:
     noise = max(float(correlation[0]) - 1, 0.0)
     last = int(np.argmax(correlation < 0)) or len(correlation)
     of_signal = 2 * (1 + 2 * float(np.square(correlation[1:last]).sum()))
-    total: float = of_signal + 4 * noise + 17 / 9 * noise**2
-    return float(total / (frames * count))
+    of_noise = 4 * noise + 17 / 9 * noise**2
+    return of_signal / (frames * count), of_noise / (frames * count)
+
+
+def sampled(bases: Sequence[Floats], site: SlopeTurbulence, duration_s: float) -> tuple[Floats, Floats]:
+    """Return how well the variances of slopes are known that a piece of frozen turbulence shows.
+
+    Parameters
+    ----------
+    bases : sequence of (2 n, modes) array
+        Each gives the sum of the variances of its modes.
+    site : SlopeTurbulence
+        Geometry and winds.
+    duration_s : float
+
+    Returns
+    -------
+    lost : (bases,) array
+        Part of each variance that is in the mean of the piece, at most 0.8.
+    covariance : (bases, bases) array
+        Relative covariance of the variances about the mean, of Gaussian slopes.
+    """
+    modes = np.hstack(bases)
+    starts = np.cumsum([0, *(basis.shape[1] for basis in bases[:-1])])
+    variance = np.add.reduceat(np.einsum("ik,ij,jk->k", modes, site.covariance_px2(), modes), starts)
+    nodes, weights = np.polynomial.legendre.leggauss(_LAGS)
+    lost, covariance = np.zeros(len(bases)), np.zeros((len(bases), len(bases)))
+    for part, weight in zip(0.5 * (1 + nodes), 0.5 * weights, strict=True):
+        lag = part**2  # of the duration: short lags count most
+        later = modes.T @ site.covariance_px2(lag * duration_s) @ modes
+        weight *= 4 * part * (1 - lag)
+        lost += weight * np.add.reduceat(np.diag(later), starts)
+        squares = np.add.reduceat(np.square(later), starts, axis=0)
+        covariance += 2 * weight * np.add.reduceat(squares, starts, axis=1)
+    lost = np.clip(lost / variance, 0.0, _MOST_LOST)
+    left = variance * (1 - lost)
+    return lost, covariance / np.outer(left, left)

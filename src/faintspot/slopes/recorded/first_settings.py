@@ -27,6 +27,8 @@ _WIDTH_OF_WINDOW = 0.25  # of the window's side, where no spot is seen
 _LEAST_NOISE, _LARGEST_GAIN = 1e-6, 100.0  # noise over flux; of `Window.centroid_gain`
 ASSUMED_NOISE_E = 3.0  # of a dark pixel, which gives the gain of a single frame
 _WEIGHTS = (1.25, 1.6)  # width of the weight over the spot's: best where read noise, photon noise dominates
+_WINDOWS = (1.0, 1.5, 2.2, 3.2)  # width of a fixed window over the spot's: wide where spots move far
+_LEAST_RESPONSE = 0.05  # below, the displacements are not known well enough to choose the width
 _LEAST_DISPLACEMENT = 0.15  # rms over the spot's width: frames to come may move more than static ones
 _TIGHT = 3.0  # search range over the rms displacement
 _LEAST_RANGE_PX = 1.0
@@ -166,12 +168,20 @@ class _Trial:
             for reach in (None, tight)
             for factor in _WEIGHTS
         ]
-        window = Settings("window", search_range_px=tight, flux_e=_rounded(self._spots.flux), **width)
-        shown = self._measured(window.replace(centroid_gain=1.0))
-        product = max(float((shown * self._truth).sum()), 1e-30)
-        response = product**2 / float((shown**2).sum() * (self._truth**2).sum())
-        gain = min(float((shown**2).sum()) / product, _LARGEST_GAIN)  # of least squares
-        window = window.replace(centroid_gain=_rounded(gain))
+        windows = [
+            self._reduced(
+                Settings(
+                    "window",
+                    window_fwhm_px=_rounded(factor * self._fwhm),
+                    search_range_px=tight,
+                    flux_e=_rounded(self._spots.flux),
+                    **width,
+                )
+            )
+            for factor in _WINDOWS
+        ]
+        is_known = windows[0][1] > _LEAST_RESPONSE
+        window, response = max(windows, key=lambda each: each[1]) if is_known else windows[0]
         best, least = following[0], math.inf
         for settings in following:
             if (error := self._error(self._measured(settings))) < _BETTER * least:
@@ -179,6 +189,14 @@ class _Trial:
         if response < _FAINT and self._error(self._measured(window)) < _AS_GOOD * least:
             return window, response
         return best, 1.0
+
+    def _reduced(self, window: Settings) -> tuple[Settings, float]:
+        """Return a fixed window with slopes of least squares, and the slope that they show for 1 px."""
+        shown = self._measured(window.replace(centroid_gain=1.0))
+        product = max(float((shown * self._truth).sum()), 1e-30)
+        response = product**2 / float((shown**2).sum() * (self._truth**2).sum())
+        gain = min(float((shown**2).sum()) / product, _LARGEST_GAIN)
+        return window.replace(centroid_gain=_rounded(gain)), response
 
     def _error(self, positions: Floats) -> float:
         return float(np.abs(positions - self._truth).mean())

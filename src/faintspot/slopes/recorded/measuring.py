@@ -30,6 +30,7 @@ from faintspot.slopes.pipeline.mean_flux import MeanFlux
 from faintspot.slopes.pipeline.settings import with_preset, without_denoising
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.recorded.response import response
 from faintspot.slopes.recorded.survey import survey
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
@@ -197,6 +198,9 @@ def measure_recorded(
                 attributes["reference_file"] = str(reference)
         with errors_within(configuration_file):
             measure = SpotFollower(pipeline) if follow else pipeline.with_dark(seen.mean)
+        shown = response(measure, seen.mean) if isinstance(measure, SlopePipeline) else None
+        if shown is not None:
+            attributes["response"] = shown.tolist()
         summary = Summary(source.n_frames, len(layout), origin=origin, doubtful=bool(layout.doubts))
         summary.saturation_adu = saturation_adu
         if positions is None:

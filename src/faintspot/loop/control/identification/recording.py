@@ -37,6 +37,7 @@ NUMBERS = {
     "pixel_scale_arcsec": _positive("Angle of one unit of the slopes.", "arcsec", 1e-9, 1e9),
     "delay_frames": _positive("Delay of the loop.", "frames", 1e-3, 100.0),
     "largest_command": _positive("Limit of a command.", "", 1e-30, 1e30),
+    "gain_error": _positive("Relative error of the centroid gain of an open loop.", "", 1e-6, 10.0),
     "outer_scale_m": _positive("Outer scale of the turbulence.", "m", 1e-2, 1e6),
     "science_wavelength_m": _positive("Wavelength of the Strehl ratio.", "m", 1e-8, 1e-3),
     "sent_after_frames": Option(
@@ -91,6 +92,8 @@ class Recording:
     prior_std: Any = None
     """(2 n,): width of the estimator's prior, of which the slopes have been freed. Default: it had none."""
     largest_command: float | None = None
+    gain_error: float | None = None
+    """Relative error of the centroid gain of an open loop, which is 1. Default: 0."""
     outer_scale_m: float | None = None
     science_wavelength_m: float = 1.65e-6
     is_closed: bool = True
