@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,7 @@ from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.following import SpotFollower
 from faintspot.slopes.pipeline.labelled import layout_coordinates
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
-from faintspot.slopes.pipeline.settings import with_preset, without_denoising
+from faintspot.slopes.pipeline.settings import Settings, with_preset, without_denoising
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.response import response
@@ -157,56 +158,42 @@ def measure_recorded(
     if follow and mean_flux:
         raise InputError("follow (--follow) and mean_flux (--mean-flux): expected one of them, got both")
     described, origin, stored_reference = _configured(configuration_file, frames, key)
-    layout, settings, calibration = described.layout, described.settings, described.calibration
-    if changes:
-        settings = settings.replace(**changes)
-    if not denoise:
-        settings = without_denoising(settings, "denoise = False (--no-denoise)")
-    if preset is not None:
-        settings = with_preset(settings, preset)
+    layout, settings = described.layout, _settings(described.settings, changes, denoise, preset)
     positions = read_reference(reference) if isinstance(reference, str | Path) else reference
     if positions is None:
         positions = stored_reference
     options: dict[str, Any] = {**described.spot, "threads": threads}
     try:
-        pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
+        pipeline = SlopePipeline(layout, settings, described.calibration, positions, **options)
     except InputError as error:
         about_reference = positions is not None and error.name == "reference"
         file = reference if about_reference and isinstance(reference, str | Path) else configuration_file
         raise error.within(file) from None
     with open_frames(frames, key=key, time_axis=time_axis) as source:
-        _check_output(output, frames)
-        if source.shape != layout.frame_shape:
-            raise InputError(
-                f"{source.description}: frames of {source.shape[0]} x {source.shape[1]} pixels, expected "
-                f"{layout.frame_shape[0]} x {layout.frame_shape[1]} as in {configuration_file}"
-            )
+        _check_files(source, frames, output, layout, configuration_file)
+        summary = Summary(source.n_frames, len(layout), origin=origin, doubtful=bool(layout.doubts))
+        if positions is None:
+            summary.reference = reference_in_words(layout.fitted)
         seen = survey(source)
-        saturation_adu = seen.saturation_adu if calibration.saturation_adu is None else None
-        if saturation_adu is not None:
-            calibration = replace(calibration, saturation_adu=saturation_adu)
+        if described.calibration.saturation_adu is None and seen.saturation_adu is not None:
+            summary.saturation_adu = seen.saturation_adu
+            calibration = replace(described.calibration, saturation_adu=seen.saturation_adu)
             pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
         if mean_flux:
             pipeline = _with_mean_flux(pipeline, source)
         attributes = _attributes(pipeline, source, frames, described, key, unit, keep, follow)
+        factor = pixels_in(one_of("unit", unit, UNITS), attributes)
         if time_axis is not None:
             attributes["source_time_axis"] = time_axis
-        factor = pixels_in(one_of("unit", unit, UNITS), attributes)
         if positions is not None:
             attributes["reference"] = np.asarray(positions).tolist()
-            if isinstance(reference, str | Path):
-                attributes["reference_file"] = str(reference)
+        if isinstance(reference, str | Path):
+            attributes["reference_file"] = str(reference)
         with errors_within(configuration_file):
             measure = SpotFollower(pipeline) if follow else pipeline.with_dark(seen.mean)
         shown = response(measure, seen.mean) if isinstance(measure, SlopePipeline) else None
         if shown is not None:
             attributes["response"] = shown.tolist()
-        summary = Summary(source.n_frames, len(layout), origin=origin, doubtful=bool(layout.doubts))
-        summary.saturation_adu = saturation_adu
-        if positions is None:
-            summary.reference = reference_in_words(layout.fitted)
-        most = _FOLLOWED_FRAMES if follow else _BLOCK_BYTES // (4 * source.shape[0] * source.shape[1])
-        size = block_frames or max(1, most)
         with create_writer(
             output,
             n_frames=source.n_frames,
@@ -216,18 +203,29 @@ def measure_recorded(
             overwrite=overwrite,
         ) as writer:
             summary.resumed_at = done = writer.finished()
-            again = [(0, done)] if follow and done < source.n_frames else []
-            for first, last in [*again, (done, source.n_frames)]:
-                for start, block in source.blocks(first, last, size):
-                    slopes = replace(measure(block), keep=kept)
-                    if start >= done:
-                        writer.append(start, scaled_positions(slopes.variables, factor))
-                        summary.add(slopes)
-                    if progress is not None:
-                        progress(start + len(block), source.n_frames)
+            size = block_frames or _block_frames(source, follow)
+            again = source.blocks(0, done, size) if follow and done < source.n_frames else ()
+            for start, block in itertools.chain(again, source.blocks(done, source.n_frames, size)):
+                slopes = replace(measure(block), keep=kept)
+                if start >= done:
+                    writer.append(start, scaled_positions(slopes.variables, factor))
+                    summary.add(slopes)
+                if progress is not None:
+                    progress(start + len(block), source.n_frames)
     prepared = measure.plan.prepared
     summary.failed_frames, summary.failure = prepared.faults, prepared.fault
     return summary
+
+
+def _settings(
+    settings: Settings, changes: Mapping[str, Any] | None, denoise: bool, preset: str | None
+) -> Settings:
+    """Return the settings as changed by the arguments."""
+    if changes:
+        settings = settings.replace(**changes)
+    if not denoise:
+        settings = without_denoising(settings, "denoise = False (--no-denoise)")
+    return settings if preset is None else with_preset(settings, preset)
 
 
 def _configured(
@@ -297,10 +295,27 @@ def _with_mean_flux(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeli
     return pipeline.with_flux(MeanFlux(np.concatenate(flux)))
 
 
-def _check_output(output: str | Path, frames: Sequence[str | Path]) -> None:
-    """Refuse to replace the frames by their slopes."""
+def _check_files(
+    source: FrameSource,
+    frames: Sequence[str | Path],
+    output: str | Path,
+    layout: Layout,
+    configuration_file: str | Path,
+) -> None:
+    """Refuse frames of another shape, and to replace the frames by their slopes."""
     if Path(output).resolve() in [split_location(path)[0].resolve() for path in frames]:
         raise InputError(f"{output}: expected a name for the slopes, got a file of the frames")
+    if source.shape != layout.frame_shape:
+        got, expected = (f"{height} x {width}" for height, width in (source.shape, layout.frame_shape))
+        raise InputError(
+            f"{source.description}: frames of {got} pixels, expected {expected} as in {configuration_file}"
+        )
+
+
+def _block_frames(source: FrameSource, follow: bool) -> int:
+    """Return the number of frames to work on at a time."""
+    height, width = source.shape
+    return _FOLLOWED_FRAMES if follow else max(1, _BLOCK_BYTES // (4 * height * width))
 
 
 def _version(path: Path) -> str:

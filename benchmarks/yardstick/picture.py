@@ -1,0 +1,42 @@
+"""Picture of the page's first table: `python -m benchmarks.yardstick.picture docs/results/yardstick.md`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from faintspot.base.report.drawing import new_figure
+
+MARKERS = "os^D"
+
+
+def rows_of(text: str) -> list[list[str]]:
+    """Return the cells of the first table of candidates, its head first."""
+    lines = text[text.index("| candidate |") :].split("\n\n")[0].splitlines()
+    rows = [[cell.replace("`", "").strip() for cell in line.strip("|").split("|")] for line in lines]
+    return [rows[0], *rows[2:]]
+
+
+def draw(path: Path) -> Path:
+    """Draw the photon efficiency of every candidate for spots of each origin, the best on top."""
+    (_, *origins), *rows = rows_of(path.read_text(encoding="utf-8"))
+    origins = origins[: len(MARKERS)]
+    found = {
+        row[0]: [float(cell.split(" ")[0]) for cell in row[1 : len(origins) + 1]] for row in rows if row[1]
+    }
+    names = sorted(found, key=lambda name: sum(found[name]))
+    figure = new_figure(7.5, 0.32 * len(names) + 1.2)
+    axes = figure.subplots()
+    for place, (origin, marker) in enumerate(zip(origins, MARKERS, strict=True)):
+        axes.plot([found[name][place] for name in names], range(len(names)), marker, label=f"spots: {origin}")
+    axes.set(yticks=range(len(names)), yticklabels=names, xlim=(0, 1))
+    axes.set_xlabel("photon efficiency, 1: Cramer-Rao bound")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="upper left", frameon=False)
+    picture = path.with_suffix(".png")
+    figure.savefig(picture, dpi=110)
+    return picture
+
+
+if __name__ == "__main__":
+    print(draw(Path(sys.argv[1])))
