@@ -262,14 +262,14 @@ def test_slopes_of_frames_are_those_of_an_open_loop(tmp_path: Path) -> None:
     values = {name: np.zeros((20, 9)) for name in ("flux", "valid", "flags", "iterations", "bad_pixels")}
     x, y = rng.normal(0, 1, (2, 20, 9))
     values["flags"][3, 4], values["flags"][5, 6] = SubapertureFlag.NO_FLUX, SubapertureFlag.AT_SEARCH_LIMIT
-    attributes = {
+    attributes: dict[str, object] = {
         "fingerprint": "one",
         "configuration": (tmp_path / "faintspot.toml").read_text(),
     }
     keep, response = {"keep": ["limited"]}, {"response": [0.5] * 18}
     for name, more, gain in (("a.zarr", keep, 1.0), ("b.npz", keep, 1.0), ("c.zarr", response, 0.5)):
         with create_writer(
-            tmp_path / name, n_frames=20, n_subapertures=9, attributes=attributes | more, coordinates={}
+            tmp_path / name, n_frames=20, n_subapertures=9, attributes={**attributes, **more}, coordinates={}
         ) as writer:
             writer.append(0, {"x": x, "y": y, **values})
         with pytest.raises(InputError, match="frame_rate_hz: unknown; give it with --frame-rate-hz"):
