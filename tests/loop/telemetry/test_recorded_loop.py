@@ -253,7 +253,7 @@ def test_slopes_of_very_different_size_are_broken() -> None:
 
 
 def test_slopes_of_frames_are_those_of_an_open_loop(tmp_path: Path) -> None:
-    """Slopes in the axes of a turned array; what is flagged is left out, unless the run keeps it."""
+    """Slopes in the axes of a turned array; what is flagged is left out, unless kept or in the response."""
     pytest.importorskip("zarr")
     layout = replace(fs.Layout.grid((3, 3), pixels=8), angle_deg=90.0, pixel_scale_arcsec=0.2, diameter_m=1.8)
     layout.save(tmp_path / "faintspot.toml")
@@ -262,14 +262,14 @@ def test_slopes_of_frames_are_those_of_an_open_loop(tmp_path: Path) -> None:
     values = {name: np.zeros((20, 9)) for name in ("flux", "valid", "flags", "iterations", "bad_pixels")}
     x, y = rng.normal(0, 1, (2, 20, 9))
     values["flags"][3, 4], values["flags"][5, 6] = SubapertureFlag.NO_FLUX, SubapertureFlag.AT_SEARCH_LIMIT
-    attributes = {
+    attributes: dict[str, object] = {
         "fingerprint": "one",
         "configuration": (tmp_path / "faintspot.toml").read_text(),
-        "keep": ["limited"],
     }
-    for name in ("slopes.zarr", "slopes.npz"):
+    keep, response = {"keep": ["limited"]}, {"response": [0.5] * 18}
+    for name, more, gain in (("a.zarr", keep, 1.0), ("b.npz", keep, 1.0), ("c.zarr", response, 0.5)):
         with create_writer(
-            tmp_path / name, n_frames=20, n_subapertures=9, attributes=attributes, coordinates={}
+            tmp_path / name, n_frames=20, n_subapertures=9, attributes={**attributes, **more}, coordinates={}
         ) as writer:
             writer.append(0, {"x": x, "y": y, **values})
         with pytest.raises(InputError, match="frame_rate_hz: unknown; give it with --frame-rate-hz"):
@@ -278,6 +278,6 @@ def test_slopes_of_frames_are_those_of_an_open_loop(tmp_path: Path) -> None:
         assert not loop.is_closed
         assert (loop.commands, loop.subaperture_m, loop.pixel_scale_arcsec) == (None, 0.6, 0.2)
         assert np.array_equal(loop.cells, layout.cells)
-        expected = np.hstack([y, -x])
+        expected = np.hstack([y, -x]) / gain
         expected[3, [4, 13]] = np.nan
         assert np.allclose(loop.slopes, expected, atol=1e-6, equal_nan=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, increasing, one_of, real_array
 from faintspot.base.errors import InputError, errors_within
-from faintspot.base.flags import SubapertureFlag
+from faintspot.base.flags import NO_FLAG, SubapertureFlag
 from faintspot.base.npz import read_arrays
 from faintspot.base.toml_files import check_keys, parse_file
 from faintspot.base.validity import leave_out
@@ -216,13 +216,13 @@ def _of_slopes(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected slopes with their layout ({' '.join(run.notes)})")
     if layout.geometry != "square":
         raise InputError(f"{path}: expected a square array of lenslets, got a {layout.geometry} one")
-    slopes, gain_error = _proportional(run.stored)
+    slopes, usable, gain_error = _proportional(run.stored)
     x, y = np.split(slopes, 2, axis=1)
     angle = math.radians(layout.angle_deg)
     along, across = math.cos(angle) * x + math.sin(angle) * y, math.cos(angle) * y - math.sin(angle) * x
     values: dict[str, Any] = {
         "slopes": np.hstack([along, across]),
-        "flags": run.stored.variables["flags"] & ~np.uint8(run.keep),
+        "flags": run.stored.variables["flags"] & ~np.uint8(run.keep | usable),
         "slope_unit": "px",
         "cells": layout.cells,
         "loop": "open",
@@ -231,21 +231,22 @@ def _of_slopes(path: Path) -> dict[str, Any]:
     return values | {name: scale for name in _SCALES if (scale := getattr(layout, name)) is not None}
 
 
-def _proportional(stored: StoredSlopes) -> tuple[Floats, float]:
+def _proportional(stored: StoredSlopes) -> tuple[Floats, SubapertureFlag, float]:
     """Return slopes (frames, 2 n) divided by their response, NaN where that is low, and its relative error.
 
-    Of estimators whose slopes are not linear in the pixels no response is known: it is taken to be 1. Slopes
-    lost at the edges of their windows are the largest ones, so that those left vary too little.
+    The flags of slopes that count nevertheless: those at the edges of their windows are the largest ones, and
+    the response is that with them. Where it is not known it is taken to be 1, and they are lost.
     """
     slopes = np.hstack([stored.variables[axis] for axis in "xy"]).astype(np.float64)
-    lost = _OF_LOST * float((stored.variables["flags"] & SubapertureFlag.AT_SEARCH_LIMIT != 0).mean())
+    limited = SubapertureFlag.AT_SEARCH_LIMIT
+    share = float((stored.variables["flags"] & limited != 0).mean())
     if "response" not in stored.attributes:
-        return slopes, math.hypot(_GAIN_ERROR, lost)
+        return slopes, NO_FLAG, math.hypot(_GAIN_ERROR, _OF_LOST * share)
     response = np.asarray(stored.attributes["response"], np.float64)
     low = response < _LEAST_RESPONSE * max(float(np.median(response)), 0.0)
     slopes = np.where(low, np.nan, slopes / np.where(low, 1.0, response))
     nonlinear = _NONLINEAR * (1 - min(float(np.median(response)), 1.0))
-    return slopes, math.hypot(_GAIN_ERROR, nonlinear, lost)
+    return slopes, limited, math.hypot(_GAIN_ERROR, nonlinear, share)
 
 
 def _of_aot(path: Path) -> dict[str, Any]:

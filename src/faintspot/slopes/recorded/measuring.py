@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ from faintspot.slopes.pipeline.settings import Settings, with_preset, without_de
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.response import response
-from faintspot.slopes.recorded.survey import survey
+from faintspot.slopes.recorded.survey import stretches, survey
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
 
@@ -41,6 +42,7 @@ _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small
 _FOLLOWED_FRAMES = 32  # of a block, one after the other: for the progress bar
 
 _LOOKS_FOR_FLUX, _FRAMES_FOR_FLUX = 20, 50  # stretches of frames over the whole recording
+_FRAMES_FOR_RESPONSE = 200  # fewest, as of the statistics that need it
 
 Progress = Callable[[int, int], None]
 """Called with the number of finished frames and of all frames."""
@@ -191,9 +193,11 @@ def measure_recorded(
             attributes["reference_file"] = str(reference)
         with errors_within(configuration_file):
             measure = SpotFollower(pipeline) if follow else pipeline.with_dark(seen.mean)
-        shown = response(measure, seen.mean) if isinstance(measure, SlopePipeline) else None
-        if shown is not None:
-            attributes["response"] = shown.tolist()
+        if isinstance(measure, SlopePipeline) and source.n_frames >= _FRAMES_FOR_RESPONSE:
+            with suppress(InputError):  # of a damaged frame, which is reported when it is measured
+                attributes["response"] = response(measure, seen.mean, stretches(source)).tolist()
+        prepared = measure.plan.prepared
+        faults = prepared.faults
         with create_writer(
             output,
             n_frames=source.n_frames,
@@ -212,8 +216,7 @@ def measure_recorded(
                     summary.add(slopes)
                 if progress is not None:
                     progress(start + len(block), source.n_frames)
-    prepared = measure.plan.prepared
-    summary.failed_frames, summary.failure = prepared.faults, prepared.fault
+    summary.failed_frames, summary.failure = prepared.faults - faults, prepared.fault
     return summary
 
 

@@ -29,7 +29,7 @@ class Survey:
     """None if no values pile up."""
 
 
-def _stretches(source: FrameSource) -> Iterator[NDArray[np.generic]]:
+def stretches(source: FrameSource) -> Iterator[NDArray[np.generic]]:
     """Yield up to 50 frames from each of 20 places all over a recording, in blocks (n, h, w); none twice."""
     apart = max(source.n_frames / _LOOKS, _FRAMES)
     size = max(1, _BLOCK_PIXELS // (source.shape[0] * source.shape[1]))
@@ -43,7 +43,7 @@ def survey(source: FrameSource) -> Survey:
     """Look at frames all over a recording, up to 1000 of them."""
     frames, values, looked = MeanFrame(source.shape), LargestValues(), 0
     with suppress(InputError):  # of a damaged frame, which is reported when it is measured
-        for block in _stretches(source):
+        for block in stretches(source):
             frames.add(block)
             if looked < _FRAMES_FOR_SATURATION:
                 values.add(block)
