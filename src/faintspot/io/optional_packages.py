@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from types import ModuleType
 from typing import Any
 
 from faintspot.base.errors import MissingExtraError
@@ -28,7 +29,7 @@ def load_tifffile() -> Any:
     return _load("tifffile", "tifffile", "Reading a TIFF file")
 
 
-def load_zarr() -> Any:
+def load_zarr() -> ModuleType:
     """Return the package zarr."""
     return _load("zarr", "zarr", "Reading or writing a Zarr store")
 
@@ -41,7 +42,7 @@ def has_zarr() -> bool:
         return False
 
 
-def _load(module: str, package: str, purpose: str) -> Any:
+def _load(module: str, package: str, purpose: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +12,16 @@ from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.slope_product import SlopeProduct
 from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
-from faintspot.slopes.kernels.driver.products import ProductPart, add_products, finish_product, is_measured
+from faintspot.slopes.kernels.driver.products import (
+    ProductMemory,
+    ProductPart,
+    add_products,
+    finish_product,
+    is_measured,
+)
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
 _compiled = partial(compiled_with, source=__file__)
 
@@ -26,17 +32,17 @@ square of a slope along one axis, px^2."""
 
 @_compiled
 def true_slopes(
-    x: Any,
-    y: Any,
-    flags: Any,
-    error_x: Any,
-    error_y: Any,
-    covariance_xy: Any,
-    gain: Any,
-    slopes: Any,
-    errors: Any,
-    covariance: Any,
-    statistics: Any,
+    x: Singles,
+    y: Singles,
+    flags: NDArray[np.uint8],
+    error_x: Singles,
+    error_y: Singles,
+    covariance_xy: Singles,
+    gain: float,
+    slopes: Floats,
+    errors: Floats,
+    covariance: Floats,
+    statistics: Floats,
 ) -> None:
     """Write slopes [true px], all x, then all y, their errors and covariances; invalid: 0, infinite and 0.
 
@@ -75,7 +81,9 @@ FLUX, DISPLACEMENT, FLUX_TIMES_DISPLACEMENT = range(3)
 
 
 @_compiled
-def displaced_flux(commands: Any, flux: Any, columns: Any, work: Any, statistics: Any) -> None:
+def displaced_flux(
+    commands: Floats, flux: Singles, columns: Singles, work: tuple[Singles, Singles], statistics: Floats
+) -> None:
     """Write means of the flux, of the squared displacement by the mirror, and of their product.
 
     Parameters
@@ -108,7 +116,14 @@ def displaced_flux(commands: Any, flux: Any, columns: Any, work: Any, statistics
 
 @_compiled
 def integrate(
-    slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, next_row: Any, memory: Any
+    slopes: Floats,
+    columns: Singles,
+    gain: float,
+    keep: float,
+    largest: float,
+    rows: Floats,
+    next_row: int,
+    memory: ProductMemory,
 ) -> float:
     """Write the next command: `keep` times the latest minus `gain` times the wavefront, clipped.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -73,12 +74,12 @@ class PythonPlan(EstimatorPlan):
         self.found(typical_images(sensor.n, sensor.window), sensor.zero.copy())
 
     @property
-    def tables(self) -> Any:
+    def tables(self) -> gravity.GravityTables:
         """See `EstimatorPlan`."""
         return gravity.GravityTables()
 
     @property
-    def own_scratch(self) -> Any:
+    def own_scratch(self) -> Callable[..., gravity.GravityScratch]:
         """See `EstimatorPlan`."""
         return gravity.gravity_scratch
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -81,7 +81,7 @@ class KeepingBrightest(Centroid):
         """Knowledge required by the automatic options, if there are any."""
         return frozenset({Need.READ_NOISE, Need.WIDTH}) if self.is_automatic else frozenset()
 
-    def default_of(self, name: str, pixels: int) -> Any:
+    def default_of(self, name: str, pixels: int) -> float:
         """Return the default of `keep_brightest`."""
         if name == "keep_brightest":
             return min(max(FEWEST_KEPT, round(KEPT_FRACTION * pixels)), pixels - 1)
@@ -131,12 +131,12 @@ class GravityPlan(EstimatorPlan):
     # Tables of the kernels ------------------------------------------------------------------------------
 
     @cached_property
-    def tables(self) -> Any:
+    def tables(self) -> gravity.GravityTables:
         """Tables of the step before the background subtraction."""
         return gravity.GravityTables()
 
     @property
-    def own_scratch(self) -> Any:
+    def own_scratch(self) -> Callable[..., gravity.GravityScratch]:
         """See `EstimatorPlan`."""
         return gravity.gravity_scratch
 

@@ -90,13 +90,13 @@ class _Plan(LikelihoodPlan):
             self.flux_kernel = flux_above_edges
         self._posteriors: list[PosteriorGrid] = []
         self._levels: dict[float, int] = {}  # first table of each level of flux measured so far
-        self._scratch: tuple[int, Any] = (-1, None)
+        self._scratch = (-1, partial(spot_fits.spot_scratch))
         self._grid, self._spacing = NO_POSTERIOR.grid, NO_POSTERIOR.spacing
         self.table_shape = (0, 0, 0)
         """Shape of the table of each kind of sub-aperture: positions, rows, columns."""
 
     @property
-    def tables(self) -> Any:
+    def tables(self) -> spot_fits.PosteriorTables:
         """See `EstimatorPlan`."""
         if len(self._posteriors) > 1:
             self._posteriors = [spot_tables.joined(self._posteriors)]
@@ -106,7 +106,7 @@ class _Plan(LikelihoodPlan):
         )
 
     @property
-    def own_scratch(self) -> Any:
+    def own_scratch(self) -> partial[spot_fits.SpotScratch]:
         """See `EstimatorPlan`."""
         positions = len(self.tables.grid)
         if self._scratch[0] != positions:

@@ -57,7 +57,7 @@ class Smoothed(KeepingBrightest):
         """See `Estimator`."""
         return BrightestPixels.like(self)
 
-    def default_of(self, name: str, pixels: int) -> Any:
+    def default_of(self, name: str, pixels: int) -> float:
         """See `Options`."""
         return _USUAL_PX if name == "smoothing_px" else super().default_of(name, pixels)
 

@@ -207,7 +207,7 @@ class _Plan(EstimatorPlan):
         return min(found)[1:] if found else None
 
     @cached_property
-    def tables(self) -> Any:
+    def tables(self) -> window.WindowTables | window.RowTables:
         """See `EstimatorPlan`."""
         sensor, kinds = self.sensor, self.weights.kinds(self.sensor.n)
         top, left, bottom, right = self._region
