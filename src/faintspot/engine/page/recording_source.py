@@ -62,7 +62,7 @@ class RecordingSource:
         self._playing, self._speed, self._position_s = True, 1.0, 0.0
         self._looked_s = time.monotonic()
         self._next, self._shown_picture, self._moved = 0, -1, True
-        self._block: tuple[int, NDArray[Any]] = (-1, np.empty(0, self._type))
+        self._block: tuple[int, NDArray[np.void]] = (-1, np.empty(0, self._type))
 
     @property
     def length_s(self) -> float:
@@ -135,7 +135,7 @@ class RecordingSource:
 
     # Reading ------------------------------------------------------------------------------------------------
 
-    def _records(self, first: int, end: int) -> NDArray[Any]:
+    def _records(self, first: int, end: int) -> NDArray[np.void]:
         """Return the records of frames `first` to `end`, in the order of the store."""
         together = self._store.frames_together
         parts = [np.empty(0, self._type)]
@@ -144,7 +144,7 @@ class RecordingSource:
             parts.append(self._of_block(number, together)[max(first - begin, 0) : end - begin])
         return np.concatenate(parts)
 
-    def _of_block(self, number: int, together: int) -> NDArray[Any]:
+    def _of_block(self, number: int, together: int) -> NDArray[np.void]:
         """Return the records of one chunk of the store; the last chunk is cached."""
         if self._block[0] != number:
             start, stop = number * together, min((number + 1) * together, self._store.frames)

@@ -44,7 +44,7 @@ class Ring:
         Type of an item.
     """
 
-    def __init__(self, cell: NDArray[np.int64], items: NDArray[Any]) -> None:
+    def __init__(self, cell: NDArray[np.int64], items: NDArray[np.void]) -> None:
         self.items, self.kind, self._cell = items, items.dtype, cell
 
     @property
@@ -58,7 +58,7 @@ class Ring:
         store(self._cell, 0, written)
         fence()  # before the next item overwrites the oldest
 
-    def since(self, cursor: int, most: int | None = None) -> tuple[NDArray[Any], int, int]:
+    def since(self, cursor: int, most: int | None = None) -> tuple[NDArray[np.void], int, int]:
         """Return copies of the items from a cursor on, in order.
 
         Parameters

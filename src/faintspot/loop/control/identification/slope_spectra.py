@@ -10,7 +10,6 @@ from __future__ import annotations
 import copy
 import math
 from functools import lru_cache, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,7 +160,13 @@ def _four_quarters(quarter: Floats, sign: int) -> Floats:
 
 @_compiled
 def _interpolate(
-    apart_m: Any, shift_m: Any, scale: Any, tables: Any, derived: Any, weights: Any, out: Any
+    apart_m: Floats,
+    shift_m: Floats,
+    scale: tuple[float, float, int],
+    tables: Floats,
+    derived: int,
+    weights: Floats,
+    out: Floats,
 ) -> None:
     """Write tables at shifted separations by cubic splines, then derivatives [1/m] along x and along y.
 
@@ -203,7 +208,7 @@ def _interpolate(
 
 
 @_compiled
-def _spline(apart_m: Any, side: Any, spacing: Any, origin: Any, nodes: Any, weights: Any) -> int:
+def _spline(apart_m: float, side: float, spacing: float, origin: int, nodes: int, weights: Floats) -> int:
     """Write weights and derivatives (2, 4) of coefficients at a separation; return the first one's place."""
     ratio = apart_m / side
     root = math.sqrt(1.0 + ratio * ratio)
