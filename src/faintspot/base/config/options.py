@@ -192,6 +192,10 @@ class PerSubaperture:
         return PerSubaperture, (self.default, dict(self.others))  # a read-only mapping cannot be pickled
 
 
+Value = float | str | NDArray[np.generic] | PerSubaperture | None
+"""An option that may differ between sub-apertures: one value, an array, or a default and others."""
+
+
 @dataclass(frozen=True, eq=False)
 class Options:
     """Base class of frozen dataclasses whose fields are declared by `option` and checked on creation.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import LARGEST_FLOAT32
-from faintspot.base.config.options import is_auto, option
+from faintspot.base.config.options import Value, is_auto, option
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.algorithms.automatic import automatic_kept_pixels
 from faintspot.slopes.estimators.algorithms.brightest import RULES, most_kept, threshold_rank
@@ -48,7 +48,7 @@ class Centroid(Estimator):
 class KeepingBrightest(Centroid):
     """Centre of gravity of the brightest pixels."""
 
-    keep_brightest: Any = option(
+    keep_brightest: Value = option(
         None,
         "Number of pixels kept by the background subtraction. Default: 8 % of the window's pixels, at "
         'least 5. "auto": chosen by `estimators.algorithms.automatic.automatic_kept_pixels`.',
@@ -57,7 +57,7 @@ class KeepingBrightest(Centroid):
         whole=True,
         automatic=True,
     )
-    rule: Any = option(
+    rule: Value = option(
         "subtract_next",
         "Rule that sets the level subtracted from the kept pixels; see `faintspot.brightest_pixels`.",
         choices=RULES,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import option
+from faintspot.base.config.options import Value, option
 from faintspot.slopes.estimators.base import Need, Style
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.scene import Scene
@@ -23,7 +23,7 @@ from faintspot.slopes.kernels.spot_fits import fits as spot_fits
 class Fitted(Stepping):
     """Fit of the PSF to the image."""
 
-    blur_px: Any = option(
+    blur_px: Value = option(
         0.0,
         "Standard deviation of the Gaussian blur applied to the PSF, for broadening by turbulence.",
         unit="px",

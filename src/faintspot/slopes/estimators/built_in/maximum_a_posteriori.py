@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import option
+from faintspot.base.config.options import Value, option
 from faintspot.base.config.presets import PRESETS
 from faintspot.base.sizes import MOST_NUMBERS, check_size
 from faintspot.slopes.estimators import spot_tables
@@ -36,7 +36,7 @@ _LEVELS = 8
 class MaximumAPosteriori(Likelihood):
     """Maximum likelihood with a prior centred on the reference position or on the predicted slope."""
 
-    prior_std_px: Any = option(
+    prior_std_px: Value = option(
         None,
         "Standard deviation of the prior on the position. Default: no prior other than the search range.",
         unit="px",

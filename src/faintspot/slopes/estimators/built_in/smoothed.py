@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import option
+from faintspot.base.config.options import Value, option
 from faintspot.slopes.estimators.algorithms.automatic import automatic_smoothing
 from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Step, Style
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
@@ -30,7 +30,7 @@ _WIDTHS = (1.0, 0.6, 0.8, 1.3, 1.7)  # multiples of the automatic width
 class Smoothed(KeepingBrightest):
     """Centre of gravity of the brightest pixels of the image smoothed by a Gaussian."""
 
-    smoothing_px: Any = option(
+    smoothing_px: Value = option(
         None,
         "Standard deviation of the Gaussian. Default: 0.7.",
         unit="px",

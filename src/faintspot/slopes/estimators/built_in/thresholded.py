@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import option
+from faintspot.base.config.options import Value, option
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.base import Style
 from faintspot.slopes.estimators.built_in.gravity import Centroid, Floats, GravityPlan
@@ -28,7 +28,7 @@ _SMALLEST_E = 0.01
 class Thresholded(Centroid):
     """Centre of gravity after subtracting a threshold from every pixel; negative pixels are set to 0."""
 
-    threshold_e: Any = option(None, "Level subtracted from every pixel.", unit="e-", low=0.0, high=1e12)
+    threshold_e: Value = option(None, "Level subtracted from every pixel.", unit="e-", low=0.0, high=1e12)
 
     name = "thresholded"
     label = "thresholded centre of gravity"
