@@ -97,7 +97,7 @@ def layout_around(centres: ArrayLike, frame_shape: tuple[int, int], side: int) -
     return Layout(frame_shape, (side, side), corners, finite_array("lenslet centres", centres))
 
 
-def parts_of(source: str | Path | Mapping[str, Any]) -> Configuration:
+def parts_of(source: str | Path | Mapping[str, object]) -> Configuration:
     """Return the pipeline's parts from a tool's configuration.
 
     Parameters

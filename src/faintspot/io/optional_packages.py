@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-from types import ModuleType
 from typing import Any
 
 from faintspot.base.errors import MissingExtraError
@@ -29,7 +28,7 @@ def load_tifffile() -> Any:
     return _load("tifffile", "tifffile", "Reading a TIFF file")
 
 
-def load_zarr() -> ModuleType:
+def load_zarr() -> Any:
     """Return the package zarr."""
     return _load("zarr", "zarr", "Reading or writing a Zarr store")
 
@@ -42,7 +41,7 @@ def has_zarr() -> bool:
         return False
 
 
-def _load(module: str, package: str, purpose: str) -> ModuleType:
+def _load(module: str, package: str, purpose: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError:

@@ -131,7 +131,7 @@ class PageState:
             strip[:, 0] -= strip[-1, 0]
         shown = np.unique(strip[:, _STRIP.index("method")]).astype(int).tolist()
         star = self.star_flux_e
-        values: dict[str, Any] = {
+        values: dict[str, object] = {
             "flux_of": "kept by the method" if star is None else "of the star",
             "strip": _STRIP,
             "strip_s": STRIP_S,
@@ -268,7 +268,7 @@ class PageState:
         return self.methods[method] if method < len(self.methods) else f"method {method}"
 
 
-def flag_names() -> list[dict[str, Any]]:
+def flag_names() -> list[dict[str, object]]:
     """Return the possible flags of a sub-aperture, for the page's legend."""
     return [
         {"bit": int(flag), "name": str(flag.name).lower().replace("_", " "), "invalid": bool(flag & INVALID)}
@@ -279,7 +279,7 @@ def flag_names() -> list[dict[str, Any]]:
 def _in_plain(compared: MethodDifference) -> dict[str, Any]:
     """Return a figure with half its confidence interval, and its difference from the first method's."""
     mean, difference = compared.mean, compared.difference
-    row: dict[str, Any] = {"mean": mean.value, "half": (mean.high - mean.low) / 2}
+    row: dict[str, object] = {"mean": mean.value, "half": (mean.high - mean.low) / 2}
     if difference is not None:
         row |= {"difference": difference.value, "difference_half": (difference.high - difference.low) / 2}
         row["decided"] = difference.decided

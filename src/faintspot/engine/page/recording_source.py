@@ -113,7 +113,7 @@ class RecordingSource:
         """Return the functions of the requests, by name."""
         return {"play": self._play}
 
-    def _play(self, request: Mapping[str, object]) -> Mapping[str, Any]:
+    def _play(self, request: Mapping[str, object]) -> Mapping[str, object]:
         """Move to "position_s", play or pause ("playing"), and set the "speed"."""
         position, speed, playing = (request.get(name) for name in ("position_s", "speed", "playing"))
         if position is not None:
@@ -172,7 +172,7 @@ class RecordingSource:
             return None
         return np.asarray(self._store.read("commands", end - 1, end)[0], np.float64)
 
-    def _changes(self, end: int, anew: bool) -> list[dict[str, Any]]:
+    def _changes(self, end: int, anew: bool) -> list[dict[str, object]]:
         """Return the changes of settings up to this moment that have not been sent yet."""
         sent = 0 if anew else self._n_sent
         self._n_sent = int(np.searchsorted(self._change_indices, end))

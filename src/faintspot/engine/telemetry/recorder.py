@@ -106,7 +106,7 @@ class Recorder:
         self._change_cursor = self._dropped_changes = (
             0  # from the first one, to know the settings at the start
         )
-        self._changes: list[dict[str, Any]] = []
+        self._changes: list[dict[str, object]] = []
         described = ("layout", "settings", "reference", "parts", "control")
         attributes = {
             "name": name,

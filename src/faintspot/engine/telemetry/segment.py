@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -85,7 +83,7 @@ class Ring:
         return copies[overwritten:], last, first - cursor + overwritten
 
 
-def layout_values(layout: Layout) -> dict[str, Any]:
+def layout_values(layout: Layout) -> dict[str, object]:
     """Return a layout as plain values, from which `Layout` can be rebuilt."""
-    values: dict[str, Any] = plain_values(vars(layout))
+    values: dict[str, object] = plain_values(vars(layout))
     return values

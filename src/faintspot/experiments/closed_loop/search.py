@@ -29,7 +29,9 @@ Axes = Mapping[str, Sequence[Any]]
 """Values of each option; the usual one first."""
 
 
-def coordinate_search(axes: Axes, badness: Callable[[Choice, str, Sequence[Any]], Sequence[float]]) -> Choice:
+def coordinate_search(
+    axes: Axes, badness: Callable[[Choice, str, Sequence[object]], Sequence[float]]
+) -> Choice:
     """Look along each axis in turn, from the first values, and again along those for which others changed.
 
     Parameters
@@ -192,7 +194,7 @@ def _is_scale(values: Sequence[object]) -> bool:
 
 def smoothed(
     kind: MethodKind, stars: Sequence[LoopConfiguration], choices: Sequence[Choice]
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """Return the choices at several fluxes, with numbers among the options that are a power of the flux.
 
     The Strehl ratio hardly depends on an option near its best value, so that the best one of a few short runs
@@ -256,7 +258,7 @@ class _Trials:
     ) -> None:
         self._kind, self._configuration, self._search = kind, configuration, search
         self._tuned, self._advance, self._frames = tuned, advance, 0
-        self._strehl: dict[tuple[tuple[Any, ...], int, int], float] = {}
+        self._strehl: dict[tuple[tuple[object, ...], int, int], float] = {}
 
     def best(self) -> Tuned:
         """Return the best of the values that are tuned."""
@@ -293,7 +295,7 @@ class _Trials:
                 self._advance(self._frames)
         return self._strehl[key]
 
-    def _neighbours(self, choice: Choice) -> list[dict[str, Any]]:
+    def _neighbours(self, choice: Choice) -> list[dict[str, object]]:
         """Return the choices one step away in one option."""
         neighbours = []
         for name, tunable in self._tuned.items():
@@ -303,7 +305,7 @@ class _Trials:
                     neighbours.append({**choice, name: tunable.values[step]})
         return neighbours
 
-    def _climbed(self, best: dict[str, Any]) -> dict[str, Any]:
+    def _climbed(self, best: dict[str, object]) -> dict[str, object]:
         """Return where steps to the best neighbour end."""
         for _ in range(self._search.rounds):
             better = max(self._neighbours(best), key=self._fine, default=best)
@@ -312,7 +314,7 @@ class _Trials:
             best = better
         return best
 
-    def _between(self, best: Choice) -> dict[str, Any]:
+    def _between(self, best: Choice) -> dict[str, object]:
         """Return a choice with positive numbers at the top of the parabola through their neighbours."""
         choice = dict(best)
         for name, tunable in self._tuned.items():

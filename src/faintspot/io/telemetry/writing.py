@@ -63,9 +63,7 @@ class TelemetryStore:
         with zarr.config.set({"array.write_empty_chunks": True}):
             self._arrays: dict[str, Any] = dict(group.arrays())
 
-    def append(
-        self, records: NDArray[np.void], images: NDArray[Any], attributes: Mapping[str, object]
-    ) -> None:
+    def append(self, records: NDArray[Any], images: NDArray[Any], attributes: Mapping[str, object]) -> None:
         """Append records and images and replace attributes; on return they are in the store.
 
         Raises
@@ -116,6 +114,6 @@ def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mappin
     hidden.rename(path)
 
 
-def _columns(items: NDArray[np.void]) -> list[tuple[str, NDArray[np.void]]]:
+def _columns(items: NDArray[Any]) -> list[tuple[str, NDArray[Any]]]:
     """Return the stored fields of a structured array, by name."""
     return [(name, items[name]) for name in stored_names(items.dtype)]

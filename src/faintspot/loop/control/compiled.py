@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +13,7 @@ from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.slope_product import SlopeProduct
 from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
-from faintspot.slopes.kernels.driver.products import (
-    ProductMemory,
-    ProductPart,
-    add_products,
-    finish_product,
-    is_measured,
-)
+from faintspot.slopes.kernels.driver.products import ProductPart, add_products, finish_product, is_measured
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -116,14 +111,7 @@ def displaced_flux(
 
 @_compiled
 def integrate(
-    slopes: Floats,
-    columns: Singles,
-    gain: float,
-    keep: float,
-    largest: float,
-    rows: Floats,
-    next_row: int,
-    memory: ProductMemory,
+    slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, next_row: Any, memory: Any
 ) -> float:
     """Write the next command: `keep` times the latest minus `gain` times the wavefront, clipped.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import comb
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +67,7 @@ class SplineGrid:
 
         A small part of it is that of second derivatives.
         """
-        form: Any = 0
+        form: object = 0
         for order, share in ((3, 1.0), (2, _CURVATURE)):
             for along in range(order + 1):
                 matrix = sparse.kron(_steps(self.shape[0], order - along), _steps(self.shape[1], along))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,13 +161,7 @@ def _four_quarters(quarter: Floats, sign: int) -> Floats:
 
 @_compiled
 def _interpolate(
-    apart_m: Floats,
-    shift_m: Floats,
-    scale: tuple[float, float, int],
-    tables: Floats,
-    derived: int,
-    weights: Floats,
-    out: Floats,
+    apart_m: Any, shift_m: Any, scale: Any, tables: Any, derived: Any, weights: Any, out: Any
 ) -> None:
     """Write tables at shifted separations by cubic splines, then derivatives [1/m] along x and along y.
 

@@ -105,7 +105,7 @@ class KeepingBrightest(Centroid):
         number = "an automatic number of" if is_auto(self.keep_brightest) else kept
         return f"{number} brightest of {pixels} pixels kept (rule {rule}), centre of gravity"
 
-    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[object]]:
         """Return numbers of kept pixels around the automatic one, larger for speckled spots."""
         kept = float(automatic_kept_pixels(**scene.rule_arguments, method=self.automatic_method))
         kept *= max(1.0, scene.d_over_r0)

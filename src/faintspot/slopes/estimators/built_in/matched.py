@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +40,7 @@ class Fitted(Stepping):
 
     needs = frozenset({Need.PSF})
 
-    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[object]]:
         """Return blurs to try for speckled spots."""
         if not scene.d_over_r0:
             return {}

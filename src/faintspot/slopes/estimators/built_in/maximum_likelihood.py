@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +52,7 @@ class Likelihood(Fitted):
         """Keep the number of steps: more would follow the weights of high flux."""
         return self
 
-    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[object]]:
         """Return the options of the fit and, for speckled spots, also model errors."""
         errors = {"model_error": list(_MODEL_ERRORS)} if scene.d_over_r0 else {}
         return {**super().tuned(scene), **errors}

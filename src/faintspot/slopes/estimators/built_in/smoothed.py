@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +65,7 @@ class Smoothed(KeepingBrightest):
         width = self._span("smoothing_px", n_subapertures, pixels)
         return f"Gaussian smoothing of {width} px; {self.kept_in_words(n_subapertures, pixels)}"
 
-    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[object]]:
         """Return numbers of kept pixels and widths around the automatic ones."""
         width = float(automatic_smoothing(**scene.rule_arguments)) or _USUAL_PX
         return {**super().tuned(scene), "smoothing_px": [width * factor for factor in _WIDTHS]}

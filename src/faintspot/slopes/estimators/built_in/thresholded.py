@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +39,7 @@ class Thresholded(Centroid):
         """See `Estimator`."""
         return f"centre of gravity of the flux above {self._span('threshold_e', n_subapertures, pixels)} e-"
 
-    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[object]]:
         """Return multiples of the noise of a dark pixel, and fractions of a typical spot's peak."""
         peak = scene.flux_e / (2.5 * scene.seen_fwhm_px**2)
         levels = [factor * scene.dark_noise_e for factor in _OF_NOISE] + [
