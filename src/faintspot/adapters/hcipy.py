@@ -126,7 +126,7 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         self._slopes = hcipy.Field(self.measured.measure(frame, prior_px=prior_px), self.estimation_grid)
         return self._slopes
 
-    def calibrating(self, flux_e: float | None = None) -> object:
+    def calibrating(self, flux_e: float | None = None) -> Any:
         """Measure noise-free images in a `with` block; see `ToolSlopes.calibrating`."""
         return self.measured.calibrating(flux_e)
 

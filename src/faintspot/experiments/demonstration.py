@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +81,7 @@ def demonstration_layout() -> Layout:
 
 def simulate(
     layout: Layout, flux_e: float, n_frames: int, rng: np.random.Generator
-) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
+) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """Return frames in ADU and the true positions (n_frames, n, 2), px."""
     return sensor_frames(
         layout.corners,

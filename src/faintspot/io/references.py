@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from faintspot.io.slopes import read_slopes
 from faintspot.io.stored.slopes_format import StoredSlopes
 
 
-def read_reference(location: str | Path) -> NDArray[np.generic]:
+def read_reference(location: str | Path) -> NDArray[Any]:
     """Read reference positions for `SlopePipeline`.
 
     Parameters

@@ -27,7 +27,7 @@ class ClientRequests(Protocol):
         ...
 
 
-def answered(client_requests: ClientRequests, request: dict[str, Any]) -> dict[str, object]:
+def answered(client_requests: ClientRequests, request: dict[str, Any]) -> dict[str, Any]:
     """Carry out a request; always return an answer."""
     functions = client_requests.functions()
     try:

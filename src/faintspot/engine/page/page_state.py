@@ -123,7 +123,7 @@ class PageState:
 
     # Messages to the page ------------------------------------------------------------------------------
 
-    def now(self) -> tuple[dict[str, Any], dict[str, NDArray[np.generic]]]:
+    def now(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return values and arrays of the newest frame and of the strip charts."""
         newest = self.newest
         strip = np.array(self._strip, np.float64).reshape(-1, len(_STRIP))
@@ -140,7 +140,7 @@ class PageState:
             "lost": self.lost,
             "missed": self.missed,
         }
-        arrays: dict[str, NDArray[np.generic]] = {"strip": strip.astype(np.float32)}
+        arrays: dict[str, NDArray[Any]] = {"strip": strip.astype(np.float32)}
         if newest is not None:
             values |= {"frame": int(newest["frame"]), "method": self._method_name(int(newest["method"]))}
             arrays |= {name: newest[name] for name in ("x", "y", "flux", "flags")}
@@ -268,7 +268,7 @@ class PageState:
         return self.methods[method] if method < len(self.methods) else f"method {method}"
 
 
-def flag_names() -> list[dict[str, object]]:
+def flag_names() -> list[dict[str, Any]]:
     """Return the possible flags of a sub-aperture, for the page's legend."""
     return [
         {"bit": int(flag), "name": str(flag.name).lower().replace("_", " "), "invalid": bool(flag & INVALID)}

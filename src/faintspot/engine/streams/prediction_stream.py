@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -87,7 +88,7 @@ class PredictionStream:
         self._follower.look()
         self.counters.restarts = self._follower.counters.restarts
 
-    def status(self) -> dict[str, object]:
+    def status(self) -> dict[str, Any]:
         """Return the stream's state as plain values."""
         return {"stream": self.stream, "obstacle": self._follower.obstacle, **asdict(self.counters)}
 

@@ -264,7 +264,7 @@ class TelemetryRing(Segment):
         item["text"][: len(text)] = np.frombuffer(text, np.uint8)
         ring.count(written + 1)
 
-    def changes_since(self, cursor: int) -> tuple[list[dict[str, object]], int, int]:
+    def changes_since(self, cursor: int) -> tuple[list[dict[str, Any]], int, int]:
         """Return the changes of settings from a cursor on, as `Ring.since` does.
 
         Each has frame, number, changes (values by name) and where (sub-apertures, None for all).

@@ -255,7 +255,7 @@ def default_methods(configuration: LoopConfiguration) -> list[str]:
     return names + [f"{name}{CONTROL_SIGN}{Kalman.kind}" for name in kalman]
 
 
-def _wider(values: Sequence[Any], option: Option) -> Sequence[object]:
+def _wider(values: Sequence[Any], option: Option) -> Sequence[Any]:
     """Return values with some beyond both ends: in loops the best may be beyond."""
     if option.choices or option.whole or len(values) < _FEWEST_TO_WIDEN or min(values) <= 0:
         return values

@@ -29,9 +29,7 @@ Axes = Mapping[str, Sequence[Any]]
 """Values of each option; the usual one first."""
 
 
-def coordinate_search(
-    axes: Axes, badness: Callable[[Choice, str, Sequence[object]], Sequence[float]]
-) -> Choice:
+def coordinate_search(axes: Axes, badness: Callable[[Choice, str, Sequence[Any]], Sequence[float]]) -> Choice:
     """Look along each axis in turn, from the first values, and again along those for which others changed.
 
     Parameters
@@ -194,7 +192,7 @@ def _is_scale(values: Sequence[object]) -> bool:
 
 def smoothed(
     kind: MethodKind, stars: Sequence[LoopConfiguration], choices: Sequence[Choice]
-) -> list[dict[str, object]]:
+) -> list[dict[str, Any]]:
     """Return the choices at several fluxes, with numbers among the options that are a power of the flux.
 
     The Strehl ratio hardly depends on an option near its best value, so that the best one of a few short runs
@@ -258,7 +256,7 @@ class _Trials:
     ) -> None:
         self._kind, self._configuration, self._search = kind, configuration, search
         self._tuned, self._advance, self._frames = tuned, advance, 0
-        self._strehl: dict[tuple[tuple[object, ...], int, int], float] = {}
+        self._strehl: dict[tuple[tuple[Any, ...], int, int], float] = {}
 
     def best(self) -> Tuned:
         """Return the best of the values that are tuned."""
@@ -295,7 +293,7 @@ class _Trials:
                 self._advance(self._frames)
         return self._strehl[key]
 
-    def _neighbours(self, choice: Choice) -> list[dict[str, object]]:
+    def _neighbours(self, choice: Choice) -> list[dict[str, Any]]:
         """Return the choices one step away in one option."""
         neighbours = []
         for name, tunable in self._tuned.items():
@@ -305,7 +303,7 @@ class _Trials:
                     neighbours.append({**choice, name: tunable.values[step]})
         return neighbours
 
-    def _climbed(self, best: dict[str, object]) -> dict[str, object]:
+    def _climbed(self, best: dict[str, Any]) -> dict[str, Any]:
         """Return where steps to the best neighbour end."""
         for _ in range(self._search.rounds):
             better = max(self._neighbours(best), key=self._fine, default=best)
@@ -314,7 +312,7 @@ class _Trials:
             best = better
         return best
 
-    def _between(self, best: Choice) -> dict[str, object]:
+    def _between(self, best: Choice) -> dict[str, Any]:
         """Return a choice with positive numbers at the top of the parabola through their neighbours."""
         choice = dict(best)
         for name, tunable in self._tuned.items():

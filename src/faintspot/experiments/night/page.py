@@ -81,7 +81,7 @@ def write_night(night: Night, folder: str | Path) -> list[Path]:
     return [folder / NIGHT_STORE, folder / SUMMARY_FILE, *pages]
 
 
-def night_summary(night: Night) -> dict[str, object]:
+def night_summary(night: Night) -> dict[str, Any]:
     """Return differences, verdicts, lines and means as plain values for JSON; null is not known."""
     sets = [*night.set_names, "all"]
     return {
@@ -235,11 +235,11 @@ def _facts(night: Night) -> Mapping[str, str]:
     )
 
 
-def _plain_record(record: object, names: Mapping[str, str]) -> dict[str, object]:
+def _plain_record(record: object, names: Mapping[str, str]) -> dict[str, Any]:
     return {name: plain(getattr(record, attribute)) for name, attribute in names.items()}
 
 
-def _plain_estimate(estimate: Estimate) -> dict[str, object] | None:
+def _plain_estimate(estimate: Estimate) -> dict[str, Any] | None:
     if not math.isfinite(estimate.value):
         return None
     numbers = {name: plain(getattr(estimate, name)) for name in ("value", "standard_error", "low", "high")}

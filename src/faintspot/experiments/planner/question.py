@@ -438,7 +438,7 @@ class Question(Options):
 _LAYOUT, _LASER = "layout", "laser"
 
 
-def read_camera(path: str | Path) -> dict[str, object]:
+def read_camera(path: str | Path) -> dict[str, Any]:
     """Return the values of a camera file by the names of `faintspot.experiments.Question`.
 
     A table [layout.grid], as in a configuration, gives `layout`; [laser] gives `laser`.
@@ -451,7 +451,7 @@ def read_camera(path: str | Path) -> dict[str, object]:
     document = parse_file(path)
     groups = {name: declared.group for name, declared in Question.declared().items()}
     check_keys(f"{path}: ", document, [*groups.values(), _LAYOUT, _LASER], what="table")
-    values: dict[str, object] = {}
+    values: dict[str, Any] = {}
     for table, content in document.items():
         entries = checked_table(f"{path}: {table}", content)
         if table == _LAYOUT:

@@ -256,7 +256,7 @@ class EstimatorPlan:
     """Number of rows in the settings table."""
     needs_flux: bool = False
     """Whether the flux is measured in every frame."""
-    flux_kernel: object = staticmethod(flux_of_groups)
+    flux_kernel: Any = staticmethod(flux_of_groups)
     """Compiled function that measures the flux."""
     flux_step: float = 1.02
     """Measured flux is quantised in steps of this factor, so that settings change slowly."""

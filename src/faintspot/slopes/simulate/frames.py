@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -131,7 +131,7 @@ def sensor_frames(
     detector: Detector | None = None,
     rng: np.random.Generator | None = None,
     **spot_shape: Unpack[SpotShape],
-) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
+) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """Return frames of a whole Shack-Hartmann sensor in ADU and the true positions of their spots.
 
     The flux of each spot is confined to its own window, as with a field stop. For more frames than fit into

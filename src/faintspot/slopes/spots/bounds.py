@@ -34,7 +34,7 @@ _FLUX_STEPS_PER_DECADE = 12
 class SpotImages(Protocol):
     """Object that provides noiseless spot images at given positions, such as `faintspot.PSF`."""
 
-    def images(self, positions: object, shape: tuple[int, int], flux_e: object = 1.0) -> Floats:
+    def images(self, positions: Any, shape: tuple[int, int], flux_e: Any = 1.0) -> Floats:
         """Return images (n, ny, nx) of spots at positions (n, 2)."""
 
 

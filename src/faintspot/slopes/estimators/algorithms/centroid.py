@@ -13,7 +13,7 @@ from faintspot.slopes.kernels.gravity.stacks import centroid_stack
 from faintspot.slopes.kernels.parallel import run_groups
 
 
-def centre_of_gravity(images: ArrayLike) -> NDArray[np.generic]:
+def centre_of_gravity(images: ArrayLike) -> NDArray[Any]:
     """Return the centre of gravity of each image.
 
     Parameters

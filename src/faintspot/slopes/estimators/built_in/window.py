@@ -124,7 +124,7 @@ class _Plan(EstimatorPlan):
     estimator: Window
 
     @property
-    def kernel(self) -> object:
+    def kernel(self) -> Any:
         """See `EstimatorPlan`."""
         return window.window_of_groups if self._columns is None else window.window_in_rows
 
