@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -97,7 +97,7 @@ def layout_around(centres: ArrayLike, frame_shape: tuple[int, int], side: int) -
     return Layout(frame_shape, (side, side), corners, finite_array("lenslet centres", centres))
 
 
-def parts_of(source: str | Path | Mapping[str, Any]) -> Configuration:
+def parts_of(source: str | Path | Mapping[str, object]) -> Configuration:
     """Return the pipeline's parts from a tool's configuration.
 
     Parameters
@@ -119,14 +119,19 @@ def parts_of(source: str | Path | Mapping[str, Any]) -> Configuration:
     raise InputError(f"faintspot: expected a file or tables of settings, got {type(source).__name__}")
 
 
-class AdapterOptions(TypedDict, total=False):
-    """Options that every adapter passes on to `ToolSlopes`."""
+class PipelineOptions(TypedDict, total=False):
+    """Options that `ToolSlopes` passes on to `faintspot.SlopePipeline`."""
 
     psf: PSF | None
     score: Score | None
+    threads: int | None
+
+
+class AdapterOptions(PipelineOptions, total=False):
+    """Options that every adapter passes on to `ToolSlopes`."""
+
     calibration_flux_e: float
     flux_frames: float | None
-    threads: int | None
 
 
 class ToolSlopes:
@@ -140,15 +145,13 @@ class ToolSlopes:
         Default: images are in electrons.
     unit_per_px : (2,) array
         The tool's unit per pixel along x and y; negative if its axis is opposite to the frame's.
-    psf, score : PSF, Score, optional
-        For estimators that need them; see `faintspot.SlopePipeline`.
     calibration_flux_e : float
         Mean flux of a sub-aperture, electrons, at which noise-free frames are measured.
     flux_frames : float, optional
         Time constant (frames) of the running mean of the flux for estimators that use it, if the settings
         have no `flux_e`; begins after 20 frames. None: the flux is that of each frame.
-    threads : int, optional
-        See `faintspot.SlopePipeline`.
+    **options
+        psf, score and threads; see `faintspot.SlopePipeline`.
 
     Raises
     ------
@@ -163,13 +166,11 @@ class ToolSlopes:
         calibration: Calibration | None = None,
         *,
         unit_per_px: ArrayLike = (1.0, 1.0),
-        psf: PSF | None = None,
-        score: Score | None = None,
         calibration_flux_e: float = CALIBRATION_FLUX_E,
         flux_frames: float | None = FLUX_FRAMES,
-        threads: int | None = None,
+        **options: Unpack[PipelineOptions],
     ) -> None:
-        self.pipeline = SlopePipeline(layout, settings, calibration, psf=psf, score=score, threads=threads)
+        self.pipeline = SlopePipeline(layout, settings, calibration, **options)
         self.unit_per_px = finite_array("unit_per_px", unit_per_px).astype(np.float64).reshape(2, 1)
         self._flux_e = _checked_flux(calibration_flux_e)
         if flux_frames is not None:

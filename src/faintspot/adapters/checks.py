@@ -6,7 +6,6 @@ import functools
 import importlib.metadata
 import re
 import warnings
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,7 +48,7 @@ def _numbers(version: str) -> tuple[int, ...]:
     return tuple(found + [0] * (3 - len(found)))
 
 
-def check_matrix(name: str, matrix: ArrayLike) -> NDArray[Any]:
+def check_matrix(name: str, matrix: ArrayLike) -> NDArray[np.generic]:
     """Return an interaction or control matrix after checking that it is usable.
 
     Raises
@@ -68,7 +67,9 @@ def check_matrix(name: str, matrix: ArrayLike) -> NDArray[Any]:
     return array
 
 
-def predicted(predict: Any, last: NDArray[Any] | None, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
+def predicted(
+    predict: object, last: NDArray[np.generic] | None, shape: tuple[int, ...]
+) -> NDArray[np.float64] | None:
     """Return the slopes that a tool's loop predicts for the next frame, in the tool's unit and order.
 
     Parameters

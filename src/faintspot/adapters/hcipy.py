@@ -135,7 +135,7 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         """Field (2, n): standard errors of the last estimate, m; infinite where unknown."""
         return hcipy.Field(self.measured.standard_errors, self.estimation_grid)
 
-    def _frame(self, images: Any) -> NDArray[Any]:
+    def _frame(self, images: Any) -> NDArray[np.generic]:
         """Return the image as rows and columns."""
         image = images[0] if isinstance(images, list | tuple) and len(images) == 1 else None
         height, width = self._frame_shape
@@ -148,7 +148,7 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         return np.asarray(image).reshape(self._frame_shape)
 
 
-def _points(grid: object) -> NDArray[Any]:
+def _points(grid: object) -> NDArray[np.generic]:
     """Return the coordinates of a grid's points, (n, 2)."""
     if not isinstance(grid, hcipy.Grid) or grid.ndim != 2:
         raise InputError(f"mla_grid: expected a two-dimensional hcipy.Grid, got {type(grid).__name__}")

@@ -119,7 +119,7 @@ class OOPAOAttachment:
         """Measurement of each source, with `last` slopes (px), `standard_errors` and `flux`."""
         return tuple(source.slopes for source in self._sources)
 
-    def _integrate(self, src: object, sh_data: object) -> Any:
+    def _integrate(self, src: object, sh_data: object) -> object:
         """Run OOPAO's own step, which calls `centroid`, and note its source."""
         self._current = next((s for s in self._sources if s.data is sh_data), self._sources[0])
         return self._own(src, sh_data)
@@ -145,7 +145,7 @@ class _Source:
         """Measurement of this source."""
         return self._spots.measured
 
-    def positions(self, image: Any) -> NDArray[np.float64]:
+    def positions(self, image: object) -> NDArray[np.float64]:
         """Return positions; see `OOPAOAttachment._centroid`."""
         images, camera = self._spots.checked(image), self.wfs.cam
         noise_free = not np.any(camera.photonNoise) and not np.any(camera.readoutNoise)

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import functools
 import logging
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -31,7 +33,7 @@ PREDICTED = "predicted"
 """Name of the input stream of predicted slopes."""
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> type:
     made = {"FaintspotSlopes": slopes_process, "FaintspotCamera": camera, "FaintspotLoop": loop}
     if name in made:
         return made[name]()
@@ -49,7 +51,7 @@ def _pyrtc() -> Any:
 
 
 @functools.cache
-def slopes_process() -> Any:
+def slopes_process() -> type:
     """Return the class `FaintspotSlopes`, a `SlopesProcess` of pyRTC.
 
     Its configuration is that of a `SlopesProcess` of type "SHWFS", and
@@ -74,15 +76,15 @@ def slopes_process() -> Any:
     class FaintspotSlopes(process):  # type: ignore[misc]
         """A pyRTC slopes process that uses faintspot instead of pyRTC's centroiders."""
 
-        def __init__(self, conf: Any) -> None:
+        def __init__(self, conf: Mapping[str, Any]) -> None:
             self.measuring = _Measuring(conf)
             super().__init__(conf)
 
-        def _compute_slopes_shwfs(self, image: object) -> NDArray[np.float32]:
+        def _compute_slopes_shwfs(self, image: NDArray[np.generic]) -> NDArray[np.float32]:
             """Return slopes as pyRTC's centroiders do: (2 N, N) px, the x map above the y map."""
             return self.measuring.maps(self, image, tool.open_stream)
 
-        def calibrating(self, flux_e: float | None = None) -> Any:
+        def calibrating(self, flux_e: float | None = None) -> AbstractContextManager[None]:
             """Measure as for calibration in a `with` block; see `ToolSlopes.calibrating`."""
             return self.measuring.tool.calibrating(flux_e)
 
@@ -91,7 +93,7 @@ def slopes_process() -> Any:
 
 
 @functools.cache
-def camera() -> Any:
+def camera() -> type:
     """Return the class `FaintspotCamera`, a pyRTC `WavefrontSensor` that reads frames from a stream.
 
     Its configuration is that of a `WavefrontSensor`, with the function `expose`, and
@@ -113,7 +115,7 @@ def camera() -> Any:
 
         EXTRA_CONFIG_KEYS = ("frames",)
 
-        def __init__(self, conf: Any) -> None:
+        def __init__(self, conf: Mapping[str, Any]) -> None:
             self.following = _Frames(conf)
             super().__init__(conf)
 
@@ -132,7 +134,7 @@ def camera() -> Any:
 
 
 @functools.cache
-def loop() -> Any:
+def loop() -> type:
     """Return the class `FaintspotLoop`, a `Loop` of pyRTC with the function `predictive_filter`.
 
     Its configuration is that of a `Loop`, and
@@ -152,7 +154,7 @@ def loop() -> Any:
 
         EXTRA_CONFIG_KEYS = ("controller",)
 
-        def __init__(self, conf: Any) -> None:
+        def __init__(self, conf: Mapping[str, Any]) -> None:
             name = conf.get("controller")
             self.controller = None if name is None else PredictiveControl.load(name)
             self._starts = True
@@ -179,14 +181,14 @@ def loop() -> Any:
 class _Frames:
     """Frames of a stream, in order."""
 
-    def __init__(self, conf: Any) -> None:
+    def __init__(self, conf: Mapping[str, Any]) -> None:
         name = conf.get("frames")
         if not isinstance(name, str):
             raise InputError(f"wfs.frames: expected the name of a stream, got {name!r}")
         self._shape = int(conf["height"]), int(conf["width"])
         self._follower = Follower(name, _logger.warning, self._incompatible)
 
-    def next_into(self, frame: NDArray[Any]) -> bool:
+    def next_into(self, frame: NDArray[np.integer]) -> bool:
         """Wait a moment for a new frame; return whether there was one."""
         publication = self._follower.take(_MOMENT_S) if self._follower.wait(_MOMENT_S) else None
         if publication is not None:
@@ -205,7 +207,7 @@ class _Frames:
 class _Measuring:
     """Measurement of a slopes process; created when its geometry is known."""
 
-    def __init__(self, conf: Any) -> None:
+    def __init__(self, conf: Mapping[str, Any]) -> None:
         if "faintspot" not in conf:
             raise InputError("slopes.faintspot: expected a faintspot.toml or its tables, got none")
         self.parts = parts_of(conf["faintspot"])
@@ -231,7 +233,7 @@ class _Measuring:
             raise InputError("slopes: no frame has been measured yet; measure one first")
         return self._tool
 
-    def maps(self, process: Any, image: Any, open_stream: object) -> NDArray[np.float32]:
+    def maps(self, process: Any, image: NDArray[np.generic], open_stream: object) -> NDArray[np.float32]:
         """Measure an image; return maps with slopes of pyRTC's valid sub-apertures only."""
         n = int(process.num_regions)
         valid = _mapped("valid_sub_aps", process.valid_sub_aps, n).astype(bool)

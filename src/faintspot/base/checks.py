@@ -20,7 +20,7 @@ LARGEST_FLOAT64 = 1e290
 _WHOLE = -(2.0**53), 2.0**53  # whole numbers that float64 holds
 
 
-def real_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray[Any]:
+def real_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray[np.generic]:
     """Return `value` as a real numeric array (bool counts as integer); dtype is kept.
 
     Masked values (numpy.ma) become NaN, and integer arrays with masked values become floats.
@@ -48,14 +48,14 @@ def real_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray
     return array
 
 
-def _masked_as_nan(value: np.ma.MaskedArray[Any, Any]) -> NDArray[Any]:
+def _masked_as_nan(value: np.ma.MaskedArray[Any, Any]) -> NDArray[np.generic]:
     """Return a masked array as floats with NaN in masked places; float32 if it is exact."""
     dtype = np.result_type(value.dtype, np.float32)
-    filled: NDArray[Any] = np.ma.filled(value.astype(dtype), np.nan)
+    filled: NDArray[np.generic] = np.ma.filled(value.astype(dtype), np.nan)
     return filled
 
 
-def finite_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray[Any]:
+def finite_array(name: str, value: object, *, minimum_dimensions: int = 0) -> NDArray[Any]:
     """Return `value` as a real array without NaN or infinity."""
     array = real_array(name, value, minimum_dimensions=minimum_dimensions)
     if array.dtype.kind == "f":
@@ -66,7 +66,7 @@ def finite_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArr
     return array
 
 
-def image_stack(name: str, value: Any) -> NDArray[np.floating[Any]]:
+def image_stack(name: str, value: object) -> NDArray[np.floating[Any]]:
     """Return `value` as finite float32 or float64 images (..., ny, nx), contiguous.
 
     float32 and float16 images become float32, all others float64.
@@ -90,7 +90,7 @@ class NumberKind(TypedDict, total=False):
 
 def numbers_between(
     name: str,
-    value: Any,
+    value: object,
     low: float = -np.inf,
     high: float = np.inf,
     *,
@@ -110,16 +110,16 @@ def numbers_between(
         bad = float(array[wrong].flat[0])
         raise InputError(f"expected {_range_text(low, high, low_open)}", name=name, value=bad)
     if integer:
-        rounded: NDArray[Any] = np.rint(array)
+        rounded: NDArray[np.generic] = np.rint(array)
         if np.any(rounded != array):
             bad = float(array[rounded != array].flat[0])
             raise InputError("expected a whole number", name=name, value=bad)
         return rounded.astype(np.int64)
-    numbers: NDArray[Any] = array.astype(np.float64)
+    numbers: NDArray[np.generic] = array.astype(np.float64)
     return numbers
 
 
-def _has_truth_values(value: Any) -> bool:
+def _has_truth_values(value: object) -> bool:
     """Return whether a value, or an item of a sequence, is True or False."""
     if isinstance(value, np.ndarray):
         return bool(value.dtype == np.bool_)
@@ -154,7 +154,7 @@ def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
     return value
 
 
-def strings_of(name: str, value: Any) -> tuple[str, ...]:
+def strings_of(name: str, value: object) -> tuple[str, ...]:
     """Return a sequence of texts as a tuple.
 
     Raises

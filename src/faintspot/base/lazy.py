@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 
-def lazy_attributes(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
+def lazy_attributes(package: str, homes: Mapping[str, str]) -> Callable[[str], object]:
     """Return the `__getattr__` of a package.
 
     Parameters
@@ -31,6 +31,6 @@ def lazy_attributes(package: str, homes: Mapping[str, str]) -> Callable[[str], A
     return get
 
 
-def lazy_packages(package: str, names: str) -> Callable[[str], Any]:
+def lazy_packages(package: str, names: str) -> Callable[[str], object]:
     """Return the `__getattr__` of a package whose sub-packages (names separated by spaces) load lazily."""
     return lazy_attributes(package, {name: f"{package}.{name}" for name in names.split()})

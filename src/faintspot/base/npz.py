@@ -126,7 +126,7 @@ class NpzFile:
         return cls.FIELDS or tuple(item.name for item in fields(cls))  # type: ignore[arg-type]
 
 
-def _restored(value: Any) -> Any:
+def _restored(value: Any) -> object:
     """Return an array as what it was: a row of texts is a tuple, what has no axes a plain number or text."""
     if value.ndim == 0:
         return value.item()

@@ -7,7 +7,6 @@ import os
 import sys
 import warnings
 from importlib import import_module
-from typing import Any
 
 import click
 
@@ -67,7 +66,7 @@ class _LazyGroup(click.Group):
         command.name = name  # in the modules all are called "command"
         return command
 
-    def invoke(self, context: click.Context) -> Any:
+    def invoke(self, context: click.Context) -> object:
         """Run a command."""
         try:
             return super().invoke(context)
@@ -118,7 +117,7 @@ class _Terminal(logging.Handler):
         click.echo(f"faintspot: {record.getMessage()}", err=True)
 
 
-def main(arguments: list[str] | None = None) -> Any:
+def main(arguments: list[str] | None = None) -> object:
     """Run the command line; an error of the user's ends with one line and exit code 2."""
     # Before NumPy is loaded: small matrices gain nothing from BLAS threads, which get in the way of our own.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -205,7 +205,7 @@ class Engine:
             "prediction": None if self._prediction is None else self._prediction.status(),
         }
 
-    def loop_status(self) -> dict[str, Any]:
+    def loop_status(self) -> dict[str, object]:
         """Return the state of the loop as plain values."""
         if self.loop is None:
             return {"state": NONE}
@@ -491,7 +491,7 @@ class Engine:
         Also do all that takes time: write changes to telemetry, replace dead workers, check streams.
         """
         looks = last_change = 0
-        loop_assumed: dict[str, Any] = {}
+        loop_assumed: dict[str, object] = {}
         while True:
             stopping = self._stopping.wait(_WATCH_S)
             looks += 1
@@ -517,7 +517,7 @@ class Engine:
             if stopping and (ring is None or not self._waiting):
                 return
 
-    def _tell_of_loop(self, last: dict[str, Any]) -> dict[str, Any]:
+    def _tell_of_loop(self, last: dict[str, object]) -> dict[str, Any]:
         """Write to telemetry when the loop was opened, and why, or closed, or its gain changed."""
         if self.loop is None:
             return last

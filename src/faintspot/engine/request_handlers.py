@@ -42,7 +42,7 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
     }
 
 
-def _set(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+def _set(engine: Engine, fields: dict[str, Any]) -> Mapping[str, object]:
     try:
         change = engine.live.propose(changes_of(fields), fields.get("where"))
     except InputError:
@@ -51,20 +51,24 @@ def _set(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
 
 
-def _interleave(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, Any]:
+def _interleave(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, object]:
     every = int(number_between("every", fields.get("every", _USUAL_TURN), 1, integer=True))
     change = engine.interleave(_text(fields, "methods"), every)
     return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
 
 
-def _stop(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, Any]:
+def _stop(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, object]:
     engine.stop()
     return {}
 
 
-def _take_learnt(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, Any]:
+def _take_learnt(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, object]:
     """Note what was learnt beside the engine, and take the new model, if one is handed over."""
-    learning: dict[str, Any] = {"found": _text(fields, "found"), "unix_time_s": time.time(), "taken": False}
+    learning: dict[str, object] = {
+        "found": _text(fields, "found"),
+        "unix_time_s": time.time(),
+        "taken": False,
+    }
     engine.learning = learning
     if fields.get("model") is None:
         return {}
@@ -79,7 +83,7 @@ def _take_learnt(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, A
     return {}
 
 
-def _take_spots(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, Any]:
+def _take_spots(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, object]:
     """Measure with the PSF and the fixed weights of a sodium profile from the next frame on."""
     sodium = fields.get("sodium")
     if not isinstance(sodium, Mapping):
@@ -101,7 +105,7 @@ def _text(fields: Mapping[str, object], name: str) -> str:
     return value
 
 
-def loop_command(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, Any]:
+def loop_command(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, object]:
     """Open or close the loop, change its gain or flatten the mirror; return the loop's part of the status.
 
     Raises

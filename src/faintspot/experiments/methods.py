@@ -115,7 +115,7 @@ def score_for_scene(
     )
 
 
-def tuned_options(method: Method, scene: Scene) -> dict[str, list[Any]]:
+def tuned_options(method: Method, scene: Scene) -> dict[str, list[object]]:
     """Return what a method may choose from in a scene; the usual value of each option is the first."""
     return {
         name: list(dict.fromkeys(_rounded(dict(enumerate(values))).values()))

@@ -44,7 +44,7 @@ class Unit:
 
     key: str
     """Key of its result in the store."""
-    arguments: tuple[Any, ...]
+    arguments: tuple[object, ...]
     size: int = 1
     """Amount of work, for the progress bar."""
 
@@ -217,7 +217,7 @@ def _by_joblib(
                 results.close()
 
 
-def _in_worker(work: tuple[Any, ...], place: tuple[int, Path | None], package: tuple[Any, ...]) -> Any:
+def _in_worker(work: tuple[Any, ...], place: tuple[int, Path | None], package: tuple[Any, ...]) -> object:
     """Run a unit with the estimators that are registered where the experiment was started."""
     (function, arguments), (number, progress_file), (own, version) = work, place, package
     if version != __version__:
@@ -265,18 +265,18 @@ def _followed(count: _Count) -> Iterator[Path]:
 
 
 @contextmanager
-def _cluster(scheduler: str, say: Callable[[str], None]) -> Iterator[Any]:
+def _cluster(scheduler: str, say: Callable[[str], None]) -> Iterator[object]:
     """Connect to a running scheduler; yield joblib's backend, which alone waits forever for lost workers."""
     import distributed
     from joblib._dask import DaskDistributedBackend
 
     class Backend(DaskDistributedBackend):  # type: ignore[misc]
-        def submit(self, func: object, callback: Any = None) -> Any:
+        def submit(self, func: object, callback: Any = None) -> object:
             future = super().submit(func, callback)
             future.add_done_callback(lambda done: done.exception() and callback(done.exception()))
             return future
 
-        def retrieve_result_callback(self, out: object) -> Any:
+        def retrieve_result_callback(self, out: object) -> object:
             if isinstance(out, BaseException):  # Dask's own, not a unit's
                 raise BrokenProcessPool(str(out))
             return super().retrieve_result_callback(out)

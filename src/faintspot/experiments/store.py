@@ -146,9 +146,9 @@ class ZarrStore:
                 f"{self.path}: cannot be read: the store is damaged ({one_line(error)}): delete it"
             ) from None
 
-    def _new_array(self, name: str, values: NDArray[np.generic]) -> Any:
+    def _new_array(self, name: str, values: NDArray[np.generic]) -> object:
         text = values.dtype.kind in "UT"
-        empty: Any = "" if text else np.zeros((), values.dtype)[()]
+        empty: object = "" if text else np.zeros((), values.dtype)[()]
         return self._group.create_array(
             name,
             shape=(len(self._rows), *values.shape),
@@ -171,7 +171,7 @@ def kind_of_store(path: Path) -> str | None:
     return kind if isinstance(kind, str) else None
 
 
-def _attributes(path: Path) -> dict[str, Any]:
+def _attributes(path: Path) -> dict[str, object]:
     """Return the attributes of a store of units; none when there is something else."""
     try:
         attributes = stored_attributes(path)

@@ -99,7 +99,7 @@ class FrameSource(Closing):
         """Close the open file, if any."""
         self._open.close()
 
-    def _read(self, array: StoredArray, start: int, stop: int) -> NDArray[Any]:
+    def _read(self, array: StoredArray, start: int, stop: int) -> NDArray[np.generic]:
         """Read from one file, keeping at most one open: there may be thousands."""
         if array is not self._open:
             self._open.close()
@@ -163,7 +163,7 @@ def open_frames(
     return FrameSource(arrays)
 
 
-def read_array(location: str | Path) -> NDArray[Any]:
+def read_array(location: str | Path) -> NDArray[np.generic]:
     """Read one whole array (dark, flat, bad-pixel map) from a file of any frame format.
 
     Parameters

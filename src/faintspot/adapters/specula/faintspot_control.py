@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,12 +65,12 @@ class FaintspotControl(BaseProcessingObj):  # type: ignore[misc]
         self.outputs["out_comm"] = self.out_comm
 
     @classmethod
-    def input_names(cls) -> dict[str, Any]:
+    def input_names(cls) -> dict[str, object]:
         """Return the input."""
         return {"in_slopes": InputDesc(Slopes, "Residual slopes")}
 
     @classmethod
-    def output_names(cls) -> dict[str, Any]:
+    def output_names(cls) -> dict[str, object]:
         """Return the output."""
         return {"out_comm": OutputDesc(BaseValue, "Commands, with the delay")}
 

@@ -94,7 +94,7 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         self.outputs["out_subapdata"] = subapdata
 
     @classmethod
-    def input_names(cls) -> Any:
+    def input_names(cls) -> object:
         """Return SPECULA's inputs, and the predicted slopes."""
         return {
             **super().input_names(),
@@ -102,7 +102,7 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         }
 
     @classmethod
-    def output_names(cls) -> Any:
+    def output_names(cls) -> object:
         """Return SPECULA's outputs."""
         return {**super().output_names(), "out_subapdata": OutputDesc(SubapData, "Sub-apertures")}
 

@@ -10,13 +10,15 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from types import MappingProxyType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import numbers_between, one_of, strings_of
 from faintspot.base.errors import InputError
+
+_Value = TypeVar("_Value")
 
 AUTO = "auto"
 REQUIRED: Any = MISSING
@@ -144,7 +146,7 @@ class Option:
             raise error from None
 
 
-def option(default: Any, meaning: str, **bounds: Any) -> Any:
+def option(default: _Value, meaning: str, **bounds: Any) -> _Value:
     """Declare an option of a dataclass derived from `Options`; `bounds` are the other fields of `Option`.
 
     Examples
@@ -161,15 +163,16 @@ def option(default: Any, meaning: str, **bounds: Any) -> Any:
     faintspot.base.errors.InputError: power = 9: expected a number from 1 to 4
     """
     bounds.setdefault("optional", default is None)
-    return field(default=default, metadata={"option": Option(meaning, **bounds)})
+    declared: _Value = field(default=default, metadata={"option": Option(meaning, **bounds)})
+    return declared
 
 
-def setting(default: object, meaning: str = "", **bounds: object) -> Any:
+def setting(default: _Value, meaning: str = "", **bounds: object) -> _Value:
     """Declare an option that has one value for the whole sensor; see `option`."""
     return option(default, meaning, per_subaperture=False, **bounds)
 
 
-def number(default: object, low: float, high: float, meaning: str = "", **bounds: object) -> Any:
+def number(default: _Value, low: float, high: float, meaning: str = "", **bounds: object) -> _Value:
     """Declare a number from `low` to `high`, or None if that is its default; see `option`."""
     return setting(default, meaning, low=low, high=high, **bounds)
 
@@ -187,6 +190,10 @@ class PerSubaperture:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return PerSubaperture, (self.default, dict(self.others))  # a read-only mapping cannot be pickled
+
+
+Value = float | str | NDArray[np.generic] | PerSubaperture | None
+"""An option that may differ between sub-apertures: one value, an array, or a default and others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +245,7 @@ class Options:
             if not _same(getattr(self, name), defaults[name])
         }
 
-    def default_of(self, name: str, pixels: int) -> Any:
+    def default_of(self, name: str, pixels: int) -> float:
         """Return the value used in place of None for windows of `pixels` pixels; NaN if there is none."""
         return math.nan
 

@@ -13,7 +13,7 @@ PRESETS = ("accurate", "fast")
 
 FEW_KEPT = 32
 """Pixels whose centre of gravity does not depend on the shallow background, which converges last."""
-_DENOISING: dict[str, dict[str, Any]] = {
+_DENOISING: dict[str, dict[str, object]] = {
     "accurate": {"tolerance": 2.5e-3, "max_iterations": 480},
     "fast": {"tolerance": 0.0, "max_iterations": 8},
 }

@@ -113,7 +113,7 @@ class ConfigurationTable(Options):
 Part = TypeVar("Part", bound=ConfigurationTable)
 
 
-def save_tables(path: str | Path, tables: Mapping[str, Mapping[str, Any] | None]) -> None:
+def save_tables(path: str | Path, tables: Mapping[str, Mapping[str, object] | None]) -> None:
     """Write tables into a configuration file; None removes a table. Other tables and comments are preserved.
 
     Raises
@@ -147,7 +147,7 @@ def tables_as_text(tables: Mapping[str, object]) -> str:
     return tomlkit.dumps(document)
 
 
-def per_subaperture(where: str, value: object) -> Any:
+def per_subaperture(where: str, value: object) -> object:
     """Return { default = 2.5, 4 = 3.0 } as values of some sub-apertures and a default for the others.
 
     Raises
@@ -174,7 +174,7 @@ def is_map(value: object) -> bool:
     )
 
 
-def _toml_table(values: Mapping[str, object]) -> Any:
+def _toml_table(values: Mapping[str, object]) -> object:
     import tomlkit
 
     table = tomlkit.table()
@@ -183,7 +183,7 @@ def _toml_table(values: Mapping[str, object]) -> Any:
     return table
 
 
-def _toml_value(value: object) -> Any:
+def _toml_value(value: object) -> object:
     import tomlkit
 
     if isinstance(value, PerSubaperture):

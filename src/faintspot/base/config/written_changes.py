@@ -26,7 +26,7 @@ def parse_changes(changes: Sequence[str], *, texts: Sequence[str] = ()) -> dict[
     InputError
         If a text is not NAME=VALUE, a name is repeated, or a value is empty.
     """
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     for text in changes:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not (name and equals):
@@ -69,7 +69,7 @@ def parse_ranges(text: str, name: str = "sub-apertures") -> list[int]:
     return list(numbers)
 
 
-def _parsed_value(text: str) -> Any:
+def _parsed_value(text: str) -> object:
     if text.lower() in _WORDS:
         return _WORDS[text.lower()]
     for number in (int, float):

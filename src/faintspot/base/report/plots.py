@@ -102,7 +102,7 @@ class Panel:
     y_linear_below: float = 0.0
     x_range: tuple[float | None, float | None] = (None, None)
     y_range: tuple[float | None, float | None] = (None, None)
-    levels: Mapping[float, Mapping[str, Any]] = field(default_factory=dict)
+    levels: Mapping[float, Mapping[str, object]] = field(default_factory=dict)
     at: Mapping[float, Mapping[str, Any]] = field(default_factory=dict)
     above: tuple[ArrayLike, Sequence[float], str] | None = None
     log: bool = False

@@ -58,7 +58,7 @@ class Texts:
         self,
         name: str,
         figure: Figure,
-        rows: Sequence[Sequence[Any]] = (),
+        rows: Sequence[Sequence[object]] = (),
         columns: Sequence[str] = (),
         /,
         **values: object,
@@ -116,7 +116,7 @@ class _Scope(dict[str, Any]):
         super().__init__(values)
         self._record = record
 
-    def __missing__(self, name: str) -> Any:
+    def __missing__(self, name: str) -> object:
         if isinstance(self._record, Mapping):
             return self._record[name]
         return getattr(self._record, name)

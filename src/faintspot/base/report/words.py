@@ -123,7 +123,7 @@ class Words(Formatter):
     def __init__(self) -> None:
         self.known: list[bool] = []
 
-    def get_field(self, field_name: str, args: Sequence[object], kwargs: Mapping[str, object]) -> Any:
+    def get_field(self, field_name: str, args: Sequence[object], kwargs: Mapping[str, object]) -> object:
         """Return the value of a field; parts of None leave out the sentence."""
         name = re.split(r"[.\[]", field_name)[0]
         if kwargs[name] is None and name != field_name:

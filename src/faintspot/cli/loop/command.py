@@ -29,7 +29,7 @@ _output = option(
 )
 
 
-def _compared(command: Callable[..., object]) -> Callable[..., Any]:
+def _compared(command: Callable[..., object]) -> Callable[..., object]:
     """Add the options of every comparison."""
     return CONFIGURATION(QUICK(_output(experiment_options(command))))
 
@@ -243,7 +243,7 @@ def _measure(
     configuration: str,
     name: str,
     run: Callable[..., Any],
-    *what: Any,
+    *what: object,
     output: str | None,
     quick: bool,
     overwrite: bool,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,8 @@ from faintspot.cli.shared.options import FRAMES, configuration_option, name_opti
 from faintspot.engine.requests.private_socket import socket_path
 
 if TYPE_CHECKING:
+    from faintspot.engine.engine import Engine
+    from faintspot.engine.streams.bridge import StreamBridge
     from faintspot.slopes.pipeline.configuration import Configuration
 
 
@@ -159,7 +161,7 @@ def run(
     click.echo(summary(engine.status()))
 
 
-def _learning(engine: Any, config: str) -> Any:
+def _learning(engine: Engine, config: str) -> AbstractContextManager[None]:
     """The process that learns for the engine, as a context, if it can learn and shall."""
     from faintspot.engine.background.learning import background_learning
     from faintspot.loop.control.identification.models import predicts
@@ -170,7 +172,7 @@ def _learning(engine: Any, config: str) -> Any:
     return background_learning(engine, config, options.learn_every_s, partial(click.echo, err=True))
 
 
-def _following(engine: Any, described: Configuration) -> Any:
+def _following(engine: Engine, described: Configuration) -> AbstractContextManager[None]:
     """The process that follows a laser guide star's profile, as a context, if the configuration wants it."""
     from faintspot.engine.background.sodium import background_sodium
 
@@ -180,14 +182,14 @@ def _following(engine: Any, described: Configuration) -> Any:
     return background_sodium(engine, str(described.path), partial(click.echo, err=True))
 
 
-def _followed(stream: str, name: str) -> Any:
+def _followed(stream: str, name: str) -> StreamBridge:
     """The stream as the engine's own source, which keeps a processor busy as waiting for rows would."""
     from faintspot.engine.streams.bridge import StreamBridge
 
     return StreamBridge(stream, name, say=partial(click.echo, err=True), spins=(os.cpu_count() or 1) > 1)
 
 
-def _stop_when_set(stop: threading.Event, engine: Any) -> None:
+def _stop_when_set(stop: threading.Event, engine: Engine) -> None:
     """Pass a signal on to the engine."""
     stop.wait()
     engine.stop()

@@ -52,7 +52,7 @@ class Listed(click.ParamType[Any]):
     def __init__(self, kind: type = str, counts: tuple[int, ...] = (), expected: str = "") -> None:
         self.kind, self.counts, self.expected = kind, counts, expected or "numbers with commas"
 
-    def convert(self, value: Any, parameter: Any, context: click.Context | None) -> Any:
+    def convert(self, value: Any, parameter: Any, context: click.Context | None) -> object:
         """Return the items of a text as a tuple."""
         if not isinstance(value, str):
             return value
@@ -159,7 +159,7 @@ def declared(
         for name, what in reversed(kind.declared().items()):
             if name not in (names or (name,)) or not what.meaning:
                 continue
-            attributes: dict[str, Any] = {"help": what.meaning, "type": int if what.whole else float}
+            attributes: dict[str, object] = {"help": what.meaning, "type": int if what.whole else float}
             if what.choices:
                 attributes["type"] = click.Choice(what.choices)
             elif what.kind == TEXT:

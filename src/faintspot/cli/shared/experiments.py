@@ -31,7 +31,7 @@ _OPTIONS = (
 )
 
 
-def experiment_options(command: Callable[..., object]) -> Callable[..., Any]:
+def experiment_options(command: Callable[..., object]) -> Callable[..., object]:
     """Add the options that say where and how an experiment runs."""
     for each in _OPTIONS:
         command = each(command)

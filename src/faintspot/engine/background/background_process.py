@@ -47,7 +47,7 @@ class BackgroundProcess(ABC):
     def __init__(self, name: str) -> None:
         self._path, self._reader = socket_path(name), TelemetryRing.attach(name)
 
-    def tell(self, command: str, models: Mapping[str, Any], **fields: Any) -> dict[str, Any]:
+    def tell(self, command: str, models: Mapping[str, Any], **fields: object) -> dict[str, Any]:
         """Send the engine a command, with a file of each model that is not None; return its answer.
 
         Raises

@@ -62,7 +62,7 @@ class BackgroundLearning(BackgroundProcess):
         self._site, self._layout = site_of(described.layout), described.layout
         super().__init__(name)
         self._every_s = every_s
-        self._cursor, self._records = self._reader.records.written, list[NDArray[Any]]()
+        self._cursor, self._records = self._reader.records.written, list[NDArray[np.void]]()
         self._last: RelearntControl | None = None
         self._count = 0
 

@@ -91,7 +91,7 @@ class SodiumFollower(BackgroundProcess):
                 self._add(image["raw"], records[row])
         return self._count >= _FEWEST_IMAGES and time.monotonic() >= self._due_s
 
-    def _add(self, raw: NDArray[np.float32], record: NDArray[Any]) -> None:
+    def _add(self, raw: NDArray[np.float32], record: NDArray[np.void]) -> None:
         """Add an image and its slopes to the running mean."""
         valid = are_valid(record["flags"])
         if valid.mean() < _LEAST_VALID:

@@ -28,7 +28,7 @@ class Picture:
 class Batch:
     """Data that arrived since the last read."""
 
-    records: NDArray[Any]
+    records: NDArray[np.void]
     """Records, as in `faintspot.engine.telemetry.segment.record_type`."""
     missed: int = 0
     """Number of records for which the page was too slow."""

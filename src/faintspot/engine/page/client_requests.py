@@ -115,7 +115,7 @@ class RecordingThread:
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
-        self._status: dict[str, Any] = {"running": False}
+        self._status: dict[str, object] = {"running": False}
 
     def start(self, file: object) -> Mapping[str, Any]:
         """Start a recording to a new store.

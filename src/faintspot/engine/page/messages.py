@@ -20,7 +20,7 @@ _ALIGN = 8
 
 def packed(kind: str, values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]] | None = None) -> bytes:
     """Return a message; numbers that are not finite become null in values, and stay in arrays."""
-    described: dict[str, Any] = {}
+    described: dict[str, object] = {}
     blocks: list[bytes] = []
     offset = 0
     for name, array in (arrays or {}).items():

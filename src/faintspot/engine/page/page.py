@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 from faintspot.base.errors import InputError
 from faintspot.engine.page.batch import BatchSource
@@ -32,8 +31,8 @@ class Page:
         self.page_state = PageState([])
         self._drawing: FrameDrawing | None = None
         self._figures_s = self._methods_s = 0.0
-        self._methods: list[dict[str, Any]] = []
-        self._state: dict[str, Any] | None = None
+        self._methods: list[dict[str, object]] = []
+        self._state: dict[str, object] | None = None
 
     def step(self) -> None:
         """Read the source once and send updates."""

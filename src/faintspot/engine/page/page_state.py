@@ -50,7 +50,7 @@ class PageState:
 
     def __init__(self, methods: list[str]) -> None:
         self.methods = list(methods)
-        self.newest: NDArray[Any] | None = None
+        self.newest: NDArray[np.void] | None = None
         """Record of the newest frame."""
         self.changes: list[dict[str, Any]] = []
         self.seen = self.lost = self.missed = 0
@@ -65,7 +65,7 @@ class PageState:
         self._frames_of: defaultdict[int, int] = defaultdict(int)
         # The last ones: a frame's truth may be known before its record.
         self._truths: deque[tuple[int, float, float]] = deque(maxlen=4)
-        self._last: NDArray[Any] | None = None  # records of the previous read
+        self._last: NDArray[np.void] | None = None  # records of the previous read
 
     def add(self, batch: Batch) -> None:
         """Add the data of a batch."""
@@ -114,7 +114,7 @@ class PageState:
             return
         self._images += (new - self._images) / min(self._pictures, _MEAN_PICTURES)
 
-    def record_of(self, frame: int) -> NDArray[Any] | None:
+    def record_of(self, frame: int) -> NDArray[np.void] | None:
         """Return the record of a frame from the last read; None if it is older."""
         if self._last is None:
             return None
@@ -131,7 +131,7 @@ class PageState:
             strip[:, 0] -= strip[-1, 0]
         shown = np.unique(strip[:, _STRIP.index("method")]).astype(int).tolist()
         star = self.star_flux_e
-        values: dict[str, Any] = {
+        values: dict[str, object] = {
             "flux_of": "kept by the method" if star is None else "of the star",
             "strip": _STRIP,
             "strip_s": STRIP_S,
@@ -197,7 +197,7 @@ class PageState:
 
     # One read -----------------------------------------------------------------------------------------
 
-    def _rows(self, records: NDArray[Any]) -> Floats:
+    def _rows(self, records: NDArray[np.void]) -> Floats:
         """Return a row of `_FRAME` for each record."""
         valid = are_valid(records["flags"])
         count = valid.sum(axis=1)
@@ -215,7 +215,7 @@ class PageState:
             rows[:, _FRAME.index(name)] = values
         return rows
 
-    def _rms(self, records: NDArray[Any], valid: NDArray[np.bool_], n_valid: Floats) -> Floats:
+    def _rms(self, records: NDArray[np.void], valid: NDArray[np.bool_], n_valid: Floats) -> Floats:
         """Return the rms of each frame's slopes about the sub-apertures' running means for its method."""
         squares = np.full(len(records), np.nan)
         for method in np.unique(records["method"]):
@@ -233,7 +233,7 @@ class PageState:
             squares[rows] = np.sum(deviation**2, axis=(0, 2))
         return np.asarray(np.sqrt(squares / (2 * n_valid)))
 
-    def _lost_in(self, records: NDArray[Any]) -> int:
+    def _lost_in(self, records: NDArray[np.void]) -> int:
         """Return the number of missing frame numbers; 0 if the camera restarted its numbering."""
         frames = records["frame"]
         if self.newest is not None:
@@ -279,7 +279,7 @@ def flag_names() -> list[dict[str, Any]]:
 def _in_plain(compared: MethodDifference) -> dict[str, Any]:
     """Return a figure with half its confidence interval, and its difference from the first method's."""
     mean, difference = compared.mean, compared.difference
-    row: dict[str, Any] = {"mean": mean.value, "half": (mean.high - mean.low) / 2}
+    row: dict[str, object] = {"mean": mean.value, "half": (mean.high - mean.low) / 2}
     if difference is not None:
         row |= {"difference": difference.value, "difference_half": (difference.high - difference.low) / 2}
         row["decided"] = difference.decided

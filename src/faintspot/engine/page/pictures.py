@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,7 +40,7 @@ class FrameDrawing:
         }
         return packed("sensor", values, arrays)
 
-    def message(self, picture: Picture, record: NDArray[Any] | None) -> bytes:
+    def message(self, picture: Picture, record: NDArray[np.void] | None) -> bytes:
         """Return the message of a frame; without spots if its record is no longer available."""
         raw, raw_range = _in_bytes(picture.raw)
         stack, denoised_range = _in_bytes(picture.denoised)

@@ -62,7 +62,7 @@ class RecordingSource:
         self._playing, self._speed, self._position_s = True, 1.0, 0.0
         self._looked_s = time.monotonic()
         self._next, self._shown_picture, self._moved = 0, -1, True
-        self._block: tuple[int, NDArray[Any]] = (-1, np.empty(0, self._type))
+        self._block: tuple[int, NDArray[np.void]] = (-1, np.empty(0, self._type))
 
     @property
     def length_s(self) -> float:
@@ -113,7 +113,7 @@ class RecordingSource:
         """Return the functions of the requests, by name."""
         return {"play": self._play}
 
-    def _play(self, request: Mapping[str, object]) -> Mapping[str, Any]:
+    def _play(self, request: Mapping[str, object]) -> Mapping[str, object]:
         """Move to "position_s", play or pause ("playing"), and set the "speed"."""
         position, speed, playing = (request.get(name) for name in ("position_s", "speed", "playing"))
         if position is not None:
@@ -135,7 +135,7 @@ class RecordingSource:
 
     # Reading ------------------------------------------------------------------------------------------------
 
-    def _records(self, first: int, end: int) -> NDArray[Any]:
+    def _records(self, first: int, end: int) -> NDArray[np.void]:
         """Return the records of frames `first` to `end`, in the order of the store."""
         together = self._store.frames_together
         parts = [np.empty(0, self._type)]
@@ -144,7 +144,7 @@ class RecordingSource:
             parts.append(self._of_block(number, together)[max(first - begin, 0) : end - begin])
         return np.concatenate(parts)
 
-    def _of_block(self, number: int, together: int) -> NDArray[Any]:
+    def _of_block(self, number: int, together: int) -> NDArray[np.void]:
         """Return the records of one chunk of the store; the last chunk is cached."""
         if self._block[0] != number:
             start, stop = number * together, min((number + 1) * together, self._store.frames)
@@ -172,7 +172,7 @@ class RecordingSource:
             return None
         return np.asarray(self._store.read("commands", end - 1, end)[0], np.float64)
 
-    def _changes(self, end: int, anew: bool) -> list[dict[str, Any]]:
+    def _changes(self, end: int, anew: bool) -> list[dict[str, object]]:
         """Return the changes of settings up to this moment that have not been sent yet."""
         sent = 0 if anew else self._n_sent
         self._n_sent = int(np.searchsorted(self._change_indices, end))

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib.resources import files
-from typing import Any
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.json_text import parse_json, to_json
@@ -267,7 +266,7 @@ class Client(_Guarded, WebSocketHandler):
             self.close(_NOT_ALLOWED)
         await asyncio.sleep(_PAUSE_S)
 
-    async def _greeted(self, request: Mapping[str, object]) -> dict[str, Any]:
+    async def _greeted(self, request: Mapping[str, object]) -> dict[str, object]:
         """Admit a client with the rights of its token."""
         token, access = request.get("token"), self.server.access
         is_known = request.get("do") == "hello" and access.knows(token)
@@ -297,7 +296,7 @@ class Client(_Guarded, WebSocketHandler):
                 last = number
 
 
-def _parsed(message: str | bytes) -> dict[str, Any]:
+def _parsed(message: str | bytes) -> dict[str, object]:
     """Return a request: a JSON object with "do", whose values can be sent back as JSON."""
     try:
         request = parse_json(message) if isinstance(message, str) else None
@@ -309,12 +308,12 @@ def _parsed(message: str | bytes) -> dict[str, Any]:
     return request
 
 
-async def _in_thread(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+async def _in_thread(work: Callable[[], dict[str, object]]) -> dict[str, object]:
     """Run a function in a daemon thread and wait for its result."""
     loop = asyncio.get_running_loop()
-    done: asyncio.Future[dict[str, Any]] = loop.create_future()
+    done: asyncio.Future[dict[str, object]] = loop.create_future()
 
-    def finish(reply: dict[str, Any]) -> None:
+    def finish(reply: dict[str, object]) -> None:
         if not done.done():  # else the caller was cancelled
             done.set_result(reply)
 

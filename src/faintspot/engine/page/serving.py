@@ -6,7 +6,6 @@ import asyncio
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
 
 from faintspot.engine.page.access import Access
 from faintspot.engine.page.client_requests import EngineRequests
@@ -63,7 +62,7 @@ def serve(
             requests = used.enter_context(closing(EngineRequests(shown, folder)))
             server = LiveServer(source, requests, access, address, port)
 
-            def send(kind: str, values: dict[str, Any]) -> None:
+            def send(kind: str, values: dict[str, object]) -> None:
                 recording = {"recording": requests.recording.status()} if kind == "status" else {}
                 server.tell(kind, values | recording)
 

@@ -29,10 +29,10 @@ class StatusPoller:
         Called with kind ("status" or "settings") and values, in the poller's thread.
     """
 
-    def __init__(self, name: str, tell: Callable[[str, dict[str, Any]], None]) -> None:
+    def __init__(self, name: str, tell: Callable[[str, dict[str, object]], None]) -> None:
         self._path, self._tell = socket_path(name), tell
         self._stopping = threading.Event()
-        self._version: tuple[Any, ...] | None = None
+        self._version: tuple[object, ...] | None = None
         self._thread = threading.Thread(target=self._run, name="faintspot-status", daemon=True)
         self._thread.start()
 

@@ -7,7 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, TypedDict, Unpack
+from typing import Protocol, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -173,7 +173,7 @@ class Readout(ABC):
         ]
 
     @abstractmethod
-    def _frame(self) -> NDArray[Any] | None:
+    def _frame(self) -> NDArray[np.generic] | None:
         """Return frame number `_next`, or None at the end."""
 
     def run(
@@ -319,9 +319,9 @@ class SimulatedCamera(Readout):
         )
         self.frames.flags.writeable = self.truth.flags.writeable = False
 
-    def _frame(self) -> NDArray[Any]:
+    def _frame(self) -> NDArray[np.generic]:
         """Return frame number `_next`."""
-        frame: NDArray[Any] = self.frames[self._next % len(self.frames)]
+        frame: NDArray[np.generic] = self.frames[self._next % len(self.frames)]
         return frame
 
 

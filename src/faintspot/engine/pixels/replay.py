@@ -24,7 +24,7 @@ _LOOK_S = 0.05  # between two checks of the stop event while waiting for the dis
 _NAP_S = 5e-4  # between two checks of the engine's progress
 
 
-def ring_type(dtype: np.dtype[np.generic]) -> np.dtype[Any]:
+def ring_type(dtype: np.dtype[np.generic]) -> np.dtype[np.generic]:
     """Return the type in which frames are sent to the engine: uint16 stays, other types become float32.
 
     Raises
@@ -104,10 +104,10 @@ class Replay(Readout):
         self.n_frames = None if repeat else count
         self._waits, self.lost = waits, 0
         self._source, self._range = source, (begin, begin + count)
-        self._block: Iterator[NDArray[Any]] = iter(())
+        self._block: Iterator[NDArray[np.generic]] = iter(())
         self._chunks = self._converted()
         self._reader = ThreadPoolExecutor(1, "faintspot-reader")
-        self._ahead: deque[Future[NDArray[Any] | None]] = deque()
+        self._ahead: deque[Future[NDArray[np.generic] | None]] = deque()
         self._stop: StopEvent = threading.Event()
 
     def run(
@@ -157,7 +157,7 @@ class Replay(Readout):
             self._block = iter(block)
         return frame
 
-    def _read(self) -> NDArray[Any] | None:
+    def _read(self) -> NDArray[np.generic] | None:
         """Read the next block; return None at the end."""
         return next(self._chunks, None)
 
@@ -169,14 +169,14 @@ class Replay(Readout):
             _nap()
         return False
 
-    def _converted(self) -> Iterator[NDArray[Any]]:
+    def _converted(self) -> Iterator[NDArray[np.generic]]:
         """Yield blocks of the frames in the ring's type, for the reader's thread."""
         source, dtype = self._source, self._ring.dtype
         size = max(1, _BLOCK_BYTES // (source.shape[0] * source.shape[1] * source.dtype.itemsize))
         while True:
             for _, block in source.blocks(*self._range, size):
                 with np.errstate(over="ignore"):  # values beyond float32 become infinite: bad pixels
-                    converted: NDArray[Any] = block.astype(dtype, copy=False)
+                    converted: NDArray[np.generic] = block.astype(dtype, copy=False)
                 yield converted
             if self.n_frames is not None:
                 return

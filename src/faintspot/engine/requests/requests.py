@@ -181,7 +181,7 @@ class _Listener(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
         self.socket.close()
         self.socket = bound_listener(path)
 
-    def get_request(self) -> tuple[socket.socket, Any]:
+    def get_request(self) -> tuple[socket.socket, object]:
         """Accept a connection; if there are too many, end the one that was idle longest."""
         try:
             connection, address = super().get_request()
@@ -261,7 +261,7 @@ class _Conversation(socketserver.StreamRequestHandler):
 # Messages -------------------------------------------------------------------------------------------
 
 
-def _answer(handler: Handler, fields: dict[str, Any]) -> bytes:
+def _answer(handler: Handler, fields: dict[str, object]) -> bytes:
     """Carry out a command; always return a reply."""
     try:
         reply = _encoded({"ok": True, **handler(fields)})
@@ -278,11 +278,11 @@ def _encoded(message: Mapping[str, object], *, exact: bool = False) -> bytes:
     return to_json(message, exact=exact).encode() + b"\n"
 
 
-def _refusal(text: str) -> dict[str, Any]:
+def _refusal(text: str) -> dict[str, object]:
     return {"ok": False, "error": " ".join(text.split())[:2000]}
 
 
-def _parsed_request(line: bytes) -> dict[str, Any]:
+def _parsed_request(line: bytes) -> dict[str, object]:
     try:
         message = parse_json(line.decode())
     except ValueError:
@@ -292,7 +292,7 @@ def _parsed_request(line: bytes) -> dict[str, Any]:
     return message
 
 
-def changes_of(fields: Mapping[str, object]) -> dict[str, Any]:
+def changes_of(fields: Mapping[str, object]) -> dict[str, object]:
     """Return the new values of a request, by name.
 
     Raises
@@ -319,7 +319,7 @@ def _connect(connection: socket.socket, path: Path, end: float) -> None:
             time.sleep(0.01)
 
 
-def _checked_reply(server: str, line: bytes) -> dict[str, Any]:
+def _checked_reply(server: str, line: bytes) -> dict[str, object]:
     if not line.endswith(b"\n"):
         raise InputError(f"the {server} ended before it answered")
     try:

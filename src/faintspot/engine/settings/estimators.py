@@ -70,7 +70,7 @@ class EngineEstimators:
         gc.collect()  # old versions are reference cycles, and the engine runs without collection
         return {"estimators": list(file.kinds), "frame": frame}
 
-    def unload(self, name: str) -> dict[str, Any]:
+    def unload(self, name: str) -> dict[str, object]:
         """Unload an estimator; if it is in use, the last built-in one takes over.
 
         Returns

@@ -127,7 +127,7 @@ def _parsed_method(text: str) -> InterleavedMethod:
 def _parsed_settings(text: str) -> InterleavedMethod:
     first, *others = text.split("+")
     name, colon, strength = first.partition(":")
-    changes: dict[str, Any] = {}
+    changes: dict[str, object] = {}
     if first not in (_SET, _NONE):
         if name in estimators():
             changes["estimator"] = name

@@ -92,7 +92,7 @@ class RunningSettings(Generic[Prepared]):
         # `take` takes neither of them.
         self._proposing = threading.Lock()  # held while settings are prepared, which may take seconds
         self._lock = threading.Lock()  # for the history and the newest settings
-        self._under_way: tuple[dict[str, Any], float] | None = None
+        self._under_way: tuple[dict[str, object], float] | None = None
         first = _Version(prepare(settings), Change(0, {}, None, frame_number=-1))
         # Written with `_lock` held; read by the engine.
         self._newest = first
@@ -233,7 +233,7 @@ class RunningSettings(Generic[Prepared]):
         """
         if after == self.change_number:
             return []
-        taken: list[tuple[int, int, dict[str, Any], list[int] | None]] = []
+        taken: list[tuple[int, int, dict[str, object], list[int] | None]] = []
         with self._lock:
             frame_number = None
             for change in takewhile(lambda entry: entry.number > after, reversed(self._record)):
@@ -308,7 +308,7 @@ def _checked_indices(where: Sequence[int], n: int) -> list[int]:
     return [int(index) for index in array]
 
 
-def _plain(settings: Settings, name: str, n: int, pixels: int) -> Any:
+def _plain(settings: Settings, name: str, n: int, pixels: int) -> object:
     """Return a setting as plain values, with its default filled in."""
     value = settings.estimator.name if name == "estimator" else getattr(settings, name)
     if name == "steps" and isinstance(settings.estimator, Stepping):

@@ -259,7 +259,7 @@ class ImageStreamWriter:
                 f"{self.path}: this stream cannot be made: {places.total} bytes ({error.strerror})"
             ) from None
 
-    def _head(self, dtype: np.dtype[np.generic]) -> NDArray[Any]:
+    def _head(self, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
         """Return the metadata of a new stream."""
         head = np.zeros((), METADATA)
         code = next(code for code, each in TYPES.items() if np.dtype(each) == dtype)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import time
 from functools import cache
-from typing import Any
 
 BYTES = 32
 """Size of a semaphore in memory (sem_t on 64-bit Linux)."""
@@ -17,7 +16,7 @@ class _Time(ctypes.Structure):
 
 
 @cache
-def _libc() -> Any:
+def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None, use_errno=True)
 
 

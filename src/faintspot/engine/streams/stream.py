@@ -230,7 +230,7 @@ class Follower:
         self,
         name: str,
         say: Callable[[str], None] = lambda text: None,
-        incompatible: Callable[[tuple[int, ...], np.dtype[Any]], str] = lambda shape, dtype: "",
+        incompatible: Callable[[tuple[int, ...], np.dtype[np.generic]], str] = lambda shape, dtype: "",
         meanwhile: Callable[[], str] = lambda: "waiting",
         holds: str = "values",
         prepare: Callable[[Stream], object] = lambda source: None,

@@ -65,7 +65,7 @@ class _Reading:
 
     ring: Ring
     cursor: int
-    items: list[NDArray[Any]] = field(default_factory=list)
+    items: list[NDArray[np.void]] = field(default_factory=list)
     dropped: int = 0
 
     def read(self, most: int) -> int:
@@ -76,7 +76,7 @@ class _Reading:
             self.items.append(items)
         return len(items)
 
-    def taken(self) -> NDArray[Any]:
+    def taken(self) -> NDArray[np.void]:
         """Return the items, and forget them."""
         items, self.items = self.items, []
         return np.concatenate([np.empty(0, self.ring.kind), *items])
@@ -106,7 +106,7 @@ class Recorder:
         self._change_cursor = self._dropped_changes = (
             0  # from the first one, to know the settings at the start
         )
-        self._changes: list[dict[str, Any]] = []
+        self._changes: list[dict[str, object]] = []
         described = ("layout", "settings", "reference", "parts", "control")
         attributes = {
             "name": name,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,7 +42,7 @@ class Ring:
         Type of an item.
     """
 
-    def __init__(self, cell: NDArray[np.int64], items: NDArray[Any]) -> None:
+    def __init__(self, cell: NDArray[np.int64], items: NDArray[np.void]) -> None:
         self.items, self.kind, self._cell = items, items.dtype, cell
 
     @property
@@ -58,7 +56,7 @@ class Ring:
         store(self._cell, 0, written)
         fence()  # before the next item overwrites the oldest
 
-    def since(self, cursor: int, most: int | None = None) -> tuple[NDArray[Any], int, int]:
+    def since(self, cursor: int, most: int | None = None) -> tuple[NDArray[np.void], int, int]:
         """Return copies of the items from a cursor on, in order.
 
         Parameters
@@ -85,7 +83,7 @@ class Ring:
         return copies[overwritten:], last, first - cursor + overwritten
 
 
-def layout_values(layout: Layout) -> dict[str, Any]:
+def layout_values(layout: Layout) -> dict[str, object]:
     """Return a layout as plain values, from which `Layout` can be rebuilt."""
-    values: dict[str, Any] = plain_values(vars(layout))
+    values: dict[str, object] = plain_values(vars(layout))
     return values

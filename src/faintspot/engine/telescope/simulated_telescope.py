@@ -178,7 +178,7 @@ class SimulatedTelescope(Readout, Closing):
             self._order = Order(before.ordered(self.configuration, changes))
             return self._order
 
-    def status(self) -> dict[str, Any]:
+    def status(self) -> dict[str, object]:
         """Return the telescope's counters and conditions, for the control channel."""
         last = self._last
         return {
@@ -200,7 +200,7 @@ class SimulatedTelescope(Readout, Closing):
 
     # ---- frame by frame
 
-    def _frame(self) -> NDArray[Any]:
+    def _frame(self) -> NDArray[np.generic]:
         """Return frame number `_next`, whose exposure began a frame time ago (except for the first one)."""
         if self._underway is None:
             self._underway = self._begin(self._next)

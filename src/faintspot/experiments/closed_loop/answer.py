@@ -243,7 +243,7 @@ class LoopAnswer:
         write_atomically(loop, star.replace("control", **gain).to_text())
         return loop
 
-    def _loop_table(self, flux: int) -> dict[str, Any]:
+    def _loop_table(self, flux: int) -> dict[str, object]:
         best = self.best
         strehl, choice = self.strehl(best.name, flux), self.choice(best.name, flux)
         table = {
@@ -263,6 +263,6 @@ class LoopAnswer:
         return table
 
 
-def _simplicity(kind: MethodKind) -> tuple[Any, ...]:
+def _simplicity(kind: MethodKind) -> tuple[object, ...]:
     beyond_baseline = kind.name != BASELINE, kind.control != INTEGRATOR
     return *beyond_baseline, int(Knowledge.of(kind.estimator)), kind.estimator.cost, kind.name

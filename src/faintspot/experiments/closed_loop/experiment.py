@@ -192,7 +192,7 @@ def _digest(value: object) -> str:
 
 def scored_runs(
     kind: MethodKind, star: LoopConfiguration, choice: Choice, off: DisabledErrors, advance: Advance
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, NDArray[np.generic]]:
     """Run a tuned method in all realisations of the turbulence, in one process: control learns only once.
 
     Returns

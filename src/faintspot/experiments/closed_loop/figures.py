@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -103,7 +101,7 @@ def _switched(term: str) -> str:
     return "whole loop" if term == "nothing" else f"without {term}"
 
 
-def method_style(name: str) -> dict[str, Any]:
+def method_style(name: str) -> dict[str, object]:
     """Return the style of a method's estimator; markers are hollow where the loop does more than the usual.
 
     Lines of control that learns are dash-dotted.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -202,7 +201,7 @@ class LoopQuestion(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        loop: Any = self.configuration
+        loop: object = self.configuration
         if not isinstance(loop, LoopConfiguration):
             got = type(loop).__name__
             raise InputError(

@@ -145,7 +145,7 @@ class Night:
             shutil.rmtree(path, ignore_errors=True)
             hidden.rename(path)
 
-    def _columns(self) -> dict[str, NDArray[Any]]:
+    def _columns(self) -> dict[str, NDArray[np.generic]]:
         """Return the arrays by name."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}

@@ -19,13 +19,13 @@ from faintspot.experiments.night.blocks import Night
 Floats = NDArray[np.float64]
 
 _TEXT = Texts("faintspot.experiments.night")
-_REFERENCE_STYLE: dict[str, Any] = {"color": "#000000", "marker": "o"}
-_TV_STYLES: dict[str, dict[str, Any]] = {
+_REFERENCE_STYLE: dict[str, object] = {"color": "#000000", "marker": "o"}
+_TV_STYLES: dict[str, dict[str, object]] = {
     ALL_STRENGTHS: {"color": "#8a8a8a", "marker": "^"},
     BEST: {"color": METHOD_COLOURS[0], "marker": "s"},
 }
 _MARKERS = "Dv<>P"
-_POINT: dict[str, Any] = {"ls": "", "ms": 5, "elinewidth": 0.7, "alpha": 0.85}
+_POINT: dict[str, object] = {"ls": "", "ms": 5, "elinewidth": 0.7, "alpha": 0.85}
 
 
 def panels_figure(night: Night) -> FigureWithData:
@@ -65,7 +65,7 @@ def panels_figure(night: Night) -> FigureWithData:
     return _TEXT.figure("panels", figure, rows, strengths=night.has_strengths, **values)
 
 
-def _shown(night: Night) -> dict[str, tuple[NDArray[np.bool_], dict[str, Any]]]:
+def _shown(night: Night) -> dict[str, tuple[NDArray[np.bool_], dict[str, object]]]:
     """Return blocks and style of what is drawn, by name; each block once, the reference last."""
     every = groups(night)
     best = next((group.rows for group in every if group.name == BEST), np.zeros(len(night.strehl), np.bool_))
@@ -85,7 +85,7 @@ def _shown(night: Night) -> dict[str, tuple[NDArray[np.bool_], dict[str, Any]]]:
 
 def _points(
     night: Night,
-    shown: dict[str, tuple[NDArray[np.bool_], dict[str, Any]]],
+    shown: dict[str, tuple[NDArray[np.bool_], dict[str, object]]],
     x: Floats,
     x_error: Floats | None = None,
 ) -> list[Line]:
@@ -122,7 +122,7 @@ def _regressions(night: Night) -> list[Line]:
 
 
 def _of_strengths(
-    night: Night, shown: dict[str, tuple[NDArray[np.bool_], dict[str, Any]]], bottom: dict[str, Any]
+    night: Night, shown: dict[str, tuple[NDArray[np.bool_], dict[str, object]]], bottom: dict[str, Any]
 ) -> Panel:
     """Return blocks against strength, and the ranges at the height of the reference plus their difference."""
     reference = night.strehl[night.method == night.reference]

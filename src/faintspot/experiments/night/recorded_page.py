@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ def page_of_recording(recorded: RecordedNight) -> Report:
     return replace(page, sections=[*page.sections, _phase_section(recorded), _blocks_section(recorded)])
 
 
-def summary_of_recording(recorded: RecordedNight) -> dict[str, Any]:
+def summary_of_recording(recorded: RecordedNight) -> dict[str, object]:
     """Return the numbers of the page as plain values for JSON; null is not known."""
     night, gains = recorded.night, recorded.gains
     parts = ("standard_error", "low", "high")

@@ -133,7 +133,7 @@ def observe(
     choices: dict[str, Choice],
     alone: bool,
     advance: Advance,
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, NDArray[np.generic]]:
     """Observe one set; return the values of its blocks, NaN up to the number of blocks of the longest set.
 
     Parameters

@@ -40,7 +40,7 @@ _LARGEST_RATIO = 1.6  # of R to R without denoising; what is above is cut off
 _MARKERS = "osD^vPX<>*"
 _ERROR_TICKS = (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3)
 _KEPT_TICKS = (1, 3, 10, 30, 100)
-_TV_OR_NOT: dict[str, dict[str, Any]] = {TV: {"ls": "-"}, NO_TV: {"ls": "--", "mfc": "white"}}
+_TV_OR_NOT: dict[str, dict[str, object]] = {TV: {"ls": "-"}, NO_TV: {"ls": "--", "mfc": "white"}}
 _LEGEND: dict[str, dict[str, Any]] = {
     "TV": {"color": "#333333", "ls": "-"},
     "no TV": {"color": "#333333", "ls": "--", "marker": "o", "mfc": "white"},
@@ -109,7 +109,7 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
     rows_of_panels = [parts for profile in profiles if (parts := kept_panels(dataset, profile))]
     if not rows_of_panels or not {NO_TV, TV} <= set(dataset["estimator"].values):
         return None
-    rows: list[list[Any]] = []
+    rows: list[list[object]] = []
     panels: list[list[Panel]] = []
     fixed = fixed_mode(dataset).removeprefix("fixed")
     for parts in rows_of_panels:
@@ -167,7 +167,7 @@ def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | 
     return FigureWithData(f"baselines-{profile}", title, caption, figure, *table_of_cells(dataset, every))
 
 
-def _axis_of(table: list[dict[str, Any]]) -> str:
+def _axis_of(table: list[dict[str, object]]) -> str:
     counts = {name: len({row[name] for row in table}) for name in PARAMETERS if name != "profile"}
     if counts["flux_e"] > 1:
         return "flux_e"
@@ -183,7 +183,7 @@ def _by_label(
     table: list[dict[str, Any]], cells: Sequence[int], axis: str, labelled: Sequence[str]
 ) -> list[tuple[str, list[int]]]:
     """Return the cells of each line of a panel, by increasing value of what varies, after their label."""
-    groups: dict[tuple[Any, ...], list[tuple[float, int]]] = {}
+    groups: dict[tuple[object, ...], list[tuple[float, int]]] = {}
     for row, cell in zip(table, cells, strict=True):
         groups.setdefault(tuple(row[key] for key in labelled), []).append((float(row[axis]), cell))
     return [
@@ -196,7 +196,7 @@ def _styles(labels: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return colour and marker of each label: told apart with any colour vision, in order when many."""
     from matplotlib import colormaps
 
-    colours: Sequence[Any] = METHOD_COLOURS
+    colours: Sequence[object] = METHOD_COLOURS
     if len(labels) > len(METHOD_COLOURS):
         colours = [colormaps["viridis"](fraction) for fraction in np.linspace(0.0, 0.9, len(labels))]
     return {
@@ -206,7 +206,10 @@ def _styles(labels: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def _tv_lines(
-    dataset: xarray.Dataset, parts: list[tuple[str, list[int]]], styles: dict[str, dict[str, Any]], axis: str
+    dataset: xarray.Dataset,
+    parts: list[tuple[str, list[int]]],
+    styles: dict[str, dict[str, object]],
+    axis: str,
 ) -> list[Line]:
     """Return R with and without TV against an axis, for each label."""
     lines = []
@@ -232,7 +235,7 @@ def _range_of(axis: str, values: Any) -> tuple[float | None, float | None]:
 
 def _over_k(
     dataset: xarray.Dataset, cell: int, label: str, colour: object
-) -> tuple[list[Line], list[list[Any]]]:
+) -> tuple[list[Line], list[list[object]]]:
     """Return R of a cell against the number of pixels kept as lines and as rows; circles are those chosen."""
     lines, rows = [], []
     k, (parameters,) = dataset["k"].values, parameters_of(dataset, [cell])

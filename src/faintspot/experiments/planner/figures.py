@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +106,7 @@ def _mark_budget(axes: Axes, answer: Answer) -> None:
         return
     magnitude = float(answer.magnitudes(limit.value))
     axes.plot([magnitude], [budget], "o", ms=13, mfc="none", mec="#E69F00", mew=2.5, zorder=5)
-    style: dict[str, Any] = {"color": "#8a5f00", "weight": "bold"}
+    style: dict[str, object] = {"color": "#8a5f00", "weight": "bold"}
     note(axes, f"limit {magnitude:.2f}", (magnitude, budget), "data", xytext=(12, -16), **style)
 
 

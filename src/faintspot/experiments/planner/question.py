@@ -179,7 +179,7 @@ class Question(Options):
         **_positive,
     )
     band: str = setting(DEFAULT_BAND, "Band of the magnitude.", choices=tuple(ZERO_POINTS), group="star")
-    zero_point: Any = setting(
+    zero_point: float | None = setting(
         None,
         "Photons/s/m^2 of magnitude 0 in the band. Default: that of --band.",
         unit="photons",
@@ -200,7 +200,7 @@ class Question(Options):
         group="tune",
         **_positive,
     )
-    budget: Any = setting(
+    budget: str | None = setting(
         None,
         "Slope error allowed, such as 0.1 (px), 0.05arcsec: asks for the limiting magnitude.",
         unit="error",

@@ -148,7 +148,7 @@ def _check_flux(stack: NDArray[np.generic], dark: object, layout: Layout, gain: 
         )
 
 
-def _stack(name: str, value: object) -> NDArray[Any]:
+def _stack(name: str, value: object) -> NDArray[np.generic]:
     array = finite_array(name, value, minimum_dimensions=2)
     if array.ndim > 3:
         raise InputError(f"{name}: expected (n, h, w) or (h, w), got shape {array.shape}")
@@ -162,7 +162,7 @@ def _calibration(
     em_gain = float(stated.get("em_gain") or 1.0)
     measured = _measured(stack, darks, layout, em_gain)
     gain, read_noise = stated.get("gain_e_per_adu"), stated.get("read_noise_e")
-    dark: Any = float(np.median(layout.images(stack)[..., [0, -1], :]))
+    dark: object = float(np.median(layout.images(stack)[..., [0, -1], :]))
     if darks is not None:
         dark = darks.mean(axis=0)
     elif measured is not None:
@@ -234,7 +234,7 @@ def _measured_on_spots(stack: NDArray[Any], dark: Any, layout: Layout, em_gain: 
 def _some(frames: NDArray[np.generic], layout: Layout) -> NDArray[Any]:
     """Frames from all of a recording, as many as hold enough spots."""
     count = min(len(frames), max(1, _SPOTS_TO_LEARN_FROM // len(layout)))
-    sample: NDArray[Any] = frames[np.linspace(0, len(frames) - 1, count).round().astype(int)]
+    sample: NDArray[np.generic] = frames[np.linspace(0, len(frames) - 1, count).round().astype(int)]
     return sample
 
 
@@ -319,7 +319,7 @@ def _range_to_use(measured: SpotRange, psf: PSF, layout: Layout, facts: list[str
 
 
 def _without_background(
-    calibration: Calibration, fitted: LearntPSF, has_darks: bool, stated: dict[str, Any], facts: list[str]
+    calibration: Calibration, fitted: LearntPSF, has_darks: bool, stated: dict[str, object], facts: list[str]
 ) -> Calibration:
     """Take the fitted background off with the dark; above the camera's own, it is light with noise."""
     background = float(fitted.background_e[0])

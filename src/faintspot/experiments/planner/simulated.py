@@ -90,7 +90,7 @@ class SimulatedSpots:
 
     def measure_each(
         self, sample: SpotFrames, method: Method, name: str, values: Sequence[Any]
-    ) -> list[tuple[NDArray[Any], NDArray[Any]]]:
+    ) -> list[tuple[NDArray[np.generic], NDArray[np.generic]]]:
         """Return x and y, (n_frames, SPOTS_PER_FRAME), for each value of one of a method's options.
 
         Where sub-apertures may have values of their own, the values share one pipeline.

@@ -125,7 +125,7 @@ def _stacks(blocks: Iterable[Block], pixels: int) -> Iterator[list[Block]]:
         yield stack
 
 
-def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDArray[Any]]:
+def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDArray[np.generic]]:
     """Measure one cell of a study.
 
     Parameters
@@ -219,7 +219,7 @@ class Scores:
         return np.concatenate(self._stated[method]) if method in self._stated else None
 
 
-def _results(scores: Scores) -> dict[str, NDArray[Any]]:
+def _results(scores: Scores) -> dict[str, NDArray[np.generic]]:
     """Arrange choices and scores as the dataset has them."""
     cell, specification, truth = scores.methods.cell, scores.methods.specification, scores.truth
     methods, modes = specification.estimators, specification.modes

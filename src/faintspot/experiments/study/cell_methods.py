@@ -114,7 +114,7 @@ class CellMethods:
 
     def _method(self, estimator: Estimator) -> Method:
         """Tell an estimator what it has to know."""
-        widths: dict[str, Any] = {}
+        widths: dict[str, object] = {}
         if Need.WIDTH in estimator.needs:
             widths["spot_fwhm_px"], widths["spot_fwhm_y_px"] = self._spot_fwhm_px
         return Method(

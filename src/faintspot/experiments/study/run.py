@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -54,7 +54,7 @@ def new_dataset(specification: StudySpecification) -> xarray.Dataset:
         "mode": len(specification.modes),
         "k": specification.largest_k,
     }
-    variables: dict[str, Any] = {
+    variables: dict[str, object] = {
         name: (
             dims,
             np.full([sizes[dim] for dim in dims], np.nan),
@@ -63,7 +63,7 @@ def new_dataset(specification: StudySpecification) -> xarray.Dataset:
         for name, (dims, units, description) in VARIABLES.items()
     }
     variables[DONE] = (("cell",), np.zeros(len(cells), bool), {"long_name": "whether the cell is measured"})
-    coordinates: dict[str, Any] = {
+    coordinates: dict[str, object] = {
         "estimator": np.array(specification.estimators),
         "estimator2": np.array(specification.estimators),
         "mode": np.array(specification.modes),

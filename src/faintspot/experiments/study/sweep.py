@@ -144,9 +144,9 @@ class Sweep:
     name: str
     flux_e: Any = 100.0
     read_noise_e: Any = 0.1
-    profile: Any = "diffraction"
+    profile: object = "diffraction"
     size: Any = 1.0
-    elongation: Any = 1.0
+    elongation: object = 1.0
     pixels: Any = 16
     position_range_px: Any = 1.0
     background_e: Any = 0.0
@@ -183,11 +183,11 @@ def _values(where: str, name: str, values: Any) -> tuple[Any, ...]:
     return tuple(dict.fromkeys(checked_numbers(where, items, RANGES[name])))
 
 
-def checked_numbers(where: str, items: object, bounds: Option) -> list[Any]:
+def checked_numbers(where: str, items: object, bounds: Option) -> list[object]:
     """Return plain numbers within the bounds, or raise InputError."""
     kind = {"low_open": bounds.low_open, "integer": bounds.whole}
     array = numbers_between(where, items, bounds.low, bounds.high, **kind)
     if array.ndim != 1:
         raise InputError(f"{where}: expected a list of numbers, got shape {array.shape}")
-    numbers: list[Any] = array.tolist()
+    numbers: list[object] = array.tolist()
     return numbers

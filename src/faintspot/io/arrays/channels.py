@@ -37,6 +37,6 @@ def grey(name: str, values: NDArray[np.generic], *, selectable: bool = True) -> 
     return np.ascontiguousarray(first[..., 0])
 
 
-def one_channel(values: NDArray[np.generic], name: str) -> NDArray[Any]:
+def one_channel(values: NDArray[np.generic], name: str) -> NDArray[np.generic]:
     """Return the channel of this name of an image (h, w, 2 to 4)."""
     return np.ascontiguousarray(values[..., min(CHANNELS.index(name), values.shape[-1] - 2)])

@@ -55,7 +55,7 @@ def check_array(name: str, array: Any) -> None:
     check_bytes(name, math.prod(array.chunks) * array.dtype.itemsize, MOST_WHOLE_BYTES, "a chunk")
 
 
-def stored_attributes(path: Path) -> dict[str, Any]:
+def stored_attributes(path: Path) -> dict[str, object]:
     """Return the attributes of a store that is a group.
 
     Raises
@@ -64,7 +64,7 @@ def stored_attributes(path: Path) -> dict[str, Any]:
         When it is not a group of format 3.
     """
     text = read_bytes(path / "zarr.json", "metadata", MOST_TEXT_BYTES)
-    attributes: dict[str, Any] = parse_json(text)["attributes"]
+    attributes: dict[str, object] = parse_json(text)["attributes"]
     return attributes
 
 

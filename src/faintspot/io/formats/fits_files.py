@@ -197,7 +197,7 @@ class _Scaling:
         except Exception as error:  # cards are parsed on access and may be broken
             raise InputError(f"{name}: BSCALE, BZERO and BLANK must be numbers ({one_line(error)})") from None
 
-    def __call__(self, stored: NDArray[np.generic]) -> NDArray[Any]:
+    def __call__(self, stored: NDArray[np.generic]) -> NDArray[np.generic]:
         if self.blank is None and self.scale == 1.0 and self.zero == 0.0:
             return stored
         bits = 8 * stored.itemsize
@@ -206,7 +206,7 @@ class _Scaling:
             other = np.dtype(f"{'i' if bits == 8 else 'u'}{stored.itemsize}")
             if self.zero == (-128.0 if bits == 8 else 2.0 ** (bits - 1)):
                 unsigned = stored.view(f"u{stored.itemsize}")
-                flipped: NDArray[Any] = unsigned ^ unsigned.dtype.type(1 << (bits - 1))
+                flipped: NDArray[np.generic] = unsigned ^ unsigned.dtype.type(1 << (bits - 1))
                 return flipped.view(other)
         is_single = bits <= 16 or (stored.dtype.kind == "f" and bits == 32)
         values: NDArray[np.floating[Any]] = stored.astype(np.float32 if is_single else np.float64)

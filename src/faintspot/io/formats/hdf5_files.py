@@ -36,7 +36,7 @@ class Hdf5(FileFormat):
             if reverse:  # MATLAB's (height, width, frames) is (frames, width, height) here
                 shape = (*shape[:-2], *shape[:-3:-1])
 
-            def open_array(files: ExitStack) -> Any:
+            def open_array(files: ExitStack) -> object:
                 data_set = files.enter_context(h5py.File(path, "r"))[chosen]
                 return _Transposed(data_set) if reverse else data_set
 
@@ -55,7 +55,7 @@ def _dimensions(h5py: Any, file: Any) -> dict[str, int]:
     """Return the number of dimensions of each data set by its path; links are not followed."""
     dimensions: dict[str, int] = {}
 
-    def visit(name: str, item: Any) -> None:
+    def visit(name: str, item: object) -> None:
         if isinstance(item, h5py.Dataset) and not name.startswith("#"):  # MATLAB's internal data
             dimensions[name] = len(item.shape or ())
 

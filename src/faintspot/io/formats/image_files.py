@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +37,7 @@ class _Image(FileFormat):
                 f"{path}: expected 8 bits of a colour, got 16, of which 8 would be lost; save it in grey"
             )
 
-        def load() -> NDArray[Any]:
+        def load() -> NDArray[np.generic]:
             with image.open(path, formats=[self.name]) as opened:
                 values = np.asarray(opened)
             if not is_colour:

@@ -51,7 +51,7 @@ class Npy(FileFormat):
             header = _Header.read(str(path), stream)
         check_present(str(path), path, header.offset + math.prod(header.shape) * header.dtype.itemsize)
 
-        def open_array(files: ExitStack) -> Any:
+        def open_array(files: ExitStack) -> object:
             if header.fortran_order:
                 return np.load(path, mmap_mode="r", allow_pickle=False)
             return StreamedArray(
@@ -102,7 +102,7 @@ class Npz(FileFormat):
                 lambda: unpacked(path, "a frame", [name], MOST_WHOLE_BYTES)[name],
             )
 
-        def open_array(files: ExitStack) -> Any:
+        def open_array(files: ExitStack) -> object:
             archive = files.enter_context(zipfile.ZipFile(path))
             stream = files.enter_context(archive.open(member))
             return StreamedArray(stream, header.offset, header.dtype, header.shape, compressed=True)
@@ -166,7 +166,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     return {item.filename.removesuffix(".npy"): item for item in members}
 
 
-def _pieces(array: NDArray[np.generic]) -> Iterator[NDArray[Any]]:
+def _pieces(array: NDArray[np.generic]) -> Iterator[NDArray[np.generic]]:
     """Yield an array in pieces of bounded size along its first axis."""
     if not array.shape:
         yield array

@@ -101,7 +101,7 @@ def _array(name: str, path: Path, chosen: list[Any], numbers: list[int]) -> Stor
             lambda files: StreamedArray(files.enter_context(path.open("rb")), offset, dtype, shape),
         )
 
-    def open_pages(files: ExitStack) -> Any:
+    def open_pages(files: ExitStack) -> object:
         file = files.enter_context(load_tifffile().TiffFile(path))
         pages = _Pages(path, [page for number in numbers for page in file.series[number].pages])
         return pages if count > 1 else pages[0:1][0]
@@ -120,7 +120,7 @@ class _Pages:
         pages = np.stack([self._decoded(page) for page in self._pages[part]])
         return pages if pages.ndim == 3 else grey(str(self._path), pages, selectable=False)
 
-    def _decoded(self, page: Any) -> NDArray[Any]:
+    def _decoded(self, page: Any) -> NDArray[np.generic]:
         if page.compression in _PLAIN or importlib.util.find_spec("imagecodecs"):
             return np.asarray(page.asarray(maxworkers=1))
         if page.dtype.itemsize > 4:

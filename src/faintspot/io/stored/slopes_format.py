@@ -138,7 +138,7 @@ def pixels_in(unit: str, attributes: Mapping[str, Any]) -> float:
     return float(scale)
 
 
-def scaled_positions(variables: Mapping[str, NDArray[Any]], factor: float) -> dict[str, NDArray[Any]]:
+def scaled_positions(variables: Mapping[str, NDArray[Any]], factor: float) -> dict[str, NDArray[np.generic]]:
     """Return variables with positions and their errors converted to pixels of another size."""
     factors = {"px": np.float32(factor), "px^2": np.float32(factor**2)}
     return {

@@ -47,7 +47,7 @@ _COORDINATES = "coordinates"
 _AT_ONCE = 16
 _CHUNK_NUMBERS = 1 << 16
 # As "c.12.0" instead of a folder for each: folders must be synchronised, too.
-_CHUNK_NAMES: dict[str, Any] = {"name": "default", "separator": "."}
+_CHUNK_NAMES: dict[str, object] = {"name": "default", "separator": "."}
 
 
 class SlopeStore:

@@ -100,7 +100,7 @@ def _system(telemetry: Telemetry, ao_mode: str) -> Any:
     )
 
 
-def _noise(telemetry: Telemetry) -> Any:
+def _noise(telemetry: Telemetry) -> object:
     """Return the table with variances and covariance of every slope's errors, and its flags."""
     from astropy.io import fits
 
@@ -126,7 +126,7 @@ def _metadata(telemetry: Telemetry) -> list[Any]:
     ]
 
 
-def _sensor(telemetry: Telemetry, source: object, estimator: str | None) -> Any:
+def _sensor(telemetry: Telemetry, source: object, estimator: str | None) -> object:
     """Return the Shack-Hartmann sensor with its measurements."""
     import aotpy
 
@@ -176,7 +176,7 @@ def _mask(cells: NDArray[np.int64]) -> NDArray[np.int32] | None:
     return mask if np.count_nonzero(mask >= 0) == len(indices) else None
 
 
-def _detector(telemetry: Telemetry) -> Any:
+def _detector(telemetry: Telemetry) -> object:
     """Return the detector with the recorded frames."""
     import aotpy
 

@@ -12,7 +12,7 @@ from faintspot.io.stored.slopes_format import VARIABLES
 class ArrayStorage(NamedTuple):
     """Storage of an array of telemetry."""
 
-    dtype: np.dtype[Any]
+    dtype: np.dtype[np.generic]
     dimensions: tuple[str, ...]
     units: str
     in_all: bool

@@ -149,7 +149,7 @@ def item_type(
     align : bool
         Whether each array begins at a multiple of its numbers' size.
     """
-    columns: list[Any] = [(_NOT_STORED, np.int64)]
+    columns: list[object] = [(_NOT_STORED, np.int64)]
     for name, stored in ARRAYS.items():
         first, *others = stored.dimensions
         if first == item and name not in without:

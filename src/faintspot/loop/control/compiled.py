@@ -16,6 +16,7 @@ from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
 from faintspot.slopes.kernels.driver.products import ProductPart, add_products, finish_product, is_measured
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
 _compiled = partial(compiled_with, source=__file__)
 
@@ -26,17 +27,17 @@ square of a slope along one axis, px^2."""
 
 @_compiled
 def true_slopes(
-    x: Any,
-    y: Any,
-    flags: Any,
-    error_x: Any,
-    error_y: Any,
-    covariance_xy: Any,
-    gain: Any,
-    slopes: Any,
-    errors: Any,
-    covariance: Any,
-    statistics: Any,
+    x: Singles,
+    y: Singles,
+    flags: NDArray[np.uint8],
+    error_x: Singles,
+    error_y: Singles,
+    covariance_xy: Singles,
+    gain: float,
+    slopes: Floats,
+    errors: Floats,
+    covariance: Floats,
+    statistics: Floats,
 ) -> None:
     """Write slopes [true px], all x, then all y, their errors and covariances; invalid: 0, infinite and 0.
 
@@ -75,7 +76,9 @@ FLUX, DISPLACEMENT, FLUX_TIMES_DISPLACEMENT = range(3)
 
 
 @_compiled
-def displaced_flux(commands: Any, flux: Any, columns: Any, work: Any, statistics: Any) -> None:
+def displaced_flux(
+    commands: Floats, flux: Singles, columns: Singles, work: tuple[Singles, Singles], statistics: Floats
+) -> None:
     """Write means of the flux, of the squared displacement by the mirror, and of their product.
 
     Parameters

@@ -199,7 +199,7 @@ class Control:
         assert self.reconstructor  # refuses a matrix that cannot be inverted
         object.__setattr__(self, "model", self._checked_model())
 
-    def _checked_model(self) -> Any:
+    def _checked_model(self) -> object:
         kind = self.options.controller
         if self.removed_modes and not integrates(kind):
             raise InputError(
@@ -398,7 +398,7 @@ def _of_table(configuration: Configuration, values: Mapping[str, Any]) -> Contro
         return Control(arrays[INTERACTION], arrays.get(REFERENCE), options, file, centres)
 
 
-def _read(path: Path, name: str, location: object) -> NDArray[Any]:
+def _read(path: Path, name: str, location: object) -> NDArray[np.generic]:
     """Read an array from the file that the table names, relative to the configuration."""
     if not isinstance(location, str):
         raise InputError(f"expected the name of a file, found {location!r:.80}", name=f"{TABLE}.{name}")

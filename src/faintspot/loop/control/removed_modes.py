@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +23,7 @@ _compiled = partial(compiled_with, source=__file__)
 
 
 @_compiled
-def _mean(values: Any, flags: Any) -> float:
+def _mean(values: Floats, flags: NDArray[np.uint8]) -> float:
     """Return the mean over valid sub-apertures; 0 without any."""
     total, valid = 0.0, 0
     for s in range(flags.shape[0]):
@@ -35,7 +34,7 @@ def _mean(values: Any, flags: Any) -> float:
 
 
 @_compiled
-def _remove(flags: Any, focus: Any, slopes: Any, statistics: Any) -> None:
+def _remove(flags: NDArray[np.uint8], focus: Floats, slopes: Floats, statistics: Floats) -> None:
     """Subtract the modes, fitted to valid slopes by least squares; write the mean square that is left."""
     n = flags.shape[0]
     product, square, residual, valid = 0.0, 0.0, 0.0, 0

@@ -39,13 +39,13 @@ def _map(name: str, value: object) -> NDArray[np.float64]:
     return array
 
 
-def _scalar_or_map(name: str, value: object) -> Any:
+def _scalar_or_map(name: str, value: object) -> object:
     if real_array(name, value).ndim == 0:
         return number_between(name, value, -_LARGEST_ADU, _LARGEST_ADU)
     return _map(name, value)
 
 
-def _read_noise(name: str, value: object) -> Any:
+def _read_noise(name: str, value: object) -> object:
     """Return a number, or a map whose values are in range or NaN, not all of them NaN."""
     if real_array(name, value).ndim == 0:
         return number_between(name, value, 0.0, _LARGEST_READ_NOISE_E)
@@ -57,7 +57,7 @@ def _read_noise(name: str, value: object) -> Any:
     return noise
 
 
-def _mask_or_list(name: str, value: object) -> NDArray[Any]:
+def _mask_or_list(name: str, value: object) -> NDArray[np.generic]:
     """Return a boolean mask, or rows and columns as (n, 2) int64."""
     try:
         array = np.array(value)
@@ -220,12 +220,12 @@ class Calibration(ConfigurationTable, table="calibration"):
             save_arrays(store, maps)
         save_tables(path, {"calibration": {**values, **{key: f"{store.name}:{key}" for key in maps}}})
 
-    def to_table(self) -> dict[str, Any]:
+    def to_table(self) -> dict[str, object]:
         """Return the table of a configuration file, in which maps are represented by their shapes."""
         values = super().to_table()
         return {key: f"map of {value.shape}" if is_map(value) else value for key, value in values.items()}
 
-    def _arrays(self) -> dict[str, NDArray[Any]]:
+    def _arrays(self) -> dict[str, NDArray[np.generic]]:
         """Maps with the size of a frame."""
         arrays = {name: getattr(self, name) for name in _MAPS}
         return {
@@ -308,7 +308,7 @@ def read_map(key: str, location: str | Path) -> NDArray[Any]:
     return np.asarray((array != 0) | ~np.isfinite(array))
 
 
-def _map_or_value(path: Path, key: str, value: object) -> Any:
+def _map_or_value(path: Path, key: str, value: object) -> object:
     """Read the map named in a configuration file, relative to that file."""
     if key not in _MAPS or not isinstance(value, str):
         return value

@@ -7,7 +7,7 @@ never tests its name.
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -170,7 +170,7 @@ class Estimator(Options):
         """
         return None
 
-    def locate(self, images: NDArray[np.float32], sensor: Sensor, prior: Floats) -> Any:
+    def locate(self, images: NDArray[np.float32], sensor: Sensor, prior: Floats) -> object:
         """Return the positions of the spots of one frame; override this in an estimator without a kernel.
 
         Parameters
@@ -304,12 +304,12 @@ class EstimatorPlan:
         raise NotImplementedError
 
     @property
-    def tables(self) -> Any:
+    def tables(self) -> tuple[object, ...]:
         """Tables that the kernel reads in addition to the settings: a NamedTuple."""
         raise NotImplementedError
 
     @property
-    def own_scratch(self) -> Any:
+    def own_scratch(self) -> Callable[..., tuple[object, ...]]:
         """Function that allocates the kernel's scratch memory; unchanged as long as `tables` are."""
         raise NotImplementedError
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +25,15 @@ _TYPICAL_FLUX_E = 300.0
 _AT_SEARCH_LIMIT = np.uint8(SubapertureFlag.AT_SEARCH_LIMIT)
 
 
-def _limited(away: NDArray[np.generic], table: NDArray[np.float32], flags: NDArray[np.uint8]) -> NDArray[Any]:
+def _limited(
+    away: NDArray[np.generic], table: NDArray[np.float32], flags: NDArray[np.uint8]
+) -> NDArray[np.generic]:
     """Clip slopes (n, 2) to the search range, and set the flags (n,) of the valid ones that were clipped."""
     reach = table[groups.RANGE]
     at_limit = np.abs(away).max(axis=1) >= reach - groups.LIMIT_ROUNDING_PX
     flags &= ~_AT_SEARCH_LIMIT
     flags[at_limit & (flags & UNMEASURED == 0)] |= _AT_SEARCH_LIMIT
-    slopes: NDArray[Any] = np.clip(away, -reach[:, None], reach[:, None])
+    slopes: NDArray[np.generic] = np.clip(away, -reach[:, None], reach[:, None])
     return slopes
 
 
@@ -73,12 +75,12 @@ class PythonPlan(EstimatorPlan):
         self.found(typical_images(sensor.n, sensor.window), sensor.zero.copy())
 
     @property
-    def tables(self) -> Any:
+    def tables(self) -> gravity.GravityTables:
         """See `EstimatorPlan`."""
         return gravity.GravityTables()
 
     @property
-    def own_scratch(self) -> Any:
+    def own_scratch(self) -> Callable[..., gravity.GravityScratch]:
         """See `EstimatorPlan`."""
         return gravity.gravity_scratch
 

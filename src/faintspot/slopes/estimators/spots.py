@@ -66,12 +66,12 @@ class SpotPlan(EstimatorPlan):
         )
 
     @property
-    def tables(self) -> Any:
+    def tables(self) -> spot_fits.ModelTables | spot_fits.PosteriorTables:
         """See `EstimatorPlan`."""
         return self.model_tables
 
     @cached_property
-    def own_scratch(self) -> Any:
+    def own_scratch(self) -> partial[spot_fits.SpotScratch]:
         """See `EstimatorPlan`."""
         return partial(spot_fits.spot_scratch, rank=self.model.rank, taps=self.taps.shape[2])
 

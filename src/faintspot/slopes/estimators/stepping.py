@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 from faintspot.base.config.options import option
 from faintspot.slopes.estimators.base import Estimator
@@ -16,7 +16,7 @@ _STEPS_IN_BRIGHT_FLUX = 12
 class Stepping(Estimator):
     """Estimator that makes the same number of steps for every image, so that its run time is constant."""
 
-    steps: Any = option(None, "Number of steps.", low=1, high=100, whole=True, per_subaperture=False)
+    steps: int | None = option(None, "Number of steps.", low=1, high=100, whole=True, per_subaperture=False)
 
     usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 3}
     """By preset."""

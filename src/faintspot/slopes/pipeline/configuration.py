@@ -191,7 +191,7 @@ def unpacked(files: Mapping[str, str]) -> tuple[Calibration, PSF | None, Score |
 
 def to_text(*items: Layout | Calibration | Settings) -> str:
     """Return the configuration as TOML text; calibration maps are represented by their shapes."""
-    tables: dict[str, Any] = {}
+    tables: dict[str, object] = {}
     for item in items:
         if isinstance(item, Settings):
             tables |= {name: values for name, values in item.to_tables().items() if values}

@@ -70,7 +70,7 @@ def table_of_slopes(slopes: Variables, layout: Layout | None, unit: str) -> pand
     return pandas.DataFrame(columns, index)
 
 
-def layout_coordinates(layout: Layout) -> dict[str, NDArray[Any]]:
+def layout_coordinates(layout: Layout) -> dict[str, NDArray[np.generic]]:
     """Return the position of each sub-aperture in the form used in files of slopes."""
     return {
         "centre_x": layout.centres[:, 0],
@@ -82,7 +82,7 @@ def layout_coordinates(layout: Layout) -> dict[str, NDArray[Any]]:
 
 def _parts(
     slopes: Variables, layout: Layout | None, unit: str
-) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
+) -> tuple[dict[str, NDArray[np.generic]], dict[str, NDArray[np.generic]]]:
     """Return the variables (n_frames, n_subapertures) in the given unit, and the coordinates."""
     variables = {name: np.atleast_2d(slopes[name]) for name in VARIABLES}
     n = variables["x"].shape[1]

@@ -84,7 +84,7 @@ class Plan:
     ) -> None:
         n, pixels = len(layout), layout.pixels
 
-        def per_subaperture(name: str) -> NDArray[Any]:
+        def per_subaperture(name: str) -> NDArray[np.generic]:
             return settings.values(name, n, pixels)
 
         search = per_subaperture("search_range_px").astype(np.float64)
@@ -116,9 +116,9 @@ class Plan:
         self._fixed = self._fixed_table(per_subaperture)
         self._levels: list[NDArray[np.float32]] = []
         self._variants: dict[int, int] = {}
-        self._kernels: dict[tuple[Any, str], Direct] = {}
+        self._kernels: dict[tuple[object, str], Direct] = {}
         self._lock = threading.RLock()
-        self._made: tuple[NDArray[np.float32], Any, Any] | None = None
+        self._made: tuple[NDArray[np.float32], object, object] | None = None
         if not self.needs_flux:
             self._add(self.sensor.flux_e)
 
@@ -165,7 +165,7 @@ class Plan:
         predicted = self.no_prior if prior is None else prior
         return Task(settings, variants, predicted, tables, self.variances)
 
-    def _arguments(self) -> tuple[NDArray[np.float32], Any, Any]:
+    def _arguments(self) -> tuple[NDArray[np.float32], object, object]:
         """Return settings, tables and scratch function, rebuilt only for a new flux level."""
         with self._lock:
             if self._made is None or len(self._made[0]) != len(self._levels):

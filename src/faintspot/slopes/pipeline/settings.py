@@ -30,7 +30,7 @@ class SharedOptions(Options):
         high=1e4,
         low_open=True,
     )
-    max_bad_fraction: Any = option(
+    max_bad_fraction: object = option(
         0.25, "Fraction of bad pixels above which a sub-aperture is invalid.", low=0.0, high=1.0
     )
     error_scale: Any = option(1.0, "Factor applied to the standard errors.", low=0.0, high=1e3, low_open=True)
@@ -43,14 +43,14 @@ class SharedOptions(Options):
         high=1e12,
         low_open=True,
     )
-    spot_fwhm_px: Any = option(
+    spot_fwhm_px: object = option(
         None,
         "Full width at half maximum of the spots in the frame, along x. Default: the width of the PSF.",
         unit="px",
         low=0.1,
         high=64.0,
     )
-    spot_fwhm_y_px: Any = option(
+    spot_fwhm_y_px: object = option(
         None, "As spot_fwhm_px, along y. Default: the width along x.", unit="px", low=0.1, high=64.0
     )
 

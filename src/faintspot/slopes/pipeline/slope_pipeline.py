@@ -248,7 +248,7 @@ class SlopePipeline:
         pipeline._prepare()
         return pipeline
 
-    def _noise_of_images(self) -> Any:
+    def _noise_of_images(self) -> object:
         """Return the read noise of `for_images`."""
         if not self.plan.sensor.has_noise_map:
             return self.calibration.read_noise_e
@@ -327,7 +327,7 @@ class SlopePipeline:
         calibrated, denoised, background = stages
         return Stages(self.layout.images(array), calibrated, denoised, background, slopes)
 
-    def checked(self, frame: ArrayLike) -> NDArray[Any]:
+    def checked(self, frame: ArrayLike) -> NDArray[np.generic]:
         """Return one or several frames as an array; raise InputError if they do not fit the layout."""
         array = real_array("frame", frame, minimum_dimensions=2)
         if array.ndim > 3 or array.shape[-2:] != self.layout.frame_shape:
@@ -431,7 +431,7 @@ def _checks(dtype: np.dtype[np.generic], lanes: Lanes) -> Direct:
     return Direct(check_slopes)
 
 
-def kernel_frames(array: NDArray[np.generic]) -> NDArray[Any]:
+def kernel_frames(array: NDArray[np.generic]) -> NDArray[np.generic]:
     """Return frames in the form that kernels read: (n, h, w), contiguous, uint16 or float32."""
     if array.dtype in _KERNEL_TYPES and array.flags.c_contiguous and array.dtype.isnative:
         return array if array.ndim == 3 else array[None]
@@ -455,7 +455,7 @@ def _reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -
     return array
 
 
-def _camera_type(frame: ArrayLike) -> np.dtype[Any]:
+def _camera_type(frame: ArrayLike) -> np.dtype[np.generic]:
     """Return the type of the frame's pixels as given: masked integers become floats later."""
     return frame.dtype if isinstance(frame, np.ndarray) else np.asarray(frame).dtype
 

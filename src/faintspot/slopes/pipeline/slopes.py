@@ -92,7 +92,7 @@ class Slopes:
         return cls(**arrays, keep=keep)
 
     @property
-    def variables(self) -> dict[str, NDArray[Any]]:
+    def variables(self) -> dict[str, NDArray[np.generic]]:
         """Variables stored in files of slopes, by name."""
         return {name: getattr(self, name) for name in VARIABLES}
 

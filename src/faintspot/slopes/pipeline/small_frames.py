@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +34,7 @@ class SmallFrames:
         plan: Plan,
         source: Source,
         scratch: Scratch,
-        flag_doubtful: Callable[[SlopeArrays, NDArray[Any]], None],
+        flag_doubtful: Callable[[SlopeArrays, NDArray[np.generic]], None],
     ) -> None:
         n = len(source.corners)
         groups = -(-n // source.lanes.width)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from types import EllipsisType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +67,6 @@ class Rectangle:
         return cls(x0, y0, x1, y1)
 
     @property
-    def slices(self) -> tuple[Any, ...]:
+    def slices(self) -> tuple[EllipsisType, slice, slice]:
         """Slices that cut the rectangle out of one or several frames."""
         return (..., slice(self.y0, self.y1), slice(self.x0, self.x1))

@@ -98,7 +98,7 @@ def find_windows(
     return Windows(shape, window, corners, within, grid, fitted)
 
 
-def _finite_or_masked(name: str, value: ArrayLike) -> NDArray[Any]:
+def _finite_or_masked(name: str, value: ArrayLike) -> NDArray[np.generic]:
     """Return a real array of two or three dimensions, which may contain NaN."""
     array = real_array(name, value, minimum_dimensions=2)
     if array.ndim > 3:

@@ -77,7 +77,7 @@ class LaserGuideStar:
     """
 
     subapertures_m: Any
-    launch_m: Any
+    launch_m: object
     pixel_arcsec: float
     spot: PSF
     zenith_distance_deg: float = 0.0

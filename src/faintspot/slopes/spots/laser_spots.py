@@ -65,7 +65,7 @@ class LaserSpots(ConfigurationTable, table="laser"):
         If a value is missing or out of range.
     """
 
-    launch_m: Any = setting(REQUIRED, unit="m", check=_position)
+    launch_m: object = setting(REQUIRED, unit="m", check=_position)
     spot_fwhm_arcsec: float = number(REQUIRED, 0.0, 60.0, unit="arcsec", low_open=True)
     at_m: Any = setting(None, unit="m", check=_position)
     profile: SodiumProfile = field(default_factory=SodiumProfile.gaussian)

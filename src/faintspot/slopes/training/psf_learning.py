@@ -268,7 +268,7 @@ def image_stack(images: ArrayLike, calibration: Calibration) -> Stack:
     return _stack(raw[:, None], calibration.maps(raw.shape[1:])[:, None], calibration, raw.dtype)
 
 
-def _stack(windows: NDArray[Any], maps: NDArray[Any], calibration: Calibration, dtype: Any) -> Stack:
+def _stack(windows: NDArray[Any], maps: NDArray[np.generic], calibration: Calibration, dtype: Any) -> Stack:
     """Calibrate windows (n_frames, n, ny, nx) with maps (2, n, ny, nx)."""
     # Saturation NaN means none: no value is at least NaN.
     saturated = windows >= calibration.saturation(dtype)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import comb
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +40,7 @@ class SplineGrid:
         columns, rows = (high - low).astype(int) + 1
         return cls((corner + low) * pitch_px @ axes, axes, pitch_px, (int(rows), int(columns)))
 
-    def values(self, points: Floats) -> Any:
+    def values(self, points: Floats) -> sparse.csr_matrix:
         """Return the sparse matrix from nodes to the surface at points (n, 2) in frame pixels."""
         at = (points - self.origin) @ self.axes.T / self.pitch_px
         first = np.floor(at).astype(np.int64)
@@ -53,7 +52,7 @@ class SplineGrid:
         size = len(points), self.shape[0] * self.shape[1]
         return sparse.csr_matrix((weights.ravel(), (rows, node.ravel())), shape=size)
 
-    def gradients(self, outlines: Floats) -> Any:
+    def gradients(self, outlines: Floats) -> sparse.csr_matrix:
         """Return the sparse matrix from nodes to mean gradients over polygons, (2 n, nodes), per pitch."""
         points, weights, normals, areas = edge_points(outlines, _EDGE_POINTS)
         n, size = len(outlines), points[0].size // 2
@@ -63,12 +62,12 @@ class SplineGrid:
         means = [sparse.csr_matrix((part.ravel(), (rows, columns)), shape=(n, n * size)) for part in parts]
         return sparse.vstack([mean @ surface for mean in means], format="csr")
 
-    def roughness(self) -> Any:
+    def roughness(self) -> sparse.csr_matrix:
         """Return the sparse matrix whose quadratic form is the mean square of third derivatives.
 
         A small part of it is that of second derivatives.
         """
-        form: Any = 0
+        form: object = 0
         for order, share in ((3, 1.0), (2, _CURVATURE)):
             for along in range(order + 1):
                 matrix = sparse.kron(_steps(self.shape[0], order - along), _steps(self.shape[1], along))
@@ -83,9 +82,9 @@ def _weights(position: Floats) -> Floats:
     return np.stack(four, axis=-1) / 6
 
 
-def _steps(n: int, order: int) -> Any:
+def _steps(n: int, order: int) -> sparse.csr_matrix:
     """Return the sparse matrix of differences of an order between n values."""
-    matrix: Any = sparse.identity(n, format="csr")
+    matrix = sparse.identity(n, format="csr")
     for _ in range(order):
         matrix = matrix[1:] - matrix[:-1]
     return matrix

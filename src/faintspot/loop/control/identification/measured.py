@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ class Measured:
         factor = math.exp(1.96 * self.error / self.value)
         return self.value / factor, self.value * factor
 
-    def as_values(self) -> dict[str, Any]:
+    def as_values(self) -> dict[str, object]:
         """Return plain values; the remark says why one is NaN."""
         low, high = self.interval
         numbers = {"value": self.value, "error": self.error, "low": low, "high": high}

@@ -115,7 +115,7 @@ class Recording:
         frame = np.arange(len(slopes))
         if self.frame is not None:
             frame = increasing("frame", self.frame, len(slopes), integer=True)
-        values: dict[str, Any] = {"slopes": slopes, "cells": cells, "frame": frame}
+        values: dict[str, object] = {"slopes": slopes, "cells": cells, "frame": frame}
         for name, declared in NUMBERS.items():
             if hasattr(self, name):
                 values[name] = declared.checked(name, getattr(self, name))

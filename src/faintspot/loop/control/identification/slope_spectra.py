@@ -203,7 +203,7 @@ def _interpolate(
 
 
 @_compiled
-def _spline(apart_m: Any, side: Any, spacing: Any, origin: Any, nodes: Any, weights: Any) -> int:
+def _spline(apart_m: float, side: float, spacing: float, origin: int, nodes: int, weights: Floats) -> int:
     """Write weights and derivatives (2, 4) of coefficients at a separation; return the first one's place."""
     ratio = apart_m / side
     root = math.sqrt(1.0 + ratio * ratio)

@@ -43,7 +43,7 @@ GUARD_NUMBERS = 16
 
 
 @partial(compiled_with, source=__file__)
-def choose(guard: Any, learnt: Any, plain: Any) -> None:
+def choose(guard: Any, learnt: object, plain: Any) -> None:
     """Select the controller that drives the mirror from the next frame on.
 
     Parameters

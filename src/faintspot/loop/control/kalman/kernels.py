@@ -44,15 +44,15 @@ class Matrices(NamedTuple):
 
     interaction: Any
     """(commands, m)"""
-    reconstruct: Any
+    reconstruct: object
     """(m, commands)"""
     phase: Any
     """(m, commands)"""
     covariance: Any
     """(m, states): covariance of the errors of slopes and state before a measurement."""
-    uncertainty: Any
+    uncertainty: object
     """(m, m): covariance of the slopes' error."""
-    usual_inverse: Any
+    usual_inverse: object
     """(m, m): inverse of the slopes' covariance with their usual noise."""
     usual_variance: Any
     """(m,): diagonal of that covariance."""

@@ -21,6 +21,7 @@ from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
 
 Floats = NDArray[np.float64]
+_Singles = NDArray[np.float32]
 
 _REACH_OF_COVARIANCE = 2.5
 """Sub-apertures from within which corrections come while the covariance is computed: more take much time."""
@@ -211,7 +212,7 @@ def local_shapes(arrays: Mapping[str, Any], slopes: int) -> dict[str, tuple[int,
     }
 
 
-def _slopes(state: Any) -> Floats:
+def _slopes(state: _Singles) -> Floats:
     """Return the slopes (m,) of a state."""
     total = np.zeros((len(state) - 1, 2))
     for layer in range(state.shape[2]):  # faster than a sum over an axis as short as this
@@ -220,7 +221,7 @@ def _slopes(state: Any) -> Floats:
 
 
 @_compiled
-def _correct(state: Any, gains: Any, around: Any, surprise: Any) -> None:
+def _correct(state: _Singles, gains: _Singles, around: NDArray[np.int32], surprise: _Singles) -> None:
     """Add to the state of each sub-aperture what the surprise around it tells.
 
     Parameters
@@ -242,7 +243,7 @@ def _correct(state: Any, gains: Any, around: Any, surprise: Any) -> None:
 
 
 @_compiled
-def _advance(state: Any, weights: Any, near: Any, later: Any) -> None:
+def _advance(state: _Singles, weights: _Singles, near: NDArray[np.int32], later: _Singles) -> None:
     """Write the state of the next frame.
 
     Parameters

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -61,7 +60,7 @@ class Laser(ConfigurationTable, table="laser"):
         number_between("laser.altitude_m[0]", self.altitude_m[0], self.site_altitude_m + 1e3)
         for row in values:
             SodiumProfile(self.altitude_m, row)
-        density: Any = tuple(map(tuple, values.tolist()))
+        density: object = tuple(map(tuple, values.tolist()))
         object.__setattr__(self, "density", density)
 
     @property

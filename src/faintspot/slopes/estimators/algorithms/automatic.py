@@ -19,7 +19,7 @@ the centre of the window; if the noise exceeds the range of positions, the image
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Required, TypedDict, Unpack
+from typing import NamedTuple, Required, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +27,9 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.algorithms.automatic_constants import FEW, KEPT, SMOOTHING, STRENGTH, Kept
+
+_Values = np.float64 | NDArray[np.float64]  # one number, or an array
+_Truths = np.bool_ | NDArray[np.bool_]
 
 METHODS = ("tv", "none", "smoothed")
 PROFILES = ("diffraction", "gaussian")
@@ -193,45 +196,45 @@ def automatic_kept_pixels(
 class _Sensor(NamedTuple):
     """Flux, camera and window in electrons and pixels; each a number or an array."""
 
-    flux: Any
-    excess: Any
-    variance: Any  # of a dark pixel
-    counted: Any  # the part of it due to the background
-    pixels: Any
-    area: Any
-    elongation: Any
-    range_px: Any
+    flux: _Values
+    excess: _Values
+    variance: _Values  # of a dark pixel
+    counted: _Values  # the part of it due to the background
+    pixels: _Values
+    area: _Values
+    elongation: _Values
+    range_px: _Values
     gaussian: bool
 
     @property
-    def matched_squared(self) -> Any:
+    def matched_squared(self) -> _Values:
         """Return D^2."""
         return self.flux**2 / (self.area * self.variance)
 
     @property
-    def core_photons(self) -> Any:
+    def core_photons(self) -> _Values:
         """Return q."""
         return self.flux / (self.excess * self.area)
 
     @property
-    def core_photon_variance(self) -> Any:
+    def core_photon_variance(self) -> _Values:
         """Photon noise of a pixel of the core, divided by the variance of a dark pixel."""
         return self.excess * self.flux / (self.area * self.variance)
 
     @property
-    def prior_signal(self) -> Any:
+    def prior_signal(self) -> _Values:
         """D^2 r^2 / N: range of the spots over the noise of the centre of gravity of the whole window."""
         return self.matched_squared * self.range_px**2 / self.pixels
 
-    def contrast(self, constants: Kept) -> Any:
+    def contrast(self, constants: Kept) -> _Values:
         """Return C."""
         tail = constants.tail * self.excess * self.counted
         return self.flux / (self.area * (np.sqrt(self.variance) + tail))
 
 
-def _checked(name: str, value: Any, low: float, low_open: bool = False) -> Any:
+def _checked(name: str, value: object, low: float, low_open: bool = False) -> _Values:
     """Return a number or array within the range; plain numbers use a fast path (for real time)."""
-    if type(value) in (float, int) and low < value <= _LARGEST:
+    if (type(value) is float or type(value) is int) and low < value <= _LARGEST:
         return np.float64(value)
     return numbers_between(name, value, low, _LARGEST, low_open=low_open)[()]
 
@@ -273,14 +276,14 @@ def _sensor(
     )
 
 
-def _lost(sensor: _Sensor, constants: Kept) -> Any:
+def _lost(sensor: _Sensor, constants: Kept) -> _Truths:
     """Return where the core of the spot does not stand out of the noise of the dark pixels."""
     contrast = sensor.contrast(constants) * (sensor.area / 9.0) ** constants.lost_area
     limit = constants.lost * (sensor.pixels / 256.0) ** constants.lost_window
     return contrast * sensor.range_px**constants.lost_range < limit
 
 
-def _lost_and_off(sensor: _Sensor, constants: Kept) -> tuple[Any, Any]:
+def _lost_and_off(sensor: _Sensor, constants: Kept) -> tuple[_Truths, _Truths]:
     """Return where the spot is lost, and where denoising is better omitted."""
     lost = _lost(sensor, constants)
     off = lost & (sensor.prior_signal < constants.off_lost)
@@ -288,12 +291,12 @@ def _lost_and_off(sensor: _Sensor, constants: Kept) -> tuple[Any, Any]:
     return lost, off | (signal < constants.off) | (sensor.core_photons < constants.off_photons)
 
 
-def _signal_with_photons(sensor: _Sensor) -> Any:
+def _signal_with_photons(sensor: _Sensor) -> _Values:
     """Return D^2 including the photon noise of the spot itself."""
     return sensor.matched_squared / (1 + FEW.photons * sensor.core_photon_variance)
 
 
-def _found(sensor: _Sensor, constants: Kept) -> Any:
+def _found(sensor: _Sensor, constants: Kept) -> _Values:
     """Return the number of pixels to keep for a spot that stands out of the noise."""
     threshold = constants.threshold * (1 + sensor.core_photon_variance) ** -constants.threshold_photons
     window = np.log1p(sensor.pixels / sensor.area) / 3.4  # 3.4: size 1 in 16 x 16 px
@@ -313,7 +316,7 @@ def _found(sensor: _Sensor, constants: Kept) -> Any:
     return kept / np.sqrt(1 + (kept / limit) ** 2)
 
 
-def _few_photons(sensor: _Sensor) -> Any:
+def _few_photons(sensor: _Sensor) -> _Values:
     """Increase the number of pixels if photons are few and each stands out: then all of them contribute."""
     base = FEW.gaussian if sensor.gaussian else FEW.diffraction
     rarity = np.exp(-sensor.core_photons / FEW.rarity)
@@ -321,7 +324,7 @@ def _few_photons(sensor: _Sensor) -> Any:
     return base * sensor.area * rarity * seen * sensor.range_px**-FEW.range_exponent
 
 
-def _kept_without_denoising(sensor: _Sensor) -> Any:
+def _kept_without_denoising(sensor: _Sensor) -> _Values:
     constants = KEPT["none"]
     found = _found(sensor, constants)
     signal = _signal_with_photons(sensor) * sensor.range_px**2 / sensor.pixels
@@ -329,7 +332,7 @@ def _kept_without_denoising(sensor: _Sensor) -> Any:
     return np.where(_lost(sensor, constants), np.maximum(held, found), found)
 
 
-def _whole(kept: Any, sensor: _Sensor) -> NDArray[np.int64]:
+def _whole(kept: _Values, sensor: _Sensor) -> NDArray[np.int64]:
     """Round to whole numbers that leave at least one pixel for the background."""
     whole: NDArray[np.int64] = np.minimum(np.maximum(np.rint(kept), 1), sensor.pixels - 1).astype(np.int64)
     return whole

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -69,7 +67,7 @@ def pixel_noise(images: ArrayLike) -> float:
     InputError
         If images are not finite or narrower than two pixels.
     """
-    stack: NDArray[Any] = image_stack("images", images)
+    stack: NDArray[np.generic] = image_stack("images", images)
     if stack.shape[-1] < 2:
         raise InputError(f"images: expected at least 2 columns, got shape {stack.shape}")
     edges = stack[..., [0, -1], :].astype(np.float64)

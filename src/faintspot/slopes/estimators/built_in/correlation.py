@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +46,7 @@ class Correlation(Estimator):
     needs = frozenset({Need.PSF})
     style = Style("#999933", "-.", "X")
 
-    def locate(self, images: NDArray[np.float32], sensor: Sensor, prior: Floats) -> Any:
+    def locate(self, images: NDArray[np.float32], sensor: Sensor, prior: Floats) -> object:
         """See `Estimator`."""
         step = float(self.step_px)
         references, (rows, columns) = _references(sensor, step, self.local_background == "on")

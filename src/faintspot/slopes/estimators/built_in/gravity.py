@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import LARGEST_FLOAT32
-from faintspot.base.config.options import is_auto, option
+from faintspot.base.config.options import Value, is_auto, option
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.algorithms.automatic import automatic_kept_pixels
 from faintspot.slopes.estimators.algorithms.brightest import RULES, most_kept, threshold_rank
@@ -48,7 +48,7 @@ class Centroid(Estimator):
 class KeepingBrightest(Centroid):
     """Centre of gravity of the brightest pixels."""
 
-    keep_brightest: Any = option(
+    keep_brightest: Value = option(
         None,
         "Number of pixels kept by the background subtraction. Default: 8 % of the window's pixels, at "
         'least 5. "auto": chosen by `estimators.algorithms.automatic.automatic_kept_pixels`.',
@@ -57,7 +57,7 @@ class KeepingBrightest(Centroid):
         whole=True,
         automatic=True,
     )
-    rule: Any = option(
+    rule: Value = option(
         "subtract_next",
         "Rule that sets the level subtracted from the kept pixels; see `faintspot.brightest_pixels`.",
         choices=RULES,
@@ -81,7 +81,7 @@ class KeepingBrightest(Centroid):
         """Knowledge required by the automatic options, if there are any."""
         return frozenset({Need.READ_NOISE, Need.WIDTH}) if self.is_automatic else frozenset()
 
-    def default_of(self, name: str, pixels: int) -> Any:
+    def default_of(self, name: str, pixels: int) -> float:
         """Return the default of `keep_brightest`."""
         if name == "keep_brightest":
             return min(max(FEWEST_KEPT, round(KEPT_FRACTION * pixels)), pixels - 1)
@@ -105,7 +105,7 @@ class KeepingBrightest(Centroid):
         number = "an automatic number of" if is_auto(self.keep_brightest) else kept
         return f"{number} brightest of {pixels} pixels kept (rule {rule}), centre of gravity"
 
-    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[object]]:
         """Return numbers of kept pixels around the automatic one, larger for speckled spots."""
         kept = float(automatic_kept_pixels(**scene.rule_arguments, method=self.automatic_method))
         kept *= max(1.0, scene.d_over_r0)
@@ -131,12 +131,12 @@ class GravityPlan(EstimatorPlan):
     # Tables of the kernels ------------------------------------------------------------------------------
 
     @cached_property
-    def tables(self) -> Any:
+    def tables(self) -> gravity.GravityTables:
         """Tables of the step before the background subtraction."""
         return gravity.GravityTables()
 
     @property
-    def own_scratch(self) -> Any:
+    def own_scratch(self) -> Callable[..., gravity.GravityScratch]:
         """See `EstimatorPlan`."""
         return gravity.gravity_scratch
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import option
+from faintspot.base.config.options import Value, option
 from faintspot.slopes.estimators.base import Need, Style
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.scene import Scene
@@ -23,7 +22,7 @@ from faintspot.slopes.kernels.spot_fits import fits as spot_fits
 class Fitted(Stepping):
     """Fit of the PSF to the image."""
 
-    blur_px: Any = option(
+    blur_px: Value = option(
         0.0,
         "Standard deviation of the Gaussian blur applied to the PSF, for broadening by turbulence.",
         unit="px",
@@ -41,7 +40,7 @@ class Fitted(Stepping):
 
     needs = frozenset({Need.PSF})
 
-    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[object]]:
         """Return blurs to try for speckled spots."""
         if not scene.d_over_r0:
             return {}

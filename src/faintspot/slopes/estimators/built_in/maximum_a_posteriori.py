@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import option
+from faintspot.base.config.options import Value, option
 from faintspot.base.config.presets import PRESETS
 from faintspot.base.sizes import MOST_NUMBERS, check_size
 from faintspot.slopes.estimators import spot_tables
@@ -36,7 +36,7 @@ _LEVELS = 8
 class MaximumAPosteriori(Likelihood):
     """Maximum likelihood with a prior centred on the reference position or on the predicted slope."""
 
-    prior_std_px: Any = option(
+    prior_std_px: Value = option(
         None,
         "Standard deviation of the prior on the position. Default: no prior other than the search range.",
         unit="px",
@@ -90,13 +90,13 @@ class _Plan(LikelihoodPlan):
             self.flux_kernel = flux_above_edges
         self._posteriors: list[PosteriorGrid] = []
         self._levels: dict[float, int] = {}  # first table of each level of flux measured so far
-        self._scratch: tuple[int, Any] = (-1, None)
+        self._scratch = (-1, partial(spot_fits.spot_scratch))
         self._grid, self._spacing = NO_POSTERIOR.grid, NO_POSTERIOR.spacing
         self.table_shape = (0, 0, 0)
         """Shape of the table of each kind of sub-aperture: positions, rows, columns."""
 
     @property
-    def tables(self) -> Any:
+    def tables(self) -> spot_fits.PosteriorTables:
         """See `EstimatorPlan`."""
         if len(self._posteriors) > 1:
             self._posteriors = [spot_tables.joined(self._posteriors)]
@@ -106,7 +106,7 @@ class _Plan(LikelihoodPlan):
         )
 
     @property
-    def own_scratch(self) -> Any:
+    def own_scratch(self) -> partial[spot_fits.SpotScratch]:
         """See `EstimatorPlan`."""
         positions = len(self.tables.grid)
         if self._scratch[0] != positions:

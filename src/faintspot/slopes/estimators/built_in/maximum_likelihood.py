@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import option
+from faintspot.base.config.options import Value, option
 from faintspot.slopes.estimators.base import Estimator, Need, Style
 from faintspot.slopes.estimators.built_in.matched import Fitted
 from faintspot.slopes.estimators.registry import register
@@ -27,14 +27,14 @@ _LEARNT_WEIGHT_FLOOR = 1e-3
 class Likelihood(Fitted):
     """Fit whose weights follow from the noise."""
 
-    model_error: Any = option(
+    model_error: Value = option(
         0.0,
         "Deviation of the spots from the PSF, as a fraction of each pixel's flux; it limits the weight of "
         "bright pixels. 0.1 to 0.5 for speckled spots. Values above sqrt(300 e- / flux) are reduced to it.",
         low=0.0,
         high=10.0,
     )
-    weight_floor: Any = option(
+    weight_floor: Value = option(
         2e-4,
         "Variance, as a fraction of the flux, added to the variance of every pixel, so that small errors "
         "of the PSF in dark wings do not get large weights.",
@@ -52,7 +52,7 @@ class Likelihood(Fitted):
         """Keep the number of steps: more would follow the weights of high flux."""
         return self
 
-    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[object]]:
         """Return the options of the fit and, for speckled spots, also model errors."""
         errors = {"model_error": list(_MODEL_ERRORS)} if scene.d_over_r0 else {}
         return {**super().tuned(scene), **errors}

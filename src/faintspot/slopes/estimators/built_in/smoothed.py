@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import option
+from faintspot.base.config.options import Value, option
 from faintspot.slopes.estimators.algorithms.automatic import automatic_smoothing
 from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Step, Style
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
@@ -30,7 +29,7 @@ _WIDTHS = (1.0, 0.6, 0.8, 1.3, 1.7)  # multiples of the automatic width
 class Smoothed(KeepingBrightest):
     """Centre of gravity of the brightest pixels of the image smoothed by a Gaussian."""
 
-    smoothing_px: Any = option(
+    smoothing_px: Value = option(
         None,
         "Standard deviation of the Gaussian. Default: 0.7.",
         unit="px",
@@ -57,7 +56,7 @@ class Smoothed(KeepingBrightest):
         """See `Estimator`."""
         return BrightestPixels.like(self)
 
-    def default_of(self, name: str, pixels: int) -> Any:
+    def default_of(self, name: str, pixels: int) -> float:
         """See `Options`."""
         return _USUAL_PX if name == "smoothing_px" else super().default_of(name, pixels)
 
@@ -66,7 +65,7 @@ class Smoothed(KeepingBrightest):
         width = self._span("smoothing_px", n_subapertures, pixels)
         return f"Gaussian smoothing of {width} px; {self.kept_in_words(n_subapertures, pixels)}"
 
-    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[object]]:
         """Return numbers of kept pixels and widths around the automatic ones."""
         width = float(automatic_smoothing(**scene.rule_arguments)) or _USUAL_PX
         return {**super().tuned(scene), "smoothing_px": [width * factor for factor in _WIDTHS]}

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import option
+from faintspot.base.config.options import Value, option
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.base import Style
 from faintspot.slopes.estimators.built_in.gravity import Centroid, Floats, GravityPlan
@@ -28,7 +27,7 @@ _SMALLEST_E = 0.01
 class Thresholded(Centroid):
     """Centre of gravity after subtracting a threshold from every pixel; negative pixels are set to 0."""
 
-    threshold_e: Any = option(None, "Level subtracted from every pixel.", unit="e-", low=0.0, high=1e12)
+    threshold_e: Value = option(None, "Level subtracted from every pixel.", unit="e-", low=0.0, high=1e12)
 
     name = "thresholded"
     label = "thresholded centre of gravity"
@@ -40,7 +39,7 @@ class Thresholded(Centroid):
         """See `Estimator`."""
         return f"centre of gravity of the flux above {self._span('threshold_e', n_subapertures, pixels)} e-"
 
-    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[object]]:
         """Return multiples of the noise of a dark pixel, and fractions of a typical spot's peak."""
         peak = scene.flux_e / (2.5 * scene.seen_fwhm_px**2)
         levels = [factor * scene.dark_noise_e for factor in _OF_NOISE] + [

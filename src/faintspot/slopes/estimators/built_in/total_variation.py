@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import PerSubaperture, is_auto, option
+from faintspot.base.config.options import PerSubaperture, Value, is_auto, option
 from faintspot.base.config.presets import FEW_KEPT, PRESETS, of_denoising
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.algorithms.automatic import automatic_strength
@@ -44,7 +44,7 @@ class TotalVariation(KeepingBrightest):
         low=0.0,
         automatic=True,
     )
-    tolerance: Any = option(
+    tolerance: Value = option(
         None,
         "Relative change in 24 iterations at which the denoising of a sub-aperture stops; see "
         "`faintspot.tv_denoise`. Default: 0.0025 where more than 32 pixels are kept; else, and with the "
@@ -52,7 +52,7 @@ class TotalVariation(KeepingBrightest):
         low=0.0,
         high=1.0,
     )
-    max_iterations: Any = option(
+    max_iterations: Value = option(
         None,
         "Iteration limit. Default: 24, or 480 where more than 32 pixels are kept or a tolerance is set; with "
         'the preset "fast" 8.',

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +66,7 @@ class _Plan(EstimatorPlan):
         self.needs_flux = bool(np.isnan(sensor.flux_e).all())
 
     @cached_property
-    def tables(self) -> Any:
+    def tables(self) -> spot_fits.ScoreTables:
         """See `EstimatorPlan`."""
         score, sensor = self._score, self.sensor
         std = np.full((sensor.n, 2), max(score.smoothing_px, _LEAST_SMOOTHING_PX))
@@ -79,7 +78,7 @@ class _Plan(EstimatorPlan):
         )
 
     @cached_property
-    def own_scratch(self) -> Any:
+    def own_scratch(self) -> partial[spot_fits.SpotScratch]:
         """See `EstimatorPlan`."""
         return partial(spot_fits.spot_scratch, taps=self.tables.taps.shape[2])
 

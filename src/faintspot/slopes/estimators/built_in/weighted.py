@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from faintspot.base.config.options import option
+from faintspot.base.config.options import Value, option
 from faintspot.base.config.presets import PRESETS
 from faintspot.slopes.estimators import spot_tables
 from faintspot.slopes.estimators.base import Need, Style
@@ -29,7 +29,7 @@ _WIDTHS = (1.0, 0.6, 0.8, 1.25, 1.6, 2.2)  # multiples of the spot's width
 class Weighted(Stepping):
     """Iteratively weighted centre of gravity (Fusco et al. 2004; Baker & Moallem 2007), gain corrected."""
 
-    weight_fwhm_px: Any = option(
+    weight_fwhm_px: Value = option(
         None,
         "Full width at half maximum of the weight, geometric mean of both axes; the weight has the "
         "elongation of the spot. Default: the width of the spot.",

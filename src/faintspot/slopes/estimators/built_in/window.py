@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import option
+from faintspot.base.config.options import Value, option
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Need, Style
 from faintspot.slopes.estimators.registry import register
@@ -38,7 +38,7 @@ MEAN, FRAME, NONE = "mean", "frame", "none"
 class Window(Estimator):
     """Centre of gravity with a fixed window, divided by its mean flux and its gain (Nicolle et al. 2004)."""
 
-    window_fwhm_px: Any = option(
+    window_fwhm_px: Value = option(
         None,
         "Full width at half maximum of the Gaussian window at the reference position, geometric mean of "
         "both axes; the window has the elongation of the spot. Default: the width of the spot. Replaced by"
@@ -47,7 +47,7 @@ class Window(Estimator):
         low=0.1,
         high=1e3,
     )
-    region_px: Any = option(
+    region_px: Value = option(
         None,
         "Side of the square of pixels around the reference position that is used; bad or saturated pixels "
         "elsewhere have no effect. Default: the whole sub-aperture.",
@@ -56,7 +56,7 @@ class Window(Estimator):
         high=64.0,
         low_open=True,
     )
-    normalisation: Any = option(
+    normalisation: Value = option(
         None,
         'Normalisation of the sums. "mean": expected flux (`flux_e`, or a running mean); "frame": flux of '
         'the frame within the window; "none": no normalisation. Default: "mean" if the flux is known, '
@@ -64,7 +64,7 @@ class Window(Estimator):
         choices=(MEAN, FRAME, NONE),
         per_subaperture=False,
     )
-    centroid_gain: Any = option(
+    centroid_gain: Value = option(
         None,
         "Centroid gain: slope measured for a displacement of 1 px; slopes are divided by it. Default: that"
         " of the spot near the reference position.",
@@ -207,7 +207,7 @@ class _Plan(EstimatorPlan):
         return min(found)[1:] if found else None
 
     @cached_property
-    def tables(self) -> Any:
+    def tables(self) -> window.WindowTables | window.RowTables:
         """See `EstimatorPlan`."""
         sensor, kinds = self.sensor, self.weights.kinds(self.sensor.n)
         top, left, bottom, right = self._region

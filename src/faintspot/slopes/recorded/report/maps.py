@@ -190,7 +190,7 @@ def _panels(rows: int, columns: int, layout: Layout) -> tuple[Figure, Any]:
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _outlines(layout: Layout) -> Any:
+def _outlines(layout: Layout) -> object:
     from matplotlib.collections import PolyCollection
 
     return PolyCollection(list(subaperture_shapes(layout)), facecolors="#f6f6f6", edgecolors=FLUX_GREY)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -145,7 +144,7 @@ def _key_numbers(run: SlopesRun) -> Section:
     return _TEXT.section("numbers", note, table)
 
 
-def _record(run: SlopesRun, index: int) -> dict[str, Any]:
+def _record(run: SlopesRun, index: int) -> dict[str, object]:
     """Return the numbers of a method; None where they say nothing."""
     method, comparison = run.methods[index], run.comparison
     scale = None if run.layout is None else run.layout.pixel_scale_arcsec
@@ -169,7 +168,7 @@ def _record(run: SlopesRun, index: int) -> dict[str, Any]:
     return record
 
 
-def _against_truth(run: SlopesRun, method: MeasuredSlopes) -> dict[str, Any]:
+def _against_truth(run: SlopesRun, method: MeasuredSlopes) -> dict[str, object]:
     """Return the numbers that need the truth; None without."""
     truth, last, valid = run.true_positions, run.methods[-1], run.valid[-1]
     if truth is None:

@@ -30,7 +30,7 @@ def profile_figure(profiles: Mapping[str, SodiumProfile]) -> FigureWithData:
     lines, rows = [], []
     for index, (name, profile) in enumerate(profiles.items()):
         altitude, density = profile.altitudes_m / 1e3, 1e3 * profile.density
-        style: dict[str, Any] = {"color": METHOD_COLOURS[1], "lw": 2.2}
+        style: dict[str, object] = {"color": METHOD_COLOURS[1], "lw": 2.2}
         if name != newest:
             dashes = ("--", ":", "-.")[index % 3] if len(before) > 1 else "--"
             style = {"color": GREY, "lw": 1.6, "ls": dashes}

@@ -218,7 +218,7 @@ def _be(count: int) -> str:
     return "is" if count == 1 else "are"
 
 
-def _checked(frame: object, bad_pixels: object) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+def _checked(frame: object, bad_pixels: object) -> tuple[NDArray[np.generic], NDArray[np.bool_]]:
     """Return frame or frames and a mask of bad pixels, where the frame may be NaN."""
     frames = real_array("frame", frame, minimum_dimensions=2)
     if frames.ndim > 3:
