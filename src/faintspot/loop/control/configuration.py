@@ -23,10 +23,10 @@ from faintspot.loop.control.compiled import CompiledIntegrator
 from faintspot.loop.control.identification.models import (
     CONTROLS,
     INTEGRATOR,
-    MODELS,
     ControlModel,
     LoopPlant,
     integrates,
+    needs_errors,
     predicts,
 )
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
@@ -314,7 +314,7 @@ class Control:
             It says what is missing.
         """
         kind = kind or self.options.controller
-        if kind in MODELS and MODELS[kind].needs_errors and calibration.read_noise_photoelectrons is None:
+        if needs_errors(kind) and calibration.read_noise_photoelectrons is None:
             raise InputError(
                 f"{TABLE}.controller = {kind!r}: expected standard errors of the slopes, which need the "
                 "camera's read noise: calibration.read_noise_e"

@@ -15,7 +15,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.io.stored.slopes_format import scaled_positions
-from faintspot.slopes.camera.binning import binned, binned_calibration
+from faintspot.slopes.camera.binning import binned
 from faintspot.slopes.kernels.driver.doubtful import flag_doubtful
 from faintspot.slopes.pipeline.light import MeanLight
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
@@ -110,15 +110,11 @@ class SpotFollower:
 
     def _of_images(self) -> SlopePipeline:
         """Return the pipeline of windows that are already cut, calibrated, and centred on their spots."""
-        given, factor = self.pipeline, self._factor
+        given, layout = self.pipeline, self.pipeline.binned_layout
         psf, score = given.spot
-        layout, settings, calibration = given.binned_layout, given.settings, given.calibration
-        if factor > 1:
-            settings = settings.magnified(1 / factor)
-            calibration = binned_calibration(calibration, factor, given.layout.frame_shape)
         reference = self._in_window - layout.offsets
         options: dict[str, Any] = {"psf": psf, "score": score, "width": given.width, "threads": given.threads}
-        return SlopePipeline(layout, settings, calibration, reference, **options).for_images()
+        return SlopePipeline(layout, *given.binned_parts, reference, **options).for_images()
 
     def __call__(self, frame: ArrayLike) -> Slopes:
         """Measure the next frame (h, w), or the next frames (n, h, w), in ADU.

@@ -123,10 +123,7 @@ class SlopePipeline:
         self._small = threading.local()
         width, factor = self._lanes.width, self.layout.bin
         psf, score, zero = self._parts
-        settings, calibration = self.settings, self.calibration
-        if factor > 1:
-            settings = settings.magnified(1 / factor)
-            calibration = binned_calibration(calibration, factor, self.layout.frame_shape)
+        settings, calibration = self.binned_parts
         maps = calibration.maps(self.binned_layout.frame_shape)
         self._calibration = packed_calibration(self.binned_layout, maps, width)
         self.plan = Plan(self.binned_layout, settings, calibration, psf, score, zero / factor, width)
@@ -153,6 +150,14 @@ class SlopePipeline:
         pipeline._lanes = lanes_for(np.float32, width)
         pipeline._prepare()
         return pipeline
+
+    @property
+    def binned_parts(self) -> tuple[Settings, Calibration]:
+        """Settings and calibration in the pixels of `binned_layout`."""
+        if self.layout.bin == 1:
+            return self.settings, self.calibration
+        calibration = binned_calibration(self.calibration, self.layout.bin, self.layout.frame_shape)
+        return self.settings.magnified(1 / self.layout.bin), calibration
 
     @property
     def spot(self) -> tuple[PSF | None, Score | None]:

@@ -10,6 +10,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.validity import are_valid
 from faintspot.io.references import subtracted_reference
 from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.recorded.statistics import mean_over_valid
 from faintspot.slopes.recorded.stored_run import StoredRun
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_pitch
@@ -32,10 +33,9 @@ def difference(run: StoredRun, other: StoredRun) -> tuple[Slopes, Slopes]:
     offsets = theirs.centres + subtracted_reference(other.stored)
     offsets -= layout.centres + subtracted_reference(run.stored)
     valid = are_valid(subtracted.flags, keep)
-    count = np.maximum(valid.sum(axis=0), 1)
     moved = {}
     for axis, offset in zip("xy", offsets.T, strict=True):
-        mean = np.where(valid, getattr(subtracted, axis), 0.0).sum(axis=0) / count
+        mean = np.nan_to_num(mean_over_valid(getattr(subtracted, axis), valid))
         moved[axis] = (getattr(own, axis) - mean - offset).astype(np.float32)
     lost = [
         np.where(are_valid(each.flags, keep).any(axis=0), 0, np.bitwise_or.reduce(each.flags))

@@ -9,7 +9,17 @@ from __future__ import annotations
 from faintspot.base.discovery import import_modules
 from faintspot.loop.control.identification.models.base import ControlModel, Lesson, LoopPlant
 
-__all__ = ["CONTROLS", "INTEGRATOR", "MODELS", "ControlModel", "Lesson", "LoopPlant", "predicts"]
+__all__ = [
+    "CONTROLS",
+    "INTEGRATOR",
+    "MODELS",
+    "ControlModel",
+    "Lesson",
+    "LoopPlant",
+    "integrates",
+    "needs_errors",
+    "predicts",
+]
 
 import_modules(__name__)
 
@@ -27,6 +37,11 @@ CONTROLS = {
 def predicts(control: str) -> bool:
     """Return whether a kind of control knows the slopes of the next frame and their errors."""
     return control in MODELS and MODELS[control].predicts
+
+
+def needs_errors(control: str) -> bool:
+    """Return whether a kind of control needs standard errors of the slopes."""
+    return control in MODELS and MODELS[control].needs_errors
 
 
 def integrates(control: str) -> bool:
