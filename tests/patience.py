@@ -1,10 +1,20 @@
-"""How long tests wait for other processes and threads."""
+"""How long tests wait for other processes and threads, and how many examples they try."""
 
 import time
 from typing import Any
 
+from hypothesis import settings
+
 LIMIT_S = 60.0
 """How long to wait for what must come."""
+
+USUAL_EXAMPLES = 25
+"""How many examples a property is tried with; a profile may have more."""
+
+
+def examples(count: int) -> settings:
+    """Try `count` examples instead of the usual number, and as many times more as the profile does."""
+    return settings(max_examples=count * settings().max_examples // USUAL_EXAMPLES)
 
 
 def wait_for(condition: Any, what: object = "", step: Any = lambda: time.sleep(0.001)) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive_estimators as oracle
 from tests.estimator_cases import (
@@ -20,6 +20,7 @@ from tests.estimator_cases import (
     with_noise_map,
 )
 from tests.estimator_oracle import assert_equals_oracle
+from tests.patience import examples
 
 import faintspot as fs
 from faintspot.slopes.estimators import estimators
@@ -43,7 +44,7 @@ def on_unknown_background(case: Case, seed: int) -> Case:
 class TestAgainstOracle:
     @pytest.mark.parametrize("estimator", QUICK)
     @given(seed=SEEDS)
-    @settings(max_examples=10)
+    @examples(10)
     def test_random_spots(self, estimator: str, seed: int) -> None:
         case = random_case(seed, estimator)
         assert_equals_oracle(case, case.measure())
@@ -51,33 +52,33 @@ class TestAgainstOracle:
     @pytest.mark.slow
     @pytest.mark.parametrize("estimator", QUICK)
     @given(seed=SEEDS)
-    @settings(max_examples=10)
+    @examples(10)
     def test_random_spots_with_a_noise_map(self, estimator: str, seed: int) -> None:
         case = with_noise_map(random_case(seed, estimator), seed)
         assert_equals_oracle(case, case.measure())
 
     @pytest.mark.parametrize("estimator", ["matched", "ml"])
     @given(seed=SEEDS)
-    @settings(max_examples=5)
+    @examples(5)
     def test_noise_map_on_an_unknown_background(self, estimator: str, seed: int) -> None:
         case = on_unknown_background(with_noise_map(random_case(seed, estimator), seed), seed)
         assert_equals_oracle(case, case.measure())
 
     @given(seed=SEEDS)
-    @settings(max_examples=4)
+    @examples(4)
     def test_posterior_with_a_noise_map(self, seed: int) -> None:
         case = with_noise_map(random_case(seed, "map", n=2), seed)
         assert_equals_oracle(case, case.measure())
 
     @given(seed=SEEDS)
-    @settings(max_examples=4)
+    @examples(4)
     def test_random_spots_with_a_prior(self, seed: int) -> None:
         case = random_case(seed, "map", n=2)
         assert_equals_oracle(case, case.measure())
 
     @pytest.mark.parametrize("estimator", ["matched", "ml"])
     @given(seed=SEEDS)
-    @settings(max_examples=10)
+    @examples(10)
     def test_random_spots_on_an_unknown_background(self, estimator: str, seed: int) -> None:
         case = on_unknown_background(random_case(seed, estimator), seed)
         assert_equals_oracle(case, case.measure())

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.estimator_cases import (
@@ -20,6 +20,7 @@ from tests.estimator_cases import (
     with_noise_map,
     with_options,
 )
+from tests.patience import examples
 from tests.refusals import assert_each_refused, refused
 
 import faintspot as fs
@@ -82,7 +83,7 @@ class TestImages:
     @pytest.mark.slow
     @EVERY
     @given(seed=SEEDS)
-    @settings(max_examples=15)
+    @examples(15)
     def test_hostile_images(self, estimator: str, seed: int) -> None:
         case = random_case(seed, estimator)
         rng = np.random.default_rng(seed)
@@ -167,7 +168,7 @@ class TestImages:
 class TestSettings:
     @EVERY
     @given(seed=SEEDS)
-    @settings(max_examples=15)
+    @examples(15)
     def test_extreme_settings(self, estimator: str, seed: int) -> None:
         rng = np.random.default_rng(seed)
         case = random_case(seed, estimator, n=6)

@@ -19,9 +19,11 @@ from pathlib import Path
 
 from tests.shared_data import ROOT
 
-PARTS = ("kernels", "files", "values")
-_SLOWEST_S = {"kernels": 300, "files": 60, "values": 120}  # a case, with compiling; longer is a hang
-_MEMORY_BYTES = {"kernels": 8 << 30, "files": 5 << 29, "values": 6 << 30}  # beyond what there is at the start
+PARTS = ("kernels", "files", "values", "properties")
+# A case, with compiling; longer is a hang.
+_SLOWEST_S = {"kernels": 300, "files": 60, "values": 120, "properties": 7200}
+# Beyond what there is at the start.
+_MEMORY_BYTES = {"kernels": 8 << 30, "files": 5 << 29, "values": 6 << 30, "properties": 8 << 30}
 
 
 def main() -> int:
@@ -61,7 +63,15 @@ def _cases(part: str, widths: tuple[int, ...]) -> Callable[[int], None]:
         from tests.fuzz import kernels
 
         return partial(kernels.run, chosen=kernels.combinations(widths))
+    if part == "properties":
+        return _try_properties
     return importlib.import_module(f"tests.fuzz.{part}").run  # type: ignore[no-any-return]
+
+
+def _try_properties(seed: int) -> None:
+    """Run every test that Hypothesis draws examples for, with others than in the tests."""
+    options = ["-m", "hypothesis", "--hypothesis-profile", "random", "--hypothesis-seed", str(seed)]
+    subprocess.run([sys.executable, "-m", "pytest", *options, "-p", "no:cacheprovider"], cwd=ROOT, check=True)
 
 
 def _run(run: Callable[[int], None], part: str, first: int, seconds: float, keep_going: bool) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.io.frame_files import cube, save, zarr
@@ -21,7 +21,6 @@ from faintspot.slopes.spots.score import TrainedScore
 
 class TestSequence:
     @given(st.data())
-    @settings(max_examples=25, deadline=None)
     def test_concatenation_of_files(self, tmp_path_factory: pytest.TempPathFactory, data: Any) -> None:
         folder = tmp_path_factory.mktemp("parts")
         counts = data.draw(st.lists(st.integers(1, 4), min_size=1, max_size=4))

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import event, given, settings
+from hypothesis import event, given
 from hypothesis import strategies as st
 from tests.loop.control.control_cases import FRAME_S, INTERACTION, PLANT, TURBULENCE, telemetry
+from tests.patience import examples
 
 from faintspot.base.errors import InputError
 from faintspot.engine.loop.control_loop import ControlLoop
@@ -128,7 +129,7 @@ def any_control(data: st.DataObject) -> None:
 
 @pytest.mark.slow
 def test_what_is_not_finite_never_reaches_the_mirror() -> None:
-    settings(max_examples=100, deadline=None)(given(st.data())(any_control))()
+    examples(100)(given(st.data())(any_control))()
 
 
 def test_a_command_that_is_begun_while_rows_arrive_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

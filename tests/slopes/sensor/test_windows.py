@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.refusals import refused
@@ -58,7 +58,6 @@ def test_a_pitch_of_whole_pixels_gives_windows_of_that_many(pitch_px: float, see
     st.sampled_from(["square", "hexagonal"]),
     st.data(),
 )
-@settings(deadline=None)
 def test_windows_of_any_lattice_do_not_overlap(
     pitch: float, angle: float, count: int, kind: str, data: st.DataObject
 ) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.refusals import assert_each_refused, refused
@@ -144,7 +144,6 @@ def test_negative_wings_tell_nothing() -> None:
     np.testing.assert_allclose(bound, positive, rtol=0.2)
 
 
-@settings(max_examples=20, deadline=None)
 @given(flux=st.floats(1, 1e4), read_noise=st.sampled_from([0.0, 0.1, 1.0, 3.0]), share=st.floats(0.1, 1))
 def test_efficiency_is_the_share_of_flux_needed(flux: float, read_noise: float, share: float) -> None:
     detector = Detector(read_noise)

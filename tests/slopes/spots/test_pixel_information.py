@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import norm, poisson
@@ -42,7 +42,6 @@ def test_information_of_a_pixel_in_its_limits() -> None:
     np.testing.assert_allclose(poisson_gaussian_information(mean, 2.0) * (mean + 4), 1, rtol=1e-4)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.floats(0, 100), st.sampled_from([0.1, 0.25, 0.5, 1.0, 3.0, 6.0, 9.0]))
 def test_information_lies_between_gaussian_and_counting(mean: float, read_noise: float) -> None:
     found = poisson_gaussian_information(np.array([mean]), read_noise)[0]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.refusals import assert_each_refused, refused
@@ -68,7 +68,6 @@ def test_equals_the_sum_over_pixels(shape: tuple[int, int]) -> None:
             np.testing.assert_allclose(found[frame, number], expected, atol=1e-12)
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     x=st.floats(-20, 20),
     y=st.floats(-20, 20),

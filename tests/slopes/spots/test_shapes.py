@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import quad
@@ -51,7 +51,6 @@ def test_each_pixel_equals_numerical_integration(profile: str, size: float) -> N
     np.testing.assert_allclose(image, 300 * np.outer(across, along), rtol=0, atol=1e-10)
 
 
-@settings(max_examples=30, deadline=None)
 @given(
     x=st.floats(-2, 2),
     y=st.floats(-2, 2),

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import quad
@@ -201,7 +201,6 @@ def test_the_same_seed_gives_the_same_images_however_many() -> None:
     np.testing.assert_allclose(few, many[:5], rtol=0, atol=1e-6)
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     d_over_r0=st.floats(0, 10),
     size=st.floats(0.3, 4),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
@@ -30,7 +30,6 @@ def test_even_functions_hold_a_constant(spacing: float) -> None:
     np.testing.assert_allclose(even.sum(axis=1)[middle - inside : middle + inside + 1], 1.0)
 
 
-@settings(max_examples=30, deadline=None)
 @given(
     symmetry=st.sampled_from(SYMMETRIES),
     spacing=st.sampled_from([0.5, 1.0]),
