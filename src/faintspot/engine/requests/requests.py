@@ -1,7 +1,7 @@
 """The control channel of a running engine: requests of the same user over a Unix socket.
 
-A request is one line of JSON, {"command": NAME, ...}. The reply is one line too: {"ok": true, ...} or
-{"ok": false, "error": "one line"}. A connection may carry several requests in sequence.
+A connection carries one request, a line of JSON {"command": NAME, ...}, and its reply, {"ok": true, ...} or
+{"ok": false, "error": "one line"}.
 """
 
 from __future__ import annotations
@@ -37,9 +37,7 @@ LENGTHY_TIMEOUT_S = 180.0
 EFFECT_TIMEOUT_S = 0.5
 """Time that a server waits for a change to take effect; then it replies that no frame came [s]."""
 _LARGEST_REPLY = 16 * 1024 * 1024
-_MOST_CONNECTIONS = 64
 _IDLE_S = 30.0  # idle time after which a connection is closed
-_PAUSE_S = 0.1  # when the system has no file descriptor left
 _LOOK_S = 0.1  # between two looks whether it is to close
 
 
@@ -103,7 +101,7 @@ class ControlServer(Closing):
     """Server that answers requests, each connection in a thread of its own, until closed.
 
     Clients that hang, send garbage or disconnect neither stop the server nor delay others. Commands named in
-    `lengthy` run one after another; all others are answered meanwhile. Processes of other users are refused.
+    `lengthy` run one after another; all others are answered meanwhile. Only the user can open the socket.
 
     Parameters
     ----------
@@ -126,6 +124,7 @@ class ControlServer(Closing):
         self.path = Path(path)
         self._handlers, self._lengthy = dict(handlers), frozenset(lengthy)
         self._brief_one, self._lengthy_one = threading.Lock(), threading.Lock()
+        self._closing = False
         self._lock_file = locked_beside(self.path)
         try:
             self._listener = _Listener(self.path, self._reply)
@@ -138,6 +137,7 @@ class ControlServer(Closing):
 
     def close(self) -> None:
         """Stop answering and remove the socket; repeated calls do nothing."""
+        self._closing = True
         self._listener.shutdown()
         self._thread.join()
 
@@ -156,6 +156,8 @@ class ControlServer(Closing):
     def _reply(self, line: bytes) -> bytes:
         """Carry out one request; always return a reply."""
         try:
+            if self._closing:
+                raise InputError("the server has ended")
             fields = _parsed_request(line)
             command = fields.pop("command", None)
             if not isinstance(command, str) or command not in self._handlers:
@@ -167,72 +169,24 @@ class ControlServer(Closing):
             return _answer(self._handlers[command], fields)
 
 
-class _Listener(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
-    """Socket of a server, and its connections."""
+class _Listener(socketserver.ThreadingUnixStreamServer):
+    """Socket of a server, which answers each connection in a thread of its own."""
 
     daemon_threads = True
-    server_address: str
+    block_on_close = False
 
     def __init__(self, path: Path, reply: Callable[[bytes], bytes]) -> None:
-        self.path, self.reply = path, reply
-        self.connections: dict[socket.socket, None] = {}  # ordered by idle time, longest first
-        self._changing = threading.Lock()
+        self.reply = reply
         super().__init__(os.fspath(path), _Conversation, bind_and_activate=False)
         self.socket.close()
         self.socket = bound_listener(path)
-
-    def get_request(self) -> tuple[socket.socket, object]:
-        """Accept a connection; if there are too many, end the one that was idle longest."""
-        try:
-            connection, address = super().get_request()
-        except BlockingIOError:
-            raise
-        except OSError:  # usually: no file descriptor left
-            self._make_room()
-            time.sleep(_PAUSE_S)
-            raise
-        if len(self.connections) >= _MOST_CONNECTIONS:
-            self._make_room()
-        self.touch(connection)
-        return connection, address
-
-    def touch(self, connection: socket.socket) -> None:
-        """Note that a connection is in use."""
-        with self._changing:
-            self.connections.pop(connection, None)
-            self.connections[connection] = None
-
-    def _make_room(self) -> None:
-        with self._changing:
-            connection = next(iter(self.connections), None)
-            if connection is not None:
-                _end(connection, socket.SHUT_RDWR)
-                del self.connections[connection]
-
-    def shutdown_request(self, request: Any) -> None:
-        """Close a connection."""
-        with self._changing:
-            self.connections.pop(request, None)
-        super().shutdown_request(request)
-
-    def server_close(self) -> None:
-        """Close the socket; connections end with the reply that they are about to send."""
-        super().server_close()
-        with self._changing:
-            for connection in self.connections:
-                _end(connection, socket.SHUT_RD)
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Print nothing: a connection that fails is closed."""
 
 
-def _end(connection: socket.socket, how: int) -> None:
-    with contextlib.suppress(OSError):
-        connection.shutdown(how)
-
-
 class _Conversation(socketserver.StreamRequestHandler):
-    """Requests of one connection, answered until it ends or is idle for too long."""
+    """Request of one connection, which is closed when it is idle for too long."""
 
     server: _Listener
 
@@ -242,20 +196,11 @@ class _Conversation(socketserver.StreamRequestHandler):
         super().setup()
 
     def handle(self) -> None:
-        """Answer request after request."""
+        """Answer the request."""
         with contextlib.suppress(OSError):  # it is gone, or idle
-            if peer_uid(self.connection) != os.geteuid():
-                kind, _ = server_of(self.server.path)
-                self.wfile.write(_encoded(_refusal(f"this {kind} answers only the user that runs it")))
-                return
-            while line := self.rfile.readline(LARGEST_REQUEST):
-                if not line.endswith(b"\n"):
-                    if len(line) == LARGEST_REQUEST:
-                        text = f"request: expected at most {LARGEST_REQUEST} bytes in one line"
-                        self.wfile.write(_encoded(_refusal(text)))
-                    return
+            line = self.rfile.readline(LARGEST_REQUEST)
+            if line.endswith(b"\n") or len(line) == LARGEST_REQUEST:
                 self.wfile.write(self.server.reply(line))
-                self.server.touch(self.connection)
 
 
 # Messages -------------------------------------------------------------------------------------------
@@ -283,6 +228,8 @@ def _refusal(text: str) -> dict[str, object]:
 
 
 def _parsed_request(line: bytes) -> dict[str, object]:
+    if not line.endswith(b"\n"):
+        raise InputError(f"request: expected at most {LARGEST_REQUEST} bytes in one line")
     try:
         message = parse_json(line.decode())
     except ValueError:
