@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintspot import InputError, Layout, Settings, SlopePipeline, Slopes, SubapertureFlag, fit_wavefront
-from faintspot.slopes.sensor.pupil import inside_pupil, lenslet_outlines, lit_outlines, pupil_of
+from faintspot.slopes.sensor.pupil import inside_pupil, lenslet_outlines, lit_outlines, pupil_of, side_m
 from faintspot.slopes.wavefront.discrepancy import slope_discrepancy
 from faintspot.slopes.wavefront.words import remarks
 from faintspot.slopes.wavefront.zernike import mean_gradients, zernike
@@ -136,8 +136,9 @@ def test_bad_input() -> None:
         fit_wavefront(flagged(slopes, slice(None)), LAYOUT)
     with pytest.raises(InputError, match="expected 35 sub-apertures, as in the layout, got 36"):
         fit_wavefront(slopes, LAYOUT[1:])
-    with pytest.raises(InputError, match=r"3 sub-apertures across, but lit ones lie 6\.32 apart"):
-        fit_wavefront(slopes, replace(SCALED, diameter_m=1.5, subaperture_m=0.5))
+    for diameter_m in (1.5, 5.0):  # of 3 and 10 sub-apertures, where 7 have flux
+        with pytest.raises(InputError, match="sub-apertures across, but those with flux"):
+            fit_wavefront(slopes, replace(SCALED, diameter_m=diameter_m, subaperture_m=0.5))
 
 
 def test_corners_of_a_square_array_are_outside_of_the_disk() -> None:
@@ -151,6 +152,32 @@ def test_corners_of_a_square_array_are_outside_of_the_disk() -> None:
     np.testing.assert_array_equal(
         fit_wavefront(wild, layout).coefficients, fit_wavefront(slopes, layout).coefficients
     )
+
+
+@pytest.mark.parametrize("lengths", [(None, 5.5), (0.5, None), (0.5, 5.5)])
+def test_the_disk_is_that_of_the_light(lengths: tuple[float | None, float | None]) -> None:
+    """A layout from a source that overfills the pupil of a star, which lies beside the middle."""
+    side, diameter = lengths
+    whole = Layout.grid((15, 15), pixels=8, pixel_scale_arcsec=0.2, subaperture_m=side, diameter_m=diameter)
+    lit = np.hypot(*(whole.cells - (8.0, 8.5)).T) < 5.5  # of 15 from 0
+    true = np.random.default_rng(6).normal(size=(2, 9))
+    positions = np.zeros((2, 2, len(whole)))
+    pupil = pupil_of(whole[lit])
+    outlines = lit_outlines(whole[lit], pupil)[0] if pupil.stated else lenslet_outlines(whole[lit])
+    gradients = mean_gradients(np.arange(2, 11), (outlines - pupil.centre_px) / pupil.radius_px)
+    positions[:, :, lit] = np.einsum("ank,fk->fan", gradients, true)
+    slopes = flagged(slopes_of(positions), np.broadcast_to(~lit, (2, len(whole))))
+    found, alone = (
+        fit_wavefront(slopes, whole, modes=9),
+        fit_wavefront(slopes_of(positions[:, :, lit]), whole[lit], modes=9),
+    )
+    nm_per_px_radius = 0.2 * RAD * 1e9 * 2.75
+    for wavefront in (found, alone):
+        assert wavefront.pupil.radius_m == pytest.approx(2.75)
+        np.testing.assert_allclose(wavefront.coefficients, nm_per_px_radius * true, atol=0.01)
+    assert found.pupil.part
+    assert "around those with flux" in remarks(found)[0]
+    assert side_m(whole.cells, side, diameter, slopes.flags) == pytest.approx(0.5)
 
 
 def test_subapertures_that_the_pupil_cuts_count_with_their_part_inside() -> None:

@@ -119,7 +119,7 @@ def _loop(
         **values,
     }
     cells = np.asarray(layout["cells"], np.int64)
-    side = side_m(cells, known["subaperture_m"], known["diameter_m"])
+    side = side_m(cells, known["subaperture_m"], known["diameter_m"], telemetry.flags)
     scale = known["pixel_scale_arcsec"]
     if side is None or scale is None:
         missing = "pixel_scale_arcsec" if side is not None else "subaperture_m or diameter_m"

@@ -302,7 +302,7 @@ def _loop(name: str, values: dict[str, Any]) -> Recording:
     )
     slopes, left_out = _usable(loop.slopes, values.get("flags"))
     remarks += [f"slopes: {left_out}"] if left_out else []
-    side = side_m(loop.cells, loop.subaperture_m, diameter_m)
+    side = side_m(loop.cells, loop.subaperture_m, diameter_m, values.get("flags"))
     return replace(loop, slopes=slopes, subaperture_m=side, remarks=tuple(remarks))
 
 

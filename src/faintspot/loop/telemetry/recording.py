@@ -90,7 +90,7 @@ def recorded_loop(
         control.interaction,
         layout.cells,
         float(frames[-1] - frames[0]) / max(float(times[-1] - times[0]) / 1e9, 1e-9),
-        subaperture_m=side_m(layout.cells, layout.subaperture_m, layout.diameter_m),
+        subaperture_m=side_m(layout.cells, layout.subaperture_m, layout.diameter_m, recording.flags[rows]),
         pixel_scale_arcsec=layout.pixel_scale_arcsec,
         delay_frames=options.delay_frames,
         frame=frames,

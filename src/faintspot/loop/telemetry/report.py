@@ -344,7 +344,8 @@ def _winds(identified: Identified, r0: Measured) -> list[Measured]:
 
 def _vibrations(report: LoopReport, identified: Identified) -> None:
     loop, part = report.loop, report.parts["vibrations"]
-    diameter_m = subapertures_across(loop.cells) * (loop.subaperture_m or math.nan)
+    measured = np.isfinite(loop.slopes).any(axis=0).reshape(2, -1).all(axis=0)
+    diameter_m = subapertures_across(loop.cells[measured]) * (loop.subaperture_m or math.nan)
     to_nm = math.sqrt(2) * (loop.pixel_scale_arcsec or math.nan) * ARCSEC * diameter_m / 4 * 1e9
     for line in identified.vibrations:
         rms = line.rms_px, line.rms_error_px

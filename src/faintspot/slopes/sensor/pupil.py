@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.base.flags import SubapertureFlag
 from faintspot.slopes.sensor.layout import Layout
 
 Floats = NDArray[np.float64]
 
 _DISK_CORNERS = 256
+_MOST_UNLIT = 2.5  # sub-apertures of a stated diameter, cut by its edge on both sides
 
 
 @dataclass(frozen=True)
@@ -29,42 +32,70 @@ class Pupil:
     """Radius in the entrance pupil; None if the layout does not give its size."""
     stated: bool = False
     """Whether the layout states the disk's size in sub-apertures: it is known where it cuts them."""
+    part: bool = False
+    """Whether the layout has sub-apertures without flux, which the disk does not count."""
 
 
-def pupil_of(layout: Layout) -> Pupil:
+def pupil_of(layout: Layout, flags: NDArray[Any] | None = None) -> Pupil:
     """Return the disk of the pupil.
 
     The centre is that of the rectangle along the rows of the lattice that contains all illuminated
     sub-apertures. The diameter is its longer side, so that corners of a square array are outside; if both
     `subaperture_m` and `diameter_m` are given, it is their ratio.
 
+    Parameters
+    ----------
+    layout : Layout
+    flags : (n,) or (n_frames, n) array of int, optional
+        Flags of slopes. Default: all sub-apertures of the layout are illuminated.
+
     Raises
     ------
     InputError
-        If these two give a disk outside which a sub-aperture lies as a whole.
+        If these two give a disk outside which a sub-aperture lies as a whole, or one that the illuminated
+        sub-apertures do not fill.
     """
+    lit = np.ones(len(layout), np.bool_) if flags is None else lit_subapertures(flags)
     pitch = lenslet_pitch(layout)
     angle = np.deg2rad(layout.angle_deg)
     along = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    rotated = layout.centres @ along  # x along the rows
+    centres = layout.centres[lit]
+    rotated = centres @ along  # x along the rows
     low, high = rotated.min(axis=0), rotated.max(axis=0)
     x, y = along @ ((low + high) / 2)
-    farthest = float(np.hypot(*(layout.centres - (x, y)).T).max())
+    farthest = float(np.hypot(*(centres - (x, y)).T).max())
     radius = 0.5 * (float((high - low).max()) + pitch)
     side, diameter = layout.subaperture_m, layout.diameter_m
     stated = side is not None and diameter is not None
     if side is not None and diameter is not None:
+        across = 2 * radius / pitch
         radius = 0.5 * pitch * diameter / side
-        if farthest > radius + pitch / np.sqrt(2):
+        unlit = diameter / side - across > max(_MOST_UNLIT, 0.1 * across)
+        if unlit or farthest > radius + pitch / np.sqrt(2):
+            extent = f"{across:.3g}" if unlit else f"{2 * farthest / pitch:.3g} between the farthest centres"
             raise InputError(
                 f"layout.diameter_m = {diameter:g} and layout.subaperture_m = {side:g}: "
-                f"{diameter / side:.3g} sub-apertures across, but lit ones lie "
-                f"{2 * farthest / pitch:.3g} apart"
+                f"{diameter / side:.3g} sub-apertures across, but those with flux extend over {extent}; "
+                "state the diameter of the illuminated part, or only one of the two lengths"
             )
     elif side is not None:
         diameter = 2 * radius / pitch * side
     metres = None if diameter is None else diameter / 2
-    return Pupil((float(x), float(y)), radius, radius / pitch, metres, stated)
+    return Pupil((float(x), float(y)), radius, radius / pitch, metres, stated, not lit.all())
+
+
+def lit_subapertures(flags: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which sub-apertures have flux, from the flags of their slopes, (n,); all of them if none has.
+
+    They have it in at least half as many frames as the one that has it most often. Those with too many bad
+    pixels count as long as no other one is dark.
+    """
+    flags = np.atleast_2d(flags)
+    often = (flags & int(SubapertureFlag.NO_FLUX) == 0).mean(axis=0)
+    lit = often >= max(0.5 * often.max(), 1e-9)
+    if not lit.all():
+        lit &= ~(flags & int(SubapertureFlag.TOO_MANY_BAD_PIXELS) > 0).all(axis=0)
+    return np.asarray(lit if lit.any() else ~lit)
 
 
 def inside_pupil(layout: Layout, pupil: Pupil) -> NDArray[np.bool_]:
@@ -145,8 +176,16 @@ def subapertures_across(cells: NDArray[np.int64]) -> int:
     return int(np.ptp(cells, axis=0).max()) + 1
 
 
-def side_m(cells: NDArray[np.int64], subaperture_m: float | None, diameter_m: float | None) -> float | None:
-    """Return the side of a sub-aperture, given or from the diameter of the pupil; None without either."""
+def side_m(
+    cells: NDArray[np.int64],
+    subaperture_m: float | None,
+    diameter_m: float | None,
+    flags: NDArray[Any] | None = None,
+) -> float | None:
+    """Return the side of a sub-aperture, given or from the diameter of the pupil; None without either.
+
+    With the flags of slopes (n_frames, n), the pupil is that of the sub-apertures with flux.
+    """
     if subaperture_m is None and diameter_m is not None:
-        return diameter_m / subapertures_across(cells)
+        return diameter_m / subapertures_across(cells if flags is None else cells[lit_subapertures(flags)])
     return subaperture_m

@@ -166,7 +166,7 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     x, y, flags = (np.atleast_2d(getattr(slopes, name)) for name in ("x", "y", "flags"))
     if x.ndim != 2 or x.shape[1] != len(layout):
         raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {x.shape[-1]}")
-    pupil = pupil_of(layout)
+    pupil = pupil_of(layout, flags)
     outlines, share = _in_pupil(layout, pupil)
     valid, left_out = leave_out(flags, slopes.keep, {"outside the pupil": share < _LEAST_SHARE})
     illuminated = np.asarray(valid.any(axis=0))

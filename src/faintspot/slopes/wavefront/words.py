@@ -77,6 +77,7 @@ def remarks(wavefront: Wavefront) -> list[str]:
     pupil = wavefront.pupil
     modes, frames = wavefront.modes, len(wavefront.fitted)
     size = "" if pupil.radius_m is None else f" ({2 * pupil.radius_m:.3g} m)"
+    size += " around those with flux" if pupil.part else ""
     lines = [
         f"Zernike modes Z{modes[0]} to Z{modes[-1]} in Noll's order on a disk of "
         f"{2 * pupil.radius_subapertures:.3g} sub-apertures{size}, fitted by least squares; condition number "

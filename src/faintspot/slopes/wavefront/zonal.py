@@ -134,7 +134,7 @@ def zonal_map(slopes: Slopes, layout: Layout) -> ZonalMap:
     if flags.ndim != 2 or flags.shape[1] != len(layout):
         n = flags.shape[-1]
         raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {n}")
-    pupil, outlines, share = pupil_of(layout), lenslet_outlines(layout), np.ones(len(layout))
+    pupil, outlines, share = pupil_of(layout, flags), lenslet_outlines(layout), np.ones(len(layout))
     if pupil.stated:
         outlines, share = lit_outlines(layout, pupil)
     often = are_valid(flags, slopes.keep).mean(axis=0)
