@@ -152,7 +152,8 @@ def start(g: ArrayLike, task: Task) -> Estimate:
         peak = smoothed_peak(task.spot, std_x, std_y, task.reach, (g.shape[0], g.shape[1]), task.background)
         flux = max(best[0] / peak, 1.0)
     distance = best[0] - max(others, default=-math.inf)
-    return Estimate(best[1], best[2], flux, margin=100 * distance / max(np.abs(blurred).max(), 1e-30))
+    x, y = clamp(best[1], low_x, high_x), clamp(best[2], low_y, high_y)
+    return Estimate(x, y, flux, margin=100 * distance / max(np.abs(blurred).max(), 1e-30))
 
 
 @cache
@@ -221,8 +222,8 @@ def information(m: Floats, dm: list[Floats], w: Floats, task: Task, name: str) -
 def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = None) -> Estimate:
     """Fisher scoring in x, y, flux and, where it is unknown, background; errors as before the last step.
 
-    A move that is cut short leaves the others to what they then should be: they are solved for last. Without
-    information on the place it stays.
+    A move that is cut short leaves the others to what they then should be: along a limit the other axis is
+    solved for again, flux and background last. Without information on the place it stays.
     """
     assert task.spot is not None
     g = task.counted(g) if name in ("ml", "map") else np.asarray(g, np.float64)
@@ -242,10 +243,20 @@ def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = 
         i, j = information(m, dm, w, task, name)
         margin = min(margin, soundness(i) - 1e-3, *phase_margins(x, y, g.shape, task.spot.phases))
         whole = np.linalg.solve(i, score) if soundness(i) > 1e-5 else np.zeros(len(score))
-        move = np.clip(whole[:2] / max(1.0, whole[2] / flux), -most, most)
+        growth = max(1.0, whole[2] / flux)
+        move = np.clip(whole[:2] / growth, -most, most)
         moves += (float(np.abs(move).max()),)
+        room = [(low - at, high - at) for at, (low, high) in zip((x, y), limits, strict=True)]
+        for axis, other in ((0, 1), (1, 0)):
+            margin = min(margin, *(1e3 * abs(move[axis] - bound) for bound in room[axis] if move.any()))
+            if not room[axis][0] <= move[axis] <= room[axis][1]:
+                move[axis] = clamp(move[axis], *room[axis])
+                rest = [k for k in range(len(score)) if k != axis]
+                left = np.linalg.solve(i[np.ix_(rest, rest)], score[rest] - i[rest, axis] * move[axis])[0]
+                move[other] = clamp(left / growth, -most, most)
+        move = np.array([clamp(step, *within) for step, within in zip(move, room, strict=True)])
         errors = sandwich(i, j) if soundness(i) > 1e-5 else (math.inf, math.inf)
-        x, y = clamp(x + move[0], *limits[0]), clamp(y + move[1], *limits[1])
+        x, y = x + move[0], y + move[1]
         others = np.linalg.solve(i[2:, 2:], score[2:] - i[2:, :2] @ move)
         flux = max(clamp(flux + others[0], flux / 2, flux * 2), LEAST_FLUX)
         level += others[1] if task.background else 0.0
@@ -275,7 +286,8 @@ def grid_posterior(
 
     The likelihood is the Poisson distribution's of (g + v / e) / e with mean (m + v / e) / e. With `cell`,
     the grid's spacing, positions count with what of their cell is within the limits; those more than
-    PRIOR_REACH standard deviations from the prior on an axis do not count.
+    PRIOR_REACH standard deviations from the prior on an axis do not count. Where none is left, the prior is
+    all there is.
     """
     assert task.spot is not None
     g = np.asarray(g, np.float64)
@@ -296,6 +308,8 @@ def grid_posterior(
                 share *= away <= PRIOR_REACH * task.prior_std
             if share > 0:
                 logarithm[j, i] = task.rounded_sum(q) - distance / 2 + math.log(share)
+    if np.isneginf(logarithm).all():
+        return Estimate(*task.prior, flux, 0.0, 0.0)
     p = np.exp(logarithm - logarithm.max())
     p /= p.sum()
     mean_x, mean_y = float(np.sum(p * xs)), float(np.sum(p * ys[:, None]))

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
+from scipy.optimize import minimize
 from tests import naive_estimators as oracle
 from tests.estimator_cases import (
     FIELDS,
@@ -65,12 +66,14 @@ class TestAgainstOracle:
         assert_equals_oracle(case, case.measure())
 
     @given(seed=SEEDS)
+    @example(seed=487)  # no position of the grid is both near the prior and within the limits
     @examples(4)
     def test_posterior_with_a_noise_map(self, seed: int) -> None:
         case = with_noise_map(random_case(seed, "map", n=2), seed)
         assert_equals_oracle(case, case.measure())
 
     @given(seed=SEEDS)
+    @example(seed=188536)  # a third of the expected flux, beyond the search limit
     @examples(4)
     def test_random_spots_with_a_prior(self, seed: int) -> None:
         case = random_case(seed, "map", n=2)
@@ -324,6 +327,32 @@ class TestPhysics:
         assert rms == pytest.approx(float(bound.mean()), rel=0.05)  # 1 % of it from the number of spots
         errors = np.sqrt(np.mean(slopes.standard_error_x**2))
         assert errors == pytest.approx(float(bound[0]), rel=0.05)
+
+    @pytest.mark.parametrize("limited", [0, 1])
+    def test_best_position_on_the_search_limit(self, limited: int) -> None:
+        """An oblique spot beyond the limit on one axis; the other one and the flux are left to be fitted."""
+        psf = PSF.analytic("gaussian", size=1.1, elongation=1.7, angle_deg=35.0, radius_px=26)
+        place = np.array([0.3, 0.3])
+        place[limited] = 2.0
+        image = np.round(psf.images(place[None], (10, 10), 900.0)[0]).astype(np.float32)
+        settings = fs.Settings("ml", steps=20, weight_floor=0.0, search_range_px=1.2)
+        known: dict[str, Any] = {"calibration": fs.Calibration(dark=0.0, read_noise_e=1.0), "psf": psf}
+        slopes = measure_images(image[None], settings, **known)
+        found = np.array([slopes.x[0], slopes.y[0]])
+
+        def improbability(values: Any) -> float:
+            at = np.full(2, 1.2)
+            at[1 - limited] = values[0]
+            m = np.maximum(psf.images(at[None], (10, 10), 100.0 * values[1])[0], 0.0)
+            return float(np.sum(m - (image + 1.0) * np.log(m + 1.0)))
+
+        best = minimize(improbability, [0.1, 8.0], method="Nelder-Mead", options={"fatol": 1e-8}).x
+        assert found[limited] == pytest.approx(1.2)
+        assert abs(best[0] - place[1 - limited]) > 0.1  # the limit does matter to the other axis
+        assert found[1 - limited] == pytest.approx(
+            best[0], abs=5e-3
+        )  # a tenth of its error: the PSF is tabulated
+        assert slopes.flux[0] == pytest.approx(100 * best[1], rel=2e-3)
 
 
 def test_unknown_read_noise_gives_infinite_errors() -> None:

@@ -77,9 +77,16 @@ class StreamedArray:
         *ones, part = chosen if isinstance(chosen, tuple) else (chosen,)
         shape = self._shape[len(ones) :]
         values = np.empty((part.stop - part.start, *shape[1:]), self._dtype)
-        self._stream.seek(self._offset + part.start * math.prod(shape[1:]) * self._dtype.itemsize)
+        self._go_to(self._offset + part.start * math.prod(shape[1:]) * self._dtype.itemsize)
         if self._stream.readinto(values.reshape(-1).view(np.uint8)) < values.nbytes:  # type: ignore[attr-defined]
             raise EOFError("the data end too early")
         while self._compressed and part.stop == shape[0] and self._stream.read(_PIECE_BYTES):
             pass
         return values.astype(self._dtype.newbyteorder("="), copy=False)
+
+    def _go_to(self, place: int) -> None:
+        """Go to a byte; a compressed stream is read up to it: zip verifies no checksum after a seek."""
+        if not self._compressed or place < self._stream.tell():
+            self._stream.seek(0 if self._compressed else place)
+        while (left := place - self._stream.tell()) > 0 and self._stream.read(min(left, _PIECE_BYTES)):
+            pass

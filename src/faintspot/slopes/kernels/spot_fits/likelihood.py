@@ -167,20 +167,27 @@ def _move(lanes: Any, lane_values: Any) -> None:
     dy = select(sound, (by - axy * dx) / maximum(ayy, tiny), zero)
     # A step is too long by how much more flux there is than the model has: linear is only their product.
     growth = maximum((sf - ixf * dx - iyf * dy) * inverse_ff, one)
-    dx, dy = dx / growth, dy / growth
     most = load(lanes, lane_values, LARGEST_MOVE * width)
     least = zero - most
-    dx, dy = minimum(maximum(dx, least), most), minimum(maximum(dy, least), most)
+    dx, dy = minimum(maximum(dx / growth, least), most), minimum(maximum(dy / growth, least), most)
     store(lane_values, MOVE_BEFORE * width, load(lanes, lane_values, MOVE * width))
     store(lane_values, MOVE * width, maximum(absolute(dx), absolute(dy)))
+    # Where a bound stops one axis, the other one goes to the best position on the bound.
+    low_x, high_x = load(lanes, lane_values, LOW_X * width), load(lanes, lane_values, HIGH_X * width)
+    low_y, high_y = load(lanes, lane_values, LOW_Y * width), load(lanes, lane_values, HIGH_Y * width)
+    left_x, right_x, left_y, right_y = low_x - x, high_x - x, low_y - y, high_y - y
+    free_x = minimum(dx - left_x, right_x - dx) >= zero
+    dx = select(free_x, dx, minimum(maximum(dx, left_x), right_x))
+    along = (by - axy * dx) / maximum(ayy, tiny) / growth
+    dy = select(free_x, dy, minimum(maximum(along, least), most))
+    free_y = minimum(dy - left_y, right_y - dy) >= zero
+    dy = select(free_y, dy, minimum(maximum(dy, left_y), right_y))
+    along = (bx - axy * dy) / maximum(axx, tiny) / growth
+    along = minimum(maximum(minimum(maximum(along, least), most), left_x), right_x)
+    dx = select(free_y, dx, along)
     df = (sf - ixf * dx - iyf * dy) * inverse_ff
     factor = minimum(maximum(one + df, splat(lanes, 1.0 / LARGEST_FACTOR)), splat(lanes, LARGEST_FACTOR))
-    x = minimum(
-        maximum(x + dx, load(lanes, lane_values, LOW_X * width)), load(lanes, lane_values, HIGH_X * width)
-    )
-    y = minimum(
-        maximum(y + dy, load(lanes, lane_values, LOW_Y * width)), load(lanes, lane_values, HIGH_Y * width)
-    )
+    x, y = minimum(maximum(x + dx, low_x), high_x), minimum(maximum(y + dy, low_y), high_y)
     store(lane_values, X * width, x)
     store(lane_values, Y * width, y)
     store(lane_values, FLUX * width, maximum(flux * factor, splat(lanes, LEAST_FLUX_E)))
