@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from tests.cli.cli_cases import CONFIGURATION, Commands, simulated
 from faintspot import Layout
 from faintspot.base.json_text import parse_json
 from faintspot.io import read_slopes
+from faintspot.slopes.pipeline.configuration import to_text
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.wavefront import fit_wavefront, zonal_map
 
@@ -181,6 +183,28 @@ def test_difference_of_two_recordings(run: Commands, slopes: Path, no_picture: N
     run.ok("wavefront", "again.npz", "--minus", slopes, *asked)
     again = parse_json(Path("w.json").read_text())["mean"]
     assert again["modes"][0]["mean"] == pytest.approx(moved["modes"][0]["mean"], abs=0.02)
+
+
+def test_displaced_source_is_a_tilt(run: Commands, slopes: Path, no_picture: None) -> None:
+    """Of a reference displaced by a part of a pitch, which leaves a column of lenslets without light."""
+    layout = replace(Layout.grid((4, 4), pixels=8), fitted=("centre",))
+    text = CONFIGURATION[CONFIGURATION.index("[estimator]") :]
+    Path("fitted.toml").write_text(to_text(layout) + text)
+    flat = np.roll(np.load("frames.npy"), 2, axis=2)
+    flat[:, :, :8] = 20
+    np.save("flat.npy", flat)
+    for name, reference in (("flat", ()), ("frames", ()), ("relative", ("--reference", "flat.npz"))):
+        frames = "flat.npy" if name == "flat" else "frames.npy"
+        run.ok("slopes", frames, "-c", "fitted.toml", *reference, "-o", f"{name}.npz")
+    for asked in (("relative.npz",), ("frames.npz", "--minus", "flat.npz")):
+        out = run.ok("wavefront", *asked, "--modes", 5, "-o", "w.json").out
+        wavefront = parse_json(Path("w.json").read_text())
+        means = [mode["mean"] for mode in wavefront["mean"]["modes"]]
+        # Z2 = 2 x; spots of 400 e- have an error of 0.1 px.
+        assert means[0] == pytest.approx(-wavefront["pupil_radius_subapertures"], abs=0.15)
+        np.testing.assert_allclose(means[1:], 0, atol=0.1)
+        assert "slopes lack" not in out
+    assert "slopes lack that frame's tilt" in run.ok("wavefront", "frames.npz").out
 
 
 def test_refused_maps_and_differences(run: Commands, slopes: Path) -> None:

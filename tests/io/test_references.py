@@ -36,11 +36,13 @@ def test_where_nothing_is_valid(tmp_path: Path) -> None:
     slopes["valid"][:, 3] = False
     write(tmp_path / "a.npz", slopes)
     expected = means()
-    expected[3] = 0.0
+    expected[3] = np.median(np.delete(expected, 3, axis=0), axis=0)
     np.testing.assert_allclose(read_reference(tmp_path / "a.npz"), expected, rtol=1e-12)
     slopes["valid"][:] = False
     write(tmp_path / "b.npz", slopes)
-    with pytest.raises(InputError, match=r"b\.npz: expected valid slopes to take as reference, found none"):
+    with pytest.raises(
+        InputError, match=r"b\.npz: expected valid slopes to take as reference, found none \("
+    ):
         read_reference(tmp_path / "b.npz")
 
 

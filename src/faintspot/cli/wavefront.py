@@ -152,7 +152,9 @@ def command(
         eye = None if pupil_mm is None else refraction_line(wavefront)
     with errors_of_options(actuators):
         flat = None if interaction is None else flattening(measured, interaction, stroke)
-    _print(wavefront, surface, run.notes if eye is None else [eye, *run.notes])
+    # A difference of positions in the frame lacks nothing.
+    notes = [note for note in run.notes if minus is None or note != run.about_reference]
+    _print(wavefront, surface, notes if eye is None else [eye, *notes])
     for name in output:
         save_wavefront(name, wavefront, dioptres=eye is not None)
         click.echo(name)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.base.validity import leave_out
 from faintspot.io.formats.registry import slope_endings, slope_format
 from faintspot.io.frames import read_array
 from faintspot.io.locations import split_location
@@ -24,7 +25,8 @@ def read_reference(location: str | Path) -> NDArray[Any]:
     location : str or Path
         File of slopes written by faintspot, e.g. of a flat wavefront, or an array as for `read_array`. Slopes
         give the mean of each sub-aperture's valid positions, including the reference that was subtracted. A
-        sub-aperture without valid slopes keeps that reference, by default its centre.
+        sub-aperture without valid slopes takes the median displacement of the others: a source that is
+        displaced as a whole is a tilt.
 
     Returns
     -------
@@ -64,9 +66,11 @@ def _mean_positions(path: Path, slopes: StoredSlopes) -> NDArray[np.float64]:
     valid = slopes.variables["valid"]
     count = np.count_nonzero(valid, axis=0)
     if not count.any():
-        raise InputError(f"{path}: expected valid slopes to take as reference, found none")
+        _, left_out = leave_out(slopes.variables["flags"])
+        raise InputError(f"{path}: expected valid slopes to take as reference, found none ({left_out})")
     sums = [np.sum(slopes.variables[name], axis=0, where=valid, dtype=np.float64) for name in ("x", "y")]
     means: NDArray[np.float64] = np.stack(sums, axis=1) / np.maximum(count, 1)[:, np.newaxis]
+    means[count == 0] = np.median(means[count > 0], axis=0)
     means += subtracted_reference(slopes)
     return means
 

@@ -132,8 +132,12 @@ def test_bad_input() -> None:
         fit_wavefront(slopes, LAYOUT, modes=44)
     with pytest.raises(InputError, match="modes"):
         fit_wavefront(slopes, LAYOUT, modes=73)
-    with pytest.raises(InputError, match="expected valid sub-apertures"):
-        fit_wavefront(flagged(slopes, slice(None)), LAYOUT)
+    for valid in range(3):
+        dark = np.broadcast_to(np.arange(len(LAYOUT)) >= valid, (2, len(LAYOUT)))
+        with pytest.raises(InputError, match=f"at least 3 valid sub-apertures .*, got {valid} of 36 .*dark"):
+            fit_wavefront(flagged(slopes, dark), LAYOUT)
+    dark = np.arange(len(LAYOUT)) >= np.array([[2], [3]])  # of two frames
+    assert fit_wavefront(flagged(slopes, dark), LAYOUT).fitted.tolist() == [False, True]
     with pytest.raises(InputError, match="expected 35 sub-apertures, as in the layout, got 36"):
         fit_wavefront(slopes, LAYOUT[1:])
     for diameter_m in (1.5, 5.0):  # of 3 and 10 sub-apertures, where 7 have flux

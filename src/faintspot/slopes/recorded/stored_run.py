@@ -44,6 +44,8 @@ class StoredRun:
     laser: LaserSpots | None = None
     lost: list[str] = field(default_factory=list)
     """Optional parts of a pipeline: a PSF or a score, whose file may be missing."""
+    about_reference: str = ""
+    """Note about the terms that its slopes lack, as their reference was fitted to a frame."""
 
     @property
     def estimator(self) -> Estimator | None:
@@ -114,7 +116,8 @@ def open_run(path: Path) -> StoredRun:
         store.notes.append(f"The layout of {path.name} was doubtful: {doubts}.")
     if store.layout is not None and store.layout.fitted and "reference" not in stored.attributes:
         text = reference_in_words(store.layout.fitted)
-        store.notes.append(f"{text[0].upper()}{text[1:]}.")
+        store.about_reference = f"{text[0].upper()}{text[1:]}."
+        store.notes.append(store.about_reference)
     n = stored.variables["x"].shape[1]
     if store.layout is not None and len(store.layout) != n:
         store.notes.append(

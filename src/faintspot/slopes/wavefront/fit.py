@@ -23,6 +23,8 @@ LARGEST_CONDITION = 100.0
 """Largest condition number of the modes' gradients, each scaled to 1: the noise amplification allowed."""
 _HIGHEST_ORDER, _USUAL_CONDITION = 8, 20.0  # defaults; higher orders are rarely needed
 _TILTS = 2
+FEWEST_SUBAPERTURES = 3
+"""Fewest valid sub-apertures of a wavefront: two show no surface."""
 _LEAST_SHARE = 0.1  # of a sub-aperture's area in the pupil, below which its slope tells too little
 
 
@@ -170,8 +172,8 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     outlines, share = _in_pupil(layout, pupil)
     valid, left_out = leave_out(flags, slopes.keep, {"outside the pupil": share < _LEAST_SHARE})
     illuminated = np.asarray(valid.any(axis=0))
-    if not illuminated.any():
-        raise InputError("slopes: expected valid sub-apertures to fit a wavefront, found none")
+    if np.count_nonzero(illuminated) < FEWEST_SUBAPERTURES:
+        raise too_few(illuminated, left_out)
     gradients, condition = _chosen_gradients(modes, outlines, illuminated)
     unit, scale = unit_of(layout, pupil)
     errors = np.concatenate(
@@ -194,6 +196,14 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
         pupil,
         condition,
         left_out,
+    )
+
+
+def too_few(valid: NDArray[np.bool_], left_out: str) -> InputError:
+    """Return the error of slopes with too few valid sub-apertures for a wavefront."""
+    return InputError(
+        f"slopes: expected at least {FEWEST_SUBAPERTURES} valid sub-apertures for a wavefront, got "
+        f"{np.count_nonzero(valid)} of {len(valid)}{f' ({left_out})' if left_out else ''}"
     )
 
 
@@ -276,7 +286,8 @@ def _weighted_fit(
     for number in range(len(patterns)):
         rows = np.flatnonzero(of_frame.ravel() == number)
         used = valid[rows[0]]
-        if not _condition(gradients[used]) <= LARGEST_CONDITION:
+        few = np.count_nonzero(used) < 2 * FEWEST_SUBAPERTURES
+        if few or not _condition(gradients[used]) <= LARGEST_CONDITION:
             continue
         root = np.sqrt(weights[used] / weights[used].mean())
         inverse = np.linalg.pinv(root[:, None] * gradients[used]) * root

@@ -17,7 +17,7 @@ from faintspot.base.validity import are_valid, leave_out
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import Pupil, lenslet_outlines, lenslet_pitch, lit_outlines, pupil_of
-from faintspot.slopes.wavefront.fit import Wavefront
+from faintspot.slopes.wavefront.fit import FEWEST_SUBAPERTURES, Wavefront, too_few
 from faintspot.slopes.wavefront.surface import SplineGrid
 from faintspot.slopes.wavefront.units import POINTS, OfLength, unit_of
 
@@ -144,8 +144,10 @@ def zonal_map(slopes: Slopes, layout: Layout) -> ZonalMap:
     }
     valid, left_out = leave_out(flags, slopes.keep, causes)
     lit = np.asarray(valid.any(axis=0))
-    if not 0 < np.count_nonzero(lit) <= _MOST:
-        raise InputError(f"slopes: expected 1 to {_MOST} valid sub-apertures, got {np.count_nonzero(lit)}")
+    if np.count_nonzero(lit) < FEWEST_SUBAPERTURES:
+        raise too_few(lit, left_out)
+    if np.count_nonzero(lit) > _MOST:
+        raise InputError(f"slopes: expected at most {_MOST} valid sub-apertures, got {np.count_nonzero(lit)}")
     measured = _measured(slopes, valid, share)
     parts = _connected_parts(layout, lit)
     nearest, points, reach = _places(layout, outlines, pupil, lit)
