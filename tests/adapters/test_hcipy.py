@@ -220,6 +220,23 @@ def test_calibration_and_prediction(optics: Any) -> None:
     assert np.abs(np.asarray(first)).max() > 10 * np.abs(bright).max()
 
 
+def test_predictions_are_in_metres_on_the_detector(optics: Any) -> None:
+    """5 electrons say little, a prior of 0.02 px a lot."""
+    predicted_m = np.random.default_rng(4).uniform(-0.5, 0.5, (2, 49)) * PIXEL_M
+    settings = Settings("map", flux_e=5.0, prior_std_px=0.02)
+    estimator = SlopeEstimator(
+        *(optics.mla_grid, optics.mla_index),
+        settings=settings,
+        calibration=fs.Calibration(read_noise_e=1.0),
+        psf=fs.PSF.analytic("gaussian", size=1.0),
+        predict=lambda slopes: predicted_m,
+    )
+    image = image_through(optics, (0.0,)) * (5.0 * 49 / 1e6)
+    estimator.estimate([image])
+    slopes = np.asarray(estimator.estimate([image]))
+    np.testing.assert_allclose(slopes, predicted_m, rtol=0, atol=0.02 * PIXEL_M)
+
+
 def test_images_that_do_not_fit(optics: Any) -> None:
     estimator = SlopeEstimator(optics.mla_grid, optics.mla_index, settings=FAINT)
     image = image_through(optics)

@@ -6,7 +6,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,11 @@ from tests.patience import wait_for
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.experiments import running
 from faintspot.experiments.running import Unit, WorkerPool, run_units
 from faintspot.experiments.store import ZarrStore
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+with_processes = pytest.mark.machine_time("starts other processes")
 
 ROOT = Path(__file__).parents[2]
 UNITS = [Unit(f"unit {number}", (number,), 10) for number in range(4)]
@@ -118,6 +120,7 @@ def test_interrupted_and_started_again() -> None:
     assert values(run_units(double, UNITS, store, WorkerPool(workers=0))) == [0, 2, 4, 6]
 
 
+@with_processes
 def test_processes_give_the_same() -> None:
     said: list[str] = []
     counts: list[tuple[int, int]] = []
@@ -130,6 +133,7 @@ def test_processes_give_the_same() -> None:
             run_units(function, UNITS, {}, WorkerPool(2))
 
 
+@with_processes
 def test_a_process_dies(tmp_path: Path) -> None:
     units = [Unit(unit.key, (str(tmp_path), *unit.arguments)) for unit in UNITS]
     assert values(run_units(die_once, units, {}, WorkerPool(2))) == [0, 2, 4, 6]
@@ -137,6 +141,7 @@ def test_a_process_dies(tmp_path: Path) -> None:
         run_units(die, UNITS, {}, WorkerPool(2))
 
 
+@with_processes
 def test_the_bar_moves_within_units() -> None:
     counts: list[int] = []
 
@@ -149,6 +154,7 @@ def test_the_bar_moves_within_units() -> None:
     assert counts[-1] == 20
 
 
+@with_processes
 def test_interruption_does_not_wait_for_units() -> None:
     store: dict[str, Any] = {}
     units = [Unit("short", (0,), 2), Unit("long", (1,), 1), Unit("longer", (2,), 1)]
@@ -163,6 +169,7 @@ def test_interruption_does_not_wait_for_units() -> None:
 
 
 CHILD = """
+from faintspot.experiments import running
 from faintspot.experiments.running import Unit, WorkerPool, run_units
 from tests.experiments.test_running import note_and_sleep
 units = [Unit(str(number), ({folder!r}, number)) for number in range(4)]
@@ -170,6 +177,7 @@ run_units(note_and_sleep, units, dict(), WorkerPool(2))
 """
 
 
+@with_processes
 def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     program = subprocess.Popen([sys.executable, "-c", CHILD.format(folder=str(tmp_path))], env=environment())
     try:
@@ -200,6 +208,7 @@ print(float(run(study, pool=WorkerPool(2))["error"].mean()))
 """
 
 
+@with_processes
 def test_own_estimators_reach_the_workers(tmp_path: Path) -> None:
     for package in ("xarray", "zarr"):
         pytest.importorskip(package)
@@ -208,6 +217,29 @@ def test_own_estimators_reach_the_workers(tmp_path: Path) -> None:
     ended = subprocess.run([sys.executable, script], capture_output=True, text=True, env=environment())
     assert ended.returncode == 0, ended.stderr
     assert 0.3 < float(ended.stdout) < 0.7  # as positions are within a pixel of the middle
+
+
+@pytest.mark.parametrize("losses", [2, 3])
+def test_units_of_lost_workers_are_run_again(monkeypatch: pytest.MonkeyPatch, losses: int) -> None:
+    """Each time one unit is finished before the workers are lost; three losses end the run."""
+    begun: list[list[int]] = []
+
+    def by_joblib(function: Any, units: dict[int, Unit], *_: object) -> Iterator[tuple[int, Any]]:
+        begun.append(list(units))
+        for number, unit in list(units.items()):
+            yield number, function(*unit.arguments, lambda done: None)
+            if len(begun) <= losses:
+                raise BrokenProcessPool("killed")
+
+    monkeypatch.setattr(running, "_by_joblib", by_joblib)
+    store: dict[str, Any] = {}
+    if losses == 2:
+        assert values(run_units(double, UNITS, store, WorkerPool(2))) == [0, 2, 4, 6]
+    else:
+        with pytest.raises(InputError):
+            run_units(double, UNITS, store, WorkerPool(2))
+        assert sorted(store) == [unit.key for unit in UNITS[:3]]
+    assert begun == [[0, 1, 2, 3], [1, 2, 3], [2, 3]]
 
 
 def test_number_of_workers_is_checked() -> None:

@@ -7,7 +7,8 @@ import pytest
 from tests.loop.control.control_cases import INTERACTION
 
 from faintspot.engine.loop.control_loop import ControlLoop
-from faintspot.engine.loop.guard import LostSpots
+from faintspot.engine.loop.guard import Guard, LostSpots
+from faintspot.loop.control.compiled import INVALID_PART
 from faintspot.loop.control.configuration import Control, ControlOptions
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout
@@ -110,6 +111,27 @@ def test_a_proven_loop_is_closed_again(frames: int, asked: str, again: bool) -> 
     status = run.loop.status()
     assert (status["closed_again_because"] is not None) == again
     assert (status["opened_because"] is None) == again
+
+
+@pytest.mark.parametrize(("part", "again"), [(0.45, True), (0.55, False)])
+def test_a_loop_is_closed_again_at_half_the_invalid_slopes(part: float, again: bool) -> None:
+    """That have opened it, as fractions of the limit."""
+    guard = Guard(Control(INTERACTION, None, OPTIONS), LAYOUT)
+    commands, flux, summary = np.zeros(COMMANDS), np.full(N, 100.0, "f4"), np.zeros(8)
+    guard.begin()
+
+    def opened(frames: int) -> bool:
+        return any(guard.objection(summary, commands, flux, commands) for _ in range(frames))
+
+    assert not opened(OPTIONS.proven_frames)
+    summary[INVALID_PART] = 0.95 * OPTIONS.most_invalid
+    assert not opened(300)
+    summary[INVALID_PART] = 1.05 * OPTIONS.most_invalid
+    assert opened(300)
+    summary[INVALID_PART] = part * OPTIONS.most_invalid
+    for _ in range(300):
+        guard.watch(summary, commands, flux)
+    assert guard.may_close_again == again
 
 
 def test_flux_that_is_not_finite_counts_as_none() -> None:

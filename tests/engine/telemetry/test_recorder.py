@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("zarr")
 
 from tests.engine.commands import process
-from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written, write
+from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written, write, write_images
 from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
@@ -27,10 +27,8 @@ from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
 from faintspot.io.telemetry.writing import TelemetryStore
 
-pytestmark = [
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-    pytest.mark.machine_time("clocks, threads and other processes"),
-]
+pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+with_threads = pytest.mark.machine_time("clocks, threads and other processes")
 
 PATIENCE_S = 60.0
 
@@ -48,6 +46,7 @@ def record_on(name: str, path: Path, started: Event) -> None:
     Recorder(name, path).run(progress=lambda frames: started.set() if frames > 100 else None)
 
 
+@with_threads
 def test_a_number_of_frames(engine: Engine, name: str, tmp_path: Path) -> None:
     path = tmp_path / "night.zarr"
     seen: list[int] = []
@@ -68,6 +67,7 @@ def test_a_number_of_frames(engine: Engine, name: str, tmp_path: Path) -> None:
     assert attributes["settings"] == SETTINGS
 
 
+@with_threads
 def test_a_time(engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Written in many parts."""
     monkeypatch.setattr(recorder, "_FLUSH_S", 0.02)
@@ -78,6 +78,7 @@ def test_a_time(engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.M
     assert as_written(vars(telemetry))
 
 
+@with_threads
 def test_an_engine_that_ends(engine: Engine, name: str, tmp_path: Path) -> None:
     """All that it has left behind is in the store."""
     recording = Recorder(name, tmp_path / "night.zarr")
@@ -88,6 +89,7 @@ def test_an_engine_that_ends(engine: Engine, name: str, tmp_path: Path) -> None:
     assert read_telemetry(tmp_path / "night.zarr").frame[-1] == engine.frames - 1
 
 
+@with_threads
 def test_a_signal(engine: Engine, name: str, tmp_path: Path) -> None:
     stop = threading.Event()
     threading.Timer(0.3, stop.set).start()
@@ -96,6 +98,7 @@ def test_a_signal(engine: Engine, name: str, tmp_path: Path) -> None:
     assert len(read_telemetry(tmp_path / "night.zarr", images=False).frame) == report.frames > 10
 
 
+@with_threads
 def test_a_slow_disk_loses_only_records(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     append = TelemetryStore.append
 
@@ -115,6 +118,7 @@ def test_a_slow_disk_loses_only_records(name: str, tmp_path: Path, monkeypatch: 
     assert 0 < absent <= report.dropped == telemetry.attributes["dropped_records"]
 
 
+@with_threads
 def test_a_full_disk(engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One line; what was written is readable; the engine goes on."""
     import zarr
@@ -142,6 +146,7 @@ def test_a_full_disk(engine: Engine, name: str, tmp_path: Path, monkeypatch: pyt
     assert engine.frames > frames
 
 
+@with_threads
 def test_a_killed_recorder_leaves_a_whole_store(engine: Engine, name: str, tmp_path: Path) -> None:
     spawn = multiprocessing.get_context("spawn")
     started, path = spawn.Event(), tmp_path / "night.zarr"
@@ -154,7 +159,7 @@ def test_a_killed_recorder_leaves_a_whole_store(engine: Engine, name: str, tmp_p
     assert not telemetry.attributes["complete"]
 
 
-def test_what_cannot_be_recorded(name: str, tmp_path: Path) -> None:
+def test_a_recording_needs_an_engine_a_new_store_and_limits_above_zero(name: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="start the engine first"):
         Recorder(name, tmp_path / "night.zarr")
     assert not list(tmp_path.iterdir())
@@ -168,6 +173,22 @@ def test_what_cannot_be_recorded(name: str, tmp_path: Path) -> None:
         for wrong in ({"n_frames": 0}, {"seconds": 0.0}):
             with pytest.raises(InputError, match=next(iter(wrong))):
                 Recorder(name, tmp_path / f"{next(iter(wrong))}.zarr").run(**wrong)
+
+
+def test_what_was_overwritten_is_counted(name: str, tmp_path: Path) -> None:
+    """Of rings of 8 records and 3 images; one place of each may be being written to."""
+    with TelemetryRing.create(name, LAYOUT, records=8, image_slots=3) as ring:
+        recording = Recorder(name, tmp_path / "night.zarr")
+        for frame in range(20):
+            write(ring, frame)
+            write_images(ring, frame)
+        report = recording.run(n_frames=7)
+    assert (report.frames, report.dropped) == (7, 13)
+    assert (report.images, report.dropped_images) == (2, 18)
+    telemetry = read_telemetry(tmp_path / "night.zarr")
+    assert list(telemetry.image_frame) == [18, 19]
+    assert telemetry.attributes["dropped_records"] == 13
+    assert telemetry.attributes["dropped_images"] == 18
 
 
 def test_methods_that_came_later_are_named(name: str, tmp_path: Path) -> None:

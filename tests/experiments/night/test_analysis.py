@@ -116,11 +116,17 @@ def test_without_paired_runs_hours_are_those_of_the_measured_effect() -> None:
 
 
 def test_ranges_of_strengths_hold_every_strength_once() -> None:
+    """One on an edge belongs to the paper's range, else to the lower range."""
     night = night_with(8, best=0.2)
-    ranges = by_strength(night)
-    assert sum(each.blocks for _, each in ranges) == (night.strength_e > 0).sum()
-    assert max((each.measured.value, each.name) for _, each in ranges)[1] == "0.6 to 1.1 e⁻"
-    assert [strength for strength, _ in ranges] == sorted(strength for strength, _ in ranges)
+    strength = night.strength_e.copy()
+    edges = np.array([0.3, 0.4, 0.6, 1.1, 1.4, 1.6, 1.9])
+    strength[strength > 0] = edges[np.arange((strength > 0).sum()) % len(edges)]
+    ranges = by_strength(replace(night, strength_e=strength))
+    expected = [np.isin(strength, part) for part in ([0.3], [0.4], [0.6, 1.1], [1.4, 1.6], [1.9])]
+    assert [each.blocks for _, each in ranges] == [np.count_nonzero(rows) for rows in expected]
+    assert [mean for mean, _ in ranges] == pytest.approx([strength[rows].mean() for rows in expected])
+    of_night = by_strength(night)
+    assert max((each.measured.value, each.name) for _, each in of_night)[1] == "0.6 to 1.1 e⁻"
 
 
 def test_the_line_against_r0_is_least_squares() -> None:

@@ -9,6 +9,7 @@ from tests.loop.telemetry.loop_cases import AIR, RATE_HZ, recorded
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.telemetry import over_time
 from faintspot.loop.telemetry.over_time import table_of_pieces, turbulence_over_time
 from faintspot.loop.telemetry.page import page_of_loop
 from faintspot.loop.telemetry.report import report_of_loop
@@ -49,6 +50,28 @@ def test_pieces_of_an_open_loop() -> None:
     )
     page = page_of_loop(report_of_loop(loop, compare=False), pieces).html()
     assert "Against time" in page
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "every_s", "frames", "rest"), [(400.0, 1.1, 440, 0), (500.0, 0.8, 400, 399)]
+)
+def test_pieces_are_all_whole_ones(
+    monkeypatch: pytest.MonkeyPatch, rate_hz: float, every_s: float, frames: int, rest: int
+) -> None:
+    seen: list[list[int]] = []
+
+    def report(part: Recording, **_: object) -> None:
+        seen.append([part.frame[0], part.frame[-1]])
+        raise InputError("not fitted")
+
+    monkeypatch.setattr(over_time, "report_of_loop", report)
+    slopes = np.zeros((3 * frames + rest, 50))
+    loop = replace(
+        recorded(), slopes=slopes, frame=7 + np.arange(len(slopes)), commands=None, frame_rate_hz=rate_hz
+    )
+    pieces = turbulence_over_time(loop, every_s)
+    assert [piece.start_s for piece in pieces] == pytest.approx([0.0, every_s, 2 * every_s])
+    assert seen == [[7 + start, 6 + start + frames] for start in (0, frames, 2 * frames)]
 
 
 def test_pieces_that_do_not_fit() -> None:

@@ -65,7 +65,8 @@ def turbulence_over_time(
         When a piece is too short, or the recording shorter than one.
     """
     fewest_s = 2 * FEWEST_FRAMES / loop.frame_rate_hz
-    length = number_between("every_s", every_s, fewest_s) * loop.frame_rate_hz
+    # 1.1 s of 400 frames each are 440 frames, without the error of rounding.
+    length = round(number_between("every_s", every_s, fewest_s) * loop.frame_rate_hz, 6)
     since = loop.frame - loop.frame[0]
     count = int((since[-1] + 1) / length)
     if count < 1:

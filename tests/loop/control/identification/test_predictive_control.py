@@ -6,14 +6,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.loop.control.control_cases import CELLS, INTERACTION, LAYERS, PHASE_OF_COMMANDS
 from tests.loop.telemetry.loop_cases import recorded
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
+from faintspot.loop.control.identification import predictive_control
+from faintspot.loop.control.identification.models.kalman import Kalman
+from faintspot.loop.control.identification.predictive_control import LoopOfControl, PredictiveControl, learn
 from faintspot.loop.control.identification.recording import Recording
 
-pytestmark = pytest.mark.slow
 GAIN = 0.5
 
 
@@ -41,6 +43,7 @@ def commands(control: PredictiveControl, slopes: np.ndarray) -> np.ndarray:
     return np.array([control(row) for row in slopes])
 
 
+@pytest.mark.slow
 def test_what_is_learnt(control: PredictiveControl) -> None:
     """Winds within 1 m/s; the gain within 15 %, as slopes of bilinear wavefronts are not mean gradients."""
     assert control.delay_frames.value == 2.0
@@ -49,6 +52,7 @@ def test_what_is_learnt(control: PredictiveControl) -> None:
     assert speeds == pytest.approx([np.hypot(8, 3), np.hypot(6, 14)], abs=1.0)
 
 
+@pytest.mark.slow
 def test_file(control: PredictiveControl, recording: Recording, tmp_path: Path) -> None:
     control.save(tmp_path / "controller.npz")
     read = PredictiveControl.load(tmp_path / "controller.npz")
@@ -59,6 +63,7 @@ def test_file(control: PredictiveControl, recording: Recording, tmp_path: Path) 
     assert read.integrator_gain == control.integrator_gain
 
 
+@pytest.mark.slow
 def test_slopes_that_were_not_measured(control: PredictiveControl, recording: Recording) -> None:
     control.reset()
     slopes = recording.slopes[0].copy()
@@ -67,6 +72,7 @@ def test_slopes_that_were_not_measured(control: PredictiveControl, recording: Re
     assert np.isfinite(control(np.full_like(slopes, np.nan))).all()
 
 
+@pytest.mark.slow
 def test_exported_matrices(control: PredictiveControl, recording: Recording, tmp_path: Path) -> None:
     """In the unit and with the sign of the recording, within 1e-6 of the largest command."""
     control.export(tmp_path / "controller.npz")
@@ -87,12 +93,32 @@ def test_exported_matrices(control: PredictiveControl, recording: Recording, tmp
     assert file["largest_command"] > 0
 
 
+@pytest.mark.slow
 def test_learn_again_continues(control: PredictiveControl, recording: Recording) -> None:
     sent = commands(control, recording.slopes[:50])[-1]
     control.learn_again(recording.part(slice(0, 1500)))
     np.testing.assert_allclose(control(recording.slopes[50]), sent, atol=0.5 * np.abs(sent).max())
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_learning_again_keeps_the_command(monkeypatch: pytest.MonkeyPatch, sign: float) -> None:
+    """Slopes of 0 change it by the integrator's leak alone; `sign` is that of the user's commands."""
+    residual, variance = 1.0, np.ones(18)
+    arrays = {"first": 0.9 * LAYERS.first, "second": LAYERS.second, "driving_px2": LAYERS.driving}
+    arrays |= {"variance_px2": variance, "covariance_xy_px2": np.zeros(9)}
+    model = Kalman(arrays, 0.4, 1.0, (residual, residual), PHASE_OF_COMMANDS)
+    gains = np.array([2.0, 0.0, 1.0, 0.0, 1.0, 0.0])
+    loop = LoopOfControl(INTERACTION, np.ones(18), np.ones(18), sign, gains, np.zeros((0, 6)), 10.0, 0.4, 1)
+    control, again = PredictiveControl(loop, model), PredictiveControl(loop, model)
+    monkeypatch.setattr(predictive_control, "learn", lambda recording, start: again)
+    held = np.linspace(-1.0, 2.0, 12)
+    control.reset(held)
+    np.testing.assert_allclose(control(np.zeros(18)), 0.99 * held, atol=1e-6)
+    control.learn_again(Recording(np.zeros((400, 18)), None, None, CELLS.astype(int), frame_rate_hz=250.0))
+    np.testing.assert_allclose(control(np.zeros(18)), 0.99**2 * held, atol=1e-6)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [
