@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import faintspot as fs
-from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, pinned, ratio, spread
+from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, pinned, ratio
 from faintspot.slopes.estimators import estimator_named
 from faintspot.slopes.kernels.compilation.host import lanes_for
 from faintspot.slopes.kernels.driver.groups import Source, flux_of_groups, new_scratch
@@ -23,25 +23,18 @@ from faintspot.slopes.pipeline.plan import packed_calibration
 ITERATIONS, KEEP, NOISE_STD, FLUX_E, READ_NOISE_E = 20, 12, 0.45, 200.0, 0.1
 SHAPES = ((6, 6), (32, 32))
 LIMITS = {"ml": 0.35, "weighted": 0.35}
-TRAINED_LIMIT = 0.15
-
-
-def _score(rng: np.random.Generator) -> fs.TrainedScore:
-    """A score of three passes; what is in its tables does not matter for the time."""
-    tables = rng.normal(0.0, 1e-3, (1, 1, 3, 2, 65, 65)).astype(np.float32)
-    return fs.TrainedScore(tables, np.array([FLUX_E]), np.full((1, 1, 2), 0.1))
 
 
 def pipelines(layout: fs.Layout, calibration: fs.Calibration) -> dict[str, fs.SlopePipeline]:
     """Return every estimator's pipeline."""
-    psf, score = fs.PSF.analytic(), _score(np.random.default_rng(1))
+    psf = fs.PSF.analytic()
     rotated = fs.PSF.analytic(elongation=2.0, angle_deg=30.0)
 
     def pipeline(estimator: str, spot: fs.PSF = psf, **settings: Any) -> fs.SlopePipeline:
         if "keep_brightest" in estimator_named(estimator).declared():
             settings["keep_brightest"] = KEEP
         chosen = fs.Settings(estimator, **settings)
-        return fs.SlopePipeline(layout, chosen, calibration, psf=spot, score=score, threads=1)
+        return fs.SlopePipeline(layout, chosen, calibration, psf=spot, threads=1)
 
     near: dict[str, Any] = {"search_range_px": 1.0}
     tv: dict[str, Any] = {"noise_std": NOISE_STD, "tolerance": 0.0, "max_iterations": ITERATIONS}
@@ -58,7 +51,6 @@ def pipelines(layout: fs.Layout, calibration: fs.Calibration) -> dict[str, fs.Sl
         "ml, rotated elongated PSF": pipeline("ml", rotated, **near),
         "map": pipeline("map", flux_e=FLUX_E, **near),
         "map, prior of 0.3 px": pipeline("map", flux_e=FLUX_E, prior_std_px=0.3, **near),
-        "trained": pipeline("trained", flux_e=FLUX_E, **near),
     }
 
 
@@ -90,9 +82,6 @@ def _row(name: str, n: int, times: Times) -> Row:
         **whole.values,
         "own, of 20 iterations": own,
     }
-    if name == "trained":
-        own_spread = {"own, of 20 iterations": spread(times, lambda part: own_cost(part, name))}
-        return Row(name, values, f"own <= {TRAINED_LIMIT}", own <= TRAINED_LIMIT, whole.spread | own_spread)
     if name in LIMITS:
         target, met = f"<= {LIMITS[name]} of TV pipeline", whole.larger <= LIMITS[name]
         return Row(name, values, target, met, whole.spread)

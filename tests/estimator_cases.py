@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import TrainedScore
 
 NEED_PSF = ("matched", "ml", "map")
 FIELDS = (
@@ -26,7 +25,6 @@ class Case:
     settings: fs.Settings
     calibration: fs.Calibration
     psf: PSF | None = None
-    score: TrainedScore | None = None
     prior: NDArray[Any] | None = None
 
     @property
@@ -35,7 +33,7 @@ class Case:
         return fs.Layout((n * ny, nx), (ny, nx), np.column_stack([ny * np.arange(n), np.zeros(n, int)]))
 
     def pipeline(self, **options: Any) -> fs.SlopePipeline:
-        parts = {"psf": self.psf, "score": self.score, **options}
+        parts = {"psf": self.psf, **options}
         return fs.SlopePipeline(self.layout, self.settings, self.calibration, **parts)
 
     def measure(self, **options: Any) -> fs.Slopes:
@@ -52,17 +50,15 @@ class Case:
             for name, value in self.settings.chosen().items()
             if isinstance(value, np.ndarray)
         }
-        psf, score = self.psf, self.score
+        psf = self.psf
         if psf is not None and psf.index is not None:
             psf = PSF(psf.samples, psf.oversampling, psf.index[places])
-        if score is not None and score.index is not None:
-            score = replace(score, index=score.index[places])
         prior = None if self.prior is None else self.prior[places]
         settings, calibration = self.settings.replace(**per_image), self.calibration
         if isinstance(calibration.read_noise_e, np.ndarray):
             noise = calibration.read_noise_e.reshape(self.images.shape)[places]
             calibration = replace(calibration, read_noise_e=noise.reshape(-1, noise.shape[2]))
-        return Case(self.images[places], settings, calibration, psf, score, prior)
+        return Case(self.images[places], settings, calibration, psf, prior)
 
 
 # Cases ------------------------------------------------------------------------------------------------
@@ -86,27 +82,6 @@ def several_psfs() -> PSF:
 def one_psf() -> PSF:
     """One separable term."""
     return PSF.analytic("gaussian", size=0.9, radius_px=26)
-
-
-def random_score(rng: np.random.Generator, n: int) -> TrainedScore:
-    """Tables that pull towards the spot, with something random on top: no estimator, but one to compare."""
-    steps, reach = int(rng.choice([2, 4])), 4
-    nodes = np.arange(-reach * steps, reach * steps + 1) / steps
-    fall = np.exp(-(nodes**2 + nodes[:, None] ** 2) / 6)
-    shape = (2, 2, int(rng.integers(1, 4)), 2, len(nodes), len(nodes))
-    tables = rng.normal(0.0, 0.05, shape)
-    tables[..., 0, :, :] += nodes * fall
-    tables[..., 1, :, :] += nodes[:, None] * fall
-    start = str(rng.choice(["reference", "peak"]))
-    return TrainedScore(
-        tables.astype(np.float32),
-        np.array([50.0, 2000.0]),
-        rng.uniform(0.05, 0.5, (2, 2, 2)),
-        steps,
-        start,
-        1.3,
-        rng.integers(0, 2, n),
-    )
 
 
 def settings_of(estimator: str, **options: Any) -> fs.Settings:
@@ -190,9 +165,8 @@ def random_case(
         saturation_adu=3000.0 if rng.random() < 0.3 else None,
     )
     settings = random_settings(rng, estimator, n, (ny, nx))
-    score = random_score(rng, n) if estimator == "trained" else None
     prior = places + rng.normal(0.0, 0.3, (n, 2)) if rng.random() < 0.5 else None
-    return Case(images, settings, calibration, psf if estimator in NEED_PSF else None, score, prior)
+    return Case(images, settings, calibration, psf if estimator in NEED_PSF else None, prior)
 
 
 def with_noise_map(case: Case, seed: int) -> Case:

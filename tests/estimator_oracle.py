@@ -222,17 +222,6 @@ def by_window(case: Case, s: int, g: Floats, task: Task) -> Estimate:
     return replace(found, x=oracle.clamp(found.x, -reach, reach), y=oracle.clamp(found.y, -reach, reach))
 
 
-def by_score(case: Case, s: int, g: Floats, task: Task) -> Estimate:
-    assert case.score is not None
-    assert case.score.index is not None
-    first = Estimate(*task.prior)
-    if case.score.start == "peak":
-        width = case.score.smoothing_px / oracle.START_STD_PER_FWHM
-        first = oracle.start(g, replace(task, fwhm=(width, width), reach=min(4, max(g.shape) - 1)))
-    kind, flux = int(case.score.index[s]), float(case.each("flux_e")[s])
-    return oracle.trained(g, case.score, kind, flux, first, task, oracle.believed_flux(g, flux, task))
-
-
 def by_gravity(case: Case, s: int, g: Floats, task: Task) -> Estimate:
     """Without denoising."""
     name, image = case.settings.estimator.name, g
@@ -269,7 +258,6 @@ METHODS: dict[str, tuple[Callable[[Case], list[Task]], Method]] = {
     "matched": (spot_tasks, by_fit),
     "ml": (spot_tasks, by_fit),
     "map": (spot_tasks, by_posterior),
-    "trained": (tasks, by_score),
 }
 
 

@@ -196,17 +196,6 @@ def weights(m: Floats, task: Task, first_flux: float, name: str) -> Floats:
     return np.asarray(1.0 / (floor + task.excess * flux + model_error_squared * flux**2))
 
 
-def believed_flux(g: ArrayLike, expected: float, task: Task) -> float:
-    """The expected flux, or that above the window's edges where it is far more."""
-    g = np.asarray(g, np.float64)
-    inner = g[1:-1, 1:-1]
-    edges = g.size - inner.size
-    ratio = inner.size / edges
-    seen = inner.sum() - ratio * (g.sum() - inner.sum())
-    noise = inner.size * task.mean_variance + task.excess * max(inner.sum(), 0.0)
-    return seen if seen > 2 * expected + 3 * math.sqrt((1 + ratio) * noise) else expected
-
-
 def information(m: Floats, dm: list[Floats], w: Floats, task: Task, name: str) -> tuple[Floats, Floats]:
     """I = sum w dm dm and J = sum w^2 T dm dm, with the prior; T is the true variance."""
     true = task.variance + task.excess * np.maximum(m, 0.0)
@@ -417,55 +406,3 @@ def gravity_error(
     if total <= 0:
         return math.inf, math.inf
     return math.sqrt(var_x) / total, math.sqrt(var_y) / total
-
-
-# Trained score ----------------------------------------------------------------------------------------
-
-
-def trained(
-    g: ArrayLike,
-    score: Any,
-    kind: int,
-    flux: float,
-    begin: Estimate,
-    task: Task,
-    believed: float | None = None,
-) -> Estimate:
-    """x <- q + sum psi(u - q) g / believed, pass after pass; `score` has the fields of TrainedScore.
-
-    `believed` is what the flux is divided by, by default `flux`; the class is the one nearest to `flux` in
-    logarithm.
-    """
-    believed = flux if believed is None else believed
-    g = np.asarray(g, np.float64)
-    classes = np.abs(np.log(np.asarray(score.flux_e)) - math.log(flux))
-    chosen = int(np.argmin(classes))
-    limits = task.limits(g.shape)
-    x, y = clamp(begin.x, *limits[0]), clamp(begin.y, *limits[1])
-    steps = score.steps_per_px
-    margin = begin.margin
-    for tables in np.asarray(score.tables, np.float64)[kind, chosen]:
-        margin = min(margin, *(abs((p * steps) % 1.0 - 0.5) for p in (x, y)))
-        qx, qy = np.rint(x * steps) / steps, np.rint(y * steps) / steps
-        moves = [projection(g, table, steps, qx, qy) / believed for table in tables]
-        x, y = clamp(qx + moves[0], *limits[0]), clamp(qy + moves[1], *limits[1])
-    errors = [
-        task.error_scale
-        * np.interp(math.log(flux), np.log(score.flux_e), score.standard_error_px[kind, :, axis])
-        for axis in (0, 1)
-    ]
-    return Estimate(x, y, flux, float(errors[0]), float(errors[1]), margin)
-
-
-def projection(g: Floats, table: Floats, steps: int, qx: float, qy: float) -> float:
-    """Sum of psi(u - q) g, psi being zero outside of its table."""
-    rows, columns = table.shape
-    total = 0.0
-    for j, v in enumerate(pixel_centres(g.shape[0])):
-        for i, u in enumerate(pixel_centres(g.shape[1])):
-            row = (v - qy) * steps + (rows - 1) / 2
-            column = (u - qx) * steps + (columns - 1) / 2
-            r, c = round(row), round(column)
-            if 0 <= r < rows and 0 <= c < columns:
-                total += table[r, c] * g[j, i]
-    return float(total)

@@ -32,7 +32,6 @@ OF_THE_PROGRAM = {
 """Without a bound: of nothing, types, kernels, or sizes, of which a program has few; a few kB each."""
 
 OF_DATA = {
-    "experiments/closed_loop/methods.py _trained_score": 4,
     "loop/control/identification/slope_spectra.py _table": 44,
     "loop/simulation/control.py _learnt": 4,
     "loop/simulation/control.py _telemetry": 1,

@@ -97,14 +97,14 @@ class TestAgainstOracle:
         ("width", "estimator"),
         [
             *product((16,), QUICK),
-            *product((8,), ("tv", "window", "ml", "trained")),
+            *product((8,), ("tv", "window", "ml")),
         ],
     )
     def test_any_simd_width(self, estimator: str, width: int) -> None:
         case = random_case(width, estimator, n=7)
         assert assert_equals_oracle(case, case.measure(width=width)) > 2
 
-    @pytest.mark.parametrize("estimator", ["ml", "trained", "weighted", "window", "brightest"])
+    @pytest.mark.parametrize("estimator", ["ml", "weighted", "window", "brightest"])
     @pytest.mark.parametrize("window", [(2, 2), (3, 5), (5, 17), (20, 24)])
     def test_any_window(self, estimator: str, window: tuple[int, int]) -> None:
         case = random_case(11, estimator, n=6, window=window)
@@ -182,16 +182,14 @@ class TestIndependence:
             assert np.array_equal(getattr(calm, name)[::2], getattr(expected, name)[::2]), name
         assert_same(expected, case.select(slice(2, 9)).measure(), slice(2, 9))
 
-    @pytest.mark.parametrize("estimator", ["map", "trained"])
-    def test_measure_is_the_pipeline(self, estimator: str) -> None:
-        case = random_case(9, estimator, n=5)
-        parts: dict[str, Any] = {"psf": case.psf, "score": case.score, "prior": case.prior}
+    def test_measure_is_the_pipeline(self) -> None:
+        case = random_case(9, "map", n=5)
+        parts: dict[str, Any] = {"psf": case.psf, "prior": case.prior}
         slopes = measure_images(case.images, case.settings, calibration=case.calibration, **parts)
         assert_same(slopes, case.measure())
 
-    @pytest.mark.parametrize("estimator", ["map", "trained"])
-    def test_measured_flux_does_not_depend_on_frames_before(self, estimator: str) -> None:
-        case = random_case(10, estimator, n=6)
+    def test_measured_flux_does_not_depend_on_frames_before(self) -> None:
+        case = random_case(10, "map", n=6)
         measured = replace(case, settings=case.settings.replace(flux_e=None))
         frame = case.images.reshape(-1, case.images.shape[2])
         used, fresh = measured.pipeline(), measured.pipeline()
@@ -217,7 +215,7 @@ class TestNoiseMap:
             np.testing.assert_allclose(getattr(found, name), values, rtol=1e-5, atol=1e-5, err_msg=name)
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("estimator", ["tv", "weighted", "trained", "map"])
+    @pytest.mark.parametrize("estimator", ["tv", "weighted", "map"])
     def test_images_and_widths(self, estimator: str) -> None:
         """Calibrated images and other SIMD widths give what the frames give."""
         case = with_noise_map(random_case(22, estimator, n=9), 1)

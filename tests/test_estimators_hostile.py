@@ -15,7 +15,6 @@ from tests.estimator_cases import (
     assert_sane,
     one_psf,
     random_case,
-    random_score,
     settings_of,
     with_noise_map,
     with_options,
@@ -28,7 +27,6 @@ from faintspot.slopes.estimators import estimators
 from faintspot.slopes.kernels.driver import groups
 from faintspot.slopes.pipeline.images import measure_images
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import TrainedScore
 
 Flag = fs.SubapertureFlag
 SEEDS = st.integers(0, 2**32 - 1)
@@ -70,13 +68,9 @@ def hostile_images(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[
 
 def flat_case(estimator: str, images: NDArray[Any], **changes: Any) -> Case:
     """Images with the simplest settings."""
-    n = len(images)
     chosen: dict[str, Any] = {"threshold_e": 1.0, "spot_fwhm_px": 2.0, "keep_brightest": 5, **changes}
-    score = random_score(np.random.default_rng(0), n) if estimator == "trained" else None
     psf = one_psf() if estimator in FITTED else None
-    return Case(
-        images, settings_of(estimator, **chosen), fs.Calibration(dark=0.0, read_noise_e=1.0), psf, score
-    )
+    return Case(images, settings_of(estimator, **chosen), fs.Calibration(dark=0.0, read_noise_e=1.0), psf)
 
 
 class TestImages:
@@ -223,13 +217,6 @@ class TestSettings:
         expected = replace(case, prior=np.where(np.abs(prior) < 1, prior, 0.0)).measure()
         assert_same(replace(case, prior=prior).measure(), expected)
 
-    def test_a_score_that_overflows(self) -> None:
-        case = random_case(4, "trained", n=6)
-        assert isinstance(case.score, TrainedScore)
-        score = replace(case.score, tables=np.sign(case.score.tables) * np.float32(1e6))
-        images = np.float32(1e35) * case.images
-        assert_sane(replace(case, score=score, images=images).measure())
-
     @pytest.mark.parametrize("estimator", FITTED)
     @pytest.mark.parametrize("nodes", [5, 7, 41])
     def test_small_and_odd_psfs(self, estimator: str, nodes: int) -> None:
@@ -286,9 +273,6 @@ class TestRefused:
         psf = PSF(one_psf().samples, 8, [0, 0])
         with refused("psf.index", "3 numbers", "got 2"):
             measure_images(self.IMAGES, ml, calibration=self.NOISE, psf=psf)
-        score = random_score(np.random.default_rng(1), 2)
-        with refused("score.index", "3 numbers", "got 2"):
-            measure_images(self.IMAGES, fs.Settings(estimator="trained"), calibration=self.NOISE, score=score)
         with refused("flux_e", "3 values", "got 2"):
             chosen = fs.Settings(estimator="ml", flux_e=[1.0, 2.0])
             measure_images(self.IMAGES, chosen, calibration=self.NOISE, psf=one_psf())

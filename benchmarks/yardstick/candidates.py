@@ -15,7 +15,6 @@ import faintspot as fs
 from benchmarks.yardstick.network import Network
 from benchmarks.yardstick.spots import Floats
 from faintspot.slopes.estimators.algorithms.noise import suggested_strength
-from faintspot.slopes.simulate import Detector
 from faintspot.slopes.training.psf_learning import LearntPSF
 
 Images = NDArray[Any]
@@ -52,7 +51,7 @@ class Known:
         """Strength of TV that the package suggests."""
         return float(suggested_strength(self.read_noise_e, self.flux_e, int(np.prod(self.shape))))
 
-    def measured(self, name: str, score: Any = None, **settings: Any) -> Measure:
+    def measured(self, name: str, **settings: Any) -> Measure:
         """Return an estimator on images from which the background has been taken."""
         camera = fs.Calibration(dark=0.0, read_noise_e=self.read_noise_e, background_e=self.background_e)
         spot = fs.PSF(self.learnt.psf.samples, self.learnt.psf.oversampling)
@@ -61,7 +60,7 @@ class Known:
         @lru_cache(1)
         def pipeline(number: int) -> fs.SlopePipeline:
             layout = fs.Layout.stacked(number, self.shape)
-            return fs.SlopePipeline(layout, chosen, camera, psf=spot, score=score, threads=1)
+            return fs.SlopePipeline(layout, chosen, camera, psf=spot, threads=1)
 
         def measure(images: Images) -> Floats:
             slopes = pipeline(len(images))(images.reshape(-1, images.shape[2]))
@@ -92,16 +91,6 @@ def estimators(known: Known) -> dict[str, dict[str, Measure]]:
     near: dict[str, Any] = {"search_range_px": SEARCH_PX}
     flux: dict[str, Any] = {"flux_e": known.flux_e}
     strength = known.strength_e
-    analytic = fs.PSF.analytic("diffraction", size=1.0)
-    score = fs.train_estimator(
-        **flux,
-        **near,
-        detector=Detector(read_noise_e=known.read_noise_e, background_e=known.background_e),
-        shape=known.shape,
-        size=float(known.learnt.psf.fwhm_px.mean() / analytic.fwhm_px.mean()),
-        position_range_px=1.5,
-        rng=np.random.default_rng(3),
-    )
     denoising = {
         "tv": ("noise_std", [strength * factor for factor in _STRENGTHS]),
         "smoothed": ("smoothing_px", [0.5, 0.7, 1.0, 1.4]),
@@ -125,7 +114,6 @@ def estimators(known: Known) -> dict[str, dict[str, Measure]]:
         },
         "ml": {"": known.measured("ml", weight_floor=0.001, **near)},
         "map": {"": known.measured("map", weight_floor=0.001, **flux, **near)},
-        "trained": {"": known.measured("trained", score, **flux, **near)},
         "network, position": {"": lambda images: known.network(images, known.flux_e, known.read_noise_e)[1]},
     }
 

@@ -41,10 +41,8 @@ if TYPE_CHECKING:
     from faintspot.slopes.spots.fixed_weights import FixedWeights as FixedWeights
     from faintspot.slopes.spots.laser import LaserGuideStar as LaserGuideStar
     from faintspot.slopes.spots.psf import PSF as PSF
-    from faintspot.slopes.spots.score import TrainedScore as TrainedScore
     from faintspot.slopes.spots.sodium import SodiumProfile as SodiumProfile
     from faintspot.slopes.training import learn_psf as learn_psf
-    from faintspot.slopes.training import train_estimator as train_estimator
     from faintspot.slopes.wavefront import Wavefront as Wavefront
     from faintspot.slopes.wavefront import fit_wavefront as fit_wavefront
 
@@ -67,7 +65,6 @@ _HOMES = {
     "SpotFollower": "faintspot.slopes.pipeline.following",
     "Stages": "faintspot.slopes.pipeline.slopes",
     "SubapertureFlag": "faintspot.base.flags",
-    "TrainedScore": "faintspot.slopes.spots.score",
     "Wavefront": "faintspot.slopes.wavefront",
     "brightest_pixels": "faintspot.slopes.estimators.algorithms.brightest",
     "centre_of_gravity": "faintspot.slopes.estimators.algorithms.centroid",
@@ -79,7 +76,6 @@ _HOMES = {
     "measure_images": "faintspot.slopes.pipeline.images",
     "measure_detector": "faintspot.slopes.camera.photon_transfer",
     "photon_efficiency": "faintspot.slopes.spots.bounds",
-    "train_estimator": "faintspot.slopes.training",
     "tune": "faintspot.experiments",
     "tv_denoise": "faintspot.slopes.estimators.algorithms.total_variation",
     **{name: f"faintspot.{name}" for name in _PACKAGES},

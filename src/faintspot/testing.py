@@ -27,7 +27,6 @@ from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import Score
 from faintspot.slopes.spots.shapes import spots
 
 SIDE = 16
@@ -49,10 +48,6 @@ class EstimatorTests:
         """Return the estimator with options that suit 16 x 16 px, spots of 2 px and 1 e- of read noise."""
         raise NotImplementedError
 
-    def score(self) -> Score | None:
-        """Return the score that the estimator applies, or None."""
-        return None
-
     # The sensor -------------------------------------------------------------------------------------
 
     def pipeline(self, n: int = N, **options: Any) -> SlopePipeline:
@@ -63,7 +58,6 @@ class EstimatorTests:
             Settings(self.make(), **shared),
             Calibration(dark=0.0, read_noise_e=READ_NOISE_E),
             psf=PSF.analytic("gaussian", size=SPOT_FWHM_PX / 2, radius_px=12),
-            score=self.score(),
             **options,
         )
 

@@ -14,9 +14,7 @@ from faintspot.experiments.study.specification import StudySpecification
 from faintspot.experiments.study.sweep import Sweep
 from faintspot.io import open_frames
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.slopes.estimators import spot_tables
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import TrainedScore
 
 GRID = "[layout.grid]\nshape = [3, 3]\npixels = 8\n"
 SETTINGS = '[estimator]\nname = "centroid"\n'
@@ -39,13 +37,6 @@ def map_of(pixels: int, size: float, **options: Any) -> fs.SlopePipeline:
     layout = fs.Layout.grid((4, 4), pixels=pixels)
     psf = PSF.analytic("gaussian", size=size, radius_px=8)
     return fs.SlopePipeline(layout, fs.Settings("map", **options), fs.Calibration(read_noise_e=1.0), psf=psf)
-
-
-def large_score() -> Any:
-    score = TrainedScore(
-        np.zeros((1, 1, 1, 2, 9, 9), np.float32), np.ones(1), np.ones((1, 1, 2)), steps_per_px=64
-    )
-    return spot_tables.score_tables(score, (64, 64), 16)
 
 
 def spread(points: int) -> Any:
@@ -83,7 +74,6 @@ CASES: dict[str, tuple[Callable[[Path], Any], tuple[str, ...]]] = {
         ("map: tables of the posterior", "search_range_px", "one flux_e"),
     ),
     "posterior of any flux": (lambda _: map_of(64, 0.3), ("map: tables of the posterior",)),
-    "score": (lambda _: large_score(), ("score.tables", "smaller windows")),
     "psf's radius": (lambda _: PSF.analytic(radius_px=256), ("radius_px = 256",)),
     "psfs": (lambda _: PSF.analytic(size=np.ones(99), radius_px=128, index=range(99)), ("psf.samples",)),
     "psf's side": (lambda _: PSF(np.ones((5, 5001)), 8), ("psf.samples: expected at most 4097",)),

@@ -14,7 +14,7 @@ from faintspot.loop.simulation.configuration.configuration import LoopConfigurat
 
 PHOTONS = (5.0, 14.0, 40.0, 100.0, 320.0)
 BRIGHT = 0.8
-SHIFTS = {"brightest": -2.0, "window": 0.0, "trained": 0.01, "map_predicted": 0.2, "window+kalman": 0.5}
+SHIFTS = {"brightest": -2.0, "window": 0.0, "smoothed": 0.01, "map_predicted": 0.2, "window+kalman": 0.5}
 """Magnitudes by which the curves are fainter than the baseline's."""
 MIDDLE = 13.0
 """Magnitude at which the baseline has half of what it has with bright stars."""

@@ -7,7 +7,7 @@ from faintspot.experiments.methods import Knowledge, method_for_scene, tuned_opt
 from faintspot.slopes.estimators import Scene, estimators
 
 SCENE = Scene(flux_e=123.456, read_noise_e=3.0, window=(12, 12), spot_fwhm_px=1.77, position_range_px=1.0)
-WITHOUT_OPTIONS = ("centroid", "trained")
+WITHOUT_OPTIONS = ("centroid",)
 
 
 @pytest.mark.parametrize("name", list(estimators()))
@@ -16,7 +16,7 @@ def test_every_estimator_is_made_for_a_scene(name: str) -> None:
     method = method_for_scene(kind, SCENE, psf=PSF.analytic())
     assert (method.name, method.label) == (name, kind.label)
     assert method.settings.search_range_px == 1.0
-    assert (method.psf is None) == (Knowledge.of(method.estimator) < Knowledge.SPOT or name == "trained")
+    assert (method.psf is None) == (Knowledge.of(method.estimator) < Knowledge.SPOT)
     options = tuned_options(method, SCENE)
     for option, values in options.items():
         changed = method.with_options({option: values[-1]})
@@ -31,7 +31,6 @@ def test_knowledge_follows_from_the_needs() -> None:
         "matched",
         "ml",
         "map",
-        "trained",
     ]
     assert [name for name, knowledge in found.items() if knowledge is Knowledge.WIDTH] == [
         "window",

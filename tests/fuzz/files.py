@@ -21,7 +21,6 @@ from faintspot.io.references import read_reference
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import TrainedScore
 
 _NUMBER = re.compile(rb"\d+(\.\d*)?([eE][-+]?\d+)?")
 _WORDS = (b"1e300", b"-1", b"nan", b"-inf", b"0", b"0.5", b"9" * 30, b'"x"', b"[]", b"{}", b"true", b"null")
@@ -116,7 +115,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "telemetry.zarr": _read_telemetry,
     "aot.fits": _read_aot,
     "psf.npz": PSF.load,
-    "score.npz": TrainedScore.load,
+    "weights.npz": fs.FixedWeights.load,
     "faintspot.toml": _read_configuration,
     "faintspot.calibration.npz": lambda path: _read_configuration(path.with_name("faintspot.toml")),
     "study.toml": StudySpecification.from_file,
@@ -128,7 +127,6 @@ READERS: dict[str, Callable[[Path], Any]] = {
 @cache
 def _originals() -> Path:
     """Return a folder with a sound file of each, which stays as long as the process."""
-    from tests.estimator_cases import random_score
     from tests.io import frame_files, slope_files, telemetry_files
 
     from faintspot.io import read_telemetry, write_aot
@@ -153,9 +151,10 @@ def _originals() -> Path:
     some = telemetry_files.records_of(10, 5), telemetry_files.images_of(10)
     store.append(*some, {"changes": telemetry_files.CHANGES})
     write_aot(folder / "aot.fits", read_telemetry(store.path))
-    psf, score = PSF.analytic(radius_px=5), random_score(np.random.default_rng(0), 9)
+    psf = PSF.analytic(radius_px=5)
+    weights = fs.FixedWeights(*np.random.default_rng(0).uniform(0.1, 1.0, (3, 8, 8)))
     psf.save(folder / "psf.npz")
-    score.save(folder / "score.npz")
+    weights.save(folder / "weights.npz")
     path = folder / "faintspot.toml"
     layout = fs.Layout.grid((3, 3), pixels=8)
     camera = fs.Calibration(
@@ -164,7 +163,7 @@ def _originals() -> Path:
     chosen = fs.Settings("map", flux_e=100.0, search_range_px=2.0, prior_std_px=1.0).replace(
         where=3, flux_e=50.0
     )
-    for item in (layout, camera, chosen, psf, score):
+    for item in (layout, camera, chosen, psf, weights):
         configuration.save(path, item)
     (folder / "study.toml").write_text(_STUDY)
     (folder / "camera.toml").write_text(_CAMERA)

@@ -86,12 +86,9 @@ def _pipeline(rng: np.random.Generator, estimator: str, width: int) -> fs.SlopeP
     if estimator in NEED_PSF:
         kinds = PSF(several_psfs().samples, 8, rng.integers(0, 3, n))
         psf = [one_psf(), kinds, PSF.analytic("gaussian", size=0.3, radius_px=3)][rng.integers(3)]
-    score = estimator_cases.random_score(rng, n) if estimator == "trained" else None
     reference = rng.uniform(-1, 1, (n, 2)) * rng.choice([1.0, 30.0])
     calibration = _calibration(rng, layout.frame_shape)
-    return fs.SlopePipeline(
-        layout, settings, calibration, reference, psf=psf, score=score, width=width, threads=1
-    )
+    return fs.SlopePipeline(layout, settings, calibration, reference, psf=psf, width=width, threads=1)
 
 
 def _layout(rng: np.random.Generator) -> fs.Layout:

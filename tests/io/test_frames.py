@@ -16,7 +16,6 @@ from tests.refusals import refused
 from faintspot.io import open_frames, read_array, read_slopes
 from faintspot.io.references import read_reference
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import TrainedScore
 
 
 class TestSequence:
@@ -86,7 +85,6 @@ READERS: list[Callable[[Path], Any]] = [
     lambda path: open_frames([path]),
     read_array,
     PSF.load,
-    TrainedScore.load,
     read_reference,
 ]
 

@@ -19,7 +19,6 @@ from faintspot.io.references import read_reference
 from faintspot.io.stored import slopes_format
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import TrainedScore
 
 MIB = 1 << 20
 
@@ -47,7 +46,6 @@ def refused(*words: str) -> Iterator[None]:
 
 READERS: list[tuple[str, Callable[[Path], Any]]] = [
     ("samples", PSF.load),
-    ("tables", TrainedScore.load),
     ("frames", read_array),
     ("frames", lambda path: read_arrays(path, "a PSF", most=8 * MIB)),
     ("x", read_slopes),

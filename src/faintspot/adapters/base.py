@@ -21,8 +21,8 @@ from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
+from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import Score
 
 CALIBRATION_FLUX_E = 1000.0
 """Flux of a sub-aperture [electrons] at which noise-free frames are measured."""
@@ -123,7 +123,7 @@ class PipelineOptions(TypedDict, total=False):
     """Options that `ToolSlopes` passes on to `faintspot.SlopePipeline`."""
 
     psf: PSF | None
-    score: Score | None
+    score: FixedWeights | None
     threads: int | None
 
 

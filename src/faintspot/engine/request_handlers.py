@@ -14,8 +14,8 @@ from faintspot.engine.engine import Engine
 from faintspot.engine.path.pipeline_maker import PipelineMaker
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
 from faintspot.loop.control.identification.models import ControlModel
+from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import load_score
 from faintspot.slopes.training.known_sodium import SODIUM
 
 LENGTHY = ("set", "interleave", "load", "swap", "unload", "learnt", "spots")
@@ -92,7 +92,7 @@ def _take_spots(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, ob
         raise InputError("spots: this engine does not know how its pipelines are made")
     changes: dict[str, Any] = {"psf": PSF.load(_text(fields, "psf"))}
     if fields.get("score") is not None:
-        changes["score"] = load_score(_text(fields, "score"))
+        changes["score"] = FixedWeights.load(_text(fields, "score"))
     change = engine.renew_spots(replace(maker, **changes), {SODIUM: sodium})
     engine.sodium = {**sodium, "unix_time_s": time.time()}
     return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any
 
-import numpy as np
-
 from faintspot.base.config.options import AUTO
 from faintspot.loop.simulation.methods import Method
-from faintspot.slopes.camera.detector import Detector
 from faintspot.slopes.estimators.base import Estimator, Need, Style
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.gravity import KeepingBrightest
@@ -22,8 +18,6 @@ from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import Score, TrainedScore
-from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
 
 
 class Knowledge(IntEnum):
@@ -36,14 +30,12 @@ class Knowledge(IntEnum):
     @classmethod
     def of(cls, estimator: Estimator | type[Estimator]) -> Knowledge:
         """Return what follows from an estimator's needs."""
-        if estimator.needs & {Need.PSF, Need.SCORE}:
+        if Need.PSF in estimator.needs:
             return cls.SPOT
         return cls.WIDTH if Need.WIDTH in estimator.needs else cls.NOISE
 
 
-def method_for_scene(
-    kind: type[Estimator], scene: Scene, *, psf: PSF | None = None, score: Score | None = None
-) -> Method:
+def method_for_scene(kind: type[Estimator], scene: Scene, *, psf: PSF | None = None) -> Method:
     """Return an estimator with the options that a scene asks for, before any are tuned.
 
     Parameters
@@ -51,8 +43,8 @@ def method_for_scene(
     kind : type of Estimator
     scene : Scene
         Its range of positions is the search range.
-    psf, score : PSF, Score, optional
-        Only what the estimator needs is kept.
+    psf : PSF, optional
+        Ignored by an estimator that needs none.
 
     Raises
     ------
@@ -72,46 +64,6 @@ def method_for_scene(
         kind.label,
         settings,
         psf=psf if Need.PSF in kind.needs else None,
-        score=score if Need.SCORE in kind.needs else None,
-    )
-
-
-def score_for_scene(
-    scene: Scene,
-    detector: Detector,
-    rng: np.random.Generator,
-    *,
-    flux_e: Any = None,
-    search_range_px: float | None = None,
-    realisations: int = 20_000,
-) -> TrainedScore:
-    """Train a score on simulated spots of a scene.
-
-    Parameters
-    ----------
-    scene : Scene
-    detector : Detector
-    rng : numpy.random.Generator
-    flux_e : float or (float, float), optional
-        As `faintspot.train_estimator`. Default: the scene's.
-    search_range_px : float, optional
-        Default: half the window.
-    realisations : int
-    """
-    from faintspot.slopes.training.simulation import train_estimator
-
-    return train_estimator(
-        flux_e=scene.flux_e if flux_e is None else flux_e,
-        detector=detector,
-        shape=scene.window,
-        profile=scene.profile,
-        size=scene.spot_fwhm_px / math.sqrt(scene.elongation) / FWHM_OF_SIZE_1_PX[scene.profile],
-        elongation=scene.elongation,
-        d_over_r0=scene.d_over_r0,
-        position_range_px=scene.position_range_px,
-        search_range_px=search_range_px,
-        realisations=realisations,
-        rng=rng,
     )
 
 

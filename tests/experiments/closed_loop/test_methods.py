@@ -10,7 +10,7 @@ from faintspot.loop.simulation.simulation import simulate_loop
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.registry import estimators
 
-NAMES = (*estimators(), "ml_weighted", "map_predicted_weighted", "trained_predicted", "tv_uncorrected")
+NAMES = (*estimators(), "ml_weighted", "map_predicted_weighted", "tv_uncorrected")
 
 
 def first_choice(name: str) -> dict[str, Any]:
@@ -45,10 +45,8 @@ def test_names_say_what_the_loop_does() -> None:
 def test_defaults_suit_the_configuration() -> None:
     usual = default_methods(small())
     assert set(estimators()) <= set(usual)
-    assert {"ml_weighted", "map_predicted", "map_predicted_weighted", "trained_predicted"} <= set(usual)
+    assert {"ml_weighted", "map_predicted", "map_predicted_weighted"} <= set(usual)
     assert not any(name.endswith("_uncorrected") for name in usual)
-    elongated = default_methods(small().replace("sensor", spot_elongation=1.2, samples=12))
-    assert set(usual) - set(elongated) == {"trained", "trained_predicted"}
     assert "tv_uncorrected" in default_methods(small().replace("control", mode="open"))
 
 

@@ -227,8 +227,8 @@ def test_images_may_come_in_parts() -> None:
 
 
 def test_nothing_to_choose_needs_no_images() -> None:
-    specification = StudySpecification("s", [Sweep("a")], estimators=["ml", "trained"], fixed_k=[])
+    specification = StudySpecification("s", [Sweep("a")], estimators=["ml", "centroid"], fixed_k=[])
     methods = CellMethods(specification.cells()[0], specification)
     choices = Tuning(methods).choices()
     assert choices["ml", "best"][0] == (("blur_px", 0.0), ("model_error", 0.0))
-    assert choices["trained", "best"][0] == ()
+    assert choices["centroid", "best"][0] == ()

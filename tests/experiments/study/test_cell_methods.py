@@ -133,14 +133,13 @@ def test_candidates_in_a_cell() -> None:
     specification = StudySpecification(
         "x",
         [Sweep("a", pixels=16, d_over_r0=[0, 2])],
-        estimators=["brightest", "tv", "ml", "matched", "trained", "weighted"],
+        estimators=["brightest", "tv", "ml", "matched", "weighted"],
         strengths=[0.5, 1.0],
         blurs=[0.0, 1.0],
         model_errors=[0.2],
     )
     still, speckled = (CellMethods(cell, specification) for cell in specification.cells())
     assert still.candidates("brightest") == [()]
-    assert still.candidates("trained") == [()]
     assert still.candidates("tv") == [(("noise_std", 0.5),), (("noise_std", 1.0),)]
     assert still.estimator("tv", (("noise_std", 0.5),)).noise_std == 0.5 * still.cell.pixel_noise_e  # type: ignore[attr-defined]
     assert still.candidates("ml") == [(("blur_px", 0.0), ("model_error", 0.0))]

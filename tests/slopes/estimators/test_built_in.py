@@ -15,7 +15,7 @@ import faintspot as fs
 from faintspot.base.statistics import absolute_errors
 from faintspot.slopes.camera.detector import Detector
 from faintspot.slopes.estimators import Estimator, estimators, registry
-from faintspot.testing import FLUX_E, READ_NOISE_E, SIDE, EstimatorTests
+from faintspot.testing import EstimatorTests
 
 EXAMPLE = ROOT / "examples" / "own_estimator.py"
 
@@ -26,18 +26,6 @@ def only_here() -> Iterator[None]:
     yield
     registry._kinds.pop("power", None)
     sys.modules.pop("own_estimator", None)
-
-
-@functools.cache
-def trained_score() -> fs.TrainedScore:
-    return fs.train_estimator(
-        flux_e=FLUX_E,
-        detector=fs.slopes.simulate.Detector(read_noise_e=READ_NOISE_E),
-        shape=(SIDE, SIDE),
-        profile="gaussian",
-        realisations=2000,
-        rng=np.random.default_rng(3),
-    )
 
 
 @functools.cache
@@ -59,9 +47,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "window": {"window_fwhm_px": 4.0},
     "map": {"prior_std_px": 0.5},
 }
-# The iterations of "tv" stop at a relative change of 1 %, where they have not yet made the image symmetric; a
-# trained score finds the centre to its training's noise.
-CENTRE_TOLERANCE_PX = {"tv": 0.015, "trained": 0.02}
+# The iterations of "tv" stop at a relative change of 1 %, where they have not yet made the image symmetric.
+CENTRE_TOLERANCE_PX = {"tv": 0.015}
 
 
 class TestEveryEstimator(EstimatorTests):
@@ -75,9 +62,6 @@ class TestEveryEstimator(EstimatorTests):
     def make(self) -> Estimator:
         kind = example_estimator() if self.kind == "power" else estimators()[self.kind]
         return kind(**OPTIONS.get(self.kind, {}))
-
-    def score(self) -> fs.TrainedScore | None:
-        return trained_score() if self.kind == "trained" else None
 
 
 @pytest.mark.parametrize("side", [8, 12, 16])

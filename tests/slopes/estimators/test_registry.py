@@ -29,7 +29,6 @@ BUILT_IN = [
     "matched",
     "ml",
     "map",
-    "trained",
 ]
 
 

@@ -23,9 +23,8 @@ def frames(n: int, flux_e: float, seed: int = 1) -> tuple[Any, Any]:
     )
 
 
-def score() -> fs.TrainedScore:
-    tables = np.random.default_rng(3).normal(0.0, 0.01, (1, 2, 2, 2, 33, 33)).astype(np.float32)
-    return fs.TrainedScore(tables, np.array([50.0, 500.0]), np.full((1, 2, 2), 0.1))
+def weights() -> fs.FixedWeights:
+    return fs.FixedWeights(*np.random.default_rng(3).uniform(0.1, 1.0, (3, *LAYOUT.window)))
 
 
 class TestWhatIsMissing:
@@ -38,7 +37,6 @@ class TestWhatIsMissing:
                 {"calibration": None, "psf": fs.PSF.analytic()},
                 r"calibration\.read_noise_e",
             ),
-            (fs.Settings("trained"), {}, r"score: expected a TrainedScore .*train_estimator"),
             (fs.Settings("weighted"), {}, r"settings\.spot_fwhm_px"),
             (fs.Settings(noise_std="auto"), {}, r"settings\.spot_fwhm_px"),
             (fs.Settings("thresholded"), {}, r"estimator\.threshold_e"),
@@ -62,13 +60,12 @@ class TestMeasuredFlux:
             assert np.array_equal(together.x[i], alone.x)
             assert np.array_equal(together.flags[i], alone.flags)
 
-    @pytest.mark.parametrize("estimator", ["trained", "map"])
-    def test_is_close_to_the_flux_given(self, estimator: str) -> None:
+    def test_is_close_to_the_flux_given(self) -> None:
         """Of 12 spots of 400 e- the mean flux is known to 3 %, which moves no slope by more than 0.03 px."""
         frame, _ = frames(1, 400.0)
-        parts: dict[str, Any] = {"psf": fs.PSF.analytic(), "score": score()}
-        measured = fs.SlopePipeline(LAYOUT, fs.Settings(estimator=estimator), NOISE, **parts)(frame[0])
-        given = fs.SlopePipeline(LAYOUT, fs.Settings(estimator=estimator, flux_e=400.0), NOISE, **parts)
+        psf = fs.PSF.analytic()
+        measured = fs.SlopePipeline(LAYOUT, fs.Settings("map"), NOISE, psf=psf)(frame[0])
+        given = fs.SlopePipeline(LAYOUT, fs.Settings("map", flux_e=400.0), NOISE, psf=psf)
         assert np.abs(measured.x - given(frame[0]).x).max() < 0.03
 
     @pytest.mark.parametrize("value", [0.0, -1e6, 1e30, np.nan, np.inf])
@@ -76,23 +73,23 @@ class TestMeasuredFlux:
         frame = np.full(LAYOUT.frame_shape, value, np.float32)
         for settings in (
             fs.Settings(noise_std="auto", keep_brightest="auto", spot_fwhm_px=1.9),
-            fs.Settings(estimator="trained"),
             fs.Settings(estimator="map"),
         ):
-            slopes = fs.SlopePipeline(LAYOUT, settings, NOISE, psf=fs.PSF.analytic(), score=score())(frame)
+            slopes = fs.SlopePipeline(LAYOUT, settings, NOISE, psf=fs.PSF.analytic())(frame)
             assert np.isfinite(slopes.vector).all()
 
 
 class TestConfiguration:
-    def test_psf_and_score_come_back(self, tmp_path: Path) -> None:
+    def test_psf_and_weights_come_back(self, tmp_path: Path) -> None:
         path = tmp_path / "faintspot.toml"
         psf = fs.PSF.analytic(elongation=2.0, angle_deg=30.0, radius_px=8.0)
-        for item in (LAYOUT, fs.Settings(estimator="ml"), NOISE, psf, score()):
+        for item in (LAYOUT, fs.Settings(estimator="ml"), NOISE, psf, weights()):
             configuration.save(path, item)
         again = configuration.Configuration(path)
         assert again.psf is not None
         assert np.allclose(again.psf.samples, psf.samples)
-        assert again.score == score()
+        assert again.score is not None
+        assert np.array_equal(again.score.x, weights().x)
         frame = frames(1, 300.0)[0][0]
         expected = fs.SlopePipeline(LAYOUT, fs.Settings(estimator="ml"), NOISE, psf=psf)(frame)
         assert np.array_equal(fs.SlopePipeline.from_file(path)(frame).x, expected.x)

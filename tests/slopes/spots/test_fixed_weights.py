@@ -11,7 +11,6 @@ from tests.refusals import assert_each_refused, refused
 import faintspot as fs
 from faintspot.slopes.estimators.built_in.window import Window
 from faintspot.slopes.pipeline.images import measure_images
-from faintspot.slopes.spots.score import load_score
 from faintspot.slopes.spots.shapes import spots
 
 SIDE = 12
@@ -153,8 +152,7 @@ def test_quad_cells() -> None:
 def test_files(tmp_path: Path, learnt: fs.FixedWeights) -> None:
     path = tmp_path / "weights.npz"
     learnt.save(path)
-    again = load_score(path)
-    assert isinstance(again, fs.FixedWeights)
+    again = fs.FixedWeights.load(path)
     for name in ("x", "y", "mean_spot", "flux"):
         np.testing.assert_array_equal(getattr(again, name), getattr(learnt, name))
 

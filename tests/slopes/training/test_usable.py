@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from faintspot import Calibration, Layout, learn_psf
 from faintspot.base.errors import InputError
 from faintspot.slopes.simulate import Detector, sensor_frames
-from faintspot.slopes.training import train_from_frames
 from faintspot.slopes.training.usable import usable_subapertures
 
 LAYOUT = Layout.grid((6, 6), pixels=12)
@@ -57,11 +56,3 @@ def test_psf_is_that_of_the_others() -> None:
     np.testing.assert_array_equal(found.samples, expected.samples)
     assert found.index is not None
     np.testing.assert_array_equal(found.index[USED], kinds[USED])
-
-
-def test_score_is_that_of_the_others() -> None:
-    options: dict[str, Any] = {"draws": 1, "passes": 1, "start": "reference"}
-    with pytest.warns(UserWarning, match="score: left out 3 of 36 sub-apertures: dark"):
-        found = train_from_frames(frames(), LAYOUT, CAMERA, rng=np.random.default_rng(2), **options)
-    expected = train_from_frames(frames(), LAYOUT[USED], CAMERA, rng=np.random.default_rng(2), **options)
-    np.testing.assert_array_equal(found.tables, expected.tables)

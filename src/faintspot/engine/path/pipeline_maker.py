@@ -12,8 +12,8 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import Score
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class PipelineMaker:
     layout: Layout
     calibration: Calibration
     psf: PSF | None = None
-    score: Score | None = None
+    score: FixedWeights | None = None
     reference: NDArray[Any] | None = None
     """Reference slopes, as for `SlopePipeline`."""
 

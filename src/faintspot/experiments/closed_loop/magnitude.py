@@ -20,11 +20,10 @@ from faintspot.loop.simulation.simulation import DisabledErrors
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.smoothed import Smoothed
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
-from faintspot.slopes.estimators.built_in.trained import Trained
 from faintspot.slopes.estimators.built_in.window import Window
 
 KIND = "magnitude"
-QUICK_METHODS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation, Window, Trained))
+QUICK_METHODS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation, Window))
 _QUICK_FLUXES = 3
 
 
@@ -51,7 +50,7 @@ def run_magnitude(
     folder : path
         Where finished units are remembered; made where it is not there.
     methods : sequence of str, optional
-        See `experiments.closed_loop.methods.method_kind`. Default: `default_methods`; with `quick`, five.
+        See `experiments.closed_loop.methods.method_kind`. Default: `default_methods`; with `quick`, four.
     photons : sequence of float, optional
         Photo-electrons of a fully lit sub-aperture in a frame. Default: the configuration's.
     quick : bool

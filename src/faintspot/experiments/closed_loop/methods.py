@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,13 +11,11 @@ import numpy as np
 from faintspot.base.checks import one_of
 from faintspot.base.config.options import AUTO, Option
 from faintspot.base.errors import InputError
-from faintspot.experiments.methods import score_for_scene
 from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR, predicts
 from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.configuration.sections import CLOSED, RunLength
+from faintspot.loop.simulation.configuration.sections import CLOSED
 from faintspot.loop.simulation.methods import PRIOR, Method
-from faintspot.loop.simulation.telescope.camera import make_detector
 from faintspot.slopes.estimators.base import Estimator, Need
 from faintspot.slopes.estimators.built_in.correlation import Correlation
 from faintspot.slopes.estimators.built_in.maximum_a_posteriori import MaximumAPosteriori
@@ -27,7 +23,6 @@ from faintspot.slopes.estimators.built_in.window import Window
 from faintspot.slopes.estimators.registry import estimator_named, estimators
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.psf import PSF, spot_psf
-from faintspot.slopes.spots.score import TrainedScore
 
 Choice = Mapping[str, Any]
 """Values of what is tuned, by name: `LOOP_GAIN` and options of the estimator."""
@@ -54,8 +49,6 @@ _METHODS_OF_LASER = (
 _STEPS_BEYOND = 2  # in the ratio of an end to its neighbour
 _FEWEST_TO_WIDEN = 4
 _FIRST_VALUES = (3, 2)  # of a method's first option, and of each further one
-_TRAINING_SPOTS = 8000
-_TRAINING_SEED = 4
 
 
 @dataclass(frozen=True)
@@ -154,8 +147,7 @@ class MethodKind:
 
         Without a choice, options are automatic and the loop gain is the configuration's.
 
-        The PSF of those that need one is that of a flat wavefront; the score is trained on simulated spots
-        of the same strength of turbulence, flux and camera.
+        The PSF of those that need one is that of a flat wavefront.
 
         Raises
         ------
@@ -172,7 +164,9 @@ class MethodKind:
         laser, needs_psf = configuration.laser is not None, Need.PSF in estimator.required
         if not laser and any(name in self.variants for name in _OF_LASER):
             raise InputError(f"method = {self.name!r}: expected a configuration with a laser")
-        changes = {key: value for name in self.variants for key, value in VARIANTS[name].changes.items()}
+        changes: dict[str, Any] = {
+            key: value for name in self.variants for key, value in VARIANTS[name].changes.items()
+        }
         return Method(
             self.label,
             Settings(
@@ -182,7 +176,6 @@ class MethodKind:
             control=self.control,
             noise_scale=float(choice.get(NOISE_SCALE, 1.0)),
             psf=_flat_psf(configuration) if needs_psf and not laser else None,
-            score=_trained_score(_without_runs(configuration)) if Need.SCORE in estimator.required else None,
             **changes,
         )
 
@@ -233,18 +226,16 @@ def default_methods(configuration: LoopConfiguration) -> list[str]:
     """Return the names of the methods that are compared where none are asked for.
 
     Every estimator, as far as it suits; those that take a prior also with the loop's prediction, and those
-    that weigh pixels by their noise also with a weighted reconstructor. A score is trained for spots that
-    turbulence speckles: not where the source is elongated. In closed loop, the strongest usual estimator and
-    the one that gains most from a prior also with the Kalman filter. In open loop, where an error of the
-    centroid gain is not fed back, those that know nothing of the spot also without its correction.
+    that weigh pixels by their noise also with a weighted reconstructor. In closed loop, the strongest usual
+    estimator and the one that gains most from a prior also with the Kalman filter. In open loop, where an
+    error of the centroid gain is not fed back, those that know nothing of the spot also without its
+    correction.
     With a laser guide star, those that suit elongated spots, with the profile learnt before and followed.
     """
     if configuration.laser is not None:
         return list(_METHODS_OF_LASER)
     names = []
     for name, kind in estimators().items():
-        if Need.SCORE in kind.needs and configuration.sensor.spot_elongation > 1:
-            continue
         names.append(name)
         predicted = f"{name}{_PREDICTED}" if kind.takes_prior else name
         names += [predicted] if kind.takes_prior else []
@@ -278,18 +269,3 @@ def _spread(values: Sequence[Any], count: int) -> Tunable:
 def _flat_psf(configuration: LoopConfiguration) -> PSF:
     sensor = configuration.sensor
     return spot_psf(configuration.spot_width_px / 2, sensor.spot_elongation, radius_px=sensor.pixels)
-
-
-def _without_runs(configuration: LoopConfiguration) -> LoopConfiguration:
-    """Return the configuration without what no score depends on, so that one serves runs of any length."""
-    return replace(configuration, run=RunLength(seed=configuration.run.seed))
-
-
-@functools.lru_cache(maxsize=4)
-def _trained_score(configuration: LoopConfiguration) -> TrainedScore:
-    """Train the score on spots of the weakest seeing: when unsure, the larger d / r0 is better."""
-    scene = configuration.scene
-    # Spots are elongated along another direction in each sub-aperture; it is trained on round ones.
-    scene = replace(scene, elongation=1.0, spot_fwhm_px=scene.spot_fwhm_px / math.sqrt(scene.elongation))
-    rng = np.random.default_rng([configuration.run.seed, _TRAINING_SEED])
-    return score_for_scene(scene, make_detector(configuration), rng, realisations=_TRAINING_SPOTS)

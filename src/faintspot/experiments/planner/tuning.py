@@ -18,21 +18,19 @@ from faintspot.base.statistics import OUTLIER_PX, Estimate, SlopeStatistics, abs
 from faintspot.experiments.closed_loop.methods import Choice
 from faintspot.experiments.closed_loop.search import coordinate_search, corrected_badness
 from faintspot.experiments.curves import Curve, limiting_flux, magnitude_gain
-from faintspot.experiments.methods import Knowledge, method_for_scene, score_for_scene, tuned_options
+from faintspot.experiments.methods import Knowledge, method_for_scene, tuned_options
 from faintspot.experiments.planner.answer import Answer, MethodResult
 from faintspot.experiments.planner.promise import Promise, check_promises
 from faintspot.experiments.planner.question import Question
 from faintspot.experiments.planner.simulated import SimulatedSpots, SpotFrames
 from faintspot.loop.simulation.methods import Method
-from faintspot.slopes.estimators.base import Estimator, Need
+from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.thresholded import Thresholded
 from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.spots.bounds import MEAN_ABSOLUTE, cramer_rao
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import TrainedScore
-from faintspot.slopes.training.simulation import CLASS_WIDTH
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -47,7 +45,6 @@ _ERROR_TOLERANCE = 0.05  # of the standard errors, below which they need no fact
 _SEARCHED_E = (0.1, 1e7)  # electrons within which the limiting flux is sought
 _SEARCH_STEPS = 4  # fluxes that are added at a time
 _BOUND_SHARES = 9  # quantiles of the sub-apertures' flux that the bound is averaged over
-_TRAINING_SHARE = 0.75  # of the scored spots, to train each class on
 
 
 def tune(
@@ -109,11 +106,9 @@ def tune(
     count = _default_realisations(question) if realisations is None else realisations
     number = int(number_between("realisations", count, 256, integer=True))
     each_side = int(number_between("steps", steps, 1, 20, integer=True))
-    spots_rng, score_rng, noise_rng, resampling_rng = spawn(
-        np.random.default_rng(1) if rng is None else rng, 4
-    )
+    spots_rng, noise_rng, resampling_rng = spawn(np.random.default_rng(1) if rng is None else rng, 3)
     spots = SimulatedSpots.of(question, number, spots_rng)
-    trial = _Trial(question, spots, int(_TRAINING_SHARE * number), score_rng, noise_rng, progress)
+    trial = _Trial(question, spots, noise_rng, progress)
     trial.add(range(-each_side, each_side + 1))
     answer = trial.answer(resampling_rng)
     while question.budget_px is not None and (further := _further(answer, trial.steps)):
@@ -158,15 +153,12 @@ class _Trial:
 
     question: Question
     spots: SimulatedSpots
-    training: int
-    """Spots that each class of a score is trained on."""
-    score_rng: np.random.Generator
     noise_rng: np.random.Generator
     progress: Progress | None
 
     def __post_init__(self) -> None:
-        self._left_out = _left_out(self.question)
-        self._kinds = {name: kind for name, kind in estimators().items() if name not in self._left_out}
+        self._left_out: dict[str, str] = {}
+        self._kinds = dict(estimators())
         self._scored: dict[int, dict[str, _Scored]] = {}
         self._finished = self._to_do = 0
 
@@ -178,21 +170,13 @@ class _Trial:
     def add(self, steps: Sequence[int]) -> None:
         """Try more fluxes."""
         fluxes = [_flux_of(self.question.star_flux_e, step) for step in steps]
-        score, classes = None, 0
-        if any(Need.SCORE in kind.needs for kind in self._kinds.values()):
-            classes = 1 + 2 * round(0.5 * math.log(fluxes[-1] / fluxes[0]) / math.log(CLASS_WIDTH) - 0.5)
-            classes = max(classes, 1)
-        self._to_do += len(self._kinds) * len(fluxes) + classes
-        if classes:
-            middle = math.sqrt(fluxes[0] * fluxes[-1])
-            score = _trained(self.question, middle, self.training, classes, self.score_rng)
-            self._advance(classes)
+        self._to_do += len(self._kinds) * len(fluxes)
         for step, flux, rng in zip(steps, fluxes, spawn(self.noise_rng, len(fluxes)), strict=True):
             samples = self.spots.exposed(flux, rng)
             self._scored[step] = {}
             for name, kind in list(self._kinds.items()):
                 try:
-                    self._scored[step][name] = self._tried(kind, flux, samples, score)
+                    self._scored[step][name] = self._tried(kind, flux, samples)
                 except InputError as error:
                     if name in (BrightestPixels.name, Thresholded.name):  # what all are compared with
                         raise
@@ -200,12 +184,10 @@ class _Trial:
                     del self._kinds[name]
                 self._advance(1)
 
-    def _tried(
-        self, kind: type[Estimator], flux_e: float, samples: Sequence[SpotFrames], score: TrainedScore | None
-    ) -> _Scored:
+    def _tried(self, kind: type[Estimator], flux_e: float, samples: Sequence[SpotFrames]) -> _Scored:
         """Choose an estimator's options on the first sample, and score it on the second."""
         scene, spots = self.question.scene(flux_e), self.spots
-        (first, second), method = samples, method_for_scene(kind, scene, psf=self._psf, score=score)
+        (first, second), method = samples, method_for_scene(kind, scene, psf=self._psf)
         if method.estimator.uses_flux and self.question.flux_is_known:
             method = method.with_options({"flux_e": float(f"{flux_e:.4g}")})
 
@@ -279,29 +261,6 @@ def _default_realisations(question: Question) -> int:
     ny, nx = question.shape
     share = min(1.0, 256 / (ny * nx)) * (_SPECKLED_SHARE if question.d_over_r0 else 1.0)
     return max(_FEWEST_REALISATIONS, round(_REALISATIONS * share))
-
-
-def _left_out(question: Question) -> dict[str, str]:
-    """Return the estimators that cannot be tried, and why."""
-    if question.psf is None:
-        return {}
-    reason = "its training simulates assumed profiles; `slopes.training.train_from_frames` learns from frames"
-    return {name: reason for name, kind in estimators().items() if Need.SCORE in kind.needs}
-
-
-def _trained(
-    question: Question, flux_e: float, realisations: int, classes: int, rng: np.random.Generator
-) -> TrainedScore:
-    """Train the score for fluxes around one, which is in the middle of a class."""
-    reach = CLASS_WIDTH ** (classes / 2)
-    return score_for_scene(
-        question.scene(flux_e),
-        question.detector,
-        rng,
-        flux_e=(flux_e / reach, flux_e * reach),
-        search_range_px=question.search_range_px,
-        realisations=realisations,
-    )
 
 
 def _error_scale(slopes: Slopes, truth: Floats) -> float:

@@ -6,13 +6,12 @@ import functools
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.experiments.methods import Kind, keeps_every_k, score_for_scene
+from faintspot.experiments.methods import Kind, keeps_every_k
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator, Need
@@ -23,7 +22,6 @@ from faintspot.slopes.pipeline.images import measure_images
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.spots.psf import PSF, spot_psf
-from faintspot.slopes.spots.score import TrainedScore
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
 
 if TYPE_CHECKING:
@@ -40,7 +38,6 @@ Measured = tuple[Floats, Bools, Floats | None]
 """Positions (n, K, 2), whether they are valid (n, K), and stated standard errors (n, 2), if any, px."""
 
 _KEPT = "keep_brightest"
-_TRAINING = 1  # word that is added to a cell's seed
 _LEAST_FLUX_E = 1e-3  # a mean of noise may be negative
 _TABLE_PIXELS = 1 << 14  # of images at a time, whose tables then stay in the processor's cache
 
@@ -121,7 +118,6 @@ class CellMethods:
             estimator.label,
             Settings(estimator, search_range_px=self._within_px, flux_e=self.flux_e, **widths),
             psf=self._psf if Need.PSF in estimator.needs else None,
-            score=self._score if Need.SCORE in estimator.needs else None,
         )
 
     def _axes(self, kind: Kind) -> dict[str, list[float]]:
@@ -179,15 +175,6 @@ class CellMethods:
         """Width along x and y, without turbulence."""
         along, across = self._psf.fwhm_px[0].tolist()
         return along, across
-
-    @functools.cached_property
-    def _score(self) -> TrainedScore:
-        """Trained on spots of a seed of their own."""
-        cell = self.cell
-        entropy = [*cell.seed(self.specification.seed).entropy, _TRAINING]  # type: ignore[misc]
-        rng = np.random.default_rng(np.random.SeedSequence(entropy))
-        scene = replace(self.scene, position_range_px=cell.position_range_px)
-        return score_for_scene(scene, cell.detector, rng, search_range_px=self._within_px)
 
 
 def position_table(

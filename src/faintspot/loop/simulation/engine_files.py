@@ -22,8 +22,8 @@ from faintspot.loop.simulation.telescope.model import prepare
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF, spot_psf
-from faintspot.slopes.spots.score import Score
 
 CONFIGURATION = "faintspot.toml"
 INTERACTION = "interaction_matrix.npy"
@@ -108,7 +108,7 @@ def fixed_window(configuration: LoopConfiguration, **options: object) -> Setting
     return Settings("window", window_fwhm_px=width, flux_e=configuration.photons, **options)
 
 
-def _method(settings: Settings, psf: PSF, score: Score | None, control: str) -> Method:
+def _method(settings: Settings, psf: PSF, score: FixedWeights | None, control: str) -> Method:
     """Return the method of the simulated loop that equals the engine's."""
     with_prior = predicts(control) and settings.estimator.takes_prior
     if with_prior and PRIOR in settings.declared() and getattr(settings, PRIOR) is None:

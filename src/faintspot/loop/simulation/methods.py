@@ -11,8 +11,8 @@ from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import Score
 
 PRIOR = "prior_std_px"
 """Option of estimators whose prior the loop sets: standard deviation from the predicted position."""
@@ -55,7 +55,7 @@ class Method(Options, table="method"):
     follows_profile : bool
         Whether spots of a laser guide star are those of a sodium profile that is followed, not of the one
         learnt before the run.
-    psf, score : PSF, Score, optional
+    psf, score : PSF, FixedWeights, optional
         For the estimators that need them. Default PSF: that of a flat wavefront, or with a laser that of the
         profile learnt.
 
@@ -86,7 +86,7 @@ class Method(Options, table="method"):
     matched_weights: bool = False
     follows_profile: bool = False
     psf: PSF | None = None
-    score: Score | None = None
+    score: FixedWeights | None = None
 
     @property
     def estimator(self) -> Estimator:

@@ -19,7 +19,6 @@ from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.estimators.sensor import Sensor
 from faintspot.slopes.kernels.driver.groups import COMMON_ROWS, flux_of_groups
-from faintspot.slopes.spots.score import TrainedScore
 
 Floats = NDArray[np.float64]
 
@@ -37,13 +36,11 @@ class Need(enum.Enum):
     READ_NOISE = "calibration.read_noise_e: expected the read noise (electrons)"
     WIDTH = "settings.spot_fwhm_px: expected the spots' width (px), or a PSF,"
     PSF = "psf: expected a PSF"
-    SCORE = "score: expected a TrainedScore"
 
 
 _MAKERS = {
     Need.READ_NOISE: "; read_noise_e in [calibration] gives it (faintspot layout --read-noise-e)",
     Need.PSF: "; faintspot.learn_psf makes one",
-    Need.SCORE: "; faintspot.train_estimator makes one",
 }
 
 
@@ -198,7 +195,6 @@ class Estimator(Options):
         """
         missing = {
             Need.PSF: sensor.psf is None,
-            Need.SCORE: not isinstance(sensor.score, TrainedScore),
             Need.READ_NOISE: sensor.calibration.read_noise_e is None,
             Need.WIDTH: bool(np.isnan(sensor.spot_fwhm_px).any()),
         }

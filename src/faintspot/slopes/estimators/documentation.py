@@ -13,7 +13,6 @@ _NEEDS = {
     Need.READ_NOISE: "read noise",
     Need.WIDTH: "the spots' width",
     Need.PSF: "PSF",
-    Need.SCORE: "trained score",
 }
 
 

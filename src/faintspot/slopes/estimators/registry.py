@@ -29,7 +29,6 @@ _FIRST = (
     "matched",
     "maximum_likelihood",
     "maximum_a_posteriori",
-    "trained",
 )
 """Modules of `built_in` that are listed first, in this order."""
 

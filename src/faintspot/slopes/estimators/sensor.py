@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import Score
 
 Floats = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ class Sensor:
     ----------
     layout : Layout
     calibration : Calibration
-    psf, score : PSF, Score, or None
+    psf, score : PSF, FixedWeights, or None
     zero : (n, 2) array
         Reference positions, px from the window centres.
     search_range_px : (n,) array
@@ -40,7 +40,7 @@ class Sensor:
     layout: Layout
     calibration: Calibration
     psf: PSF | None
-    score: Score | None
+    score: FixedWeights | None
     zero: Floats
     search_range_px: Floats
     flux_e: Floats

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.sizes import check_size
 from faintspot.slopes.kernels.gravity.pixel_noise import SMALLEST_VARIANCE
 from faintspot.slopes.kernels.spot_fits.profiles import MARGIN, PHASES
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import TrainedScore
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
 Floats = NDArray[np.float64]
@@ -300,33 +298,3 @@ def posterior_tables(
             tables[i, part, :, :nx] = logarithm / excess
             constants[i, part] = (v / excess**2 * logarithm - mean / excess).sum(axis=(1, 2))
     return PosteriorGrid(tables, constants, grid, spacing)
-
-
-# Trained score --------------------------------------------------------------------------------------
-
-
-def score_tables(
-    score: TrainedScore, window: tuple[int, int], width: int
-) -> tuple[NDArray[np.float32], int, int]:
-    """Return the tables of `kernels.spot_fits.trained.apply_score`, steps per pixel and margin.
-
-    Kind and flux class share one axis, on which the flux class varies fastest.
-    """
-    steps = score.steps_per_px
-    margin = max(window) + MARGIN
-    side, length = 2 * margin + max(window), 2 * margin + max(window) + 2 * width
-    kinds, classes, passes, _, rows, columns = score.tables.shape
-    shape = (kinds * classes, passes, steps, steps, 2, side, length)
-    check_size("score.tables", shape, hint="train it for fewer kinds or fluxes, or use smaller windows")
-    result = np.zeros(shape, np.float32)
-    flat = score.tables.reshape(kinds * classes, passes, 2, rows, columns)
-    for phase_y in range(steps):
-        # Node of element i: (i - margin) * steps + phase + (rows - 1) / 2.
-        node_y = (np.arange(side) - margin) * steps + phase_y + (rows - 1) // 2
-        inside_y = np.flatnonzero((node_y >= 0) & (node_y < rows))
-        for phase_x in range(steps):
-            node_x = (np.arange(length) - margin) * steps + phase_x + (columns - 1) // 2
-            inside_x = np.flatnonzero((node_x >= 0) & (node_x < columns))
-            picked = flat[:, :, :, node_y[inside_y][:, None], node_x[inside_x]]
-            result[:, :, phase_y, phase_x][:, :, :, inside_y[:, None], inside_x] = picked
-    return result, steps, margin

@@ -20,15 +20,15 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.laser_spots import LaserSpots, matched_filter
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import Score, load_score
 
 _PACKED, _MOST_PACKED_BYTES = "faintspot.toml", 1 << 20
 _FILTER = "laser.matched_filter"
 _ANALYTIC_KEYS = ("profile", "size", "elongation", "angle_deg", "radius_px")
 
-Item = Layout | Calibration | Settings | PSF | Score
+Item = Layout | Calibration | Settings | PSF | FixedWeights
 
 
 class Configuration(Tables):
@@ -84,13 +84,13 @@ class Configuration(Tables):
             return PSF.load(self._named_file(values, ("file", "profile")))
 
     @cached_property
-    def score(self) -> Score | None:
+    def score(self) -> FixedWeights | None:
         """Score that is named, else the linear matched filter of a laser guide star, if wanted, or None."""
         values = self.tables.get("score")
         if values is None:
             return self._laser_score()
         with errors_within(self.path, "score."):
-            return load_score(self._named_file(values, ("file",)))
+            return FixedWeights.load(self._named_file(values, ("file",)))
 
     @property
     def spot(self) -> dict[str, Any]:
@@ -105,7 +105,7 @@ class Configuration(Tables):
         with errors_within(self.path):
             return self.laser.psf(self.laser.star_of(layout), layout.window)
 
-    def _laser_score(self) -> Score | None:
+    def _laser_score(self) -> FixedWeights | None:
         """Return the linear matched filter of the laser guide star, if the configuration wants it."""
         if self.laser is None or not self.laser.matched_filter or self.psf is None:
             return None
@@ -149,7 +149,7 @@ def save(path: str | Path, item: Item) -> None:
     InputError
         If the file exists and is not TOML, or cannot be written.
     """
-    if not isinstance(item, PSF | Score):
+    if not isinstance(item, PSF | FixedWeights):
         item.save(path)
         return
     table = "psf" if isinstance(item, PSF) else "score"
@@ -158,7 +158,7 @@ def save(path: str | Path, item: Item) -> None:
     save_tables(path, {table: {"file": store.name}})
 
 
-def packed(calibration: Calibration, psf: PSF | None, score: Score | None) -> dict[str, str] | None:
+def packed(calibration: Calibration, psf: PSF | None, score: FixedWeights | None) -> dict[str, str] | None:
     """Return the files that `save` writes, as base64 text by name; None if they exceed 1 MiB in total."""
     with TemporaryDirectory() as folder:
         for item in (calibration, psf, score):
@@ -170,7 +170,7 @@ def packed(calibration: Calibration, psf: PSF | None, score: Score | None) -> di
         return {file.name: base64.b64encode(file.read_bytes()).decode() for file in files}
 
 
-def unpacked(files: Mapping[str, str]) -> tuple[Calibration, PSF | None, Score | None]:
+def unpacked(files: Mapping[str, str]) -> tuple[Calibration, PSF | None, FixedWeights | None]:
     """Return the inputs of `packed` from its result.
 
     Raises

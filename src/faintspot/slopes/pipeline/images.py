@@ -12,8 +12,8 @@ from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import Score
 
 
 def measure_images(
@@ -22,7 +22,7 @@ def measure_images(
     *,
     calibration: Calibration | None = None,
     psf: PSF | None = None,
-    score: Score | None = None,
+    score: FixedWeights | None = None,
     prior: ArrayLike | None = None,
 ) -> Slopes:
     """Measure the positions of the spots in a stack of images, each image a separate sub-aperture.

@@ -27,8 +27,8 @@ from faintspot.slopes.sensor.neighbours import (
     lines_of,
     neighbours_of,
 )
+from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import Score
 
 _FWHM_OF_KEPT = 0.58  # px, times the square root of a good number of kept pixels: 12 for a FWHM of 2 px
 _MOST_FLUX_E = 9e8  # mean flux per sub-aperture above which settings stay constant
@@ -78,7 +78,7 @@ class Plan:
         settings: Settings,
         calibration: Calibration,
         psf: PSF | None,
-        score: Score | None,
+        score: FixedWeights | None,
         zero: Floats,
         width: int,
     ) -> None:

@@ -36,8 +36,8 @@ from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes, Stages
 from faintspot.slopes.pipeline.small_frames import NO_STAGES, SmallFrames
 from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import Score
 
 _KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
 _SMALL_TYPES = (np.dtype(np.uint8), *_KERNEL_TYPES)
@@ -59,8 +59,8 @@ class SlopePipeline:
         must not exceed the longer side of the frame. Default: 0.
     psf : PSF, optional
         Required by estimators that use the spot shape; it provides the spot width to others.
-    score : Score, optional
-        Required by estimators that apply one: `TrainedScore`, or `FixedWeights` for a window.
+    score : FixedWeights, optional
+        Fixed weights of a window.
     width : int, optional
         SIMD width in float32 numbers: 4, 8 or 16. Default: the width of the machine.
     threads : int, optional
@@ -94,7 +94,7 @@ class SlopePipeline:
         reference: ArrayLike | Slopes | None = None,
         *,
         psf: PSF | None = None,
-        score: Score | None = None,
+        score: FixedWeights | None = None,
         width: int | None = None,
         threads: int | None = None,
     ) -> None:
@@ -160,7 +160,7 @@ class SlopePipeline:
         return self.settings.magnified(1 / self.layout.bin), calibration
 
     @property
-    def spot(self) -> tuple[PSF | None, Score | None]:
+    def spot(self) -> tuple[PSF | None, FixedWeights | None]:
         """PSF and score of the pipeline."""
         return self._parts[:2]
 
@@ -289,7 +289,7 @@ class SlopePipeline:
         ----------
         frame : array
         prior : array or Slopes, optional
-            Predicted slopes [px], used by "map" (mean of the prior) and "trained" (starting point): an
+            Predicted slopes [px], used by "map" (mean of the prior): an
             array as for `reference`, or one such array per frame. Default: 0, which also replaces values
             that are not finite or exceed the longer side of the frame.
 
@@ -483,7 +483,7 @@ def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, layout: Layout) -> N
     return np.ascontiguousarray(np.where(possible, array, 0.0).reshape(-1, 2, n), np.float32)
 
 
-def _identity(psf: PSF | None, score: Score | None, zero: NDArray[np.float64]) -> bytes:
+def _identity(psf: PSF | None, score: FixedWeights | None, zero: NDArray[np.float64]) -> bytes:
     """Return a digest of the inputs of slopes other than layout, settings and calibration."""
     digest = hashlib.sha256(zero.tobytes())
     for part in (psf, score):

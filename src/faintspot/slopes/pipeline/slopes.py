@@ -57,8 +57,7 @@ class Slopes:
     """Standard error of x [px]; infinite where not `measured`, and where the read noise is unknown."""
     standard_error_y: NDArray[np.float32]
     covariance_xy: NDArray[np.float32]
-    """Covariance of the errors of x and y [px^2]; 0 where a standard error is infinite, and for an estimator
-    that does not know it (`trained`)."""
+    """Covariance of the errors of x and y [px^2]; 0 where a standard error is infinite."""
     keep: SubapertureFlag = field(default=NO_FLAG, kw_only=True)
     """Flags of `KEEPABLE` that do not make a slope invalid."""
 

@@ -22,9 +22,9 @@ from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
+from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.laser_spots import LaserSpots
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import Score, load_score
 
 _Part = TypeVar("_Part")
 
@@ -40,7 +40,7 @@ class StoredRun:
     settings: Settings | None = None
     calibration: Calibration | None = None
     psf: PSF | None = None
-    score: Score | None = None
+    score: FixedWeights | None = None
     laser: LaserSpots | None = None
     lost: list[str] = field(default_factory=list)
     """Optional parts of a pipeline: a PSF or a score, whose file may be missing."""
@@ -141,7 +141,7 @@ def _rebuild(store: StoredRun) -> None:
     else:
         store.calibration = stored.calibration
     store.psf = _of_the_spot(store, "psf", PSF.load)
-    store.score = _of_the_spot(store, "score", load_score)
+    store.score = _of_the_spot(store, "score", FixedWeights.load)
     store.laser = _of_the_spot(store, "laser", lambda path: configuration.Configuration(path).laser)
 
 
@@ -155,7 +155,7 @@ def _of_the_spot(store: StoredRun, name: str, load: Callable[[str], object]) -> 
         if file or Path(original).is_file():
             return getattr(configuration.Configuration(original), name)
     except InputError as error:
-        words = {"psf": "PSF", "score": "trained score", "laser": "laser guide star"}[name]
+        words = {"psf": "PSF", "score": "fixed weights", "laser": "laser guide star"}[name]
         store.lost.append(f"the {words} of {store.path.name} is gone ({error})")
     return None
 

@@ -1,5 +1,5 @@
 """Models of spots. Read in this order.
 
-`shapes` (noiseless spots), `speckled`, `psf`, `sodium` and `laser` (elongated spots), `score` and
-`fixed_weights` (linear estimators), `bounds` (Cramer-Rao bound).
+`shapes` (noiseless spots), `speckled`, `psf`, `sodium` and `laser` (elongated spots),
+`fixed_weights` (linear estimator), `bounds` (Cramer-Rao bound).
 """

@@ -1,9 +1,7 @@
-"""Learning from spots: the trained linear score, the PSF, the sodium profile, the centroid gain."""
+"""Learning from spots: the PSF, the sodium profile, the centroid gain."""
 
 from faintspot.slopes.training.centroid_gain import CentroidGain, measure_centroid_gain
 from faintspot.slopes.training.psf_learning import LearntPSF, learn_psf, learn_psf_from_images
-from faintspot.slopes.training.recorded import train_from_frames
-from faintspot.slopes.training.simulation import train_estimator
 from faintspot.slopes.training.sodium import MeanImages, SodiumFit, fit_sodium_profile, fit_spot
 
 __all__ = [
@@ -16,6 +14,4 @@ __all__ = [
     "learn_psf",
     "learn_psf_from_images",
     "measure_centroid_gain",
-    "train_estimator",
-    "train_from_frames",
 ]

@@ -1,7 +1,6 @@
 """The report of slopes in files: rebuilt from what they say, and what is missing is said."""
 
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,10 +19,7 @@ from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.recorded import measure_recorded
 from faintspot.slopes.recorded.report.stored import report_of_stored
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.simulate import Detector
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.score import TrainedScore
-from faintspot.slopes.training import train_estimator
 
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")
 PLAIN = SETTINGS.replace(estimator="brightest")
@@ -168,7 +164,7 @@ def test_frames_that_are_not_the_runs_are_noticed(tmp_path: Path) -> None:
 
 
 def measured(folder: Path, name: str, **options: Any) -> Path:
-    """Measure frames with an estimator as `faintspot slopes` does; PSF and score lie beside the settings."""
+    """Measure frames with an estimator as `faintspot slopes` does; the PSF lies beside the settings."""
     layout = sensor()
     np.save(folder / "frames.npy", simulated(layout, 5)[0])
     configured = folder / f"{name}.toml"
@@ -177,15 +173,8 @@ def measured(folder: Path, name: str, **options: Any) -> Path:
     if name == "ml":
         psf = PSF.analytic("diffraction", size=1.0)
         configuration.save(configured, PSF(psf.samples, psf.oversampling))
-    if name == "trained":
-        configuration.save(configured, small_score())
     measure_recorded([folder / "frames.npy"], configured, folder / f"{name}.zarr")
     return folder / f"{name}.zarr"
-
-
-@cache
-def small_score() -> TrainedScore:
-    return train_estimator(flux_e=(50.0, 200.0), detector=Detector(0.3), shape=(8, 8), realisations=2000)
 
 
 @pytest.mark.parametrize(
@@ -194,7 +183,6 @@ def small_score() -> TrainedScore:
         ("brightest", {}),
         ("thresholded", {"threshold_e": 0.5}),
         ("ml", {}),
-        ("trained", {}),
     ],
 )
 def test_the_page_of_an_estimator_speaks_of_it_alone(

@@ -1,1 +1,1 @@
-"""Fits of a spot model: likelihood, posterior, weights, trained score."""
+"""Fits of a spot model: likelihood, posterior, weights."""

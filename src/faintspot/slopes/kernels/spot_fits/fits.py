@@ -1,4 +1,4 @@
-"""Estimators that know the spot: the own kernels of weighted, fitted, posterior and score estimators."""
+"""Estimators that know the spot: the own kernels of weighted, fitted and posterior estimators."""
 
 from __future__ import annotations
 
@@ -30,16 +30,13 @@ from faintspot.slopes.kernels.spot_fits.background import subtract_background
 from faintspot.slopes.kernels.spot_fits.likelihood import fit_group
 from faintspot.slopes.kernels.spot_fits.posterior import posterior_of_group
 from faintspot.slopes.kernels.spot_fits.start import LEAST_FLUX_E, find_start
-from faintspot.slopes.kernels.spot_fits.trained import apply_score
 from faintspot.slopes.kernels.spot_fits.weighted import weigh_group
 
 # Rows of the settings' table that follow the common ones: flux that is expected; weights of a fit; prior.
 FLUX, WEIGHT_FLOOR, WEIGHT_EXCESS, MODEL_ERROR, PRIOR_WEIGHT = range(COMMON_ROWS, COMMON_ROWS + 5)
-# Which model and which table of the flux's; see `spot_rows`; errors of a score; light of likely outliers.
-MODEL, KIND, START_FLUX, GAIN_X, GAIN_Y, TRAINED_ERROR_X, TRAINED_ERROR_Y, LEAST_FLUX, LARGEST_MOVE = range(
-    COMMON_ROWS + 5, COMMON_ROWS + 14
-)
-SETTING_ROWS = COMMON_ROWS + 14
+# Which model and which table of the flux's; see `spot_rows`; light of likely outliers.
+MODEL, KIND, START_FLUX, GAIN_X, GAIN_Y, LEAST_FLUX, LARGEST_MOVE = range(COMMON_ROWS + 5, COMMON_ROWS + 12)
+SETTING_ROWS = COMMON_ROWS + 12
 
 OUTLIER_LIKELY = int(SubapertureFlag.OUTLIER_LIKELY)
 NOT_CONVERGED = int(SubapertureFlag.NOT_CONVERGED)
@@ -51,8 +48,6 @@ MOST_MODEL_ERROR_E = 300.0
 """Electrons: the squared model error is limited to this value over the flux. At high flux, the dark wings,
 where a PSF is least known, then do not dominate the weights.
 """
-BRIGHT = 2.0
-"""Times the expected flux from which on that of the window is believed instead, if it is significant."""
 _LIT_FRACTION = 0.2  # of the expected flux: what is surely less is no flux
 _SURELY = 3.0  # standard deviations
 _MOVING = 2.0  # standard errors that the next steps would add
@@ -83,19 +78,6 @@ class PosteriorTables(NamedTuple):
     constants: Any
     grid: Any
     spacing: Any
-
-
-class ScoreTables(NamedTuple):
-    """Tables of the kernel of a trained score."""
-
-    passes: Any
-    from_peak: Any
-    """Whether to begin with the smoothed image's peak instead of the predicted position."""
-    taps: Any
-    score: Any
-    """Arguments `steps_per_px` and `margin` of `apply_score`."""
-    steps_per_px: Any
-    margin: Any
 
 
 class SpotScratch(NamedTuple):
@@ -207,32 +189,6 @@ def locate_posterior(group: Any, tables: Any, scratch: Any, stages: Any) -> None
 
 
 @compiled
-def locate_scored(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
-    """Apply a trained score to the spots of a group."""
-    own = scratch.own
-    _begin(group, scratch)
-    if tables.from_peak:
-        _begin_at_peak(group, tables.taps, scratch)
-    _expect_flux(group, own.lane_values)
-    _believe_bright_flux(group, scratch.image, own.lane_values)
-    apply_score(
-        group.lanes,
-        scratch.image,
-        group.ny,
-        group.nx,
-        tables.score,
-        own.kinds,
-        tables.steps_per_px,
-        tables.margin,
-        own.lane_values,
-        own.starts,
-        own.rows,
-    )
-    _sum_flux(group, scratch.image, own.lane_values)
-    _finish(group, tables.passes, True, scratch)
-
-
-@compiled
 def _round(group: Any, round_electrons: Any, image: Any) -> None:
     """Round pixels of low noise to whole electrons, where that is asked for."""
     lanes, pixels = group.lanes, group.ny * group.nx
@@ -328,62 +284,6 @@ def _expect_flux(group: Any, lane_values: Any) -> None:
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
         lane_values[spot_rows.FLUX * width + lane] = max(settings[FLUX, s], LEAST_FLUX_E)
-
-
-@compiled
-def _believe_bright_flux(group: Any, image: Any, lane_values: Any) -> None:
-    """Take the flux above the window's edges where that is far more: moves would be too long by as much."""
-    lanes, ny, nx = group.lanes, group.ny, group.nx
-    width = width_of(lanes)
-    edge, inner = splat(lanes, 0.0), splat(lanes, 0.0)
-    for y in range(ny):
-        row = splat(lanes, 0.0)  # a sum for each row: they need not wait for each other
-        for x in range(nx):
-            g = load(lanes, image, (y * nx + x) * width)
-            if y == 0 or y == ny - 1 or x == 0 or x == nx - 1:
-                edge = edge + g
-            else:
-                row = row + g
-        inner = inner + row
-    n_inner = max(ny - 2, 0) * max(nx - 2, 0)
-    ratio = n_inner / (ny * nx - n_inner)
-    store(lane_values, spot_rows.SEEN * width, inner - splat(lanes, ratio) * edge)
-    store(lane_values, spot_rows.SEEN_ERROR * width, inner)
-    for lane in range(width):
-        flux = lane_values[spot_rows.SEEN * width + lane]
-        noise = n_inner * lane_values[spot_rows.VARIANCE * width + lane]
-        counts = max(lane_values[spot_rows.SEEN_ERROR * width + lane], 0.0)
-        noise += lane_values[spot_rows.EXCESS * width + lane] * counts
-        expected = lane_values[spot_rows.FLUX * width + lane]
-        if flux > BRIGHT * expected + _SURELY * math.sqrt((1.0 + ratio) * noise):
-            lane_values[spot_rows.FLUX * width + lane] = flux
-
-
-@compiled
-def _sum_flux(group: Any, image: Any, lane_values: Any) -> None:
-    """Standard errors from the training, and the flux that is seen in the whole window."""
-    lanes, ny, nx, first, settings = group.lanes, group.ny, group.nx, group.first, group.settings
-    width = width_of(lanes)
-    zero = splat(lanes, 0.0)
-    total = zero
-    for y in range(ny):
-        row = zero  # a sum for each row: they need not wait for each other
-        for x in range(nx):
-            row = row + load(lanes, image, (y * nx + x) * width)
-        total = total + row
-    store(lane_values, spot_rows.SEEN * width, total)
-    for lane in range(width):
-        s = min(first + lane, settings.shape[1] - 1)
-        lane_values[spot_rows.ERROR_X * width + lane] = settings[TRAINED_ERROR_X, s]
-        lane_values[spot_rows.ERROR_Y * width + lane] = settings[TRAINED_ERROR_Y, s]
-        lane_values[spot_rows.COVARIANCE * width + lane] = 0.0  # not trained
-        variance = lane_values[spot_rows.VARIANCE * width + lane]
-        excess = lane_values[spot_rows.EXCESS * width + lane]
-        seen = lane_values[spot_rows.SEEN * width + lane]
-        lane_values[spot_rows.SEEN_ERROR * width + lane] = math.sqrt(
-            ny * nx * variance + excess * max(seen, 0.0)
-        )
-        lane_values[spot_rows.FLUX * width + lane] = seen
 
 
 @compiled
@@ -487,4 +387,3 @@ def _finish(group: Any, steps: Any, expects_flux: Any, scratch: Any) -> None:
 weighted_of_groups = driver_of(locate_weighted)
 fitted_of_groups = driver_of(locate_fitted)
 posterior_of_groups = driver_of(locate_posterior)
-scored_of_groups = driver_of(locate_scored)
