@@ -30,11 +30,10 @@ from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.control.identification.predictive_control import LoopOfControl, PredictiveControl
 from faintspot.loop.control.identification.relearning import relearn
 from faintspot.loop.control.kalman.compiled import CompiledKalman
-from faintspot.loop.control.kalman.guarded import Guarded
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_model import neighbours_within
 from faintspot.loop.control.kalman.local_predictor import local_shapes
-from faintspot.loop.control.kalman.predictive import Predictive, PseudoOpenLoop
+from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 from faintspot.loop.control.kalman.slope_model import SlopeModel
 from faintspot.loop.control.reconstructor import Reconstructor
@@ -79,21 +78,8 @@ def small_table() -> Table:
 
     controllers: dict[str, Controller] = {
         "integrator": plant.integrator(0.4, line()),
-        "integrator, a gain for each mode": plant.integrator(
-            np.full(optics.reconstructor.modes.shape[1], 0.4), line()
-        ),
-        "pseudo-open-loop control": PseudoOpenLoop(
-            line(), plant.interaction, covariances[0], covariances[2], clean, 0.3
-        ),
         "Kalman filter, gain of each frame": predictive(line(), steady=False),
-        "the same with its guard": Guarded(
-            line(),
-            plant.interaction,
-            plant.reconstructor.matrix,
-            partial(predictive, steady=False),
-            partial(plant.integrator, 0.3),
-        ),
-        "the same, compiled": compiled(model),
+        "the same with its guard, compiled": compiled(model),
         "the same, compiled, with four layers": compiled(layered),
         "Kalman filter, constant gain": predictive(line(), steady=True),
     }

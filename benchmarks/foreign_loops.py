@@ -22,7 +22,7 @@ import click
 
 from benchmarks import machine
 from benchmarks.foreign import evaluation
-from benchmarks.foreign.evaluation import INTEGRATOR, MODAL, Effort
+from benchmarks.foreign.evaluation import INTEGRATOR, Effort
 from benchmarks.foreign.magnitudes import in_magnitudes
 from benchmarks.foreign.rows import ROWS, TOOLS, Row, chosen_rows, is_installed
 from benchmarks.results import FOLDER
@@ -32,7 +32,6 @@ _COLUMNS = (
     "loop",
     "integrator (gain)",
     "own control",
-    "modal gains",
     "best of pyRTC",
     "filter",
     "filter - integrator",
@@ -157,7 +156,7 @@ def _cells(result: dict[str, Any]) -> list[str]:
     scores, ahead, chosen = result["scores"], result["ahead"], result["chosen"]
     learnt, report = result["learnt"], result["report"]
     mean = {name: sum(values) / len(values) for name, values in scores.items()}
-    ours = INTEGRATOR, MODAL, FILTER
+    ours = INTEGRATOR, FILTER
     own = [name for name in scores if name not in ours and not name.startswith("pyRTC")]
     pyrtc = sorted((name for name in scores if name.startswith("pyRTC")), key=lambda name: mean[name])
     best = pyrtc[-1] if pyrtc else None
@@ -168,7 +167,6 @@ def _cells(result: dict[str, Any]) -> list[str]:
         f"{result['name']}: {result['title']}",
         f"{mean[INTEGRATOR]:.3f} ({chosen[INTEGRATOR].removeprefix('gain ')})",
         ", ".join(f"{mean[name]:.3f}" for name in own) or "-",
-        f"{mean[MODAL]:.3f}",
         f"{mean[best]:.3f} ({best.removeprefix('pyRTC ')})" if best else "-",
         f"{mean[FILTER]:.3f}",
         _signed(ahead[INTEGRATOR]),

@@ -22,8 +22,7 @@ from benchmarks.measuring import Row, Table
 from benchmarks.prediction import Case, Make, rivals
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.identification import learning
-from faintspot.loop.control.identification.learning import GAINS, learn_controller
-from faintspot.loop.control.identification.models.modal import Modal
+from faintspot.loop.control.identification.learning import GAINS
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.simulation import LoopConfiguration
 
@@ -34,9 +33,8 @@ _LEARNING, _TUNING = 2000, 2001
 _TUNING_FRAMES = 400
 _RIVAL_OPTIONS = {"order": (4, 8, 16), "regularization": (1e-2, 1e-1)}
 _RIVAL_GAINS = 0.7, 0.5, 1.0
-INTEGRATOR, MODES, NEIGHBOURS, ALL, RIVAL = (
+INTEGRATOR, NEIGHBOURS, ALL, RIVAL = (
     "integrator",
-    "a gain for each mode",
     "Kalman filter of neighbours",
     "Kalman filter of all slopes",
     "pyRTC's least_squares",
@@ -89,9 +87,8 @@ def _table(name: str, case: Large) -> Table:
     learnt_from = case.observed(make_telemetry, _LEARNING, case.telemetry_frames)[1]
     tuning = case.observed(make_telemetry, _TUNING, _TUNING_FRAMES * 2)[1]
     gain, integrator = case.tuned_integrator(tuning)
-    modal = learn_controller(Modal, case.plant, learnt_from, case.site, case.rate_hz)
-    makes: dict[str, Make] = {INTEGRATOR: integrator, MODES: partial(modal.guarded, case.plant)}
-    seconds = {INTEGRATOR: 0.0, MODES: 0.0}
+    makes: dict[str, Make] = {INTEGRATOR: integrator}
+    seconds = {INTEGRATOR: 0.0}
     for each, most_slopes in ((NEIGHBOURS, 0), (ALL, 10**6)):
         if each == ALL and (case.name != "diffraction_limit" or not _DENSE):
             continue

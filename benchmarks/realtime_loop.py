@@ -54,7 +54,6 @@ def _latency() -> Table:
     )
     model, noise = SlopeModel.of_covariances(covariances), np.full(len(interaction), 0.25)
     learnt: dict[str, dict[str, Any]] = {
-        "polc": {"now_px2": covariances[0], "ahead_px2": covariances[2], "gain": np.array(0.3)},
         "kalman": {
             "first": model.first,
             "second": model.second,

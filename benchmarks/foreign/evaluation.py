@@ -16,10 +16,10 @@ from benchmarks.foreign import reports, rivals
 from benchmarks.foreign.base import SETTLE_FRAMES, Control, Floats, ForeignLoop, Integrator, Observed
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.reconstructor import make_reconstructor
-from faintspot.loop.telemetry.choices import FILTER, MODES
+from faintspot.loop.telemetry.choices import FILTER
 
 TUNING_SEED, LEARNING_SEED = 1, 2
-INTEGRATOR, MODAL = "integrator", MODES
+INTEGRATOR = "integrator"
 _IN_LOOP = 2
 """Predictors of the rivals, the best in a replay, that are tried in the loop."""
 _TIMED_FRAMES = 300
@@ -173,14 +173,9 @@ def compared(ready: Commissioned, log: Log) -> dict[str, Any]:
     scores[FILTER] = [run.score for run in filtered]
     log(f"{FILTER}: {scores[FILTER]}")
     recording = recording_of(loop, ready.learning)
-    modal = reports.modal_matrix(recording)
-    scores[MODAL] = [
-        loop.run(Integrator(loop, modal, 1.0), seed, effort.frames).score for seed in effort.seeds
-    ]
-    log(f"{MODAL}: {scores[MODAL]}")
     report = reports.reported(recording, dict(scores), loop.r0_m)
     log(f"report: {report['advice']} r0 {report['r0']}")
-    chosen = {INTEGRATOR: f"gain {ready.gain:g}", MODAL: "", FILTER: ""}
+    chosen = {INTEGRATOR: f"gain {ready.gain:g}", FILTER: ""}
     for name, matrix in loop.own.items():
         gain, _ = runs.best_gain(name, matrix)
         own = [runs.integrator(name, matrix, gain, seed, effort.frames).score for seed in effort.seeds]

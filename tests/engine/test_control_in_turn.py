@@ -106,10 +106,6 @@ def test_methods_change_while_the_loop_is_closed(sky: Sky, files: tuple[Path, Co
     sky.loop.close()
     sky.frames(4)
     interleave = commands_of(engine)["interleave"]
-    for methods in ("map+modal", "window+integrator,map+polc"):
-        with refused("interleave: 'map+", "model: expected", "one of 'kalman'"):
-            interleave({"methods": methods, "every": 2})
-    assert engine.status()["methods"] == ["set"]
     interleave({"methods": "window+integrator,map+kalman", "every": 2})
     sky.frames(6)
     assert commands_of(engine)["loop"]({"action": "gain", "gain": 0.125})["loop"]["gain"] == 0.125

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import event, given
 from hypothesis import strategies as st
 from tests.loop.control.control_cases import FRAME_S, INTERACTION, PLANT, TURBULENCE, telemetry
+from tests.loop.control.naive_guarded import Guarded
 from tests.patience import examples
 
 from faintspot.base.errors import InputError
@@ -20,7 +21,6 @@ from faintspot.loop.control.configuration import Control, ControlOptions
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR, MODELS, ControlModel
 from faintspot.loop.control.integrator import Integrator
-from faintspot.loop.control.kalman.guarded import Guarded
 from faintspot.slopes.kernels.driver.products import add_slopes
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout
@@ -40,12 +40,9 @@ class PlainControl(Control):
         if kind == INTEGRATOR:
             numbers = self.interaction, self.reconstructor, gain, self.options.leak
             return Integrator(line, *numbers, weighted=True)
-        if kind == "kalman":
-            model = self.model
-            of_both = partial(model.controller, plant), partial(plant.integrator, model.plain_gain)
-            return Guarded(line, self.interaction, model.phase(plant), *of_both)
-        controller: Controller = self.model.controller(plant, line)
-        return controller
+        model = self.model
+        of_both = partial(model.controller, plant), partial(plant.integrator, model.plain_gain)
+        return Guarded(line, self.interaction, model.phase(plant), *of_both)
 
 
 @cache

@@ -148,7 +148,7 @@ def test_search_is_checked() -> None:
 
 
 def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[int]) -> None:
-    kind = method_kind("brightest+modal")
+    kind = method_kind("brightest+kalman")
     found = tuned(kind, Search(rounds=9), {LOOP_GAIN: 0.9, "keep_brightest": BEST + 1})
     highest = max(kind.tuned(small())[LOOP_GAIN].values)
     assert found.choice == {LOOP_GAIN: highest, "keep_brightest": BEST + 1}

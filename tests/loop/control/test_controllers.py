@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from tests.loop.control.control_cases import (
-    COVARIANCES,
     FRAME_S,
     INTERACTION,
     MODEL,
@@ -15,15 +14,14 @@ from tests.loop.control.control_cases import (
     PLANT,
     TURBULENCE,
 )
+from tests.loop.control.naive_guarded import Guarded
 
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import CompiledIntegrator
-from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.compiled import CompiledKalman
-from faintspot.loop.control.kalman.guarded import Guarded
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_predictor import local_filter
-from faintspot.loop.control.kalman.predictive import Predictive, PseudoOpenLoop
+from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 
 M, COMMANDS = INTERACTION.shape
@@ -114,24 +112,9 @@ class TestIntegrator(ControllerTests):
         return PLANT.integrator(GAIN, line)
 
 
-class TestModalIntegrator(ControllerTests):
-    def make(self, line: CommandDelayLine) -> Any:
-        gains = np.linspace(0.2, 0.5, PLANT.reconstructor.modes.shape[1])
-        return Integrator(line, INTERACTION, PLANT.reconstructor, gains, PLANT.leak)
-
-
 class TestCompiledIntegrator(ControllerTests):
     def make(self, line: CommandDelayLine) -> Any:
         return CompiledIntegrator(line, INTERACTION, PLANT.reconstructor.matrix, GAIN, PLANT.leak)
-
-
-class TestPseudoOpenLoop(ControllerTests):
-    # The wavefront is not one that its turbulence expects, and without slopes it expects none at all.
-    left, lost = 0.6, 0.9
-
-    def make(self, line: CommandDelayLine) -> Any:
-        covariance = COVARIANCES[0]
-        return PseudoOpenLoop(line, INTERACTION, covariance, covariance, PLANT.reconstructor.clean, 0.5)
 
 
 def predictor() -> SlopePredictor:

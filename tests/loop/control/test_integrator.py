@@ -1,7 +1,5 @@
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from tests.loop.control.control_cases import ERRORS, INTERACTION
 
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.integrator import Integrator
@@ -51,28 +49,3 @@ def test_stability_with_two_frames_of_delay(gain: float, stable: bool) -> None:
         residual = 1.0 + line.acting
         integrator.follow(residual)
     assert (abs(residual[0]) < 1e-3) == stable
-
-
-def test_equal_gains_of_all_modes_are_one_gain_on_what_is_driven() -> None:
-    reconstructor = make_reconstructor(INTERACTION)
-    lines = [CommandDelayLine(INTERACTION.shape[1], 2) for _ in range(2)]
-    equal = np.full(reconstructor.modes.shape[1], 0.4)
-    gains: tuple[float | NDArray[np.float64], ...] = (0.4, equal)
-    one, several = (
-        Integrator(line, INTERACTION, reconstructor, gain, 0.01)
-        for line, gain in zip(lines, gains, strict=True)
-    )
-    rng = np.random.default_rng(3)
-    for _ in range(5):
-        slopes = rng.standard_normal(len(INTERACTION))
-        one.update(slopes, ERRORS)
-        several.update(slopes, ERRORS)
-    np.testing.assert_allclose(lines[0].latest, lines[1].latest, atol=1e-12)
-
-
-def test_each_mode_has_its_own_gain() -> None:
-    reconstructor, line = make_reconstructor(INTERACTION), CommandDelayLine(INTERACTION.shape[1], 2)
-    modes = reconstructor.modes
-    gains = np.linspace(0.1, 0.5, modes.shape[1])
-    Integrator(line, INTERACTION, reconstructor, gains, 0.0).follow(modes[:, 2])
-    np.testing.assert_allclose(line.latest, -gains[2] * modes[:, 2], atol=1e-12)

@@ -88,7 +88,7 @@ def test_telemetry_knows_what_was_expected() -> None:
 
 def test_control_needs_a_closed_loop_and_the_whole_run() -> None:
     with pytest.raises(InputError, match="expected 'integrator' in open loop"):
-        simulate_loop(FAINT.replace("control", mode="open"), [_method("polc")])
+        simulate_loop(FAINT.replace("control", mode="open"), [_method("kalman")])
     with pytest.raises(InputError, match="integrator alone"):
         simulate_loop(FAINT, [_method(), _method("kalman")], [0] * 30 + [1] * 30)
     with pytest.raises(InputError, match=r"method.control = 'pid'"):
@@ -123,7 +123,7 @@ def test_the_centroid_gain_is_learnt() -> None:
 
 
 def test_names_of_methods_say_their_control() -> None:
-    for name in ("map+kalman", "brightest+polc", "ml_weighted+modal", "map_predicted+polc"):
+    for name in ("map+kalman", "brightest+kalman", "ml_weighted+kalman"):
         assert method_kind(name).name == name
     assert method_kind("map+integrator") == method_kind("map")
     kind = method_kind("map+kalman")

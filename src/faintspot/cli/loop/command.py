@@ -100,7 +100,7 @@ def magnitude(
     _predicted (its prior is what the loop predicts), _weighted (slopes count by their standard errors),
     _uncorrected (slopes are not divided by the centroid gain), with a laser guide star _filter (weights of
     `window` are the linear matched filter) and _followed (the sodium profile is followed), and then the
-    control: +modal, +polc or +kalman in place of the integrator.
+    control: +kalman in place of the integrator.
 
     \b
     Examples:
@@ -214,7 +214,7 @@ def night(
     "--control",
     metavar="KIND",
     default="integrator",
-    help="Control: integrator, or what learns from the loop for up to a minute: modal, polc or kalman.",
+    help="Control: integrator, or kalman, which learns from the loop for up to a minute.",
 )
 @option("--frame-rate-hz", type=float, metavar="HZ", help="Frame rate.", show_default="CONFIG")
 def engine(configuration: str, output: str, control: str, frame_rate_hz: float | None) -> None:

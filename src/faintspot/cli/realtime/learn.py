@@ -17,7 +17,7 @@ from faintspot.cli.shared.progress import progress_bar
 
 
 @needs("realtime", "zarr")
-@click.command("learn", short_help="Have a controller learn from a recording of the closed loop.")
+@click.command("learn", short_help="Learn a Kalman filter from a recording of the closed loop.")
 @click.argument("store", type=click.Path(path_type=Path), metavar="STORE", required=False)
 @configuration_option("Configuration with [control].")
 @option(
@@ -27,13 +27,6 @@ from faintspot.cli.shared.progress import progress_bar
     help="Instead of from STORE, learn from the running engine, whenever this many seconds have passed.",
 )
 @ENGINE_NAME
-@option(
-    "--control",
-    "kind",
-    metavar="KIND",
-    default="kalman",
-    help="Controller that learns: kalman, modal, polc.",
-)
 @option(
     "--winds",
     type=click.Choice(["learnt", "none"]),
@@ -53,11 +46,10 @@ def learn(
     config: str,
     every: float | None,
     name: str,
-    kind: str,
     winds: str,
     layers: tuple[tuple[float, float, float], ...],
 ) -> None:
-    """Have a controller learn from a recording of the loop, closed with an integrator, and put it into TOML.
+    """Learn a Kalman filter from a recording of the loop, closed with an integrator, and put it into TOML.
 
     STORE is what `faintspot realtime record` wrote while the engine ran with TOML, at least 200 frames
     without a gap; 2000 are better. The layout must know subaperture_m or diameter_m. Takes up to some
@@ -70,7 +62,7 @@ def learn(
     \b
     Examples:
       faintspot realtime record night.zarr --seconds 10
-      faintspot realtime learn night.zarr --control kalman
+      faintspot realtime learn night.zarr
       faintspot realtime learn night.zarr --layer 6 20 0.6 --layer 14 150 0.4
       faintspot realtime learn --every 10
     """
@@ -79,7 +71,7 @@ def learn(
     if store is None and every is not None:
         _learn_repeatedly(name, config, every)
     elif store is not None:
-        _learn_from(store, config, kind, winds, layers)
+        _learn_from(store, config, winds, layers)
 
 
 def _learn_repeatedly(name: str, config: str, every_s: float) -> None:
@@ -90,22 +82,18 @@ def _learn_repeatedly(name: str, config: str, every_s: float) -> None:
     BackgroundLearning(name, config, every_s).run(click.echo)
 
 
-def _learn_from(
-    store: Path, config: str, kind: str, winds: str, layers: tuple[tuple[float, float, float], ...]
-) -> None:
+def _learn_from(store: Path, config: str, winds: str, layers: tuple[tuple[float, float, float], ...]) -> None:
     """Learn from a recording."""
-    from faintspot.base.checks import one_of
     from faintspot.base.validity import leave_out
     from faintspot.io import read_telemetry
     from faintspot.loop.control.base import ASSUMED
     from faintspot.loop.control.configuration import load_control, prior_std_px, save_control
     from faintspot.loop.control.identification.learning import learn_controller
-    from faintspot.loop.control.identification.models import MODELS
+    from faintspot.loop.control.identification.models.kalman import Kalman
     from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
     from faintspot.loop.telemetry.recording import recorded_loop, site_of
     from faintspot.slopes.pipeline.configuration import Configuration
 
-    model = MODELS[one_of("--control", kind, list(MODELS))]
     described = Configuration(config)
     control = load_control(described)
     if control is None:
@@ -117,16 +105,16 @@ def _learn_from(
     telemetry, rate_hz = open_loop_of(loop, delay).telemetry, loop.frame_rate_hz
     known = site_of(layout, layers), rate_hz, ASSUMED if layers else winds
     with progress_bar("Filter", "steps") as show:
-        learnt = learn_controller(model, control.plant, telemetry, *known, progress=show)
+        learnt = learn_controller(Kalman, control.plant, telemetry, *known, progress=show)
     path = derived(config, ".model.npz")
     replace(learnt, centroid_gain=delay.gain).save(path)
-    save_control(config, controller=kind, model=path.name)
+    save_control(config, controller=Kalman.kind, model=path.name)
     left, left_out = learnt.left, leave_out(recording.flags)[1]
     if left_out:
         click.echo(left_out)
     click.echo(
-        f"{len(telemetry)} frames at {rate_hz:.0f} a second: {kind} leaves {left[0] / left[1]:.2f} of the "
-        f"phase variance that the integrator with gain {learnt.plain_gain:g} leaves"
+        f"{len(telemetry)} frames at {rate_hz:.0f} a second: the filter leaves {left[0] / left[1]:.2f} of "
+        f"the phase variance that the integrator with gain {learnt.plain_gain:g} leaves"
     )
     click.echo(f"{unknown}; the centroid gain of [control] is used" if unknown else delay.gain_summary)
     click.echo(f"{learnt.description}; {path} and [control] of {config} written")

@@ -33,7 +33,7 @@ from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
     "--control",
     default="integrator",
     metavar="KIND",
-    help="Control that --write-config prepares: integrator; modal, polc or kalman, which learn for a minute.",
+    help="Control that --write-config prepares: integrator, or kalman, which learns for a minute.",
 )
 @READOUT_FRACTION
 @option(

@@ -185,7 +185,7 @@ class MethodKind:
 
 
 def method_kind(name: str) -> MethodKind:
-    """Return a method by its name: that of an estimator, of variants and of control, as "ml_weighted+polc".
+    """Return a method by its name: that of an estimator, of variants and of control, as "ml_weighted+kalman".
 
     With the Kalman filter, estimators that take a prior are given its prediction.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintspot.base.toml_files import parse_text
 from faintspot.io.telemetry.recording import Telemetry
 from faintspot.loop.control.configuration import ControlOptions
-from faintspot.loop.control.identification.models import CONTROLS, integrates, predicts
+from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR, predicts
 from faintspot.loop.control.recorded import RecordedControl
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.slopes.estimators.registry import estimators
@@ -91,7 +91,7 @@ class RecordedMethods:
         For integrators: the delay, and three times one over the smallest loop gain of the recording. For
         filters, which begin anew with each turn: 100.
         """
-        if not integrates(self.controllers[method]):
+        if self.controllers[method] != INTEGRATOR:
             return _FILTER_FRAMES
         return int(self.options.delay_frames) + math.ceil(_TIMES / self.least_gain)
 

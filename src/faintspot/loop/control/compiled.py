@@ -153,7 +153,7 @@ class CompiledIntegrator(Controller):
     interaction : (m, commands) array
         Slopes in px that a unit of each command adds.
     reconstruct : (commands, m) array
-        The wavefront from slopes, as commands that cause it; with a gain for each mode where there is one.
+        The wavefront from slopes, as commands that cause it.
     gain : float
         May be changed between two frames.
     leak : float

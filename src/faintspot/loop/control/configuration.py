@@ -23,10 +23,9 @@ from faintspot.loop.control.compiled import CompiledIntegrator
 from faintspot.loop.control.identification.models import (
     CONTROLS,
     INTEGRATOR,
+    MODELS,
     ControlModel,
     LoopPlant,
-    integrates,
-    needs_errors,
     predicts,
 )
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
@@ -201,7 +200,7 @@ class Control:
 
     def _checked_model(self) -> object:
         kind = self.options.controller
-        if self.removed_modes and not integrates(kind):
+        if self.removed_modes and kind != INTEGRATOR:
             raise InputError(
                 f"expected an integrator, as the model of {kind!r} has all modes",
                 name="removed_modes",
@@ -314,7 +313,7 @@ class Control:
             It says what is missing.
         """
         kind = kind or self.options.controller
-        if needs_errors(kind) and calibration.read_noise_photoelectrons is None:
+        if kind in MODELS and calibration.read_noise_photoelectrons is None:
             raise InputError(
                 f"{TABLE}.controller = {kind!r}: expected standard errors of the slopes, which need the "
                 "camera's read noise: calibration.read_noise_e"
@@ -330,7 +329,7 @@ class Control:
         options, matrix = self.options, self.reconstructor.matrix
         if options.controller == INTEGRATOR:
             return CompiledIntegrator(line, self.controlled, matrix, options.gain, options.leak)
-        learnt: Controller = self.model.running(self.plant, line)
+        learnt: Controller = self.model.guarded(self.plant, line)
         return learnt
 
     def rehearse(self) -> None:

@@ -1,4 +1,4 @@
-"""Integrator with one gain, or one gain per mode."""
+"""Integrator with one gain."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Integrator(Controller):
     interaction : (2 n, commands) array
         Slopes in px that a unit of each command adds.
     reconstructor : Reconstructor
-    gain : float or (modes,) array
-        Loop gain, of everything or of each of the reconstructor's modes.
+    gain : float
+        Loop gain.
     leak : float
         Part of the command that is forgotten in every frame, so that a loop that has lost the star returns.
     weighted : bool
@@ -37,7 +37,7 @@ class Integrator(Controller):
         line: CommandDelayLine,
         interaction: Floats,
         reconstructor: Reconstructor,
-        gain: float | Floats,
+        gain: float,
         leak: float,
         *,
         weighted: bool = False,
@@ -65,10 +65,5 @@ class Integrator(Controller):
 
     def follow(self, wavefront: Floats) -> None:
         """Update with this frame's wavefront, given as the commands that cause it."""
-        if np.ndim(self._gain):
-            modes = self._reconstructor.modes
-            step = modes @ (self._gain * (modes.T @ wavefront))
-        else:
-            step = self._gain * wavefront
         forgotten = self._leak if self._sees_mirror else self._gain
-        self.line.put((1 - forgotten) * self.line.latest - step)
+        self.line.put((1 - forgotten) * self.line.latest - self._gain * wavefront)

@@ -23,9 +23,8 @@ from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.measured import Measured
-from faintspot.loop.control.identification.models import ControlModel, LoopPlant
+from faintspot.loop.control.identification.models import LoopPlant
 from faintspot.loop.control.identification.models.kalman import Kalman
-from faintspot.loop.control.identification.models.modal import Modal
 from faintspot.loop.control.identification.open_loop import OpenLoop
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.kalman.predictor import steady_covariance
@@ -37,7 +36,7 @@ from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 Floats = NDArray[np.float64]
 
 BEST, AS_RUN = "integrator, best gain", "as it ran"
-MODES, FILTER = "integrator, a gain for each mode", "predictive Kalman filter"
+FILTER = "predictive Kalman filter"
 FEWEST_FRAMES = 600
 _MOST_SLOPES = 500  # beyond, the filter takes too long to learn
 _LEAK = 0.01
@@ -64,25 +63,19 @@ class ControlChoice:
     strehl: Measured
     gain: float = math.nan
     """Gain of an integrator, on slopes as measured."""
-    modal_gains: tuple[float, float] | None = None
-    """Smallest and largest gain of an integrator with one for each mode, likewise."""
 
     @property
     def gain_text(self) -> str:
-        """The gain, or the range of gains, in words; empty for a filter."""
-        if self.modal_gains is not None:
-            return " to ".join(f"{gain:.2f}" for gain in self.modal_gains)
+        """The gain in words; empty for a filter."""
         return f"{self.gain:.2f}" if math.isfinite(self.gain) else ""
 
     def as_values(self) -> dict[str, Any]:
         """Return plain values."""
         names = ("residual", "less", "total", "strehl")
         gain = {"gain": self.gain} if math.isfinite(self.gain) else {}
-        of_modes = {} if self.modal_gains is None else {"modal_gains": list(self.modal_gains)}
         return {
             "name": self.name,
             **gain,
-            **of_modes,
             **{name: getattr(self, name).as_values() for name in names},
         }
 
@@ -117,9 +110,6 @@ def compared_choices(
     relative = float(np.nanmean(open_loop.variance_error)) / math.sqrt(len(reconstructor.modes.T))
     scale = _Scale.of(loop, r0, delay, relative)
 
-    def learnt_left(model: ControlModel) -> list[Floats]:
-        return [view.compared(model.replayed(plant, view.replayed, phase)) for view in views]
-
     def integrators(gains: Sequence[float]) -> list[list[Floats]]:
         of_views = [view.compared(plant.replayed_integrators(gains, view.replayed, phase)) for view in views]
         return [list(values) for values in zip(*of_views, strict=True)]
@@ -133,15 +123,13 @@ def compared_choices(
     first = open_loop.telemetry.part(0, frames // 2)
     if len(open_loop.variance) <= _MOST_SLOPES:
         known = plant, first, site, loop.frame_rate_hz
-        modal, learnt = learn_controller(Modal, *known), learn_controller(Kalman, *known)
+        learnt = learn_controller(Kalman, *known)
         choices.append(compare(BEST, *integrators([learnt.plain_gain]), gain=learnt.plain_gain))
-        gains = modal.arrays["gains"]
-        modes = compare(MODES, learnt_left(modal))
-        choices.append(replace(modes, modal_gains=(float(gains.min()), float(gains.max()))))
         expected = math.nan
         if identified is not None:
             expected = _expected_left(identified, plant, delay.gain**2 * open_loop.variance, phase)
-        choices.append(compare(FILTER, learnt_left(learnt), expected=expected))
+        left = [view.compared(learnt.replayed(plant, view.replayed, phase)) for view in views]
+        choices.append(compare(FILTER, left, expected=expected))
     else:
         best, _ = plant.best_gain(GAINS, first, phase)
         choices.append(compare(BEST, *integrators([best]), gain=best))
@@ -149,7 +137,7 @@ def compared_choices(
     for gain, values in zip(GAINS[1::2], integrators(GAINS[1::2]), strict=True):
         if values[0].max() < np.inf and values[0].mean() < uncorrected:  # else it is not stable
             choices.append(compare("integrator", values, gain=gain))
-    return [_at_gain(choice, delay.gain) for choice in choices]
+    return [replace(choice, gain=choice.gain / delay.gain) for choice in choices]
 
 
 def _expected_left(identified: Identified, plant: LoopPlant, variance: Floats, phase: Floats) -> float:
@@ -307,13 +295,6 @@ def _signed_root(name: str, unit: str, square: float, error: float) -> Measured:
     return Measured(name, unit, root, max(root - low, high - root) / _WIDE)
 
 
-def _at_gain(choice: ControlChoice, gain: float) -> ControlChoice:
-    """Return a choice whose integrator's gains are those of slopes as measured."""
-    modal = choice.modal_gains
-    of_modes = None if modal is None else (modal[0] / gain, modal[1] / gain)
-    return replace(choice, gain=choice.gain / gain, modal_gains=of_modes)
-
-
 def advice(choices: list[ControlChoice]) -> str:
     """Return one sentence that says which control to use."""
     others = [choice for choice in choices if choice.name != AS_RUN]
@@ -337,8 +318,6 @@ def _residual(choice: ControlChoice) -> float:
 
 
 def _recommended(choice: ControlChoice) -> str:
-    if choice.modal_gains is not None:
-        return f"an integrator with a gain for each mode, {choice.gain_text}"
     if choice.gain_text:
         return f"an integrator with a gain of {choice.gain_text}"
     return "the predictive Kalman filter"

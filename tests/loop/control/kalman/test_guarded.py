@@ -2,15 +2,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tests.loop.control.control_cases import COVARIANCES, INTERACTION, PHASE, PLANT, telemetry
+from tests.loop.control.control_cases import INTERACTION, PHASE, PLANT, telemetry
+from tests.loop.control.naive_guarded import Guarded
 
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.models.base import Make
-from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.choice import EXCESS, MOST_EXCESS
-from faintspot.loop.control.kalman.guarded import Guarded
-from faintspot.loop.control.kalman.predictive import PseudoOpenLoop
 
 FRAMES = telemetry(900, 0.2)
 
@@ -91,21 +89,3 @@ def test_alike_nothing_changes(prior: np.ndarray | None) -> None:
             controller.update(posterior, np.full(18, noise * np.sqrt(share)))
     assert guarded.chosen == 0
     np.testing.assert_allclose(lines[0].latest, lines[1].latest, atol=1e-6)
-
-
-def test_pseudo_open_loop_control_takes_off_what_does_not_change() -> None:
-    """Without noise, all of it that the mirror sees; slopes that were not measured do not matter."""
-    line = CommandDelayLine(12, 2)
-    matrix = PLANT.reconstructor.clean
-    control = PseudoOpenLoop(line, INTERACTION, COVARIANCES[0], COVARIANCES[0], matrix, 0.5)
-    wavefront = np.random.default_rng(3).standard_normal(12)
-    error = np.full(18, 1e-4)
-    for _ in range(60):
-        control.update(INTERACTION @ (wavefront + line.acting), error)
-    assert np.linalg.norm(line.acting + wavefront) < 0.05 * np.linalg.norm(wavefront)
-    assert isinstance(PLANT.integrator(0.3, line), Integrator)
-    wild = INTERACTION @ (wavefront + line.acting)
-    wild[4], error[4] = 1e3, np.inf
-    before = line.latest.copy()
-    control.update(wild, error)
-    assert np.abs(line.latest - before).max() < 0.5 * np.abs(wavefront).max()

@@ -14,11 +14,12 @@ from tests.loop.control.control_cases import (
     TURBULENCE,
     telemetry,
 )
+from tests.loop.control.naive_guarded import Guarded
 
 from faintspot.loop.control import slope_product
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.kalman.choice import EXCESS, MOST_EXCESS
-from faintspot.loop.control.kalman.guarded import Guarded, GuardedController
+from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter
 from faintspot.loop.control.kalman.predictive import Predictive

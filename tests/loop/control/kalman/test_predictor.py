@@ -3,8 +3,6 @@ import pytest
 from scipy.linalg import block_diag, solve_discrete_are
 from tests.loop.control.control_cases import COVARIANCES, ERRORS, LAYERS, MODEL, telemetry
 
-from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.kalman.predictive import PseudoOpenLoop
 from faintspot.loop.control.kalman.predictor import SlopePredictor, steady_covariance
 from faintspot.loop.control.kalman.slope_model import SlopeModel
 
@@ -109,14 +107,3 @@ def test_a_filter_begins_at_the_slopes_it_is_given() -> None:
     slopes = np.linspace(-1.0, 2.0, LAYERS.slopes)
     predictor.begin(slopes)
     np.testing.assert_allclose(predictor.mean_px, slopes, rtol=1e-12)
-
-
-def test_pseudo_open_loop_control_expects_what_is_on_its_way() -> None:
-    """The mirror of this frame less the latest command, as slopes."""
-    line, interaction = CommandDelayLine(2, 2), np.array([[1.0, 2.0], [0.0, 3.0], [-1.0, 1.0]])
-    control = PseudoOpenLoop(line, interaction, np.eye(3), np.eye(3), np.zeros((2, 3)), 0.5)
-    first, second = np.array([1.0, -2.0]), np.array([0.25, 4.0])
-    line.put(first)
-    line.put(second)
-    np.testing.assert_array_equal(line.acting, first)
-    np.testing.assert_allclose(control.expected().mean_px, interaction @ (first - second))

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Controller, ExpectedSlopes
+from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.kalman.choice import (
     BLENDED,
@@ -23,7 +21,6 @@ from faintspot.loop.control.kalman.choice import (
     prepare,
     restart,
 )
-from faintspot.loop.control.telemetry import as_estimated, without_prior
 
 Floats = NDArray[np.float64]
 
@@ -121,63 +118,3 @@ class GuardedController(Controller):
             self._offset = self.line.latest - command
         guard[BLENDED] = max(0.0, guard[BLENDED] - 1.0)
         self.line.put(command + guard[BLENDED] / HANDOVER_FRAMES * self._offset)
-
-
-class Guarded(GuardedController):
-    """Any two controllers side by side.
-
-    Parameters
-    ----------
-    line : CommandDelayLine
-    interaction : (m, commands) array
-    phase : (k, m) array
-        From slopes to what is compared, see `residual_phase`.
-    learnt, plain : callable
-        Return a controller, given where its commands go.
-    options
-        As for `GuardedController`.
-    """
-
-    def __init__(
-        self,
-        line: CommandDelayLine,
-        interaction: Floats,
-        phase: Floats,
-        learnt: Callable[[CommandDelayLine], Controller],
-        plain: Callable[[CommandDelayLine], Controller],
-        **options: Any,
-    ) -> None:
-        super().__init__(line, interaction, **options)
-        self._phase, makers = phase, (learnt, plain)
-        self._controllers = [make(own_line) for make, own_line in zip(makers, self._lines, strict=True)]
-
-    def expected(self) -> ExpectedSlopes:
-        """See `Controller`."""
-        mean, std = self._controllers[self.chosen].expected()
-        offset = self.line.acting - self._lines[self.chosen].acting
-        return ExpectedSlopes(mean + self._interaction @ offset, std)
-
-    def begin(self) -> None:
-        """See `Controller`."""
-        super().begin()
-        for controller in self._controllers:
-            controller.begin()
-
-    def update(
-        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
-    ) -> None:
-        """See `Controller`."""
-        expected = self.expected().mean_px
-        slopes, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
-        open_loop = slopes - self._interaction @ self.line.acting
-        error = np.sqrt(self._noise_factor * variance)
-        covariance = None  # of an estimator with a prior, that of the frame alone is not known
-        if covariance_xy_px2 is not None and self.prior_std_px is None:
-            covariance = self._noise_factor * covariance_xy_px2
-        variances = []
-        for controller, line in zip(self._controllers, self._lines, strict=True):
-            residual = open_loop + self._interaction @ line.acting
-            variances.append(float(np.square(self._phase @ (trust * residual)).sum()))
-            controller.update(as_estimated(residual, trust, controller), error, covariance)
-        self._send()
-        self._choose(*variances)

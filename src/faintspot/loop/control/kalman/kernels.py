@@ -88,7 +88,7 @@ class Memory(NamedTuple):
 def _take(
     slopes: Any, errors: Any, covariance: Any, prior_std: Any, noise_factor: Any, rows: Any, chosen: Any
 ) -> None:
-    """Write the inputs of both controllers; see `Guarded.update` and `telemetry.without_prior`."""
+    """Write the inputs of both controllers; see `telemetry.without_prior`."""
     for s in range(slopes.shape[0]):
         caused, of_learnt, of_plain = rows[HELD, s], rows[HELD_LEARNT, s], rows[HELD_PLAIN, s]
         latest = rows[LATEST_PLAIN, s]
@@ -203,7 +203,7 @@ def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, c
 
 @_compiled
 def _send(command: Any, true: Any, row: Any, memory: Any, largest: Any) -> None:
-    """Write the mirror's command; see `Guarded`."""
+    """Write the mirror's command; see `GuardedController`."""
     guard, offset = memory.guard, memory.commands[_OFFSET]
     if guard[SENT] != guard[CHOSEN]:
         guard[SENT], guard[BLENDED] = guard[CHOSEN], HANDOVER_FRAMES

@@ -1,4 +1,4 @@
-"""Control from open-loop slopes: pseudo-open-loop control and predictive control."""
+"""Predictive control from open-loop slopes."""
 
 from __future__ import annotations
 
@@ -7,58 +7,8 @@ from numpy.typing import NDArray
 
 from faintspot.loop.control.base import Controller, ExpectedSlopes, Predictor
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
-from faintspot.loop.control.noise import add_noise
 
 Floats = NDArray[np.float64]
-
-
-class PseudoOpenLoop(Controller):
-    """Pseudo-open-loop control: maximum a posteriori wavefront from open-loop slopes.
-
-    Gilles 2005, Appl. Opt. 44, 993. Slopes count by their noise in each frame, x and y by their
-    covariance. As a gain g averages over frames, the reconstructor is that for their noise in the mean,
-    g / (2 - g) of a frame's.
-
-    Parameters
-    ----------
-    line : CommandDelayLine
-    interaction : (m, commands) array
-    now_px2 : (m, m) array
-        Covariance of open-loop slopes.
-    ahead_px2 : (m, m) array
-        E[later slopes, slopes now]: those of the frame in which the command acts; or `now_px2`.
-    reconstruct : (commands, m) array
-        The wavefront, as commands that cause it, from open-loop slopes without noise.
-    gain : float
-        How much of the way to the new wavefront a command goes, 0 to 1.
-    """
-
-    undoes_prior = True
-
-    def __init__(
-        self,
-        line: CommandDelayLine,
-        interaction: Floats,
-        now_px2: Floats,
-        ahead_px2: Floats,
-        reconstruct: Floats,
-        gain: float,
-    ) -> None:
-        super().__init__(line, interaction)
-        self._gain, self._now, self._ahead = gain, now_px2, reconstruct @ ahead_px2
-
-    def update(
-        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
-    ) -> None:
-        """See `Controller`."""
-        line, gain = self.line, self._gain
-        variance = np.minimum(np.square(standard_error_px), LARGEST_VARIANCE_PX2)
-        noisy = self._now.copy()
-        share = gain / (2 - gain)
-        add_noise(noisy, share * variance, None if covariance_xy_px2 is None else share * covariance_xy_px2)
-        wavefront = self._ahead @ np.linalg.solve(noisy, slopes_px - self._interaction @ line.acting)
-        line.put((1 - gain) * line.latest - gain * wavefront)
 
 
 class Predictive(Controller):

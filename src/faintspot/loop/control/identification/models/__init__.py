@@ -16,8 +16,6 @@ __all__ = [
     "ControlModel",
     "Lesson",
     "LoopPlant",
-    "integrates",
-    "needs_errors",
     "predicts",
 ]
 
@@ -37,13 +35,3 @@ CONTROLS = {
 def predicts(control: str) -> bool:
     """Return whether a kind of control knows the slopes of the next frame and their errors."""
     return control in MODELS and MODELS[control].predicts
-
-
-def needs_errors(control: str) -> bool:
-    """Return whether a kind of control needs standard errors of the slopes."""
-    return control in MODELS and MODELS[control].needs_errors
-
-
-def integrates(control: str) -> bool:
-    """Return whether a kind of control is an integrator, with one gain or several."""
-    return control == INTEGRATOR or (control in MODELS and MODELS[control].integrates)

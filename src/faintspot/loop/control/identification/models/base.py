@@ -20,7 +20,7 @@ from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.replay import mean_residual, replayed_frames, replayed_integrators
 from faintspot.loop.control.integrator import Integrator
-from faintspot.loop.control.kalman.guarded import Guarded, GuardedController
+from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.reconstructor import Reconstructor
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 
@@ -50,7 +50,7 @@ class LoopPlant:
     delay_frames: int
     leak: float
 
-    def integrator(self, gain: float | Floats, line: CommandDelayLine) -> Controller:
+    def integrator(self, gain: float, line: CommandDelayLine) -> Controller:
         """Return an integrator of this loop."""
         return Integrator(line, self.interaction, self.reconstructor, gain, self.leak)
 
@@ -105,10 +105,6 @@ class ControlModel:
     """Accepted ranges of arrays; other values are damaged or in another unit, and products may overflow."""
     predicts: ClassVar[bool] = False
     """Whether it knows the slopes of the next frame and their errors, the prior of an estimator."""
-    needs_errors: ClassVar[bool] = True
-    """Whether it needs standard errors of the slopes."""
-    integrates: ClassVar[bool] = False
-    """Whether it is an integrator with other gains, which needs neither all modes nor a guard."""
 
     arrays: Mapping[str, Floats]
     """Those of its form in files."""
@@ -126,7 +122,7 @@ class ControlModel:
     covariance: Floats | None = None
     """(states, states) px^2: as from `steady_covariance`, where it is known already."""
     identified: Identified | None = None
-    """Turbulence that the model follows from; None for modal gains and models read from a file."""
+    """Turbulence that the model follows from; None for models read from a file."""
 
     def __init_subclass__(cls) -> None:
         _FORMS.update(dict.fromkeys(cls.forms, cls))
@@ -139,15 +135,9 @@ class ControlModel:
         """Return the learnt controller."""
         raise NotImplementedError
 
-    def running(self, plant: LoopPlant, line: CommandDelayLine) -> Controller:
-        """Return the controller for a running loop."""
-        return self.guarded(plant, line)
-
-    def guarded(self, plant: LoopPlant, line: CommandDelayLine, **options: object) -> GuardedController:
+    def guarded(self, plant: LoopPlant, line: CommandDelayLine, **options: Any) -> GuardedController:
         """Return the learnt controller with the integrator beside it; options are those of the guard."""
-        learnt, plain = partial(self.controller, plant), partial(plant.integrator, self.plain_gain)
-        options = self.of_guard(options)
-        return Guarded(line, plant.interaction, self.phase(plant), learnt, plain, **options)
+        raise NotImplementedError
 
     def of_guard(self, options: Mapping[str, object]) -> dict[str, Any]:
         """Return options of the guard with those that the model sets."""
