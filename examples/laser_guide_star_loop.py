@@ -19,7 +19,6 @@ import faintspot as fs
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.experiments.closed_loop.search import FIRST_TUNING_REALISATION
 from faintspot.loop.simulation import LoopConfiguration, LoopRecord, Method, load_loop, simulate_loop
-from faintspot.slopes.estimators.built_in.correlation import Correlation
 
 FLUXES = (60.0, 200.0)
 FRAMES, SETTLE = 160, 50
@@ -52,10 +51,8 @@ def window(width_px: float) -> Method:
 def others() -> list[Method]:
     """Return the methods without a tuned option."""
     linear, ml = fs.Settings("window"), fs.Settings("ml", search_range_px=LARGEST_PX)
-    correlation = fs.Settings(Correlation(), search_range_px=LARGEST_PX)
     known: dict[str, Any] = {"matched_weights": True}
     return [
-        Method("correlation", correlation),
         Method("linear matched filter, static", linear, **known),
         Method("linear matched filter, followed", linear, follows_profile=True, **known),
         Method("ml, followed", ml, follows_profile=True),

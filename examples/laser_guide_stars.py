@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from faintspot.cli.shared.progress import progress_bar
-from faintspot.slopes.estimators.built_in.correlation import Correlation
 from faintspot.slopes.training import MeanImages, fit_spot
 from faintspot.slopes.wavefront.zernike import mean_gradients
 
@@ -153,8 +152,6 @@ def pipelines(case: Case, known: Known, flux: float) -> Iterator[tuple[str, fs.S
     for power in (0.2, 0.35, 0.5, 0.7, 1.0):
         shaped = fs.FixedWeights.shaped(known.followed, side, power=power)
         yield "weights of the followed shape", made(window, known.followed, shaped)
-    for step in (1.0, 0.5):
-        yield "correlation", made(fs.Settings(Correlation(step_px=step), search_range_px=2.0), known.followed)
     for name, psf in (("single layer", known.start), ("followed", known.followed)):
         filters = fs.FixedWeights.matched(psf, side, **noise)
         yield f"linear matched filter, {name}", made(window, psf, filters)
@@ -313,11 +310,9 @@ def cutting_pipelines(layout: fs.Layout, psf: fs.PSF, width_px: float) -> dict[s
     """Return the methods; spots are within 2 px of the reference."""
     weights = fs.FixedWeights.matched(psf, layout.window, flux_e=CUT_FLUX_E, read_noise_e=READ_NOISE_E)
     window = fs.Settings("window", window_fwhm_px=width_px, spot_fwhm_px=width_px, normalisation="frame")
-    correlation = fs.Settings(Correlation(step_px=0.5), search_range_px=2.0)
     ml = fs.Settings("ml", search_range_px=2.0)
     return {
         "weighted centre of gravity": fs.SlopePipeline(layout, window, CALIBRATION),
-        "correlation": fs.SlopePipeline(layout, correlation, CALIBRATION, psf=psf),
         "linear matched filter": fs.SlopePipeline(layout, window, CALIBRATION, score=weights),
         "ml": fs.SlopePipeline(layout, ml, CALIBRATION, psf=psf),
     }

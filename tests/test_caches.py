@@ -42,7 +42,6 @@ OF_DATA = {
     "loop/simulation/telescope/model.py atmosphere_of": 2,
     "loop/turbulence/slope_covariance.py _structure": 4,
     "loop/turbulence/strength.py _theory": 4,
-    "slopes/estimators/built_in/correlation.py _references": 2,
     "slopes/spots/pixel_information.py _information_table": 64,
     "slopes/spots/psf.py spot_psf": 16,
     "slopes/spots/speckled.py _phase_modes": 8,

@@ -17,9 +17,12 @@ from tests.patience import LIMIT_S
 import faintspot as fs
 from faintspot.cli.realtime import control as realtime_control
 from faintspot.engine.engine import Engine
+from faintspot.engine.path.pipeline_maker import PipelineMaker
 from faintspot.engine.pixels.replay import Replay
+from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.streams.bridge import StreamBridge
 from faintspot.io import open_frames
+from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import unpacked
 
 pyshmem = pytest.importorskip("pyshmem")
@@ -181,3 +184,31 @@ def test_the_terminal_shows_the_status(bench: Bench, monkeypatch: pytest.MonkeyP
     assert f"{mean:.1f}" in next(line for line in text.splitlines() if "iterations a sub-aperture" in line)
     assert "latency p99.9, us" in text
     assert f"process {os.getpid()}, frame 0" in text
+
+
+def test_new_spots_are_measured_with_from_the_next_frame(tmp_path: Path) -> None:
+    """Slopes are those of a pipeline that has known them from the start; a file that does not fit is refused."""
+    layout, calibration = fs.Layout.grid((3, 3), pixels=10), fs.Calibration(100.0, read_noise_e=1.0)
+    settings = fs.Settings("ml", flux_e=300.0)
+    first, later = (fs.PSF.analytic("gaussian", size=size) for size in (1.0, 1.4))
+    engine = Engine(f"spots_{uuid4().hex[:8]}", PipelineMaker(layout, calibration, first), settings)
+    take = commands_of(engine)["spots"]
+    path = tmp_path / "faintspot.toml"
+    for item in (layout, calibration, settings):
+        item.save(path)
+    for file in (str(tmp_path / "none.toml"), 3, str(path)):  # the last has no PSF, which "ml" needs
+        with pytest.raises(fs.InputError):
+            take({"spots": file})
+    assert engine.live.newest.pipelines[0].spot[0] is first
+    configuration.save(path, later)
+    take({"spots": str(path)})
+    frame = np.random.default_rng(3).normal(110.0, 5.0, layout.frame_shape).astype(np.float32)
+    expected = fs.SlopePipeline(layout, settings, calibration, psf=later)
+    np.testing.assert_array_equal(engine.live.newest.pipelines[0](frame).vector, expected(frame).vector)
+    engine._streams.close()
+    engine._telemetry.close()
+
+
+def test_an_engine_of_other_pipelines_refuses_new_spots(bench: Bench, tmp_path: Path) -> None:
+    with pytest.raises(fs.InputError, match="pipelines"):
+        commands_of(bench.engine)["spots"]({"spots": str(tmp_path / "faintspot.toml")})

@@ -127,7 +127,7 @@ def test_swaps_of_an_estimator(changing: Changing, tmp_path: Path, monkeypatch: 
     live.propose({"estimator": "mine"})
 
     def change(number: int) -> None:
-        estimators.load(str(write(tmp_path, f"return sensor.zero + {number % 7} / 10")), swap=True)
+        estimators.load(str(write(tmp_path, f"return sensor.zero + {number % 7} / 10")), replace=True)
 
     count = FEW
     assert_nothing(changing.left_behind(change, count), count, 1000)

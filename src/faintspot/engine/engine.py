@@ -124,8 +124,6 @@ class Engine:
         """Parts of the real-time scheduling that were not permitted."""
         self.learning: dict[str, Any] | None = None
         """Result of the latest learning beside the engine, or the fault that ended it, for the status."""
-        self.sodium: dict[str, Any] | None = None
-        """Sodium profile fitted beside the engine, or the fault that ended it, for the status."""
         self._source, self._incompatible = source, ""
         self._path: FramePath | None = None
         self._waiting = False
@@ -201,7 +199,6 @@ class Engine:
             "not_permitted": list(self.refused),
             "loop": self.loop_status(),
             "learning": self.learning,
-            "sodium": self.sodium,
             "prediction": None if self._prediction is None else self._prediction.status(),
         }
 

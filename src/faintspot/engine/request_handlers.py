@@ -14,11 +14,9 @@ from faintspot.engine.engine import Engine
 from faintspot.engine.path.pipeline_maker import PipelineMaker
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
 from faintspot.loop.control.identification.models import ControlModel
-from faintspot.slopes.spots.fixed_weights import FixedWeights
-from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.training.known_sodium import SODIUM
+from faintspot.slopes.pipeline.configuration import Configuration
 
-LENGTHY = ("set", "interleave", "load", "swap", "unload", "learnt", "spots")
+LENGTHY = ("set", "interleave", "load", "unload", "learnt", "spots")
 """Commands that prepare something new and may compile; other commands are answered meanwhile."""
 _USUAL_TURN = 50  # frames
 LOOP_ACTIONS = ("status", "open", "close", "gain", "flat")
@@ -36,8 +34,9 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
         "learnt": partial(_take_learnt, engine),
         "spots": partial(_take_spots, engine),
         "stop": partial(_stop, engine),
-        "load": lambda fields: estimators.load(_text(fields, "source")),
-        "swap": lambda fields: estimators.load(_text(fields, "source"), swap=True),
+        "load": lambda fields: estimators.load(
+            _text(fields, "source"), replace=bool(fields.get("replace", False))
+        ),
         "unload": lambda fields: estimators.unload(_text(fields, "estimator")),
     }
 
@@ -84,17 +83,11 @@ def _take_learnt(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, o
 
 
 def _take_spots(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, object]:
-    """Measure with the PSF and the fixed weights of a sodium profile from the next frame on."""
-    sodium = fields.get("sodium")
-    if not isinstance(sodium, Mapping):
-        raise InputError(f"sodium = {sodium!r:.80}: expected a profile")
+    """Measure with the PSF and the fixed weights of a configuration file from the next frame on."""
     if not isinstance(maker := engine.preparer.make_pipeline, PipelineMaker):
         raise InputError("spots: this engine does not know how its pipelines are made")
-    changes: dict[str, Any] = {"psf": PSF.load(_text(fields, "psf"))}
-    if fields.get("score") is not None:
-        changes["score"] = FixedWeights.load(_text(fields, "score"))
-    change = engine.renew_spots(replace(maker, **changes), {SODIUM: sodium})
-    engine.sodium = {**sodium, "unix_time_s": time.time()}
+    file = _text(fields, "spots")
+    change = engine.renew_spots(replace(maker, **Configuration(file).spot), {"spots": file})
     return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
 
 

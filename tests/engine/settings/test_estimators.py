@@ -86,10 +86,10 @@ def test_load_set_swap_unload(camera: Camera, tmp_path: Path, monkeypatch: pytes
     camera.change(estimator="mine", share=0.5)
     camera.assert_measured_with(mine(path, share=0.5), camera.shoot())
 
-    with pytest.raises(fs.InputError, match="swap"):
+    with pytest.raises(fs.InputError, match="--replace"):
         camera.ask["load"]({"source": str(path)})
     write(tmp_path, PEAK.replace("self.share", "0.5 * self.share"))
-    camera.ask["swap"]({"source": str(path)})  # options stay
+    camera.ask["load"]({"source": str(path), "replace": True})  # options stay
     camera.shoot(n=2)
     camera.assert_measured_with(mine(path, share=0.5), camera.shoot())
 
@@ -173,7 +173,7 @@ def test_what_is_refused_changes_nothing(camera: Camera, tmp_path: Path) -> None
     before = camera.engine.live.change_number
     write(tmp_path, "return images[1:]")
     with pytest.raises(fs.InputError, match="my_estimator"):
-        camera.ask["swap"]({"source": str(path)})
+        camera.ask["load"]({"source": str(path), "replace": True})
     for fields in ({}, {"source": 3}, {"source": ""}):
         with pytest.raises(fs.InputError, match="source"):
             camera.ask["load"](dict(fields))
@@ -183,7 +183,7 @@ def test_what_is_refused_changes_nothing(camera: Camera, tmp_path: Path) -> None
     # What passes in the other process may be too slow in this one.
     write(tmp_path, "time.sleep(0.25)\nreturn sensor.zero")
     with pytest.raises(fs.InputError, match="us a frame"):
-        camera.ask["swap"]({"source": str(path)})
+        camera.ask["load"]({"source": str(path), "replace": True})
     write(tmp_path)
     camera.assert_measured_with(mine(path), camera.shoot())
 
@@ -201,7 +201,7 @@ def test_the_commands(camera: Camera, tmp_path: Path, monkeypatch: pytest.Monkey
         assert str(path) in run("load", path.name, "--use")  # relative to the client's folder
         camera.shoot(n=2)
         camera.assert_measured_with(mine(path), camera.shoot())
-        run("swap", path.name)
+        run("load", path.name, "--replace")
         run("unload", "mine")
         with pytest.raises(fs.InputError, match="No such file"):
             run("load", "none.py")

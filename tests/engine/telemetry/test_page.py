@@ -1,6 +1,6 @@
 """The page of recorded telemetry, from a store whose lost frames and differences are known."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -69,15 +69,6 @@ def test_rates_and_lost_frames(night: Telemetry) -> None:
     assert (frame, *words) == (510, "noise_std = 2.5", "1, 2")
     assert time_s == pytest.approx(0.5)
     assert len(change_rows(night)) == 1
-
-
-def test_a_changed_profile_is_shown_without_its_table(night: Telemetry) -> None:
-    profile = {"altitude_km": list(range(60)), "mean_km": 91.5, "spot_fwhm_arcsec": 1.2}
-    changed = replace(night, changes=[{"frame": 510, "changes": {"sodium": profile}, "where": None}])
-    ((_, _, what, where),) = change_rows(changed)
-    assert where == "all"
-    assert "91.5" in what
-    assert "59" not in what
 
 
 def test_methods_in_turn_differ_as_they_were_made(night: Telemetry) -> None:

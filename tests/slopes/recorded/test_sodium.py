@@ -13,7 +13,6 @@ from tests.slopes.recorded.recorded_cases import Page
 import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.io import open_frames
-from faintspot.slopes.recorded.report.sodium_section import sodium_sections_of_changes
 from faintspot.slopes.recorded.report.stored import report_of_stored
 from faintspot.slopes.recorded.sodium import sodium_of_frames
 from faintspot.slopes.spots.laser_spots import LaserSpots
@@ -125,20 +124,6 @@ def test_command_and_report(recording: Path, run: Commands) -> None:
     slopes = recording / "slopes.npz"
     assert run("slopes", recording / "frames.npy", "-c", path, "-o", slopes).code == 0
     assert "Sodium profile" in " ".join(Page(report_of_stored([slopes])).words)
-
-
-def test_profiles_of_a_recorded_engine() -> None:
-    followed = {
-        "altitude_km": [80.0, 90.0, 100.0],
-        "flux_per_km": [0.0, 0.1, 0.0],
-        "before_per_km": [0.02, 0.08, 0.02],
-        "spot_fwhm_arcsec": 1.2,
-    }
-    changes: list[dict[str, Any]] = [{"changes": {"noise_std": 2.0}}, {"changes": {"sodium": followed}}]
-    (section,) = sodium_sections_of_changes(changes)
-    assert len(section.figures[0].rows) == 6
-    assert sodium_sections_of_changes(changes[:1]) == []
-    assert sodium_sections_of_changes([{"changes": {"sodium": "too long"}}]) == []
 
 
 @pytest.mark.parametrize("level", [0.0, 7.0, 65535.0])

@@ -5,10 +5,8 @@ from __future__ import annotations
 import click
 
 from faintspot.cli.realtime.calibrate import calibrate
-from faintspot.cli.realtime.camera import camera
-from faintspot.cli.realtime.control import load, send, status, stop_engine, swap, unload
+from faintspot.cli.realtime.control import load, send, status, stop_engine, unload
 from faintspot.cli.realtime.demo import demo
-from faintspot.cli.realtime.follow import follow
 from faintspot.cli.realtime.learn import learn
 from faintspot.cli.realtime.record import record
 from faintspot.cli.realtime.run import run
@@ -16,8 +14,8 @@ from faintspot.cli.realtime.sources import bridge, replay
 from faintspot.cli.realtime.telescope import telescope
 from faintspot.cli.shared.needs import needs_linux
 
-_ENGINE = run, status, send, stop_engine, load, swap, unload, calibrate, follow, record
-_SOURCES = camera, replay, bridge, telescope, demo
+_ENGINE = run, status, send, stop_engine, load, unload, calibrate, record
+_SOURCES = replay, bridge, telescope, demo
 
 
 @click.group("realtime")
@@ -26,7 +24,7 @@ def command() -> None:
 
     \b
     In three terminals:
-      faintspot realtime camera --config faintspot.toml --frame-rate-hz 500
+      faintspot realtime telescope diffraction_limit --frame-rate-hz 500
       faintspot realtime run --config faintspot.toml
       faintspot realtime status --watch
     """

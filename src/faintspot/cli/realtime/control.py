@@ -1,7 +1,8 @@
-"""faintspot realtime status, send, stop, load, swap and unload: requests to a running engine or telescope."""
+"""faintspot realtime status, send, stop, load and unload: requests to a running engine or telescope."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import click
@@ -10,7 +11,7 @@ from faintspot.base.config.written_changes import parse_changes
 from faintspot.base.errors import InputError
 from faintspot.base.json_text import to_json
 from faintspot.base.toml_files import check_keys
-from faintspot.cli.realtime.camera import stop_on_signal
+from faintspot.cli.realtime.stopping import stop_on_signal
 from faintspot.cli.shared.commands import RANGES, option
 from faintspot.cli.shared.engine_requests import asked, asked_at_length, loop_in_words, notes, summary
 from faintspot.cli.shared.options import ENGINE_NAME
@@ -18,7 +19,7 @@ from faintspot.engine.requests.private_socket import ENGINE, TELESCOPE
 from faintspot.engine.requests.requests import since
 
 _REFRESH_S = 0.5
-_ALONE = {"methods": ("methods", "every"), "loop": ("loop",), "gain": ("gain",)}
+_ALONE = {"methods": ("methods", "every"), "loop": ("loop",), "gain": ("gain",), "spots": ("spots",)}
 """Names that `send` does not take together with settings, and what may stand beside them."""
 _OF_TELESCOPE = option("--telescope", is_flag=True, help="Ask the simulated telescope of that name instead.")
 
@@ -122,6 +123,8 @@ def send(name: str, subapertures: list[int] | None, telescope: bool, changes: tu
              mirror of an open loop. A guard opens the loop when the slopes diverge or too many are not
              valid; status says why
     gain     loop gain
+    spots    configuration file whose PSF and weights are used from then on, as `faintspot sodium`
+             leaves it
 
     \b
     With --telescope:
@@ -138,7 +141,7 @@ def send(name: str, subapertures: list[int] | None, telescope: bool, changes: tu
       faintspot realtime send loop=close
       faintspot realtime send --telescope magnitude=11 seeing_arcsec=1.2 wind_factor=1.5
     """
-    wanted = parse_changes(changes, texts=("methods", "loop"))
+    wanted = parse_changes(changes, texts=("methods", "loop", "spots"))
     for alone, beside in _ALONE.items():
         if alone in wanted and not telescope:
             check_keys("", wanted, beside, what=f"name beside {alone}")
@@ -151,6 +154,8 @@ def send(name: str, subapertures: list[int] | None, telescope: bool, changes: tu
         click.echo(loop_in_words(asked(name, "loop", action=wanted["loop"])["loop"]))
     elif "gain" in wanted:
         click.echo(loop_in_words(asked(name, "loop", action="gain", **wanted)["loop"]))
+    elif "spots" in wanted:
+        click.echo(since(asked_at_length(name, "spots", spots=str(Path(wanted["spots"]).resolve()))["frame"]))
     elif "methods" in wanted:
         click.echo(since(asked_at_length(name, "interleave", **wanted)["frame"]))
     else:
@@ -164,15 +169,12 @@ def stop_engine(name: str) -> None:
     asked(name, "stop")
 
 
-_FILE = click.argument("file", metavar="FILE", type=click.Path(dir_okay=False, resolve_path=True))
-_USE = option("--use", is_flag=True, help="Measure with it from now on, as send estimator=NAME does.")
-
-
 @click.command("load", short_help="Load an estimator from a Python file into a running engine.")
 @ENGINE_NAME
-@_FILE
-@_USE
-def load(**given: Any) -> None:
+@click.argument("file", metavar="FILE", type=click.Path(dir_okay=False, resolve_path=True))
+@option("--use", is_flag=True, help="Measure with it from now on, as send estimator=NAME does.")
+@option("--replace", is_flag=True, help="Replace loaded estimators of the same names, between two frames.")
+def load(name: str, file: str, use: bool, replace: bool) -> None:
     """Load the estimators that a Python file registers into a running engine.
 
     They are tried in a process of their own first, and refused where they fail, crash, return what they must
@@ -183,20 +185,7 @@ def load(**given: Any) -> None:
       faintspot realtime load examples/own_estimator.py
       faintspot realtime send estimator=power power=2
     """
-    _load("load", **given)
-
-
-@click.command("swap", short_help="Read the edited file of a loaded estimator again.")
-@ENGINE_NAME
-@_FILE
-@_USE
-def swap(**given: Any) -> None:
-    """Load the estimators of a file in place of those of the same names, between two frames."""
-    _load("swap", **given)
-
-
-def _load(command: str, name: str, file: str, use: bool) -> None:
-    reply = asked_at_length(name, command, source=file)
+    reply = asked_at_length(name, "load", source=file, replace=replace)
     names, frame = reply["estimators"], reply["frame"]
     if use:
         if len(names) != 1:

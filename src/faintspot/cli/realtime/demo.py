@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from rich.console import Console
 
-from faintspot.cli.realtime.camera import stop_on_signal
+from faintspot.cli.realtime.stopping import stop_on_signal
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.options import PORT, name_option

@@ -51,7 +51,7 @@ def record(out: Path, name: str, frames: int | None, seconds: float | None, ao_m
 
 def record_engine(name: str, store: Path, frames: int | None, seconds: float | None) -> RecordingReport:
     """Record a running engine to a new store, with a progress bar, until a limit or Ctrl-C."""
-    from faintspot.cli.realtime.camera import stop_on_signal
+    from faintspot.cli.realtime.stopping import stop_on_signal
     from faintspot.cli.shared.progress import progress_bar
     from faintspot.engine.telemetry.recorder import Recorder
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from faintspot.cli.realtime.camera import stop_on_signal
 from faintspot.cli.realtime.live import page_beside
+from faintspot.cli.realtime.stopping import stop_on_signal
 from faintspot.cli.shared.commands import RANGES, option
 from faintspot.cli.shared.engine_requests import summary
 from faintspot.cli.shared.needs import needs
@@ -21,7 +21,6 @@ from faintspot.engine.requests.private_socket import socket_path
 if TYPE_CHECKING:
     from faintspot.engine.engine import Engine
     from faintspot.engine.streams.bridge import StreamBridge
-    from faintspot.slopes.pipeline.configuration import Configuration
 
 
 @needs("realtime", "pyshmem")
@@ -145,7 +144,6 @@ def run(
         server,
         stop_on_signal() as stop,
         learns,
-        _following(engine, described),
         page,
         real_time(cpus, priority) as refused,
     ):
@@ -170,16 +168,6 @@ def _learning(engine: Engine, config: str) -> AbstractContextManager[None]:
     if options is None or not predicts(options.controller) or not options.learn_every_s:
         return nullcontext()
     return background_learning(engine, config, options.learn_every_s, partial(click.echo, err=True))
-
-
-def _following(engine: Engine, described: Configuration) -> AbstractContextManager[None]:
-    """The process that follows a laser guide star's profile, as a context, if the configuration wants it."""
-    from faintspot.engine.background.sodium import background_sodium
-
-    laser = described.laser
-    if laser is None or not laser.follow_every_s:
-        return nullcontext()
-    return background_sodium(engine, str(described.path), partial(click.echo, err=True))
 
 
 def _followed(stream: str, name: str) -> StreamBridge:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from faintspot.base.errors import InputError
-from faintspot.cli.realtime.camera import published, stop_on_signal
+from faintspot.cli.realtime.stopping import published, stop_on_signal
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.options import FRAMES, KEY, SLOTS, name_option

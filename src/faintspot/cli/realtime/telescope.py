@@ -10,7 +10,7 @@ from typing import Any, Self
 import click
 
 from faintspot.base.files import output_errors
-from faintspot.cli.realtime.camera import published, stop_on_signal
+from faintspot.cli.realtime.stopping import published, stop_on_signal
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.options import FRAMES, READOUT_FRACTION, SLOTS, name_option
 from faintspot.engine.requests.private_socket import TELESCOPE, socket_path

@@ -1,1 +1,1 @@
-"""Processes beside the engine that learn while it runs: `learning` (filters), `sodium` (spots of a laser)."""
+"""Processes beside the engine that learn filters while it runs."""

@@ -16,7 +16,7 @@ from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
 from faintspot.engine.loop.control_loop import CLOSED, STATES
-from faintspot.engine.pixels.camera import StopEvent
+from faintspot.engine.pixels.readout import StopEvent
 from faintspot.engine.requests.child_processes import ChildProcesses
 from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import request

@@ -22,7 +22,7 @@ from faintspot.engine.page.client_requests import ClientRequests, answered
 from faintspot.engine.page.latest_messages import LatestMessages
 from faintspot.engine.page.messages import packed
 from faintspot.engine.page.page import UPDATE_S, Page
-from faintspot.engine.pixels.camera import StopEvent
+from faintspot.engine.pixels.readout import StopEvent
 
 try:
     from tornado.httpserver import HTTPServer

@@ -13,7 +13,7 @@ from faintspot.engine.page.engine_source import EngineSource
 from faintspot.engine.page.recording_source import RecordingSource
 from faintspot.engine.page.server import LiveServer
 from faintspot.engine.page.status import StatusPoller
-from faintspot.engine.pixels.camera import StopEvent
+from faintspot.engine.pixels.readout import StopEvent
 
 
 def serve(

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.camera import CameraReport, Readout, StopEvent
 from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.pixels.readout import CameraReport, Readout, StopEvent
 from faintspot.io import FrameSource
 
 _BLOCK_BYTES, _BLOCKS_AHEAD = 4 << 20, 8

@@ -35,10 +35,10 @@ class EngineEstimators:
         self.fault: str | None = None
         """Reason why the last estimator was disabled."""
 
-    def load(self, source: str, *, swap: bool = False) -> dict[str, Any]:
+    def load(self, source: str, *, replace: bool = False) -> dict[str, Any]:
         """Try a file's estimators in a separate process, and load them if they pass.
 
-        With `swap` they replace those of the same names, even if these are in use.
+        With `replace` they replace those of the same names, even if these are in use.
 
         Returns
         -------
@@ -55,8 +55,10 @@ class EngineEstimators:
         tried = EstimatorTrial(path, self._preparer.make_pipeline, settings).elsewhere()
         with self._lock:
             for name in tried["estimators"]:
-                if name in self.loaded and not swap:
-                    raise InputError(f"estimator {name!r}: already loaded; use swap to load its file again")
+                if name in self.loaded and not replace:
+                    raise InputError(
+                        f"estimator {name!r}: already loaded; use load --replace to load its file again"
+                    )
             before = registry.estimators()
             file = load_estimators(path)
             try:

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from faintspot.base.checks import number_between
-from faintspot.engine.pixels.camera import StopEvent
 from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.pixels.readout import StopEvent
 from faintspot.engine.pixels.replay import ring_type
 from faintspot.engine.streams.stream import Follower, Stream, StreamCounters
 

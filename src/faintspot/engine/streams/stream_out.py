@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.camera import StopEvent
+from faintspot.engine.pixels.readout import StopEvent
 from faintspot.engine.streams.image_stream import ImageStreamWriter
 from faintspot.engine.streams.stream import Follower, Stream, image_name
 

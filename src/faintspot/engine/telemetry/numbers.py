@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -167,8 +167,6 @@ def change_rows(telemetry: Telemetry) -> Sequence[tuple[int, float, str, str]]:
 
 
 def _shortened(value: object) -> str:
-    """Return a value as text; of a table, such as a sodium profile, what is no list."""
+    """Return a value as text of limited length."""
     text = str(value)
-    if isinstance(value, Mapping):
-        text = ", ".join(f"{name} {item}" for name, item in value.items() if not isinstance(item, list))
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."

@@ -32,7 +32,6 @@ from faintspot.io.telemetry.recording import Telemetry, read_telemetry
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.report.page import slopes_sections, warnings_in_words
 from faintspot.slopes.recorded.report.run import SlopesRun
-from faintspot.slopes.recorded.report.sodium_section import sodium_sections_of_changes
 from faintspot.slopes.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.slopes.sensor.layout import Layout
 
@@ -69,7 +68,6 @@ def report_of_telemetry(path: str | Path) -> Report:
             _lost(telemetry),
             *([_methods(telemetry)] if len(run.methods) > 1 else []),
             _changes(telemetry),
-            *sodium_sections_of_changes(telemetry.changes),
             *slopes_sections(run),
             configuration_section(str(telemetry.attributes.get("settings", ""))),
         ],

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.camera import StopEvent
+from faintspot.engine.pixels.readout import StopEvent
 from faintspot.engine.settings.interleaving import methods_after
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telemetry.segment import Ring

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.camera import CameraReport, Readout, RowTimes, StopEvent, readout_type
 from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.pixels.readout import CameraReport, Readout, RowTimes, StopEvent, readout_type
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
 from faintspot.engine.streams.command_stream import CommandStream
 from faintspot.engine.streams.shared_streams import create_stream, held

@@ -17,7 +17,6 @@ from faintspot.loop.simulation.configuration.configuration import LoopConfigurat
 from faintspot.loop.simulation.configuration.sections import CLOSED
 from faintspot.loop.simulation.methods import PRIOR, Method
 from faintspot.slopes.estimators.base import Estimator, Need
-from faintspot.slopes.estimators.built_in.correlation import Correlation
 from faintspot.slopes.estimators.built_in.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.slopes.estimators.built_in.window import Window
 from faintspot.slopes.estimators.registry import estimator_named, estimators
@@ -40,7 +39,6 @@ _FIRST_TELEMETRY_GAINS = (0.2,)
 _PRIORS = (0.1, 0.175, 0.25, 0.35, 0.5, 0.75)
 _METHODS_OF_LASER = (
     "window",
-    "correlation",
     "window_filter",
     "window_filter_followed",
     "ml_followed",
@@ -197,14 +195,14 @@ def method_kind(name: str) -> MethodKind:
     slopes, _, control = name.partition(CONTROL_SIGN)
     control = one_of("control of the method", control or INTEGRATOR, list(CONTROLS))
     base, variants = slopes, set()
-    while base not in _estimators():
+    while base not in estimators():
         ending = next((ending for ending in VARIANTS if base.endswith(ending)), None)
         if ending is None:
             break
         base = base.removesuffix(ending)
         variants.add(ending)
     try:
-        estimator = _estimators().get(base) or estimator_named(base)
+        estimator = estimator_named(base)
     except InputError as error:
         expected = f"{error.expected}; after it may follow {', '.join(VARIANTS)}"
         raise InputError(expected, name="method", value=error.value) from None
@@ -215,11 +213,6 @@ def method_kind(name: str) -> MethodKind:
     if predicts(control) and estimator.takes_prior:
         variants.add(_PREDICTED)
     return MethodKind(estimator, tuple(variant for variant in VARIANTS if variant in variants), control)
-
-
-def _estimators() -> dict[str, type[Estimator]]:
-    """Return all estimators by name, with the one that is compared for laser guide stars only."""
-    return {**estimators(), Correlation.name: Correlation}
 
 
 def default_methods(configuration: LoopConfiguration) -> list[str]:

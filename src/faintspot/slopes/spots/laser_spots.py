@@ -25,7 +25,6 @@ from faintspot.slopes.spots.sodium import SodiumProfile
 
 _FARTHEST_M = 1e3
 _BEYOND_PX = 3.0  # of the window, to which PSFs reach
-_LONGEST_S = 1e6
 
 
 def _position(name: str, value: object) -> NDArray[np.float64]:
@@ -54,10 +53,6 @@ class LaserSpots(ConfigurationTable, table="laser"):
         As for `faintspot.LaserGuideStar`.
     matched_filter : bool
         Whether weights of estimator "window" are the linear matched filter of these spots.
-    follow_every_s : float
-        Interval at which a running engine fits the profile again [s]; 0: never.
-    follow_time_constant_s : float
-        Time constant of the mean images that it is fitted to [s].
 
     Raises
     ------
@@ -72,8 +67,6 @@ class LaserSpots(ConfigurationTable, table="laser"):
     zenith_distance_deg: float = 0.0
     site_altitude_m: float = 0.0
     matched_filter: bool = setting(False, kind=FLAG)
-    follow_every_s: float = number(0.0, 0.0, _LONGEST_S)
-    follow_time_constant_s: float = number(4.0, 0.0, _LONGEST_S, low_open=True)
 
     @classmethod
     def from_table(cls, values: Mapping[str, object], path: Path | None = None) -> Self:

@@ -19,8 +19,6 @@ from faintspot.slopes.training.sodium import MeanImages, SodiumFit, fit_sodium_p
 
 Floats = NDArray[np.float64]
 
-SODIUM = "sodium"
-"""Name of a new profile among an engine's changes of settings."""
 _NARROWEST_PX = 1.2  # spot from which the fit begins
 _FEWEST_ALTITUDES, _ALTITUDES = 20, 41
 IGNORED_E2 = 1e12

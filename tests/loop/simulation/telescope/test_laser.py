@@ -15,7 +15,6 @@ from faintspot.loop.simulation.telescope.laser import LaserSource, laser_guide_s
 from faintspot.loop.simulation.telescope.model import prepare
 from faintspot.loop.simulation.telescope.natural_star import LowOrders
 from faintspot.loop.simulation.telescope.sodium import FollowedSodium, learn_sodium
-from faintspot.slopes.estimators.built_in.correlation import Correlation
 from faintspot.slopes.spots.sodium import SodiumProfile
 
 pytest.importorskip("hcipy")
@@ -98,7 +97,6 @@ def test_a_natural_star_gives_tip_tilt_and_slow_focus() -> None:
 ML = fs.Settings("ml", search_range_px=2.0)
 METHODS = [
     Method("window", fs.Settings("window")),
-    Method("correlation", fs.Settings(Correlation(), search_range_px=2.0)),
     Method("filter", fs.Settings("window"), matched_weights=True),
     Method("ml, followed", ML, follows_profile=True),
 ]

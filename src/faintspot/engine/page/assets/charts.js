@@ -129,22 +129,3 @@ export function drawBars(canvas, values) {
     context.fillRect(LEFT + i * step, Math.min(y(0), y(value)), Math.max(1, step - 1), Math.abs(y(value) - y(0)) || 1);
   });
 }
-
-/** Draw densities from left to right against altitude from below. lines: [{values, colour, dash}]. */
-export function drawProfile(canvas, altitudes, lines) {
-  const low = Math.min(...altitudes), high = Math.max(...altitudes);
-  const most = Math.max(...lines.flatMap((line) => line.values), 1e-9) * 1.05;
-  const { context, width, height, y } = axes(canvas, low, high, yTicksOf(low, high, false));
-  const x = (value) => LEFT + value / most * (width - LEFT - RIGHT);
-  context.fillStyle = ink.soft;
-  for (const value of ticks(0, most, 4)) context.fillText(String(Number(value.toPrecision(6))), x(value), height - 5);
-  for (const { values, colour, dash } of lines) {
-    context.strokeStyle = ink[colour];
-    context.setLineDash(dash ? [3, 3] : []);
-    context.lineWidth = dash ? 1.5 : 2;
-    context.beginPath();
-    values.forEach((value, i) => i ? context.lineTo(x(value), y(altitudes[i])) : context.moveTo(x(value), y(altitudes[i])));
-    context.stroke();
-  }
-  context.setLineDash([]);
-}

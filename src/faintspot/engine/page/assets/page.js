@@ -1,7 +1,7 @@
 // The page: keep the newest message of each kind, and draw it with the next screen refresh.
 
 import { Connection } from "./connection.js";
-import { drawBars, drawHistogram, drawProfile, drawStrip } from "./charts.js";
+import { drawBars, drawHistogram, drawStrip } from "./charts.js";
 import { Controls, element } from "./controls.js";
 import { COLOURS, cleared, ink } from "./drawing.js";
 import { drawArrows, drawFrame, drawMap, drawSpots, drawValidity, drawWindows, verdict } from "./maps.js";
@@ -337,20 +337,10 @@ function showTiles() {
   ]);
 }
 
-function showSodium(sodium) {
-  byId("sodium-figure").hidden = !sodium;
-  if (!sodium) return;
-  const { altitude_km: altitudes, flux_per_km: now, before_per_km: before, spot_fwhm_arcsec: width, fault } = sodium;
-  if (altitudes) drawProfile(byId("sodium"), altitudes, [{ values: before, colour: "soft", dash: true }, { values: now, colour: "first" }]);
-  const shown = altitudes ? `altitude (km) against flux per km; dashed: before; spot ${inWords(width)} arcsec` : "";
-  say("sodium-caption", fault ? `no longer followed: ${fault}` : shown);
-}
-
 function showStatus() {
   const { values } = known.status;
   say("estimator", values.estimator || "");
   controls.status(values);
-  showSodium(values.sodium);
   const counters = { ...values.counters };
   if (values.subapertures && counters.processed) {
     counters["iterations per sub-aperture"] = counters.iterations / (counters.processed * values.subapertures);

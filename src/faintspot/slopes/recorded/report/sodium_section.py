@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
-import numpy as np
+from collections.abc import Mapping
 
 from faintspot.base.errors import InputError
 from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH
@@ -19,7 +16,6 @@ from faintspot.slopes.recorded.sodium import sodium_of_frames
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.laser_spots import LaserSpots
 from faintspot.slopes.spots.sodium import SodiumProfile
-from faintspot.slopes.training.known_sodium import SODIUM
 
 _TEXT = Texts("faintspot.slopes.recorded")
 
@@ -52,23 +48,6 @@ def sodium_section_of_frames(
         return _TEXT.section("sodium", missing=f"Not fitted: {error}.")
     sodium = found.sodium
     profiles = {"configured": sodium.star.focused(laser.profile), "these frames": sodium.fit.profile}
-    return _section(profiles, sodium.spot_fwhm_arcsec, found.left_out)
-
-
-def sodium_sections_of_changes(changes: Sequence[Mapping[str, Any]]) -> list[Section]:
-    """Return the section with the profiles that an engine has followed, from telemetry's changes; or none."""
-    followed = [change["changes"][SODIUM] for change in changes if SODIUM in change["changes"]]
-    followed = [change for change in followed if isinstance(change, Mapping)]  # else it was too long
-    if not followed:
-        return []
-    first, last = followed[0], followed[-1]
-    shown = ("at the start", first, "before_per_km"), ("at the end", last, "flux_per_km")
-    profiles = {
-        name: SodiumProfile(1e3 * np.asarray(fit["altitude_km"]), fit[key]) for name, fit, key in shown
-    }
-    return [_section(profiles, float(last["spot_fwhm_arcsec"]))]
-
-
-def _section(profiles: Mapping[str, SodiumProfile], spot_fwhm_arcsec: float, left_out: str = "") -> Section:
-    doubt = left_out.capitalize() or None
-    return _TEXT.section("sodium", profile_figure(profiles), width=spot_fwhm_arcsec, left_out=doubt)
+    figure = profile_figure(profiles)
+    doubt = found.left_out.capitalize() or None
+    return _TEXT.section("sodium", figure, width=sodium.spot_fwhm_arcsec, left_out=doubt)

@@ -1,25 +1,20 @@
-"""Read-out of frames row by row at a camera's pace, and a simulated camera with moving spots."""
+"""Read-out of frames row by row at a camera's pace."""
 
 from __future__ import annotations
 
-import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypedDict, Unpack
+from typing import Protocol, TypedDict
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.base.generators import spawn
-from faintspot.base.sizes import check_size
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.simulate import Detector, sensor_frames
-from faintspot.slopes.spots.shapes import SpotShape
+from faintspot.slopes.simulate import Detector
 
 _SPIN_NS = 150_000  # a sleep may overrun by this much; the last part is a busy wait
 _BETWEEN_REPORTS_NS = 100_000_000
@@ -33,48 +28,6 @@ class StopEvent(Protocol):
     def is_set(self) -> bool:
         """Return whether to stop."""
         ...
-
-
-@dataclass(frozen=True)
-class SpotMotion:
-    """Motion of the spots from frame to frame, independent for each spot and axis.
-
-    A first-order autoregressive process (AR(1)): Gaussian positions around the sub-aperture's centre, with a
-    correlation that falls by a factor e within the correlation time.
-
-    Parameters
-    ----------
-    standard_deviation_px : float
-        Standard deviation of the position along each axis.
-    correlation_time_s : float
-        Correlation time; 0 gives independent positions in every frame.
-
-    Raises
-    ------
-    InputError
-        When a value is negative or not finite.
-    """
-
-    standard_deviation_px: float = 0.3
-    correlation_time_s: float = 0.01
-
-    def __post_init__(self) -> None:
-        for name in ("standard_deviation_px", "correlation_time_s"):
-            object.__setattr__(self, name, number_between(name, getattr(self, name), 0))
-
-    def positions(
-        self, n_frames: int, n_spots: int, frame_rate_hz: float, rng: np.random.Generator
-    ) -> NDArray[np.float64]:
-        """Return x and y of every spot in every frame, px, shape (n_frames, n_spots, 2)."""
-        time_s = self.correlation_time_s
-        kept = math.exp(-1 / (frame_rate_hz * time_s)) if time_s else 0.0
-        steps = rng.standard_normal((n_frames, n_spots, 2))
-        # The first position has the same spread as all later ones.
-        steps[1:] *= math.sqrt(1 - kept**2)
-        for frame in range(1, n_frames):
-            steps[frame] += kept * steps[frame - 1]
-        positions: NDArray[np.float64] = self.standard_deviation_px * steps
-        return positions
 
 
 @dataclass(frozen=True)
@@ -233,96 +186,6 @@ class Readout(ABC):
             _wait_until(moment)
         else:
             time.sleep(max(0, moment - time.monotonic_ns()) / 1e9)
-
-
-class SimulatedCamera(Readout):
-    """Camera that publishes simulated frames of a Shack-Hartmann sensor, row by row.
-
-    The frames are simulated in advance and shown cyclically: frame number n is ``frames[n % n_distinct]``.
-    The spots jump when the cycle restarts.
-
-    Parameters
-    ----------
-    layout : Layout
-        Positions of the sub-apertures.
-    ring : PixelRing
-        Ring created by this process, with the layout's frame shape and the type given by `readout_type`.
-    frame_rate_hz : float
-        Frames per second, up to 100,000.
-    flux_e : float or array_like, shape (n,)
-        Electrons per sub-aperture and frame, as for `faintspot.slopes.simulate.sensor_frames`.
-    detector : Detector, optional
-        Default: 1 e- read noise and nothing else.
-    motion : SpotMotion, optional
-    readout_fraction : float
-        Part of the frame time in which the rows arrive one after another, 0 to 1. 0: all at once.
-    rows_per_block : int
-        Rows that are published together.
-    n_distinct : int
-        Number of frames that are simulated.
-    rng : numpy.random.Generator, optional
-        Generator of positions and noise.
-    **spot_shape
-        profile, size, elongation and angle_deg, see `faintspot.slopes.spots.shapes`.
-
-    Attributes
-    ----------
-    frames : ndarray, shape (n_distinct, rows, columns)
-        ADU, read-only.
-    truth : ndarray, float64, shape (n_distinct, n, 2)
-        True x and y of each spot from the centre of its window, px, read-only.
-
-    Raises
-    ------
-    InputError
-        When a value is out of its range, or the ring does not fit the layout and detector.
-    """
-
-    def __init__(
-        self,
-        layout: Layout,
-        ring: PixelRing,
-        *,
-        frame_rate_hz: float,
-        flux_e: ArrayLike = 200.0,
-        detector: Detector | None = None,
-        motion: SpotMotion | None = None,
-        readout_fraction: float = 0.8,
-        rows_per_block: int = 4,
-        n_distinct: int = 200,
-        rng: np.random.Generator | None = None,
-        **spot_shape: Unpack[SpotShape],
-    ) -> None:
-        camera = Detector(read_noise_e=1.0) if detector is None else detector
-        super().__init__(
-            ring,
-            layout.frame_shape,
-            readout_type(camera),
-            frame_rate_hz=frame_rate_hz,
-            readout_fraction=readout_fraction,
-            rows_per_block=rows_per_block,
-        )
-        count = int(number_between("n_distinct", n_distinct, 1, integer=True))
-        check_size("n_distinct frames", (count, *layout.frame_shape), what="pixels")
-        motion_rng, noise_rng = spawn(rng, 2)
-        moving = SpotMotion() if motion is None else motion
-        self.frames, self.truth = sensor_frames(
-            layout.corners,
-            layout.window,
-            layout.frame_shape,
-            count,
-            flux_e=flux_e,
-            positions=moving.positions(count, len(layout), frame_rate_hz, motion_rng),
-            detector=camera,
-            rng=noise_rng,
-            **spot_shape,
-        )
-        self.frames.flags.writeable = self.truth.flags.writeable = False
-
-    def _frame(self) -> NDArray[np.generic]:
-        """Return frame number `_next`."""
-        frame: NDArray[np.generic] = self.frames[self._next % len(self.frames)]
-        return frame
 
 
 def readout_type(detector: Detector) -> np.dtype[np.generic]:
