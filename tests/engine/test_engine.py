@@ -187,7 +187,7 @@ def test_the_terminal_shows_the_status(bench: Bench, monkeypatch: pytest.MonkeyP
 
 
 def test_new_spots_are_measured_with_from_the_next_frame(tmp_path: Path) -> None:
-    """Slopes are those of a pipeline that has known them from the start; a file that does not fit is refused."""
+    """Slopes are those of a pipeline that has known them from the start."""
     layout, calibration = fs.Layout.grid((3, 3), pixels=10), fs.Calibration(100.0, read_noise_e=1.0)
     settings = fs.Settings("ml", flux_e=300.0)
     first, later = (fs.PSF.analytic("gaussian", size=size) for size in (1.0, 1.4))
