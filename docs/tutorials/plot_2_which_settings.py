@@ -36,18 +36,5 @@ print(answer.best.settings)
 figure = fs.experiments.tune_figure(answer)
 
 # %%
-# What a magnitude means on the sky
-# ---------------------------------
-# How much of the sky has a star that is bright enough, near enough? From star counts (Bahcall and Soneira
-# 1980; good to about 25 %).
-
-from faintspot.experiments.closed_loop.question import PLACES, sky_coverage
-
-for magnitude in (12.0, 14.0, 16.0):
-    found = {place: sky_coverage(magnitude, 30.0, latitude, "R") for place, latitude in PLACES.items()}
-    text = ", ".join(f"{place} {100 * part:.1f} %" for place, part in found.items())
-    print(f"R = {magnitude:g}, within 30 arcsec: {text}")
-
-# %%
 # `answer.save("faintspot.toml")` writes what `faintspot slopes` and `SlopePipeline.from_file` read. For a
-# closed loop, where a slope error is only part of the story, ask `faintspot loop tune`.
+# closed loop, where a slope error is only part of the story, ask `faintspot loop magnitude`.

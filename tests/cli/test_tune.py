@@ -4,12 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.cli.cli_cases import LAYOUT, Commands, simulated
-from tests.experiments.loop_answer_cases import made_up
 
 from faintspot import Calibration, Layout, SlopePipeline
-from faintspot.experiments.closed_loop import tuning as loop_tuning
-from faintspot.experiments.closed_loop.answer import LoopAnswer
-from faintspot.experiments.closed_loop.question import LoopQuestion
 from faintspot.experiments.planner import tuning
 
 KNOWN = ("--read-noise-e", 3, "--pixels", 8, "--fwhm-px", "1.8", "--flux-e", 200)
@@ -134,37 +130,3 @@ def test_mistakes_are_named_in_one_line(
     Path("layout.toml").write_text("[layout.grid]\npixels = 8\n")
     run.refused(*arguments, naming=naming)  # type: ignore[arg-type]
     assert not Path("faintspot.toml").exists()
-
-
-def test_for_a_loop(run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a made-up answer; how it comes about is tested where it is made."""
-    asked: dict[str, object] = {}
-
-    def made(question: LoopQuestion, folder: str, **options: object) -> LoopAnswer:
-        asked.update(options, question=question, folder=folder)
-        return made_up()
-
-    monkeypatch.setattr(loop_tuning, "tune_loop", made)
-    result = run.ok(
-        *("loop", "tune", "diffraction_limit", "--magnitudes", "9,13", "--magnitude", "12"),
-        *("--methods", "tv, map+kalman", "--strehl", 0.3, "--radius-arcsec", 20),
-        *("--seed", 7, "--workers", 1),
-    )
-    question = asked["question"]
-    assert isinstance(question, LoopQuestion)
-    assert (question.magnitudes, question.methods) == ((9.0, 13.0), ("tv", "map+kalman"))
-    assert (question.strehl, question.radius_arcsec) == (0.3, 20.0)
-    assert question.configuration.run.seed == 7
-    assert question.configuration.camera.magnitude == 12.0
-    assert asked["folder"] == "diffraction_limit-tune"
-    for text in ("Recommended: window+kalman", "against window", "galactic pole", "This rests on"):
-        assert text in result.out
-    assert "--methods brightest,window,window+kalman " in result.out
-    assert max(len(line) for line in result.out.splitlines()[:-4]) <= 80
-    assert "…" not in result.out
-    assert Path("faintspot-tune.png").read_bytes().startswith(b"\x89PNG")
-    LAYOUT.save("faintspot.toml")
-    assert SlopePipeline.from_file("faintspot.toml").settings.estimator.name == "window"
-    assert Path("faintspot-loop.toml").is_file()
-    run.refused("loop", "tune", "canary", naming=("faintspot.toml", "--overwrite"))
-    run.ok("loop", "tune", "canary", "--overwrite")

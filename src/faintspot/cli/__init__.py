@@ -102,7 +102,7 @@ def group(context: click.Context) -> None:
     \b
     Without frames:
       faintspot tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100
-      faintspot loop tune diffraction_limit
+      faintspot loop magnitude diffraction_limit --quick
       faintspot demo
     """
     if context.invoked_subcommand is None:

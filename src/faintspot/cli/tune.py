@@ -91,7 +91,7 @@ def command(
     in the recording.
 
     Spots are independent from frame to frame here (open loop). In a closed loop they stay near their
-    references, which favours other estimators: `faintspot loop tune` compares them there.
+    references, which favours other estimators: `faintspot loop magnitude` compares them there.
 
     \b
     Examples:

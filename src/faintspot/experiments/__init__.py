@@ -7,13 +7,9 @@ from typing import TYPE_CHECKING
 from faintspot.base.lazy import lazy_attributes
 
 if TYPE_CHECKING:
-    from faintspot.experiments.closed_loop.answer import LoopAnswer as LoopAnswer
     from faintspot.experiments.closed_loop.budget import run_budget as run_budget
     from faintspot.experiments.closed_loop.magnitude import run_magnitude as run_magnitude
-    from faintspot.experiments.closed_loop.question import LoopQuestion as LoopQuestion
-    from faintspot.experiments.closed_loop.tuning import tune_loop as tune_loop
     from faintspot.experiments.planner.answer import Answer as Answer
-    from faintspot.experiments.planner.figures import loop_figure as loop_figure
     from faintspot.experiments.planner.figures import tune_figure as tune_figure
     from faintspot.experiments.planner.promise import Promise as Promise
     from faintspot.experiments.planner.promise import check_promises as check_promises
@@ -30,12 +26,9 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "planner.answer": "Answer",
-    "planner.figures": "loop_figure tune_figure",
+    "planner.figures": "tune_figure",
     "closed_loop.budget": "run_budget",
     "study.cell": "measure_cell",
-    "closed_loop.answer": "LoopAnswer",
-    "closed_loop.question": "LoopQuestion",
-    "closed_loop.tuning": "tune_loop",
     "closed_loop.magnitude": "run_magnitude",
     "planner.promise": "Promise check_promises",
     "planner.question": "Question",

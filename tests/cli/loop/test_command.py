@@ -83,7 +83,7 @@ def test_budget(run: Commands) -> None:
 
 
 def test_engine_files_close_the_loop(run: Commands) -> None:
-    """What `loop tune` has chosen stays, and an engine has all that it needs."""
+    """What `loop magnitude` recommends stays, and an engine has all that it needs."""
     Path("bench").mkdir()
     Path("bench/faintspot.toml").write_text('[estimator]\nname = "centroid"\n', encoding="utf-8")
     result = run("loop", "engine", "small.toml", "-o", "bench", "--frame-rate-hz", 100)

@@ -13,6 +13,7 @@ from faintspot.experiments.closed_loop.verdict import (
     NOWHERE,
     LoopResults,
     better_and_worse,
+    equal_methods,
     loop_summary,
     loop_verdict,
     options_that_may_pay,
@@ -115,3 +116,28 @@ def test_budget() -> None:
     lines = loop_summary(LoopResults(budget=result)).splitlines()
     assert len(lines) == 1 + len(TERMS)
     assert lines[1].split() == ["brightest", "pixels", "–", "0.300", "±", "0.000", "150", "±", "0"]
+
+
+def test_the_simplest_of_equal_methods_is_recommended() -> None:
+    """The baseline where it is as good as the best; another one where it is below beyond the error."""
+    steps = np.array([-0.02, -0.01, 0.01, 0.02])
+    strehl = np.array([[0.3 + steps], [0.5 + steps], [0.5 - steps], [0.7 + steps]])
+    names = ("brightest", "window", "map_predicted", "map+kalman")
+    made = replace(
+        made_up_magnitude(),
+        names=names,
+        labels=names,
+        photons=np.array([50.0]),
+        magnitudes=np.array([10.0]),
+        strehl=strehl,
+        centroid_gain=np.ones((4, 1, 4)),
+        settings=np.full((4, 1), ""),
+        choices=np.full((4, 1), '{"loop_gain": 0.3}'),
+    )
+    assert equal_methods(made, 0) == [3]
+    level = replace(made, strehl=np.concatenate([strehl[:3], strehl[1:2] + steps / 10]))
+    assert equal_methods(level, 0) == [1, 2, 3]
+    text = " ".join(loop_verdict(LoopResults(made)))
+    assert "Recommended at magnitude 10.00 (50 e-): map+kalman (loop_gain 0.3)." in text
+    nothing = replace(made, strehl=np.full(strehl.shape, np.nan))
+    assert equal_methods(nothing, 0) == []

@@ -10,7 +10,6 @@ from typing import Any
 
 import click
 
-from faintspot.cli.loop.tune import tune
 from faintspot.cli.shared.commands import NAMES, NUMBERS, option
 from faintspot.cli.shared.experiments import (
     CONFIGURATION,
@@ -44,13 +43,10 @@ def command() -> None:
 
     \b
     Examples:
-      faintspot loop tune diffraction_limit
+      faintspot loop magnitude diffraction_limit
       faintspot loop magnitude camera_3e --methods brightest,smoothed,tv
       faintspot loop show canary > mine.toml
     """
-
-
-command.add_command(tune)
 
 
 @command.command()
@@ -90,12 +86,22 @@ def show(name: str | None) -> None:
     help="Fluxes with commas, photo-electrons per sub-aperture and frame.",
     show_default="four times to an eighth of the configuration's",
 )
+@option(
+    "--write-config",
+    metavar="TOML",
+    help="Write what is recommended for the configuration's star, and the loop with its gain beside it.",
+)
 def magnitude(
-    configuration: str, methods: Names | None, flux_e: tuple[float, ...] | None, **options: Any
+    configuration: str,
+    methods: Names | None,
+    flux_e: tuple[float, ...] | None,
+    write_config: str | None,
+    **options: Any,
 ) -> None:
     """Measure the Strehl ratio of any list of methods against the star's magnitude.
 
-    Each method is tuned at each flux, its settings and the loop gain together, on other turbulence. Methods:
+    Each method is tuned at each flux, its settings and the loop gain together, on other turbulence; one is
+    recommended for each flux: the simplest of those not below the best beyond the error. Methods:
     every estimator by its name (`faintspot estimators` lists them); after the name may follow
     _predicted (its prior is what the loop predicts), _weighted (slopes count by their standard errors),
     _uncorrected (slopes are not divided by the centroid gain), with a laser guide star _filter (weights of
@@ -108,9 +114,13 @@ def magnitude(
       faintspot loop magnitude diffraction_limit --methods map_predicted,map+kalman --flux-e 20
       faintspot loop magnitude camera_3e --methods brightest,smoothed,tv,ml --flux-e 60,200,640
     """
-    from faintspot.experiments.closed_loop.magnitude import run_magnitude
+    from faintspot.experiments.closed_loop.magnitude import run_magnitude, save_recommended
+    from faintspot.loop.simulation.configuration.configuration import load_loop
 
-    _measure(configuration, "magnitude", run_magnitude, _methods(methods), flux_e, **options)
+    result = _measure(configuration, "magnitude", run_magnitude, _methods(methods), flux_e, **options)
+    if write_config is not None:
+        loop = save_recommended(result, load_loop(configuration), write_config)
+        click.echo(f"{write_config}: written, and {loop}, the loop with this star and gain")
 
 
 @_needs_loop
@@ -222,7 +232,7 @@ def engine(configuration: str, output: str, control: str, frame_rate_hz: float |
 
     Layout, calibration, PSF and [control] with interaction matrix, reference slopes and centroid gain, from
     the simulation. Estimator, settings and whatever else faintspot.toml says already stay, such as what
-    `faintspot loop tune` has chosen; without an estimator it gets the 20 brightest pixels.
+    `faintspot loop magnitude` recommends; without an estimator it gets the 20 brightest pixels.
 
     \b
     Examples:
@@ -249,8 +259,8 @@ def _measure(
     overwrite: bool,
     workers: int | None,
     scheduler: str | None,
-) -> None:
-    """Run an experiment with a progress bar, print the summary of its result and write its page."""
+) -> Any:
+    """Run an experiment with a progress bar, print its summary, write its page, and return the result."""
     from faintspot.experiments.closed_loop.page import loop_page
     from faintspot.experiments.closed_loop.verdict import LoopResults, loop_summary
     from faintspot.loop.simulation.configuration.configuration import load_loop
@@ -263,6 +273,7 @@ def _measure(
     page = Path(folder) / "report.html"
     loop_page(LoopResults.load(folder)).write(page)
     click.echo(f"{shlex.quote(str(page))}: open it in a browser")
+    return result
 
 
 def _methods(names: Names | None) -> Names | None:

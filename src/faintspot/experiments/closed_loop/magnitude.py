@@ -8,19 +8,27 @@ from pathlib import Path
 import numpy as np
 
 from faintspot.base.checks import numbers_between
+from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
-from faintspot.experiments.closed_loop.experiment import Experiment, checked_methods
-from faintspot.experiments.closed_loop.methods import default_methods
+from faintspot.base.files import derived, write_atomically
+from faintspot.base.json_text import parse_json
+from faintspot.experiments.closed_loop.experiment import Experiment, checked_methods, with_flux
+from faintspot.experiments.closed_loop.methods import default_methods, method_kind
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.closed_loop.search import Search
+from faintspot.experiments.closed_loop.verdict import equal_methods
 from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.files import MAGNITUDE_FILE
 from faintspot.loop.simulation.simulation import DisabledErrors
+from faintspot.loop.simulation.telescope.camera import camera_calibration
+from faintspot.slopes.estimators.base import Need
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.smoothed import Smoothed
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.estimators.built_in.window import Window
+from faintspot.slopes.pipeline import configuration as configuration_file
+from faintspot.slopes.spots.psf import PSF
 
 KIND = "magnitude"
 QUICK_METHODS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation, Window))
@@ -93,6 +101,55 @@ def run_magnitude(
     )
     result.save(experiment.folder / MAGNITUDE_FILE)
     return result
+
+
+def save_recommended(result: MagnitudeResult, configuration: LoopConfiguration, path: str | Path) -> Path:
+    """Write what is recommended for the configuration's star into a configuration file.
+
+    The PSF lies beside it; the table [loop] has control and loop gain, for people. The camera is written
+    where the file has none. Beside it, NAME-loop.toml is the loop with this star and loop gain.
+
+    Parameters
+    ----------
+    result : MagnitudeResult
+        The measured flux nearest to that of the star counts.
+    configuration : LoopConfiguration
+    path : path
+
+    Returns
+    -------
+    Path
+        That of NAME-loop.toml.
+
+    Raises
+    ------
+    InputError
+        When nothing is measured yet, or a file cannot be written.
+    """
+    path, flux = Path(path), int(np.argmin(np.abs(np.log(result.photons / configuration.photons))))
+    methods = equal_methods(result, flux)
+    if not methods:
+        raise InputError(f"{path}: expected a measured flux near {configuration.photons:g}, got none")
+    best, star = methods[0], with_flux(configuration, float(result.photons[flux]))
+    kind, choice = method_kind(result.names[best]), parse_json(str(result.choices[best, flux]))
+    method = kind.method(star, choice)
+    settings, psf = method.settings, method.psf
+    if settings.estimator.uses_flux:
+        settings = settings.replace(flux_e=float(f"{star.photons:.4g}"))
+    if psf is None and settings.estimator.needs & {Need.PSF, Need.WIDTH}:  # what the loop gives it
+        psf = PSF.analytic(size=star.spot_width_px / 2, elongation=star.sensor.spot_elongation)
+    for item in (settings, psf):
+        if item is not None:
+            configuration_file.save(path, item)
+    if not configuration_file.has(path, "calibration"):
+        configuration_file.save(path, camera_calibration(star))
+    strehl = float(result.strehl[best, flux].mean())
+    table = {"method": kind.name, "control": kind.control, "strehl": round(strehl, 4), **choice}
+    save_tables(path, {"loop": table})
+    loop = derived(path, "-loop.toml")
+    gain = {} if method.gain is None else {"gain": method.gain}
+    write_atomically(loop, star.replace("control", **gain).to_text())
+    return loop
 
 
 def _default(configuration: LoopConfiguration, quick: bool) -> list[str]:

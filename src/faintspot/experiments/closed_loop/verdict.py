@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from faintspot.base.errors import InputError
-from faintspot.base.report.words import with_interval
-from faintspot.base.statistics import Estimate
-from faintspot.experiments.closed_loop.methods import VARIANTS
-from faintspot.experiments.closed_loop.question import REFERENCES
+from faintspot.base.json_text import parse_json
+from faintspot.base.report.words import plain_number, with_interval
+from faintspot.base.statistics import Estimate, paired_mean
+from faintspot.experiments.closed_loop.limits import magnitude_limit
+from faintspot.experiments.closed_loop.methods import VARIANTS, MethodKind, method_kind
 from faintspot.experiments.closed_loop.results import (
     BudgetResult,
     MagnitudeResult,
@@ -20,9 +21,15 @@ from faintspot.experiments.closed_loop.results import (
     gains_in_magnitude,
 )
 from faintspot.experiments.closed_loop.tables import budget_table, in_columns, strehl_table
+from faintspot.experiments.methods import Knowledge
+from faintspot.loop.control.identification.models import INTEGRATOR
 from faintspot.loop.simulation.files import BUDGET_FILE, MAGNITUDE_FILE
+from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
+from faintspot.slopes.estimators.built_in.window import Window
 
+REFERENCES = Window.name, BrightestPixels.name
+"""Baselines of every gain, first and second, both with the integrator."""
 NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
 
 
@@ -56,12 +63,61 @@ def loop_verdict(results: LoopResults) -> list[str]:
     """Return what the results say about TV, and then about the other ways to measure slopes."""
     if results.magnitude is None:
         return []
-    lines = _magnitude_lines(results.magnitude)
+    lines = [*_recommendations(results.magnitude), *_magnitude_lines(results.magnitude)]
     # What the denoising itself does: against the same without it.
     tv, reference = tv_method(results.magnitude), reference_methods(results.magnitude)[-1]
     if tv is None or tv == reference:
         return lines
     return [_headline(differences_by_flux(results.magnitude, tv, reference)), *lines]
+
+
+def equal_methods(result: MagnitudeResult, flux: int) -> list[int]:
+    """Return the methods that are not below the best at a flux beyond the error; the first is recommended.
+
+    That is the baseline where it is among them, else the one that need not learn, has to know least and costs
+    least. Differences are paired; their intervals hold for all comparisons with the best together.
+    """
+    runs = result.strehl[:, flux]
+    measured = np.flatnonzero(np.isfinite(runs).all(axis=1))
+    if not len(measured):
+        return []
+    best = measured[np.argmax(runs[measured].mean(axis=1))]
+    comparisons = max(1, len(measured) - 1)
+    same = [int(m) for m in measured if paired_mean(runs[best] - runs[m], comparisons).decided != 1]
+    return sorted(same, key=lambda method: _simplicity(method_kind(result.names[method])))
+
+
+def _simplicity(kind: MethodKind) -> tuple[object, ...]:
+    beyond_baseline = kind.name != REFERENCES[0], kind.control != INTEGRATOR
+    return *beyond_baseline, int(Knowledge.of(kind.estimator)), kind.estimator.cost, kind.name
+
+
+def _recommendations(result: MagnitudeResult) -> list[str]:
+    """Return what is recommended at each flux, and limiting magnitudes at half of the best Strehl ratio."""
+    lines, recommended = [], list[int]()
+    for flux in reversed(range(len(result.photons))):
+        if not (equal := equal_methods(result, flux)):
+            continue
+        best, *same = equal
+        recommended.append(best)
+        choice = parse_json(str(result.choices[best, flux]))
+        values = ", ".join(
+            f"{name} {value if isinstance(value, str) else plain_number(value)}"
+            for name, value in choice.items()
+        )
+        as_good = f"; as good: {', '.join(result.labels[method] for method in same)}" if same else ""
+        star = f"{result.magnitudes[flux]:.2f} ({plain_number(result.photons[flux])} e-)"
+        lines.append(f"Recommended at magnitude {star}: {result.labels[best]} ({values}){as_good}.")
+    means = result.strehl.mean(axis=2)
+    if np.isfinite(means).any() and len(result.photons) > 1:
+        level = 0.5 * float(np.nanmax(means))
+        limits = {
+            result.labels[method]: magnitude_limit(result.magnitudes, result.strehl[method], level)
+            for method in dict.fromkeys([*recommended, *reference_methods(result)])
+        }
+        known = [f"{label} {limit.in_words()}" for label, limit in limits.items() if limit.is_known]
+        lines += [f"Limiting magnitudes at Strehl {level:.2f}: {', '.join(known)}."] if known else []
+    return lines
 
 
 def reference_methods(result: MagnitudeResult) -> list[int]:
