@@ -112,13 +112,6 @@ def test_from_frames(run: Commands) -> None:
         (("tune", "--camera", "table.toml"), ("cameras", "did you mean camera")),
         (("tune", "--camera", "layout.toml"), ("layout.grid.shape",)),
         (("tune", "--recording", "nothere.fits"), ("nothere.fits",)),
-        (("loop", "tune", "nothere"), ("nothere", "shipped")),
-        (("loop", "tune", "canary", "--read-noise-e", 3), ("--read-noise-e",)),
-        (("loop", "tune", "canary", "--magnitude", 9, "--flux-e", 10), ("--magnitude", "both")),
-        (("loop", "tune", "canary", "--magnitudes", "8"), ("--magnitudes 8", "8,14")),
-        (("loop", "tune", "canary", "--strehl", 2), ("strehl = 2",)),
-        (("loop", "tune", "canary", "--methods", "kog"), ("kog",)),
-        (("loop", "tune", "canary", "-o", "nofolder/faintspot.toml"), ("nofolder",)),
     ],
 )
 def test_mistakes_are_named_in_one_line(

@@ -9,7 +9,6 @@ from typing import Any
 import click
 import numpy as np
 
-from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.extras import require
 from faintspot.base.files import derived
@@ -29,7 +28,6 @@ from faintspot.slopes.wavefront.map_files import check_map_file
 from faintspot.slopes.wavefront.units import UNITS
 from faintspot.slopes.wavefront.words import (
     mode_table,
-    refraction_line,
     remarks,
     rms_table,
     zonal_remarks,
@@ -65,7 +63,6 @@ from faintspot.slopes.wavefront.words import (
 )
 @option("--unit", type=click.Choice(UNITS), help="Unit of the wavefront.", show_default="nm, if known")
 @option("--wavelength-nm", type=float, metavar="NM", help="Wavelength, for waves.")
-@option("--pupil-mm", type=float, metavar="MM", help="Diameter of an eye's pupil, for its refraction.")
 @option(
     "--actuators",
     metavar="FILE",
@@ -92,7 +89,6 @@ def command(
     maps: tuple[str, ...],
     unit: str | None,
     wavelength_nm: float | None,
-    pupil_mm: float | None,
     actuators: str | None,
     stroke: float | None,
     command_file: str | None,
@@ -108,7 +104,6 @@ def command(
     Examples:
       faintspot wavefront slopes.zarr
       faintspot wavefront slopes.zarr --pixel-scale-arcsec 0.38 --diameter-m 4.2 -o wavefront.json
-      faintspot wavefront eye.zarr --pixel-scale-arcsec 60 --pupil-mm 6 --unit um
       faintspot wavefront slopes.zarr --zonal --map map.fits
       faintspot wavefront warm.zarr --minus cold.zarr
       faintspot wavefront slopes.zarr --actuators interaction.npy --stroke 300
@@ -130,10 +125,6 @@ def command(
     if run.layout is None:
         raise InputError(f"{slopes}: expected slopes with their layout ({' '.join(run.notes)})")
     given: dict[str, Any] = {name: value for name, value in scales.items() if value is not None}
-    if pupil_mm is not None:
-        if "diameter_m" in given:
-            raise InputError("--pupil-mm: expected it or --diameter-m, got both")
-        given["diameter_m"] = 1e-3 * number_between("--pupil-mm", pupil_mm, 0, low_open=True)
     layout = replace(run.layout, **given)
     measured, other = Slopes.from_variables(run.stored.variables, keep=run.keep), None
     if minus is not None:
@@ -149,14 +140,13 @@ def command(
             asked = unit or "nm", wavelength_nm
             wavefront = wavefront.in_unit(*asked)
             surface = None if surface is None else surface.in_unit(*asked)
-        eye = None if pupil_mm is None else refraction_line(wavefront)
     with errors_of_options(actuators):
         flat = None if interaction is None else flattening(measured, interaction, stroke)
     # A difference of positions in the frame lacks nothing.
     notes = [note for note in run.notes if minus is None or note != run.about_reference]
-    _print(wavefront, surface, notes if eye is None else [eye, *notes])
+    _print(wavefront, surface, notes)
     for name in output:
-        save_wavefront(name, wavefront, dioptres=eye is not None)
+        save_wavefront(name, wavefront)
         click.echo(name)
     for name in maps:
         save_map(name, wavefront, layout, surface)

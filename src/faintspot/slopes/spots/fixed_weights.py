@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,20 +20,8 @@ Floats = NDArray[np.float64]
 _LARGEST = 1e6  # px, or fractions of the flux, for one pixel: above it, float32 sums are meaningless
 _SMALLEST_GAIN = 0.02
 _LEAST_WEIGHT = 1e-4  # of the largest: less counts nothing, and need not be read
-_SAME = 1e-6  # relative to the largest weight; smaller weights are ignored and not read
 _RIDGE = 1e-6  # relative to the largest weight: indistinguishable in float32 sums
 # relative to the mean variance of a pixel: keeps the solution finite without noise
-
-
-class WeightedCentre(NamedTuple):
-    """Fixed weights as a centre of gravity c of weighted pixels: the slope is gain (c - reference)."""
-
-    weights: Floats
-    """Weight of each pixel, at most 1; shape (n_kinds, ny, nx)."""
-    gain: Floats
-    """Slope in x and y [px] for a centre of gravity that moves by 1 px; shape (n_kinds, 2)."""
-    reference: Floats
-    """Centre of gravity for a slope of 0, px from the window centre; shape (n_kinds, 2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,42 +116,6 @@ class FixedWeights(NpzFile):
             )
         kinds: NDArray[np.int64] = self.index
         return kinds
-
-    def weighted_centre(self) -> WeightedCentre:
-        """Return an equivalent weighted centre of gravity, divided by the flux of the frame.
-
-        Raises
-        ------
-        InputError
-            If x and y do not follow from one map of weights, as those of a Gaussian window do.
-        """
-        rows, columns = (np.arange(side) - 0.5 * (side - 1) for side in self.window)
-        counted = (self.x != 0) | (self.y != 0) | (self.flux != 0)
-        largest = np.abs(self.flux).max(axis=(1, 2), keepdims=True)
-        gains, references = [], []
-        for maps, along in ((self.x, columns), (self.y, rows[:, None])):
-            moved = self.flux * along
-            # Best gain and offset of each kind, by least squares.
-            parts = [(a * b).sum(axis=(1, 2)) for a, b in _pairs(moved, self.flux)]
-            projections = [(maps * part).sum(axis=(1, 2)) for part in (moved, self.flux)]
-            determinant = parts[0] * parts[2] - parts[1] ** 2
-            with np.errstate(divide="ignore", invalid="ignore"):
-                gain = (parts[2] * projections[0] - parts[1] * projections[1]) / determinant
-                offset = (parts[0] * projections[1] - parts[1] * projections[0]) / determinant
-                misfit = np.abs(maps - gain[:, None, None] * moved - offset[:, None, None] * self.flux)
-                spot = (maps * self.mean_spot).sum(axis=(1, 2))
-                reference = (spot - offset) / gain
-            if not (np.isfinite(gain) & np.isfinite(reference)).all() or not np.all(
-                misfit <= _SAME * np.abs(maps).max()
-            ):
-                raise InputError(
-                    "weights: expected x and y that follow from one map of weights, as those of a Gaussian "
-                    "window, got other ones"
-                )
-            gains.append(gain)
-            references.append(reference)
-        weights = np.where(counted, self.flux / largest, 0.0)
-        return WeightedCentre(weights, np.stack(gains, axis=1), np.stack(references, axis=1))
 
     @classmethod
     def best_linear(

@@ -15,15 +15,11 @@ from faintspot.base.json_text import to_json
 from faintspot.base.report.figure_data import csv_text
 from faintspot.io.optional_packages import load_fits
 from faintspot.slopes.wavefront.fit import Wavefront, total
-from faintspot.slopes.wavefront.refraction import refraction, refraction_error
 from faintspot.slopes.wavefront.units import UNITS
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
 
-_LENS = "SPHERE", "CYLINDER", "CYLAXIS", "SPHEREQ"
-"""Keywords of FITS headers for a refraction."""
 
-
-def save_wavefront(path: str | Path, wavefront: Wavefront, *, dioptres: bool = False) -> None:
+def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
     """Write a wavefront to a file, replacing an existing one.
 
     Parameters
@@ -34,13 +30,11 @@ def save_wavefront(path: str | Path, wavefront: Wavefront, *, dioptres: bool = F
         COEFFICIENTS and STANDARD_ERRORS (a row for each frame). A frame that could not be fitted is empty,
         null or NaN.
     wavefront : Wavefront
-    dioptres : bool
-        Whether to add the refraction of an eye, of the mean and of each frame.
 
     Raises
     ------
     InputError
-        When the ending is unknown, the file cannot be written, or `refraction` refuses the wavefront.
+        When the ending is unknown or the file cannot be written.
     MissingExtraError
         When astropy is needed and not installed.
 
@@ -58,7 +52,7 @@ def save_wavefront(path: str | Path, wavefront: Wavefront, *, dioptres: bool = F
     """
     path = Path(path)
     check_wavefront_file(path)
-    write_atomically(path, _WRITERS[path.suffix.lower()](wavefront, dioptres))
+    write_atomically(path, _WRITERS[path.suffix.lower()](wavefront))
 
 
 def check_wavefront_file(path: Path) -> None:
@@ -66,7 +60,7 @@ def check_wavefront_file(path: Path) -> None:
     check_ending(path, *_WRITERS)
 
 
-def _csv(wavefront: Wavefront, dioptres: bool) -> str:
+def _csv(wavefront: Wavefront) -> str:
     unit = wavefront.unit if wavefront.unit in UNITS else "px_subaperture"
     names = [_column(int(j)) for j in wavefront.modes]
     header = ["frame", f"rms_{unit}", f"rms_without_tilt_{unit}", *(f"{name}_{unit}" for name in names)]
@@ -74,10 +68,6 @@ def _csv(wavefront: Wavefront, dioptres: bool) -> str:
     coefficients = np.concatenate([wavefront.mean[None], wavefront.coefficients])
     errors = np.concatenate([wavefront.mean_standard_error[None], wavefront.standard_errors])
     columns = [total(coefficients), total(coefficients, tilt=False), *coefficients.T, *errors.T]
-    if dioptres:
-        lens = refraction(wavefront, coefficients).values
-        header += lens
-        columns += lens.values()
     rows = []
     for number, values in enumerate(np.stack(columns, axis=1)):
         cells = (f"{value:.7g}" if np.isfinite(value) else "" for value in values)
@@ -91,7 +81,7 @@ def _column(j: int) -> str:
     return f"noll{j}_osa{osa_index(j)}_" + "_".join(re.findall(r"\w+", name))
 
 
-def _json(wavefront: Wavefront, dioptres: bool) -> str:
+def _json(wavefront: Wavefront) -> str:
     modes = [
         {
             "noll": int(j),
@@ -132,10 +122,6 @@ def _json(wavefront: Wavefront, dioptres: bool) -> str:
     }
     if wavefront.wavelength_nm is not None:
         values["wavelength_nm"] = wavefront.wavelength_nm
-    if dioptres:
-        values["mean"]["refraction"] = refraction(wavefront, wavefront.mean).values
-        values["mean"]["refraction_standard_error"] = refraction_error(wavefront).values
-        values["frames"]["refraction"] = refraction(wavefront, wavefront.coefficients).values
     return to_json({**values, "unknown": _unknown(wavefront)}, indent=1)
 
 
@@ -151,7 +137,7 @@ def _unknown(wavefront: Wavefront) -> dict[str, str]:
     return reasons
 
 
-def _fits(wavefront: Wavefront, dioptres: bool) -> bytes:
+def _fits(wavefront: Wavefront) -> bytes:
     fits = load_fits()
     unit = wavefront.unit if wavefront.unit in UNITS else "pixel"
     primary = fits.PrimaryHDU(wavefront.sheet().astype(np.float32))
@@ -166,9 +152,6 @@ def _fits(wavefront: Wavefront, dioptres: bool) -> bytes:
     primary.header["ERRFROM"] = (wavefront.errors_from, "source of the standard errors")
     if wavefront.wavelength_nm is not None:
         primary.header["WAVELEN"] = (wavefront.wavelength_nm, "length of a wave, nm")
-    if dioptres:
-        for key, value in zip(_LENS, refraction(wavefront, wavefront.mean).values.items(), strict=True):
-            primary.header[key] = (float(value[1]), f"{value[0]} of the mean")
     orders = np.array([noll_to_nm(int(j)) for j in wavefront.modes])
     columns = [
         fits.Column("NOLL", "J", array=wavefront.modes),
@@ -194,4 +177,4 @@ def _fits(wavefront: Wavefront, dioptres: bool) -> bytes:
     return stream.getvalue()
 
 
-_WRITERS: dict[str, Callable[[Wavefront, bool], str | bytes]] = {".csv": _csv, ".json": _json, ".fits": _fits}
+_WRITERS: dict[str, Callable[[Wavefront], str | bytes]] = {".csv": _csv, ".json": _json, ".fits": _fits}

@@ -6,7 +6,6 @@ import numpy as np
 
 from faintspot.base.statistics import rms
 from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
-from faintspot.slopes.wavefront.refraction import refraction, refraction_error
 from faintspot.slopes.wavefront.units import UNITS
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
 from faintspot.slopes.wavefront.zonal import ZonalMap, compared
@@ -52,24 +51,6 @@ def rms_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
     ]
     header = [f"rms over the pupil ({wavefront.unit})", "all modes", "no tip, tilt"]
     return [*header, "standard error", "no tip, tilt"], rows
-
-
-def refraction_line(wavefront: Wavefront) -> str:
-    """Return the refraction of an eye with the mean wavefront, with standard errors, in one sentence."""
-    value, error = refraction(wavefront, wavefront.mean), refraction_error(wavefront)
-    parts = []
-    for name, found in value.values.items():
-        words, unit = name.rsplit("_", 1)
-        digits, sign, unit = (2, "+", "D") if unit == "d" else (0, "", "°")
-        text, spread = f"{found:{sign}.{digits}f}".replace("-", "−"), error.values[name]
-        least = 10.0**-digits
-        known = f" ± {'< ' if spread < least else ''}{max(spread, least):.{digits}f}" if spread < 180 else ""
-        parts.append(f"{words.replace('_', ' ')} {text}{known} {unit}".replace(" °", "°"))
-    pupil_mm = 2e3 * float(wavefront.pupil.radius_m or 0.0)
-    return (
-        f"Refraction from the second order on a pupil of {pupil_mm:.3g} mm: {', '.join(parts)}. "
-        "The axis runs from +x (columns) towards +y (rows) of the frame."
-    )
 
 
 def remarks(wavefront: Wavefront) -> list[str]:
