@@ -136,5 +136,5 @@ def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (tmp_path / "study-figures" / "corrected-rms-diffraction.csv") in written
     html = written[0].read_text(encoding="utf-8")
     assert "What was found" in html
-    assert 'id="verdicts"' not in html
+    assert 'id="paper"' not in html
     assert html.count("<figcaption>") == 5

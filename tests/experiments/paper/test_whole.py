@@ -4,6 +4,7 @@ import pytest
 from tests.experiments.night_cases import night_with
 from tests.experiments.study_cases import dataset, power_law
 
+from faintspot.base.report.page import TableCell
 from faintspot.experiments.night.verdicts import OPEN
 from faintspot.experiments.paper.whole import (
     FAILS,
@@ -47,7 +48,7 @@ def test_a_night_alone() -> None:
     text = paper_markdown(rows)
     assert text.count("\n") == 2 + 4
     assert all(line.startswith("| ") and line.endswith(" |") for line in text.splitlines())
-    assert paper_section(rows).tables[0].rows[0][1] == rows[0].statement
+    assert paper_section(rows).tables[0].rows[0][1] == TableCell(rows[0].statement)
 
 
 def test_nothing_at_all() -> None:

@@ -32,8 +32,8 @@ class TestPage:
     def test_is_complete_and_in_order(self) -> None:
         html = study_report(of(paper_study(quick=True))).html()
         sections = re.findall(r'<section id="([^"]+)"', html)
-        assert sections[:5] == ["paper", "verdicts", "guidance", "baselines", "gains"]
-        assert sections[5:12] == ["fig1", "fig2", "fig3", "fig4", "fig5", "fig6", "fig7"]
+        assert sections[:4] == ["paper", "guidance", "baselines", "gains"]
+        assert sections[4:11] == ["fig1", "fig2", "fig3", "fig4", "fig5", "fig6", "fig7"]
         assert sections[-2:] == ["cases", "specification"]
         assert html.count('<tr><th scope="row">') >= 8
         assert "not finished" not in html
@@ -60,7 +60,7 @@ class TestPage:
         html = study_report(
             data.sel(estimator=["brightest", "smoothed"], estimator2=["brightest", "smoothed"])
         ).html()
-        assert "No verdicts" in html
+        assert "Nothing to judge" in html
 
 
 def test_study_without_a_finished_cell_is_refused() -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from faintspot.base.report.figure_data import csv_text
-from faintspot.base.report.page import Section, TableCell
+from faintspot.base.report.page import Section
 from faintspot.base.report.texts import Texts
 from faintspot.base.report.words import NOTHING
 from faintspot.experiments.curves import Gain, gain_at_error
@@ -17,8 +17,6 @@ from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV, label_of
 from faintspot.experiments.paper.claims import fixed_mode
 from faintspot.experiments.paper.judges import LEVEL_PX
 from faintspot.experiments.study.curves import (
-    Judgement,
-    Outcome,
     StudyConditions,
     Verdict,
     against_tv,
@@ -69,24 +67,6 @@ def table_of_cells(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[
                 if np.isfinite(values[0]):
                     rows.append([*parameters.values(), str(mode), str(method), *(f"{v:.6g}" for v in values)])
     return [*PARAMETERS, "mode", "method", "R_px", "R_se_px", *columns], rows
-
-
-_MOST_CASES_SHOWN = 3  # in the verdict table; the page lists all of them below it
-
-
-def verdicts_section(judged: list[Verdict], fixed: str) -> Section:
-    """Return the section of the verdicts; `fixed` names the mode of a fixed number of pixels."""
-    rows = [
-        [
-            TableCell(f"{item.number}. {item.claim}", small=item.rule),
-            TableCell(badge=item.outcome),
-            _cell_of_mode(item.best),
-            _cell_of_mode(item.fixed),
-        ]
-        for item in judged
-    ]
-    table = _TEXT.table("verdicts", rows, [fixed.capitalize()])
-    return _TEXT.section("verdicts", table, summary=_summary(judged, fixed), fixed=fixed)
 
 
 def cases_section(judged: list[Verdict]) -> Section:
@@ -156,29 +136,3 @@ def gains_by_mode(dataset: xarray.Dataset) -> dict[StudyConditions, dict[str, Ga
             gain = gain_at_error(curve, LEVEL_PX, rng, **TV_OVER_NO_TV) if curve.has(TV, NO_TV) else None
             table.setdefault(configuration, {})[str(mode)] = gain
     return {key: gains for key, gains in table.items() if any(gain is not None for gain in gains.values())}
-
-
-def _summary(judged: list[Verdict], fixed: str) -> str:
-    def counted(outcomes: list[Outcome]) -> str:
-        counts = [(outcome.value, outcomes.count(outcome)) for outcome in Outcome]
-        return ", ".join(f"{outcome} {n}" for outcome, n in counts if n)
-
-    best, at_fixed, together = (
-        counted([getattr(item, name).outcome if name else item.outcome for item in judged])
-        for name in ("best", "fixed", "")
-    )
-    return f"Of {len(judged)} claims: best k: {best}; {fixed}: {at_fixed}; both together: {together}"
-
-
-def _cell_of_mode(finding: Judgement) -> TableCell:
-    """Return a mode's outcome and its first cases, of different outcomes where there are any."""
-    shown = list({case.outcome: case for case in reversed(finding.cases)}.values())[::-1]
-    shown += [case for case in finding.cases if case not in shown]
-    shown = sorted(shown[:_MOST_CASES_SHOWN], key=list(finding.cases).index)
-    more = len(finding.cases) - len(shown)
-    return TableCell(
-        finding.in_words(),
-        finding.outcome,
-        items=[(f"{case.finding} – {case.outcome.value}", case.where) for case in shown],
-        link=("cases", f"and {more} more") if more else None,
-    )

@@ -29,6 +29,8 @@ class PaperRow:
     part: str
     """Figure or table."""
     statement: str
+    rule: str
+    """Rule that decides each case; "" for the night."""
     verdict: str
     condition: str
     """Cases in which it holds; "" where nothing is to be added."""
@@ -56,7 +58,7 @@ def paper_rows(dataset: xarray.Dataset | None, night: Night | None) -> list[Pape
         for each in night_verdicts(night):
             word = each.paired_outcome or each.outcome
             rows.append(
-                PaperRow(_TEXT["whole.night"], each.statement, word, "", _NIGHT("lines.number", each))
+                PaperRow(_TEXT["whole.night"], each.statement, "", word, "", _NIGHT("lines.number", each))
             )
     return rows
 
@@ -79,7 +81,7 @@ def paper_markdown(rows: Sequence[PaperRow]) -> str:
 def _row(part: str, verdict: Verdict, fixed: str) -> PaperRow:
     outcomes = {case.outcome for finding in (verdict.best, verdict.fixed) for case in finding.cases}
     if not outcomes:
-        return PaperRow(part, verdict.claim, NOT_MEASURED, "", "")
+        return PaperRow(part, verdict.claim, verdict.rule, NOT_MEASURED, "", "")
     condition = ""
     if outcomes == {Outcome.HOLDS}:
         word = HOLDS
@@ -92,7 +94,7 @@ def _row(part: str, verdict: Verdict, fixed: str) -> PaperRow:
         for name, finding in (("best k", verdict.best), (f"k = {fixed}", verdict.fixed))
         if finding.cases
     ]
-    return PaperRow(part, verdict.claim, word, condition, "; ".join(numbers))
+    return PaperRow(part, verdict.claim, verdict.rule, word, condition, "; ".join(numbers))
 
 
 def _share(finding: Judgement, where: str) -> str:

@@ -13,7 +13,7 @@ from faintspot.base.report.page import Report, Section, configuration_section
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.night.blocks import NIGHT_STORE, Night, load_night
 from faintspot.experiments.night.page import night_sections
-from faintspot.experiments.paper.claims import fixed_mode, guidance, verdicts
+from faintspot.experiments.paper.claims import guidance, verdicts
 from faintspot.experiments.paper.figures import (
     baselines_figure,
     kept_pixels_figure,
@@ -24,8 +24,6 @@ from faintspot.experiments.paper.tables import (
     baselines_section,
     cases_section,
     gains_section,
-    mode_in_words,
-    verdicts_section,
 )
 from faintspot.experiments.paper.whole import paper_rows, paper_section
 from faintspot.experiments.report.efficiency import compares_estimators, findings, result_sections
@@ -166,16 +164,14 @@ def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
 
 
 def _of_claims(dataset: xarray.Dataset, night: Night | None) -> list[Section]:
-    judged = verdicts(dataset)
     return [
         paper_section(paper_rows(dataset, night)),
-        verdicts_section(judged, mode_in_words(fixed_mode(dataset))),
         _TEXT.section("sections.guidance", *guidance(dataset)),
         baselines_section(dataset),
         gains_section(dataset),
         *_figure_sections(dataset),
         *([] if night is None else night_sections(night)),
-        cases_section(judged),
+        cases_section(verdicts(dataset)),
     ]
 
 

@@ -236,7 +236,6 @@ class Outcome(StrEnum):
     HOLDS = "holds"
     IN_PART = "holds in part"
     FAILS = "does not hold"
-    NOT_MEASURED = "not measured"
 
 
 @dataclass(frozen=True)
@@ -255,24 +254,6 @@ class Judgement:
     mode: str
     cases: Sequence[Case]
 
-    @property
-    def outcome(self) -> Outcome:
-        """Verdict on all cases together; see `combined`."""
-        return combined([case.outcome for case in self.cases])
-
-    def in_words(self) -> str:
-        """Return how many cases hold."""
-        if not self.cases:
-            return "no finished cells for it"
-        if len(self.cases) == 1:
-            return "one case"
-        counts = [sum(case.outcome is outcome for case in self.cases) for outcome in _COUNTED]
-        named = [f"{n} {outcome.value}" for n, outcome in zip(counts, _COUNTED, strict=True) if n]
-        return f"{len(self.cases)} cases: " + ", ".join(named)
-
-
-_COUNTED = (Outcome.HOLDS, Outcome.IN_PART, Outcome.FAILS)
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -283,22 +264,6 @@ class Verdict:
     rule: str
     best: Judgement
     fixed: Judgement
-
-    @property
-    def outcome(self) -> Outcome:
-        """Verdict on both modes together."""
-        measured = [item.outcome for item in (self.best, self.fixed) if item.cases]
-        return combined(measured)
-
-
-def combined(outcomes: Sequence[Outcome]) -> Outcome:
-    """Return the outcome of several: all hold, none does, or anything between."""
-    measured = [outcome for outcome in outcomes if outcome is not Outcome.NOT_MEASURED]
-    if not measured:
-        return Outcome.NOT_MEASURED
-    if all(outcome is Outcome.HOLDS for outcome in measured):
-        return Outcome.HOLDS
-    return Outcome.FAILS if all(outcome is Outcome.FAILS for outcome in measured) else Outcome.IN_PART
 
 
 def judged(holds: bool, in_part: bool) -> Outcome:
