@@ -11,7 +11,7 @@ export OPENBLAS_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint types unit slow fuzz docs release bench bench-compare pins clean
+.PHONY: help demo test test-all lint types unit optimised slow fuzz docs release bench bench-compare pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -33,6 +33,9 @@ types: $(VENV)/installed
 
 unit: $(VENV)/installed
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+
+optimised: $(VENV)/installed  ## inputs are checked without the assert statements that `python -O` leaves out
+	$(BIN)/python -O -m pytest -n 2 --dist worksteal -m "not slow" tests/base tests/loop/control/test_*.py
 
 slow: $(VENV)/installed  ## tests that start processes or a browser, or take longer
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow

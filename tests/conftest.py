@@ -7,10 +7,20 @@ compiles it. `pytest --hypothesis-profile=thorough --hypothesis-seed=N` draws 40
 import multiprocessing.process
 import signal
 import subprocess
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
-from tests.patience import USUAL_EXAMPLES
+
+# So that python -O leaves no assertion of a test out.
+HELPERS = [
+    path for path in Path(__file__).parent.rglob("*.py") if not path.name.startswith(("conf", "test_"))
+]
+pytest.register_assert_rewrite(
+    *(".".join(("tests", *path.relative_to(Path(__file__).parent).with_suffix("").parts)) for path in HELPERS)
+)
+
+from tests.patience import USUAL_EXAMPLES  # noqa: E402
 
 settings.register_profile(
     "default",

@@ -10,7 +10,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between
+from faintspot.base.checks import finite_array, not_none, number_between
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys
 from faintspot.slopes.camera.calibration import Calibration
@@ -258,14 +258,13 @@ class ToolSlopes:
 
     def _follow(self, flux_e: NDArray[np.float32]) -> None:
         """Add a frame's flux to the mean; rebuild the pipeline only now and then."""
-        assert self._flux_frames is not None
         self._frames += 1
         if self._flux is not None:
             self._flux = self._flux.updated(flux_e)
         elif self._frames < _FIRST_FRAMES:
             self._first_flux.append(flux_e)
         else:
-            self._flux = MeanFlux(np.array([*self._first_flux, flux_e]), self._flux_frames)
+            self._flux = MeanFlux(np.array([*self._first_flux, flux_e]), not_none(self._flux_frames))
             self._first_flux.clear()
         if self._flux is not None and self._frames % _FOLLOW_EVERY == 0:
             self.pipeline = self.pipeline.with_flux(self._flux)

@@ -7,7 +7,7 @@ the value, what it was and what was expected.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypedDict, Unpack
+from typing import Any, TypedDict, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,15 @@ from faintspot.base.errors import InputError
 LARGEST_FLOAT32 = 1e30
 LARGEST_FLOAT64 = 1e290
 _WHOLE = -(2.0**53), 2.0**53  # whole numbers that float64 holds
+
+_Value = TypeVar("_Value")
+
+
+def not_none(value: _Value | None) -> _Value:
+    """Return a value that must have been set before; a TypeError is an error of the program, not its user."""
+    if value is None:
+        raise TypeError("a value that must have been set before is None")
+    return value
 
 
 def real_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray[np.generic]:

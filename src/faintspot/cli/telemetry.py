@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.extras import require, require_linux
 from faintspot.base.files import derived, write_atomically
@@ -119,7 +120,7 @@ def command(
             config = config or "faintspot.toml"
             load_control(config)  # faults of the file are found before the recording
             _record(engine, recording, _SECONDS if seconds is None else seconds)
-        assert recording is not None
+        recording = not_none(recording)
         alternated = not one_loop and controller is None and _alternates(recording)
         if alternated:
             _report_night(recording, page, config, system, strehl, settle)

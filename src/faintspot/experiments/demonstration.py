@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import number_between
+from faintspot.base.checks import not_none, number_between
 from faintspot.base.statistics import Estimate, absolute_errors
 from faintspot.experiments.curves import Curve, Gain, gain_at_flux
 from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV
@@ -69,9 +69,7 @@ class Comparison:
             FLUXES_E,
             {method: np.stack([score.errors for score in scored]) for method, scored in errors.items()},
         )
-        gain = gain_at_flux(curve, SHOWN_FLUX_E, rng, **TV_OVER_NO_TV)
-        assert gain is not None  # the flux is one of the curve's
-        return gain
+        return not_none(gain_at_flux(curve, SHOWN_FLUX_E, rng, **TV_OVER_NO_TV))  # at one of its fluxes
 
 
 def demonstration_layout() -> Layout:

@@ -10,6 +10,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.base.errors import MissingExtraError
 
 try:
@@ -112,8 +113,7 @@ def note(axes: Axes, text: str, position: tuple[float, float], coordinates: str,
 def colour_bar(axes: Axes | list[Axes], mappable: Any, label: str, location: str = "right") -> None:
     """Add a colour bar to one or several axes."""
     first = axes[0] if isinstance(axes, list) else axes
-    figure = first.get_figure()
-    assert figure is not None
+    figure = not_none(first.get_figure())
     bar = figure.colorbar(mappable, ax=axes, label=label, location=location, shrink=0.85, pad=0.02, aspect=25)
     bar.outline.set_visible(False)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from faintspot.base.checks import not_none
 from faintspot.base.errors import MissingExtraError
 from faintspot.base.extras import present, require, require_linux
 
@@ -34,8 +35,7 @@ def needs_linux(command: click.Command) -> click.Command:
 
 def _check_first(command: click.Command, check: Callable[[str], None]) -> None:
     """Run a check, given the command's path, before a command's work."""
-    work = command.callback
-    assert work is not None
+    work = not_none(command.callback)
 
     @wraps(work)
     def checked(*arguments: object, **options: object) -> Any:

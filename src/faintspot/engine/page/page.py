@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.engine.page.batch import BatchSource
 from faintspot.engine.page.messages import packed
@@ -57,8 +58,7 @@ class Page:
 
     def _begin(self) -> None:
         """Clear data of another engine, or of another part of the recording."""
-        layout = self.source.layout
-        assert layout is not None
+        layout = not_none(self.source.layout)
         self.page_state = PageState(self.source.methods)
         if self._drawing is None or self._drawing.layout is not layout:
             self._drawing = FrameDrawing(layout)

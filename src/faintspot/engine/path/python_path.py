@@ -58,7 +58,8 @@ class PythonPath(FramePath):
     ) -> None:
         super().__init__(pipeline, *arguments, **options)
         prepared = pipeline.plan.prepared
-        assert isinstance(prepared, PythonPlan)
+        if not isinstance(prepared, PythonPlan):
+            raise TypeError(f"{pipeline.settings.estimator.name} is compiled: expected a FramePath")
         self._prepared, self._budget_s, self._failures = prepared, budget_s, 0
         self._images = self._stages[CALIBRATED, 0].reshape(-1, *pipeline.layout.window)
         self._requests: SimpleQueue[NDArray[np.float64] | None] = SimpleQueue()

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from faintspot.base.checks import number_between
+from faintspot.base.checks import not_none, number_between
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.readout import StopEvent
 from faintspot.engine.pixels.replay import ring_type
@@ -137,8 +137,7 @@ class StreamBridge:
 
     def _new_one(self) -> bool:
         """Wait for a publication; return False if none comes in time."""
-        source, last_count = self._follower.source, self._follower.seen
-        assert source is not None
+        source, last_count = not_none(self._follower.source), self._follower.seen
         end = self._arrived + self._spin_s
         while source.count == last_count:
             if time.monotonic() > end:
@@ -147,9 +146,8 @@ class StreamBridge:
 
     def _pass_on(self) -> bool:
         """Copy the newest publication into the ring; return whether it was whole."""
-        follower, source, ring, counters = self._follower, self._follower.source, self._ring, self.counters
-        assert source is not None
-        assert ring is not None
+        follower, counters = self._follower, self.counters
+        source, ring = not_none(follower.source), not_none(self._ring)
         expected = source.number
         slot = ring.begin(expected)
         with np.errstate(over="ignore"):  # values beyond float32 become infinite: bad pixels

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.engine.pixels.readout import StopEvent
 from faintspot.engine.streams.image_stream import ImageStreamWriter
@@ -70,8 +71,7 @@ class StreamOut:
         publication = follower.take(_PARK_S)
         if publication is None:
             return False
-        assert self._writer is not None
-        self._writer.publish(publication.values, publication.number)
+        not_none(self._writer).publish(publication.values, publication.number)
         self.counters.taken += 1
         return True
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, new_figure, styled
 from faintspot.base.report.figure_data import FigureWithData
@@ -234,8 +235,7 @@ def methods_figure(telemetry: Telemetry, values: Mapping[str, Sequence[MethodDif
     for name, compared in values.items():
         lines = []
         for row, method in enumerate(compared[1:]):
-            shift = method.difference
-            assert shift is not None
+            shift = not_none(method.difference)
             spread = [[shift.value - shift.low], [shift.high - shift.value]]
             style = {"fmt": "o", "color": METHOD_COLOURS[(row + 1) % len(METHOD_COLOURS)], "capsize": 3}
             lines.append(Line("", [shift.value], [row], style=style, x_error=spread))

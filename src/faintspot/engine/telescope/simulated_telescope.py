@@ -13,6 +13,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
 from faintspot.engine.pixels.pixel_ring import PixelRing
@@ -209,8 +210,7 @@ class SimulatedTelescope(Readout, Closing):
 
     def _publish(self, moment: int, frame: NDArray[np.generic]) -> None:
         """Read out one frame while the exposure of the next one begins."""
-        number, exposure = self._next, self._last
-        assert exposure is not None
+        number, exposure = self._next, not_none(self._last)
         self._underway = self._begin(number + 1)
         super()._publish(moment, frame)
         self._truth.write_locked(np.array(exposure.truth), frame_id=number)

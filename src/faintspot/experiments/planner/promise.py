@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.base.generators import spawn
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.planner.question import Question
@@ -179,8 +180,7 @@ def check_promises(
         mean = _simulated(question, fitted.psf, positions, flux_e).reshape(images.shape)
         exposed = np.asarray(camera.to_electrons(camera.expose(mean, noise)), np.float64)
         exposed_images.append(exposed - question.background_e)
-    assert question.layout is not None
-    truth = positions.reshape(*images.shape[:2], 2) - question.layout.offsets
+    truth = positions.reshape(*images.shape[:2], 2) - not_none(question.layout).offsets
     promises = {}
     for name, (method, promised_px) in methods.items():
         first, second, *simulated = (_measure(question, method, part) for part in (*pair, *exposed_images))
@@ -236,11 +236,8 @@ def images_e(frames: NDArray[np.generic], layout: Layout, calibration: Calibrati
 
 def _recorded(question: Question) -> tuple[Floats, LearntPSF]:
     """Images (n_frames, n, ny, nx) of the recording in photo-electrons, and the spots fitted to them."""
-    layout, calibration = question.layout, question.calibration
-    assert layout is not None
-    assert calibration is not None
-    assert question.recording is not None
-    images = images_e(question.recording[: frames_to_check(layout)], layout, calibration)
+    layout, calibration = not_none(question.layout), not_none(question.calibration)
+    images = images_e(not_none(question.recording)[: frames_to_check(layout)], layout, calibration)
     psf = question.psf
     if psf is None:
         psf = PSF.analytic(question.profile, size=question.size, radius_px=max(question.shape))
@@ -252,9 +249,9 @@ def _recorded(question: Question) -> tuple[Floats, LearntPSF]:
 
 def _spot_positions(question: Question, fitted: LearntPSF) -> Floats:
     """Positions (n, 2) of spots that vary as the recorded ones do, without the noise of their positions."""
-    assert question.layout is not None
-    n_frames, reach = len(fitted.positions) // len(question.layout), question.search_range_px
-    middle = np.tile(question.layout.offsets, (n_frames, 1))
+    layout = not_none(question.layout)
+    n_frames, reach = len(fitted.positions) // len(layout), question.search_range_px
+    middle = np.tile(layout.offsets, (n_frames, 1))
     offsets = np.clip(fitted.positions - middle, -reach, reach)
     mean, noise = offsets.mean(axis=0), np.mean(np.square(fitted.standard_error_px), axis=0)
     share = np.sqrt(np.maximum(1 - noise / np.maximum(offsets.var(axis=0), 1e-12), 0.0))
@@ -264,9 +261,9 @@ def _spot_positions(question: Question, fitted: LearntPSF) -> Floats:
 
 def _simulated(question: Question, psf: PSF, positions: Floats, flux_e: float) -> Floats:
     """Mean images (n, ny, nx) of simulated spots, electrons."""
-    assert question.layout is not None
-    relative = np.ones(len(question.layout)) if question.relative_flux is None else question.relative_flux
-    flux = flux_e * np.tile(relative, len(positions) // len(question.layout))
+    layout = not_none(question.layout)
+    relative = np.ones(len(layout)) if question.relative_flux is None else question.relative_flux
+    flux = flux_e * np.tile(relative, len(positions) // len(layout))
     return np.maximum(psf.images(positions, question.shape, flux), 0.0)
 
 
@@ -306,7 +303,6 @@ def _dealt(
 
 def _measure(question: Question, method: Method, images: Floats) -> Floats:
     """Slopes (n_frames, n, 2) of images as the pipeline measures them."""
-    assert question.layout is not None
     n_frames, n, ny, nx = images.shape
     # Images are in photo-electrons: the multiplication that is divided out only says how noisy they are.
     camera = Calibration(
@@ -317,7 +313,7 @@ def _measure(question: Question, method: Method, images: Floats) -> Floats:
     )
     windows = Layout.grid((n, 1), pixels=(ny, nx))
     pipeline = SlopePipeline(
-        windows, method.settings, camera, reference=question.layout.offsets, **method.parts
+        windows, method.settings, camera, reference=not_none(question.layout).offsets, **method.parts
     )
     return _positions(pipeline(images.reshape(n_frames, n * ny, nx).astype(np.float32)))
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.base.config.options import TEXT, Options, number, setting
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys, checked_table, parse_file
@@ -295,8 +296,7 @@ class Question(Options):
         """Flux of the star, electrons per sub-aperture and frame."""
         if self.flux_e is not None:
             return float(self.flux_e)
-        assert self.photometry is not None
-        return float(self.photometry.electrons(self.magnitude))
+        return float(not_none(self.photometry).electrons(self.magnitude))
 
     @property
     def subject(self) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array
+from faintspot.base.checks import finite_array, not_none
 from faintspot.base.errors import InputError
 from faintspot.experiments.planner.promise import frames_to_check, images_e
 from faintspot.experiments.planner.question import (
@@ -293,8 +293,7 @@ def _range(images: NDArray[Any], calibration: Calibration, fitted: LearntPSF, la
     fluxes = fitted.flux_e.reshape(-1, n)
     relative = _relative_flux(fitted, n, [])
     flux = fluxes.mean() * (np.ones(n) if relative is None else relative)
-    noise = calibration.read_noise_photoelectrons
-    assert noise is not None
+    noise = not_none(calibration.read_noise_photoelectrons)
     excess = calibration.excess_noise
     dark = noise**2 + excess * max(background, calibration.background_e, 0.0)
     repeated = np.tile(layout.offsets, (len(fluxes), 1)), np.tile(flux, len(fluxes))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.base.statistics import OUTLIER_PX, slope_statistics
 from faintspot.experiments.methods import keeps_every_k, knows_the_spot
 from faintspot.experiments.study.cell_methods import (
@@ -157,7 +158,7 @@ def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDA
             methods = CellMethods(cell, specification, float(flux.mean()))
             tuning = Tuning(methods)
         tuning.add(stack)
-    assert methods is not None
+    methods = not_none(methods)
     scores = Scores(methods, tuning.choices())
     for stack in _stacks(realisations(cell, specification.realisations - half, rng), cell.pixels):
         scores.add(stack)

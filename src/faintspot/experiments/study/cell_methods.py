@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.experiments.methods import Kind, keeps_every_k
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.camera.calibration import Calibration
@@ -243,8 +244,7 @@ def _brightest_first(images: Images) -> NDArray[np.int64]:
 
 def _prepared(estimator: KeepingBrightest, images: Images) -> Images:
     """Return the images (n, pixels) in which the brightest pixels are found."""
-    denoised = estimator.denoised(images)
-    assert denoised is not None
+    denoised = not_none(estimator.denoised(images))
     return np.ascontiguousarray(denoised).reshape(len(images), -1)
 
 

@@ -195,7 +195,7 @@ class Control:
                 raise InputError(f"expected positions up to {_LARGEST_SLOPE_PX:g} px", name=REFERENCE)
         object.__setattr__(self, "interaction", matrix)
         object.__setattr__(self, "reference", reference)
-        assert self.reconstructor  # refuses a matrix that cannot be inverted
+        _ = self.reconstructor  # refuses a matrix that cannot be inverted
         object.__setattr__(self, "model", self._checked_model())
 
     def _checked_model(self) -> object:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import mean_by_blocks
 from faintspot.loop.control.base import SETTLE_FRAMES
@@ -99,12 +100,12 @@ def compared_choices(
         When there are too few frames, or the mirror cannot be controlled by the slopes.
     """
     frames = len(open_loop.telemetry)
-    assert loop.interaction_matrix is not None
+    interaction_matrix = not_none(loop.interaction_matrix)
     if frames < FEWEST_FRAMES:
         raise InputError(f"{frames} frames, expected {FEWEST_FRAMES} for a replay")
-    reconstructor = make_reconstructor(loop.interaction_matrix)
-    plant = LoopPlant(loop.interaction_matrix, reconstructor, max(1, round(delay.delay_frames)), _LEAK)
-    phase = residual_phase(reconstructor.clean, loop.interaction_matrix, loop.cells)
+    reconstructor = make_reconstructor(interaction_matrix)
+    plant = LoopPlant(interaction_matrix, reconstructor, max(1, round(delay.delay_frames)), _LEAK)
+    phase = residual_phase(reconstructor.clean, interaction_matrix, loop.cells)
     gain_error = float(np.nan_to_num(delay.gain_error)) / delay.gain
     views = [_View.of(slopes, phase) for slopes in (open_loop, open_loop.scaled(1 + gain_error))]
     relative = float(np.nanmean(open_loop.variance_error)) / math.sqrt(len(reconstructor.modes.T))

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import LARGEST_FLOAT32
+from faintspot.base.checks import LARGEST_FLOAT32, not_none
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Positions
@@ -156,12 +156,12 @@ class PythonPlan(EstimatorPlan):
         if found is None:
             nowhere = np.full(self.sensor.n, np.nan)
             found = Positions(nowhere, nowhere, nowhere)
-        assert found.flux is not None
+        flux = not_none(found.flux)
         ny, nx = self.sensor.window
         usable = (np.abs(found.x) <= 0.5 * nx) & (np.abs(found.y) <= 0.5 * ny)  # false for NaN, too
-        usable &= np.abs(found.flux) <= LARGEST_FLOAT32
+        usable &= np.abs(flux) <= LARGEST_FLOAT32
         usable &= True if found.valid is None else found.valid != 0
-        slopes.flux[frame] = np.where(usable, found.flux, 0.0)
+        slopes.flux[frame] = np.where(usable, flux, 0.0)
         usable &= table[groups.ERROR_SCALE] > 0  # else known to be dark
         flags = slopes.flags[frame]
         flags &= ~_NO_FLUX

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import number_between, numbers_between, real_array
+from faintspot.base.checks import not_none, number_between, numbers_between, real_array
 from faintspot.base.errors import InputError
 
 _LEAST_FLUX_E = 1e-3
@@ -75,8 +75,7 @@ class MeanFlux:
         flux = real_array("flux_e", flux_e)
         if flux.shape != self.flux_e.shape:
             raise InputError(f"flux_e: expected shape {self.flux_e.shape}, got {flux.shape}")
-        assert self.frames is not None
-        frames = min(self.frames + 1.0, self.time_constant_frames)
+        frames = min(not_none(self.frames) + 1.0, self.time_constant_frames)
         change = np.where(np.isfinite(flux), flux - self.flux_e, 0.0) / frames
         return replace(self, flux_e=self.flux_e + change, frames=frames)
 

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, numbers_between
+from faintspot.base.checks import finite_array, not_none, numbers_between
 from faintspot.base.config.options import REQUIRED, Options, number, setting
 
 # Flux density (Jy) at magnitude 0 and relative width of the band: Bessell 1979 (PASP 91, 589) for B to I,
@@ -88,8 +88,7 @@ class Photometry(Options):
     @property
     def electrons_at_zero(self) -> float:
         """Electrons per sub-aperture and frame of a star of magnitude 0."""
-        assert self.zero_point is not None
-        flux = self.zero_point * self.area_m2 * self.frame_time_s
+        flux = not_none(self.zero_point) * self.area_m2 * self.frame_time_s
         return flux * self.throughput * self.quantum_efficiency
 
     def electrons(self, magnitude: ArrayLike) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import number_between, numbers_between, one_of, real_array
+from faintspot.base.checks import not_none, number_between, numbers_between, one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.algorithms.noise import pixel_noise
@@ -243,10 +243,8 @@ def fit_spots(
     for _ in range(_BACKGROUND_ROUNDS):
         background = float(np.median(np.mean((stack.images - wings)[:, border], axis=1)))
         state = registered(stack, index, replace(state, background_e=np.array([background])), options)
-        assert state.spots is not None
-        wings = single.images(state.spots.positions, shape, state.spots.flux_e)
-    spots = state.spots
-    assert spots is not None
+        spots = not_none(state.spots)
+        wings = single.images(spots.positions, shape, spots.flux_e)
     return LearntPSF(single, state.background_e, spots.positions, spots.flux_e, spots.error_px)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.training.psf_fit import FIRST_FORM, Form, choose_form, fit_psf, samples_of
@@ -126,14 +127,14 @@ def stacked(
     rng: np.random.Generator,
 ) -> tuple[list[tuple[Sums, Sums]], NDArray[np.int64]]:
     """Return the sums of both halves of each PSF's spots, and how many spots are in them."""
-    assert state.spots is not None
-    good = bright_enough(state.spots)
+    spots = not_none(state.spots)
+    good = bright_enough(spots)
     count = np.bincount(index[good], minlength=len(state.psf.samples))
     sums = stack_spots(
         stack.part(good),
         PSFTables.of(state.psf, options.radius_px),
         index[good],
-        state.spots.part(good),
+        spots.part(good),
         state.background_e,
         halves[good],
         draws,

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.checks import finite_array, not_none, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.slopes.spots.laser import LaserGuideStar
 from faintspot.slopes.spots.sodium import SodiumProfile
@@ -103,16 +103,15 @@ class MeanImages:
         new = MeanImages(images_e, slopes_px, frames=frames)
         if new.images_e.shape != self.images_e.shape:
             raise InputError(f"images_e: expected shape {self.images_e.shape}, got {new.images_e.shape}")
-        assert self.frames is not None
-        assert new.frames is not None
+        frames = not_none(new.frames)
         part = max(
-            new.frames / (self.frames + new.frames), 1.0 - np.exp(-new.frames / self.time_constant_frames)
+            frames / (not_none(self.frames) + frames), 1.0 - np.exp(-frames / self.time_constant_frames)
         )
         return replace(
             self,
             images_e=self.images_e + part * (new.images_e - self.images_e),
             slopes_px=self.slopes_px + part * (new.slopes_px - self.slopes_px),
-            frames=new.frames / part,
+            frames=frames / part,
         )
 
 
@@ -279,7 +278,7 @@ def fit_spot(
 def _weights(flux: Floats, shapes: Floats, dark: Floats, measured: Floats, frames: float | None) -> Floats:
     """Return the inverse variance of each pixel of the mean images."""
     least = _LEAST_VARIANCE * float(measured.mean())
-    assert frames is not None
+    frames = not_none(frames)
     weights: Floats = frames / np.maximum(flux[:, None] * shapes + dark, least)
     return weights
 

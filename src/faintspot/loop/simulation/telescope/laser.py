@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.telescope.wavefront_sensor import ShackHartmann
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
@@ -30,8 +31,7 @@ def laser_guide_star(
     configuration: LoopConfiguration, cells: NDArray[np.int64], spot_fwhm_arcsec: float
 ) -> LaserGuideStar:
     """Return the star as sub-apertures see it, with a Gaussian spot at a single altitude."""
-    laser = configuration.laser
-    assert laser is not None
+    laser = not_none(configuration.laser)
     pixel_arcsec = configuration.pixel_scale_rad / ARCSEC
     return LaserGuideStar(
         subaperture_centres_m(configuration, cells),
@@ -60,9 +60,8 @@ class ElongatedShackHartmann(ShackHartmann):
     def spots(self, wavefront_nm: NDArray[np.floating], displacement_px: float = 0.0) -> Floats:
         """See `ShackHartmann.spots`."""
         fine = super().spots(wavefront_nm, displacement_px)
-        n, nodes, pixels = len(fine), fine.shape[-1], self.along_x.shape[-1]
+        n, pixels = len(fine), self.along_x.shape[-1]
         rows = np.matmul(self.along_y, fine).reshape(n, pixels, -1)
-        assert rows.shape[-1] % nodes == 0
         images: Floats = np.matmul(rows, self.along_x)
         return np.maximum(images, 0.0)  # of splines and truncated sums
 
@@ -79,8 +78,7 @@ class LaserSource:
     """
 
     def __init__(self, configuration: LoopConfiguration, sensor: ShackHartmann) -> None:
-        laser = configuration.laser
-        assert laser is not None
+        laser = not_none(configuration.laser)
         self._laser, self._rate_hz = laser, configuration.control.frame_rate_hz
         self._fine = _with_nodes(configuration, sensor)
         star = laser_guide_star(configuration, sensor.layout.cells, laser.spot_fwhm_arcsec)

@@ -90,11 +90,10 @@ def require_hcipy(purpose: str) -> ModuleType:
 def make_pupil(configuration: LoopConfiguration) -> PupilAmplitude:
     """Return the pupil of a configuration, sampled for its sensor."""
     hcipy = require_hcipy("the closed loop")
-    telescope, sensor = configuration.telescope, configuration.sensor
+    telescope = configuration.telescope
     aperture = hcipy.make_obstructed_circular_aperture(telescope.diameter_m, telescope.obstruction)
     grid = pupil_grid(configuration)
     amplitude = hcipy.evaluate_supersampled(aperture, grid, _SUPERSAMPLING).shaped
-    assert len(amplitude) == sensor.subapertures * sensor.samples
     return PupilAmplitude(np.ascontiguousarray(amplitude, np.float32), configuration.width_m)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.telescope.laser import laser_guide_star
@@ -55,8 +56,7 @@ def learn_sodium(
     seed : int
         Of the noise of the mean.
     """
-    laser, scene = configuration.laser, configuration.scene
-    assert laser is not None
+    laser, scene = not_none(configuration.laser), configuration.scene
     dark = scene.dark_noise_e**2
     mean_e = configuration.photons * spots.mean(axis=0, dtype=np.float64)
     rng = np.random.default_rng([seed, _OF_LEARNING])
@@ -83,8 +83,7 @@ class FollowedSodium:
     """
 
     def __init__(self, configuration: LoopConfiguration, layout: Layout, sodium: KnownSodium) -> None:
-        assert configuration.laser is not None
-        self._laser, self._layout = configuration.laser, layout
+        self._laser, self._layout = not_none(configuration.laser), layout
         camera = configuration.camera
         background = camera.background_e + camera.dark_e
         self._scale = camera.gain_e_per_adu / camera.em_gain

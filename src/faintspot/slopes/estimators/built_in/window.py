@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.base.config.options import Value, option
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Need, Style
@@ -223,8 +224,7 @@ class _Plan(EstimatorPlan):
 
     def _row_tables(self, whole: window.WindowTables) -> window.RowTables:
         """Return the tables of `window_in_rows`: weights times gain, and the contribution of the dark."""
-        assert self._columns is not None
-        sensor, (width, left, columns) = self.sensor, self._columns
+        sensor, (width, left, columns) = self.sensor, not_none(self._columns)
         top, bottom = whole.top, whole.top + whole.rows
         maps = sensor.layout.images(sensor.calibration.maps(sensor.layout.frame_shape))
         dark, scale = maps[:, :, top:bottom, left : left + columns]
