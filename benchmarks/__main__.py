@@ -1,6 +1,7 @@
 """Benchmarks: `python -m benchmarks [NAME ...]`, `... compare [OLD NEW]`, in the root.
 
-A run prints its tables and writes them, with the machine and the versions, as JSON.
+A run prints its tables and writes them, with the machine and the versions, as JSON;
+those of benchmarks that are named also to docs/results/data, from where the documentation takes its figures.
 """
 
 from __future__ import annotations
@@ -76,8 +77,17 @@ _FOLDER = click.option(
 @click.argument("names", nargs=-1, type=click.Choice(NAMES))
 @click.option("--full", is_flag=True, help=f"With {', '.join(sorted(LONG))}, too.")
 @_FOLDER
-def run(names: tuple[str, ...], full: bool, folder: Path) -> None:
+@click.option(
+    "--pages",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=results.PAGES,
+    show_default=True,
+    help="Where benchmarks that are named write what the pages of the documentation show.",
+)
+def run(names: tuple[str, ...], full: bool, folder: Path, pages: Path) -> None:
     """Run the benchmarks NAMES, by default all but the long ones.
+
+    Tables of benchmarks that are named go to the documentation, too.
 
     `python -m benchmarks compare` says what changed since the run before.
     """
@@ -92,6 +102,8 @@ def run(names: tuple[str, ...], full: bool, folder: Path) -> None:
             click.echo(f"\n[{count}/{len(chosen)}] {name} ...")
             found.benchmarks.append(measured(name))
             results.write(found, folder)
+            if names and not found.benchmarks[-1].failure:
+                click.echo(results.publish(found, found.benchmarks[-1], pages))
             _show(found.benchmarks[-1])
     finally:  # an interrupted run keeps what is finished
         if found.benchmarks:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from benchmarks.machine import short
 from benchmarks.measuring import Row, Table
+from benchmarks.showing import grid
 
 FOLDER = Path(__file__).with_name("results")
+PAGES = Path(__file__).parents[1] / "docs" / "results" / "data"
+"""What the pages of the documentation show: one file a page or benchmark."""
 FORMAT = 2
 
 
@@ -82,6 +86,35 @@ def read(path: Path) -> Results:
         raise ResultsError(f"{path}: {error.strerror}") from None
     except (ValueError, KeyError, TypeError, AttributeError):
         raise ResultsError(f"{path}: not the results of benchmarks") from None
+
+
+def publish(results: Results, benchmark: Benchmark, folder: Path = PAGES) -> Path:
+    """Write the tables of a benchmark to the file that the pages take their figures from; return its path.
+
+    What the file holds besides, such as the answer and tables of other commands, stays.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{benchmark.name}.json"
+    data = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"tables": {}}
+    for table in benchmark.tables:
+        columns, rows = grid(table)
+        name = table.name.replace("-", "_")
+        data["tables"][name] = {
+            "title": table.title,
+            "configuration": data["tables"].get(name, {}).get("configuration", f"{table.title}:"),
+            "command": f"python -m benchmarks {benchmark.name}",
+            "processor": results.fingerprint["processor"],
+            "version": results.versions["faintspot"],
+            "measured": results.started[:10],
+            "columns": columns,
+            "rows": rows,
+            "notes": table.notes,
+        }
+    text = json.dumps(data, ensure_ascii=False, indent=1)
+    text = re.sub(r"\n {4,5}(?=[^ \[{}\]])", " ", text)  # a row of a table is a line
+    text = re.sub(r"\n {4}\]", "]", text).replace('[ "', '["')
+    path.write_text(f"{text}\n", encoding="utf-8")
+    return path
 
 
 def newest_first(folder: Path) -> list[Path]:

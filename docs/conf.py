@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from importlib.metadata import version as version_of
@@ -42,9 +43,36 @@ extensions = [
 exclude_patterns = ["reference/options/*", "tutorials/GALLERY_HEADER.rst", "**sg_execution_times.rst"]
 nitpicky = False
 
-myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_enable_extensions = ["colon_fence", "dollarmath", "substitution"]
 myst_heading_anchors = 4
 suppress_warnings = ["config.cache", "myst.header"]
+
+
+def _table(table: dict[str, Any]) -> str:
+    """Return a stored table as Markdown: how it was measured, its cells, and when and where."""
+    head, *rows = [f"| {' | '.join(row)} |" for row in (table["columns"], *table["rows"])]
+    grid = "\n".join([head, "|" + "---|" * len(table["columns"]), *rows])
+    command = f"`{table['command']}`, " if table["command"] else ""
+    origin = f"*{command}{table['measured']}, version {table['version']}; processor: {table['processor']}.*"
+    return f"{table['configuration']}\n\n{grid}\n\n{origin}"
+
+
+def _results() -> dict[str, dict[str, str]]:
+    """Return the stored results: `{{ page.name }}` is the figure or the table of that name."""
+    found = {}
+    for path in sorted((HERE / "results/data").glob("*.json")):
+        data = json.loads(path.read_text(encoding="utf-8"))
+        tables = {name: _table(table) for name, table in data["tables"].items()}
+        found[path.stem] = {
+            **data.get("figures", {}),
+            **tables,
+            "answer": data.get("answer", ""),
+            "question": data.get("question", ""),
+        }
+    return found
+
+
+myst_substitutions = _results()
 
 templates_path = ["_templates"]
 smartquotes_action = "qe"  # "--option" stays as it is typed

@@ -1,6 +1,8 @@
 """Results of benchmarks survive being written and read, and an interrupted run keeps what was finished."""
 
+import json
 import sys
+from datetime import date
 from pathlib import Path
 from types import ModuleType
 
@@ -37,9 +39,16 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, f"benchmarks.{name}", module)
 
 
+def options(folder: Path) -> list[str]:
+    """Return options that write into a folder only."""
+    return ["--folder", str(folder), "--pages", str(folder / "pages")]
+
+
 @pytest.mark.usefixtures("made_up")
 def test_a_benchmark_that_fails_does_not_end_the_others(tmp_path: Path) -> None:
-    answer = CliRunner().invoke(command.run, ["scale", "rivals", "--folder", str(tmp_path)])
+    answer = CliRunner().invoke(
+        command.run, ["scale", "rivals", "--folder", str(tmp_path), "--pages", str(tmp_path / "pages")]
+    )
     assert answer.exit_code == 1
     assert "[2/2] rivals" in answer.output
     (path,) = results.newest_first(tmp_path)
@@ -48,8 +57,29 @@ def test_a_benchmark_that_fails_does_not_end_the_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("made_up")
+def test_named_benchmarks_write_what_the_pages_show(tmp_path: Path) -> None:
+    pages = tmp_path / "pages"
+    pages.mkdir()
+    kept = {"title": "Other", "rows": [["a", "1"]]}
+    (pages / "rivals.json").write_text(json.dumps({"answer": "fast", "tables": {"other": kept}}))
+    assert CliRunner().invoke(command.run, ["rivals", *options(tmp_path)]).exit_code == 0
+    data = json.loads((pages / "rivals.json").read_text())
+    assert data["answer"] == "fast"
+    assert data["tables"].pop("other") == kept
+    (table,) = data["tables"].values()
+    expected = cases.rivals_table()
+    assert [row[0] for row in table["rows"]] == [row.name for row in expected.rows]
+    assert table["columns"][1] in expected.rows[0].values
+    assert table["measured"] == date.today().isoformat()
+    assert table["processor"] == machine.fingerprint()["processor"]
+    assert table["command"] == "python -m benchmarks rivals"
+
+
+@pytest.mark.usefixtures("made_up")
 def test_an_interrupted_run_keeps_what_was_finished(tmp_path: Path) -> None:
-    answer = CliRunner().invoke(command.run, ["rivals", "estimators", "--folder", str(tmp_path)])
+    answer = CliRunner().invoke(
+        command.run, ["rivals", "estimators", "--folder", str(tmp_path), "--pages", str(tmp_path / "pages")]
+    )
     assert answer.exit_code == 1
     (path,) = results.newest_first(tmp_path)
     assert [each.name for each in results.read(path).benchmarks] == ["rivals"]

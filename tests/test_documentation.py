@@ -1,10 +1,13 @@
-"""Every block of Python in README and docs runs, with what its page takes for granted; tables are whole."""
+"""Python in README and docs runs, with what its page takes for granted; figures are those stored."""
 
+import json
 import re
 import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterable
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -168,3 +171,66 @@ def test_package_page_links_to_no_file() -> None:
     assert re.findall(r"\]\((?!https://)[^)]*\)", page) == []
     assert "A noisy frame" not in page
     assert "200 electrons a spot" not in page  # what the picture shows
+
+
+RESULTS = ROOT / "docs" / "results"
+DATA = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in (RESULTS / "data").glob("*.json")}
+FIGURE = re.compile(r"\d+\.\d+|\d+(?= %)")
+"""A number that was measured: a decimal fraction or a percentage."""
+TAKEN = re.compile(r"\{\{ *(\w+)\.(\w+) *\}\}")
+NO_FIGURE = re.compile(r"```.*?^```|`[^`]*`|\]\([^)]*\)|https?://\S+|\{\{.*?\}\}", re.DOTALL | re.MULTILINE)
+
+
+def figures(text: str) -> set[str]:
+    """Return the numbers that a text states, code and addresses left out."""
+    return set(FIGURE.findall(NO_FIGURE.sub(" ", text)))
+
+
+def stored(names: Iterable[str]) -> set[str]:
+    """Return the numbers of stored results."""
+    return set().union(*(FIGURE.findall(json.dumps(DATA[name], ensure_ascii=False)) for name in names))
+
+
+def blocks_of_text(text: str) -> list[str]:
+    """Return the paragraphs, each with the table that follows it."""
+    return re.split(r"\n\s*\n(?!\|)|\n(?=- )", text)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_pages_take_only_figures_that_are_stored(page: Path) -> None:
+    taken = TAKEN.findall(page.read_text(encoding="utf-8"))
+    stored_keys = {
+        (name, key)
+        for name, data in DATA.items()
+        for key in ("question", "answer", *data.get("figures", ()), *data["tables"])
+    }
+    assert set(taken) - stored_keys == set()
+
+
+@pytest.mark.parametrize("page", sorted(RESULTS.glob("*.md")), ids=lambda page: page.stem)
+def test_pages_of_results_name_no_figure_that_the_data_do_not_have(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert figures(text) - stored({name for name, _ in TAKEN.findall(text)}) == set()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_a_paragraph_with_a_link_to_results_names_only_their_figures(page: Path) -> None:
+    unknown = {}
+    for block in blocks_of_text(page.read_text(encoding="utf-8")):
+        names = {*re.findall(r"results/(\w+)\.md", block), *(name for name, _ in TAKEN.findall(block))}
+        if found := figures(block) - stored(names & set(DATA)) if names & set(DATA) else set():
+            unknown[block[:60]] = found
+    assert unknown == {}
+
+
+@pytest.mark.parametrize("name", sorted(DATA))
+def test_an_answer_names_no_figure_that_its_tables_do_not_have(name: str) -> None:
+    data = DATA[name]
+    assert figures(data["answer"]) <= set(
+        FIGURE.findall(json.dumps([data["tables"], data["notes"], data["figures"]]))
+    )
+    for table in data["tables"].values():
+        date.fromisoformat(table["measured"])
+        assert table["processor"]
+        assert table["version"]
+        assert {len(row) for row in table["rows"]} == {len(table["columns"])}

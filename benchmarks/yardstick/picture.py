@@ -1,7 +1,8 @@
-"""Picture of the page's first table: `python -m benchmarks.yardstick.picture docs/results/yardstick.md`."""
+"""Picture of the stored table: `python -m benchmarks.yardstick.picture docs/results/data/yardstick.json`."""
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -10,19 +11,14 @@ from faintspot.base.report.drawing import new_figure
 MARKERS = "os^D"
 
 
-def rows_of(text: str) -> list[list[str]]:
-    """Return the cells of the first table of candidates, its head first."""
-    lines = text[text.index("| candidate |") :].split("\n\n")[0].splitlines()
-    rows = [[cell.replace("`", "").strip() for cell in line.strip("|").split("|")] for line in lines]
-    return [rows[0], *rows[2:]]
-
-
 def draw(path: Path) -> Path:
     """Draw the photon efficiency of every candidate for spots of each origin, the best on top."""
-    (_, *origins), *rows = rows_of(path.read_text(encoding="utf-8"))
-    origins = origins[: len(MARKERS)]
+    table = json.loads(path.read_text(encoding="utf-8"))["tables"]["yardstick"]
+    origins = table["columns"][1 : len(MARKERS) + 1]
     found = {
-        row[0]: [float(cell.split(" ")[0]) for cell in row[1 : len(origins) + 1]] for row in rows if row[1]
+        row[0].replace("`", ""): [float(cell.split(" ")[0]) for cell in row[1 : len(origins) + 1]]
+        for row in table["rows"]
+        if row[1]
     }
     names = sorted(found, key=lambda name: sum(found[name]))
     figure = new_figure(7.5, 0.32 * len(names) + 1.2)
@@ -33,7 +29,7 @@ def draw(path: Path) -> Path:
     axes.set_xlabel("photon efficiency, 1: Cramer-Rao bound")
     axes.grid(alpha=0.3)
     axes.legend(loc="upper left", frameon=False)
-    picture = path.with_suffix(".png")
+    picture = path.parents[1] / f"{path.stem}.png"
     figure.savefig(picture, dpi=110)
     return picture
 

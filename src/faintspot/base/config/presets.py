@@ -2,7 +2,7 @@
 
 "accurate" iterates until further iterations have little effect. "fast" makes a small fixed number of
 iterations. Its slope error is within 1 % of the converged one at the strength that suits the spots;
-exceptions are listed in docs/results/iterations.md.
+exceptions are listed in docs/results/tv_settings.md.
 """
 
 from __future__ import annotations

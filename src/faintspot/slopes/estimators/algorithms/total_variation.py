@@ -105,7 +105,7 @@ def tv_denoise(
         deviation, ``||u - u_24|| <= tolerance * ||u - mean(u)||`` with ``u_24`` of 24 iterations before and
         the present multiplier; tested every 24 iterations. 0 never stops early. With the default, 0.0025,
         the slope error is nearly always within 1 % of the converged one, whatever number of pixels is kept:
-        docs/results/iterations.md.
+        docs/results/tv_settings.md.
         Tolerances of different algorithms and
         packages are not comparable: "chambolle" changes less in an iteration and stops farther from the
         solution.

@@ -66,7 +66,7 @@ class TotalVariation(KeepingBrightest):
     preset: str = option(
         "accurate",
         '"fast": 8 denoising iterations for every image, so that the run time is constant. Its accuracy is '
-        "given in docs/results/iterations.md.",
+        "given in docs/results/tv_settings.md.",
         choices=PRESETS,
         per_subaperture=False,
     )
