@@ -25,7 +25,7 @@ from benchmarks.foreign import evaluation
 from benchmarks.foreign.evaluation import INTEGRATOR, Effort
 from benchmarks.foreign.magnitudes import in_magnitudes
 from benchmarks.foreign.rows import ROWS, TOOLS, Row, chosen_rows, is_installed
-from benchmarks.results import FOLDER
+from benchmarks.results import FOLDER, PAGES, publish_tables
 from faintspot.loop.telemetry.choices import FILTER
 
 _COLUMNS = (
@@ -96,6 +96,8 @@ def run_command(
             else:
                 _measure(row, effort, kept, path)
     _finish(folder, rows)
+    if not (tool or chosen or quick):
+        publish(folder)
 
 
 def _measure(row: Row, effort: Effort, cache: Path, path: Path) -> None:
@@ -132,6 +134,26 @@ def _finish(folder: Path, rows: list[Row]) -> None:
     click.echo(table)
     (folder / "table.md").write_text(table + "\n", encoding="utf-8")
     _write(folder / "all.json", results)
+
+
+def publish(folder: Path, pages: Path = PAGES) -> Path:
+    """Write the scores of all rows to the file that the documentation takes its figures from."""
+    rows = []
+    for result in json.loads((folder / "all.json").read_text(encoding="utf-8")):
+        if "scores" in result:
+            mean = {name: sum(values) / len(values) for name, values in result["scores"].items()}
+            gain = result["chosen"][INTEGRATOR].removeprefix("gain ")
+            cells = result["title"], f"{mean[INTEGRATOR]:.3f} ({gain})", f"**{mean[FILTER]:.3f}**"
+            rows.append([*cells, _signed(result["ahead"][INTEGRATOR])])
+    columns = ["loop", "integrator (gain)", "learnt filter", "filter - integrator"]
+    table = {"title": "Loops of other simulators", "columns": columns, "rows": rows}
+    origin = {
+        "command": "python -m benchmarks foreign_loops",
+        "processor": machine.fingerprint()["processor"],
+        "version": machine.versions()["faintspot"],
+        "measured": time.strftime("%Y-%m-%d"),
+    }
+    return publish_tables(pages / "foreign_loops.json", {"loops": table}, origin)
 
 
 def table_of(results: list[dict[str, Any]]) -> str:

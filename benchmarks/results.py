@@ -89,30 +89,44 @@ def read(path: Path) -> Results:
 
 
 def publish(results: Results, benchmark: Benchmark, folder: Path = PAGES) -> Path:
-    """Write the tables of a benchmark to the file that the pages take their figures from; return its path.
-
-    What the file holds besides, such as the answer and tables of other commands, stays.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{benchmark.name}.json"
-    data = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"tables": {}}
+    """Write the tables of a benchmark to the file that the pages take their figures from; return its path."""
+    tables = {}
     for table in benchmark.tables:
         columns, rows = grid(table)
-        name = table.name.replace("-", "_")
-        data["tables"][name] = {
+        tables[table.name.replace("-", "_")] = {
             "title": table.title,
-            "configuration": data["tables"].get(name, {}).get("configuration", f"{table.title}:"),
-            "command": f"python -m benchmarks {benchmark.name}",
-            "processor": results.fingerprint["processor"],
-            "version": results.versions["faintspot"],
-            "measured": results.started[:10],
             "columns": columns,
             "rows": rows,
             "notes": table.notes,
         }
+    origin = {
+        "command": f"python -m benchmarks {benchmark.name}",
+        "processor": results.fingerprint["processor"],
+        "version": results.versions["faintspot"],
+        "measured": results.started[:10],
+    }
+    return publish_tables(folder / f"{benchmark.name}.json", tables, origin)
+
+
+def publish_tables(path: Path, tables: dict[str, dict[str, Any]], origin: dict[str, str]) -> Path:
+    """Write tables to a file of the pages, with where they come from; what else it holds stays.
+
+    Parameters
+    ----------
+    path : Path
+    tables : dict
+        By name: title, columns, rows as text, notes. The configuration of a stored table stays.
+    origin : dict
+        Command, processor, version and date (measured).
+    """
+    data = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"tables": {}}
+    for name, table in tables.items():
+        stored = data["tables"].get(name, {"configuration": f"{table['title']}:"})
+        data["tables"][name] = {**stored, **origin, **table}
     text = json.dumps(data, ensure_ascii=False, indent=1)
     text = re.sub(r"\n {4,5}(?=[^ \[{}\]])", " ", text)  # a row of a table is a line
     text = re.sub(r"\n {4}\]", "]", text).replace('[ "', '["')
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(f"{text}\n", encoding="utf-8")
     return path
 

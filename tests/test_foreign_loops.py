@@ -5,8 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.foreign_loops import run_command, table_of
+from benchmarks.foreign.evaluation import INTEGRATOR
+from benchmarks.foreign_loops import publish, run_command, table_of
 from click.testing import CliRunner
+
+from faintspot.loop.telemetry.choices import FILTER
 
 
 @pytest.mark.slow
@@ -33,3 +36,17 @@ def test_an_unknown_row_is_refused() -> None:
 def test_a_failed_row_is_in_the_table() -> None:
     table = table_of([{"name": "oopao-20", "failure": "InputError: no", "seconds": 60.0}])
     assert "| oopao-20 | failed: InputError: no |" in table
+
+
+def test_scores_of_all_rows_are_what_the_documentation_shows(tmp_path: Path) -> None:
+    result = {
+        "title": "OOPAO: 20 e-",
+        "scores": {INTEGRATOR: [0.5, 0.6], FILTER: [0.7, 0.8]},
+        "chosen": {INTEGRATOR: "gain 0.4"},
+        "ahead": {INTEGRATOR: [0.2, 0.01]},
+    }
+    (tmp_path / "all.json").write_text(json.dumps([result, {"failure": "InputError: no"}]))
+    stored = json.loads(publish(tmp_path, tmp_path / "pages").read_text(encoding="utf-8"))
+    assert stored["tables"]["loops"]["rows"] == [
+        ["OOPAO: 20 e-", "0.550 (0.4)", "**0.750**", "+0.200 ± 0.010"],
+    ]
