@@ -175,20 +175,30 @@ def test_package_page_links_to_no_file() -> None:
 
 RESULTS = ROOT / "docs" / "results"
 DATA = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in (RESULTS / "data").glob("*.json")}
-FIGURE = re.compile(r"\d+\.\d+|\d+(?= %)")
-"""A number that was measured: a decimal fraction or a percentage."""
+MEASURED = {name for name, data in DATA.items() if data["tables"]}
+NUMBER = r"(?<![\d.])\d+\.\d+(?!\.?\d)(?: ± \d+\.\d+)?"
+FIGURE = re.compile(rf"{NUMBER}(?: to {NUMBER})?(?: %)?|\d+(?: to \d+)? %")
+"""What was measured: a decimal fraction with its error or range, or a percentage."""
 TAKEN = re.compile(r"\{\{ *(\w+)\.(\w+) *\}\}")
 NO_FIGURE = re.compile(r"```.*?^```|`[^`]*`|\]\([^)]*\)|https?://\S+|\{\{.*?\}\}", re.DOTALL | re.MULTILINE)
 
 
 def figures(text: str) -> set[str]:
-    """Return the numbers that a text states, code and addresses left out."""
-    return set(FIGURE.findall(NO_FIGURE.sub(" ", text)))
+    """Return the figures that a text states, code and addresses left out."""
+    return set(FIGURE.findall(re.sub(r"\s+", " ", NO_FIGURE.sub(" ", text))))
 
 
-def stored(names: Iterable[str]) -> set[str]:
-    """Return the numbers of stored results."""
-    return set().union(*(FIGURE.findall(json.dumps(DATA[name], ensure_ascii=False)) for name in names))
+def unknown_figures(text: str, names: Iterable[str], *parts: str) -> set[str]:
+    """Return the figures of a text that stored results do not have, or not in some of their parts."""
+    kept = json.dumps(
+        [[DATA[name][part] for part in parts or DATA[name]] for name in names], ensure_ascii=False
+    )
+    return {figure for figure in figures(text) if not states(kept, figure)}
+
+
+def states(text: str, figure: str) -> bool:
+    """Return whether a text has a figure as it stands."""
+    return re.search(rf"(?<![\d.]){re.escape(figure)}(?![\d]|\.\d)", text) is not None
 
 
 def blocks_of_text(text: str) -> list[str]:
@@ -210,7 +220,7 @@ def test_pages_take_only_figures_that_are_stored(page: Path) -> None:
 @pytest.mark.parametrize("page", sorted(RESULTS.glob("*.md")), ids=lambda page: page.stem)
 def test_pages_of_results_name_no_figure_that_the_data_do_not_have(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    assert figures(text) - stored({name for name, _ in TAKEN.findall(text)}) == set()
+    assert unknown_figures(text, {name for name, _ in TAKEN.findall(text)}) == set()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -218,17 +228,32 @@ def test_a_paragraph_with_a_link_to_results_names_only_their_figures(page: Path)
     unknown = {}
     for block in blocks_of_text(page.read_text(encoding="utf-8")):
         names = {*re.findall(r"results/(\w+)\.md", block), *(name for name, _ in TAKEN.findall(block))}
-        if found := figures(block) - stored(names & set(DATA)) if names & set(DATA) else set():
+        if names & MEASURED and (found := unknown_figures(block, names & MEASURED)):
             unknown[block[:60]] = found
     assert unknown == {}
+
+
+def test_each_row_of_the_readme_is_one_of_a_stored_table() -> None:
+    """A figure beside a wrong name would not be noticed otherwise."""
+    rows = [" ".join(row) for row in DATA["foreign_loops"]["tables"]["loops"]["rows"]]
+    lines = [line for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines() if "**0." in line]
+    assert len(lines) > 4
+    for line in lines:
+        assert any(all(states(row, figure) for figure in figures(line)) for row in rows), line
+
+
+def test_the_readme_names_headline_figures_only() -> None:
+    for block in blocks_of_text((ROOT / "README.md").read_text(encoding="utf-8")):
+        names = set(re.findall(r"results/(\w+)\.md", block)) & MEASURED
+        prose = "\n".join(line for line in block.splitlines() if not line.startswith("|"))
+        assert unknown_figures(prose if names else "", names, "figures", "answer") == set()
 
 
 @pytest.mark.parametrize("name", sorted(DATA))
 def test_an_answer_names_no_figure_that_its_tables_do_not_have(name: str) -> None:
     data = DATA[name]
-    assert figures(data["answer"]) <= set(
-        FIGURE.findall(json.dumps([data["tables"], data["notes"], data["figures"]]))
-    )
+    known = json.dumps([data.get(part) for part in ("figures", "tables", "notes")], ensure_ascii=False)
+    assert {figure for figure in figures(data.get("answer", "")) if not states(known, figure)} == set()
     for table in data["tables"].values():
         date.fromisoformat(table["measured"])
         assert table["processor"]
