@@ -39,15 +39,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-@pytest.hookimpl(tryfirst=True)  # before -m "not slow" selects
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that depend on clocks or other processes are slow ones, and alone are repeated, up to twice."""
-    for item in items:
-        if item.get_closest_marker("machine_time"):
-            item.add_marker(pytest.mark.slow)
-            item.add_marker(pytest.mark.flaky(reruns=2))
-
-
 @pytest.fixture(autouse=True)
 def no_processes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let only slow tests start processes."""

@@ -11,7 +11,7 @@ from tests.cli.cli_cases import Commands, command_line
 import faintspot
 from faintspot.cli import module_of
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+pytestmark = pytest.mark.slow
 
 COMMANDS = ("demo", "layout", "report", "slopes")
 

@@ -10,7 +10,7 @@ import pytest
 from faintspot.cli.realtime.stopping import stop_on_signal
 from faintspot.slopes.kernels.driver import streaming
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+pytestmark = pytest.mark.slow
 
 PATIENCE_S = 20.0
 

@@ -14,7 +14,7 @@ from faintspot.io import read_slopes
 fits = pytest.importorskip("astropy.io.fits")
 zarr = pytest.importorskip("zarr")
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+pytestmark = pytest.mark.slow
 
 
 def test_frames_in(folder: Path, run: Commands) -> None:

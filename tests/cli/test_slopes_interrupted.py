@@ -15,7 +15,7 @@ from faintspot import Settings, SlopePipeline, Slopes
 
 pytest.importorskip("zarr")
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+pytestmark = pytest.mark.slow
 
 N_FRAMES = 12_000  # three chunks of a store
 ITERATIONS = 800  # so that a run takes some seconds, and no signal comes after its end

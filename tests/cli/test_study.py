@@ -13,7 +13,7 @@ from faintspot.experiments.study import built_in as estimators
 pytest.importorskip("zarr")
 pytest.importorskip("xarray")
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+pytestmark = pytest.mark.slow
 
 SMALL = """
 name = "small"

@@ -22,7 +22,7 @@ pyshmem = pytest.importorskip("pyshmem")
 
 from tests.engine.closed_loop import COMMANDS, CONFIGURATION, Sky, make_engine  # noqa: E402
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 STILL = CONFIGURATION.replace("control", frame_rate_hz=400.0)
 

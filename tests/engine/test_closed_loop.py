@@ -26,7 +26,7 @@ pyshmem = pytest.importorskip("pyshmem")
 from tests.engine.closed_loop import COMMANDS, CONFIGURATION, PATIENCE_S, Sky, make_engine  # noqa: E402
 from tests.engine.commands import start  # noqa: E402
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 FRAMES = 60
 

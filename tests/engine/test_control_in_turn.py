@@ -17,7 +17,7 @@ pytest.importorskip("pyshmem")
 
 from tests.engine.closed_loop import CONFIGURATION, Sky, configured, make_engine
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 EVERY, FRAMES = 8, 40
 SETTINGS = fs.Settings("map", prior_std_px=1.0, flux_e=200.0)

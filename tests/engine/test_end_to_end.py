@@ -18,7 +18,7 @@ from faintspot.engine.requests.private_socket import socket_path
 
 pyshmem = pytest.importorskip("pyshmem")
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 CONFIGURATION = """
 [layout.grid]

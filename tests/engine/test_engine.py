@@ -27,7 +27,7 @@ from faintspot.slopes.pipeline.configuration import unpacked
 
 pyshmem = pytest.importorskip("pyshmem")
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 
 def test_every_frame_is_published_once_and_bit_for_bit(bench: Bench) -> None:

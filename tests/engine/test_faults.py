@@ -17,7 +17,7 @@ from faintspot.engine.pixels.segment import FOLDER
 
 pyshmem = pytest.importorskip("pyshmem")
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 
 def test_a_short_frame(bench: Bench) -> None:

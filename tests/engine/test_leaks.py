@@ -20,7 +20,7 @@ from tests.engine.estimator_files import write
 
 from faintspot.engine.settings.estimator_trial import EstimatorTrial
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 TIMES = int(os.environ.get("FAINTSPOT_LEAK_TIMES", "1"))
 FEW = max(50, 20 * TIMES)

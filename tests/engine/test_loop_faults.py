@@ -23,7 +23,7 @@ pyshmem = pytest.importorskip("pyshmem")
 from tests.engine.closed_loop import COMMANDS, PATIENCE_S, Sky, configured, make_engine  # noqa: E402
 from tests.patience import wait_for  # noqa: E402
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ pytest.importorskip("zarr")
 
 from tests.engine.closed_loop import CONFIGURATION, Sky, configured, make_engine
 
-pytestmark = [pytest.mark.slow, pytest.mark.machine_time("clocks, threads and other processes")]
+pytestmark = pytest.mark.slow
 
 EVERY, TURNS = 30, 28
 FRAMES = EVERY * TURNS

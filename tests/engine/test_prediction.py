@@ -22,7 +22,7 @@ pyshmem = pytest.importorskip("pyshmem")
 
 from tests.engine.closed_loop import CONFIGURATION, Sky, configured, make_engine  # noqa: E402
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 FRAMES = 40
 SETTINGS = fs.Settings("map", prior_std_px=1.0, flux_e=200.0)

@@ -16,7 +16,7 @@ EXAMPLE = ROOT / "examples" / "pyrtc_loop.py"
 PATIENCE_S = 240.0  # engine and pyRTC may both have to compile
 
 pytestmark = [
-    pytest.mark.machine_time("clocks, threads and other processes"),
+    pytest.mark.slow,
     pytest.mark.skipif(importlib.util.find_spec("pyrtc") is None, reason="needs pyRTC (package pyrtcao)"),
     pytest.mark.skipif(importlib.util.find_spec("pyshmem") is None, reason="needs pyshmem"),
 ]

@@ -26,7 +26,7 @@ from faintspot.experiments.running import Unit, WorkerPool, run_units
 
 distributed = pytest.importorskip("distributed", reason="needs distributed, of the extra `cluster`")
 pytestmark = [
-    pytest.mark.machine_time("starts other processes"),
+    pytest.mark.slow,
     pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 

@@ -22,7 +22,7 @@ from faintspot.experiments import running
 from faintspot.experiments.running import Unit, WorkerPool, run_units
 from faintspot.experiments.store import ZarrStore
 
-with_processes = pytest.mark.machine_time("starts other processes")
+with_processes = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 UNITS = [Unit(f"unit {number}", (number,), 10) for number in range(4)]

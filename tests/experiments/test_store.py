@@ -19,7 +19,7 @@ from faintspot.experiments.store import UnitStore, ZarrStore, kind_of_store
 
 pytest.importorskip("zarr")
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+pytestmark = pytest.mark.slow
 
 RESULT = {
     "number": np.asarray(3.5),

@@ -13,7 +13,7 @@ from faintspot.slopes.kernels.compilation.host import lanes_for
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="pages are protected as Linux does it"),
-    pytest.mark.machine_time("starts other processes"),
+    pytest.mark.slow,
 ]
 
 
@@ -39,7 +39,6 @@ def test_nothing_is_found(part: str) -> None:
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
 
 
-@pytest.mark.slow
 def test_priors_beyond_the_frame_are_no_finding() -> None:
     """The pipeline does not use them, and neither does what it is compared with."""
     kernels.run(20261133, kernels.combinations())

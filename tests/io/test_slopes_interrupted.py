@@ -15,7 +15,7 @@ import faintspot
 from faintspot.io import read_slopes
 from faintspot.io.stored import slopes_writer, slopes_zarr
 
-pytestmark = pytest.mark.machine_time("starts and kills other processes")
+pytestmark = pytest.mark.slow
 
 
 KILLED = """

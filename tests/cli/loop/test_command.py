@@ -16,7 +16,7 @@ from faintspot.slopes.pipeline import configuration
 pytest.importorskip("hcipy")
 pytest.importorskip("matplotlib")
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +49,6 @@ def test_magnitude(run: Commands) -> None:
     assert Path("page.html").is_file()
 
 
-@pytest.mark.slow
 def test_night(run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     short = NightPlan(30, 10, (2, 2), (1.0, 0.75), (2, 2), keep_brightest=12)
     monkeypatch.setattr(protocol, "QUICK_PLAN", short)

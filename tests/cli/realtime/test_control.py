@@ -22,7 +22,7 @@ pytest.importorskip("pyshmem")
 
 from tests.engine.bench import LAYOUT, Bench, simulated
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+pytestmark = pytest.mark.slow
 
 MATRIX = np.random.default_rng(1).standard_normal((2 * len(LAYOUT), 10))
 

@@ -24,7 +24,7 @@ from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import ControlServer, request
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+pytestmark = pytest.mark.slow
 
 PATIENCE_S = 240.0  # the engine may have to compile its code
 OPEN, CLOSED = 1, 2

@@ -17,7 +17,7 @@ from tests.engine.page.cases import LAYOUT, N, records
 from faintspot.engine.telemetry.segment import image_type, layout_values
 from faintspot.io.telemetry.writing import TelemetryStore
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+pytestmark = pytest.mark.slow
 
 COMMAND = [sys.executable, "-m", "faintspot", "live"]
 

@@ -7,7 +7,7 @@ import pytest
 
 from faintspot.cli.shared import engine_requests
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize(("patience_s", "takes_s", "says"), [(0.0, 0.2, True), (60.0, 0.0, False)])

@@ -14,7 +14,7 @@ from tests.shared_data import ROOT
 from faintspot.base.extras import EXTRAS, present, require
 from faintspot.cli import group
 
-pytestmark = pytest.mark.machine_time("starts other processes")
+pytestmark = pytest.mark.slow
 
 OPTIONAL = sorted({package for packages in EXTRAS.values() for package in packages})
 NEEDING = {

@@ -173,7 +173,7 @@ def test_a_better_filter_is_handed_to_the_engine(
     assert learning.ended
 
 
-@pytest.mark.machine_time("other processes")
+@pytest.mark.slow
 def test_a_process_that_dies_is_one_line(name: str, tmp_path: Path) -> None:
     """It waits for an engine that is not there, or is killed; the status says so."""
     engine, lines = SimpleNamespace(name=name, learning=None), list[str]()

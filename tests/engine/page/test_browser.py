@@ -31,7 +31,7 @@ from faintspot.io.telemetry.recording import read_telemetry
 CHROMIUM = next((found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None)
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt install chromium"),
-    pytest.mark.machine_time("a server, its clients and their clocks"),
+    pytest.mark.slow,
 ]
 PATIENCE_MS = 30_000
 DESKTOP, TELEPHONE = {"width": 1400, "height": 900}, {"width": 360, "height": 740}

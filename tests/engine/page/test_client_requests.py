@@ -17,7 +17,7 @@ from faintspot.engine.requests.requests import ControlServer
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io.telemetry.recording import read_telemetry
 
-pytestmark = pytest.mark.machine_time("a server, its clients and their clocks")
+pytestmark = pytest.mark.slow
 
 NAME = f"fs_test_{uuid4().hex[:12]}"
 

@@ -31,7 +31,7 @@ from faintspot.slopes.kernels.driver.streaming import (
     wait_for_group,
 )
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 LAYOUT = fs.Layout.grid((6, 6), pixels=8, pitch=(9, 8))
 NOISE = fs.Calibration(dark=0.0, read_noise_e=1.0)

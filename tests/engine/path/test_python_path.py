@@ -20,7 +20,7 @@ from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.time_limit import call_within
 from faintspot.slopes.estimators import Estimator, Positions
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 GENEROUS_S = 5.0
 BRIGHT = 60000

@@ -8,7 +8,7 @@ from tests.patience import wait_for
 import faintspot as fs
 from faintspot.engine.path.time_limit import call_is_under_way, call_within, end_thread
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 PATIENCE_S = 10.0
 

@@ -9,7 +9,7 @@ from tests.patience import LIMIT_S, wait_for
 
 from faintspot.engine.path.workers import Workers
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from faintspot.engine.pixels.pixel_ring import ARRIVALS, FRAME, ROWS, PixelRing
 from faintspot.engine.pixels.segment import CLOSED, FOLDER
 
 pytestmark = [
-    pytest.mark.machine_time("clocks, threads and other processes"),
+    pytest.mark.slow,
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
 ]
 

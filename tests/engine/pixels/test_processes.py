@@ -8,7 +8,7 @@ import pytest
 
 from faintspot.engine.pixels.processes import process_age_s, process_lives, process_start
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 
 def test_which_processes_live() -> None:

@@ -19,7 +19,7 @@ from faintspot.slopes.simulate import Detector
 
 pytestmark = [
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-    pytest.mark.machine_time("clocks, threads and other processes"),
+    pytest.mark.slow,
 ]
 
 SHAPE = 24, 32

@@ -25,7 +25,7 @@ from faintspot.io import FrameSource, open_frames
 
 pytestmark = [
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-    pytest.mark.machine_time("clocks, threads and other processes"),
+    pytest.mark.slow,
 ]
 SHAPE = (6, 5)
 

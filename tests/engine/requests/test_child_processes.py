@@ -14,7 +14,7 @@ from faintspot.engine.requests.child_processes import ChildProcesses
 
 pytest.importorskip("pyshmem")
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 # A bridge waits for a stream that never comes.
 PARENT = """
 import sys, time

@@ -27,7 +27,7 @@ from faintspot.engine.requests import requests as control
 from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import LARGEST_REQUEST, ControlServer, request
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 SOURCE = ROOT / "src"
 

@@ -15,7 +15,7 @@ from faintspot.engine.settings.estimator_trial import EstimatorTrial
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.estimators.registry import restore
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 
 def trial(path: Path, limit_s: float = 60.0) -> EstimatorTrial:

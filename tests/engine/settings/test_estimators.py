@@ -22,7 +22,7 @@ from faintspot.slopes.estimators.registry import restore
 
 pytest.importorskip("pyshmem")
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 BRIGHT = 60000
 FAILING = f"if {BRIGHT / 2} < images.max() < {BRIGHT}:\n    {{}}\nreturn sensor.zero + 0.25"
 

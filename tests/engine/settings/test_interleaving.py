@@ -12,7 +12,7 @@ from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.settings.interleaving import Interleaving, methods_after
 from faintspot.slopes.pipeline.settings import without_denoising
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.engine.settings.running_settings import RunningSettings
 
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 
 LAYOUT = fs.Layout.grid((2, 3), pixels=8)
 N = len(LAYOUT)

@@ -21,7 +21,7 @@ from faintspot.engine.streams.bridge import BridgeCounters, StreamBridge
 pyshmem = pytest.importorskip("pyshmem")
 pytestmark = [
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-    pytest.mark.machine_time("clocks, threads and other processes"),
+    pytest.mark.slow,
 ]
 SHAPE = (6, 5)
 

@@ -24,7 +24,7 @@ from faintspot.engine.streams.stream_out import StreamOut
 
 pyshmem = pytest.importorskip("pyshmem")
 pytestmark = [
-    pytest.mark.machine_time("clocks, threads and other processes"),
+    pytest.mark.slow,
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs shared memory as Linux has it"),
 ]
 

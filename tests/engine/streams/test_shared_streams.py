@@ -25,7 +25,7 @@ from faintspot.engine.streams.shared_streams import create_stream, lock_file, py
 from faintspot.engine.streams.slope_streams import SlopeStreams
 
 pyshmem = pytest.importorskip("pyshmem")
-pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+pytestmark = pytest.mark.slow
 STRANGER = 65534
 only_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can make another user's files")
 

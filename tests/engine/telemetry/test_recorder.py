@@ -28,7 +28,7 @@ from faintspot.io import read_telemetry
 from faintspot.io.telemetry.writing import TelemetryStore
 
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
-with_threads = pytest.mark.machine_time("clocks, threads and other processes")
+with_threads = pytest.mark.slow
 
 PATIENCE_S = 60.0
 

@@ -18,7 +18,7 @@ from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.slopes.sensor.layout import Layout
 
 pytestmark = [
-    pytest.mark.machine_time("clocks, threads and other processes"),
+    pytest.mark.slow,
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
 ]
 

@@ -45,7 +45,7 @@ pytest.importorskip("hcipy")
 pyshmem = pytest.importorskip("pyshmem")
 pytestmark = [
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-    pytest.mark.machine_time("clocks, threads and other processes"),
+    pytest.mark.slow,
 ]
 CONFIGURATION = faint().replace("control", frame_rate_hz=1000.0)  # runs of single frames take no longer
 COMMANDS, PATIENCE_S = 54, 120.0

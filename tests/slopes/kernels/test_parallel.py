@@ -11,7 +11,7 @@ from tests.patience import LIMIT_S
 from faintspot.slopes.kernels.compilation.host import lanes_for
 from faintspot.slopes.kernels.parallel import available_cpus, run_groups
 
-pytestmark = pytest.mark.machine_time("threads and their clocks")
+pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("threads", [None, 1, 2, 5])
