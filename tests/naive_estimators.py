@@ -379,7 +379,7 @@ def fixed_window(
     for axis, home in enumerate((x0, y0)):
         found.append(home + float(np.sum(weights[axis] * g)) / divisor - float(np.sum(weights[axis] * spot)))
         noise = weights[axis] ** 2 * (task.variance + task.excess * divisor * np.maximum(spot, 0.0))
-        errors.append(task.error_scale * math.sqrt(float(noise.sum())) / divisor)
+        errors.append(task.error_scale * math.sqrt(max(float(noise.sum()), 0.0)) / divisor)
     return Estimate(found[0], found[1], flux, errors[0], errors[1])
 
 

@@ -45,7 +45,7 @@ def on_unknown_background(case: Case, seed: int) -> Case:
 class TestAgainstOracle:
     @pytest.mark.parametrize("estimator", QUICK)
     @given(seed=SEEDS)
-    @examples(10)
+    @examples(6)
     def test_random_spots(self, estimator: str, seed: int) -> None:
         case = random_case(seed, estimator)
         assert_equals_oracle(case, case.measure())
@@ -60,28 +60,28 @@ class TestAgainstOracle:
 
     @pytest.mark.parametrize("estimator", ["matched", "ml"])
     @given(seed=SEEDS)
-    @examples(5)
+    @examples(3)
     def test_noise_map_on_an_unknown_background(self, estimator: str, seed: int) -> None:
         case = on_unknown_background(with_noise_map(random_case(seed, estimator), seed), seed)
         assert_equals_oracle(case, case.measure())
 
     @given(seed=SEEDS)
     @example(seed=487)  # no position of the grid is both near the prior and within the limits
-    @examples(4)
+    @examples(2)
     def test_posterior_with_a_noise_map(self, seed: int) -> None:
         case = with_noise_map(random_case(seed, "map", n=2), seed)
         assert_equals_oracle(case, case.measure())
 
     @given(seed=SEEDS)
     @example(seed=188536)  # a third of the expected flux, beyond the search limit
-    @examples(4)
+    @examples(2)
     def test_random_spots_with_a_prior(self, seed: int) -> None:
         case = random_case(seed, "map", n=2)
         assert_equals_oracle(case, case.measure())
 
     @pytest.mark.parametrize("estimator", ["matched", "ml"])
     @given(seed=SEEDS)
-    @examples(10)
+    @examples(5)
     def test_random_spots_on_an_unknown_background(self, estimator: str, seed: int) -> None:
         case = on_unknown_background(random_case(seed, estimator), seed)
         assert_equals_oracle(case, case.measure())

@@ -40,19 +40,19 @@ def test_the_loop_closes_and_stays_closed(record: LoopRecord) -> None:
 
 
 def test_runs_repeat_bit_for_bit(record: LoopRecord) -> None:
-    again = simulate_loop(faint(), [plain()])
-    np.testing.assert_array_equal(again.slopes_px, record.slopes_px)
-    np.testing.assert_array_equal(again.strehl, record.strehl)
+    again = simulate_loop(faint().replace("run", frames=30, settle_frames=1), [plain()])
+    np.testing.assert_array_equal(again.slopes_px, record.slopes_px[:30])
+    np.testing.assert_array_equal(again.strehl, record.strehl[:30])
 
 
 def test_methods_see_the_same_atmosphere_and_photons(record: LoopRecord) -> None:
     both = [plain(), Method("tv", fs.Settings(noise_std=1.0, keep_brightest=80))]
-    schedule = np.repeat([0, 1], 100)
-    mixed = simulate_loop(faint(), both, schedule)
-    np.testing.assert_array_equal(mixed.slopes_px[:100], record.slopes_px[:100])
-    np.testing.assert_array_equal(mixed.strehl[:102], record.strehl[:102])  # commands act two frames later
-    assert not np.array_equal(mixed.slopes_px[100], record.slopes_px[100])
-    assert mixed.mean_strehl(1) == pytest.approx(mixed.strehl[100:].mean())
+    schedule = np.repeat([0, 1], 20)
+    mixed = simulate_loop(faint().replace("run", frames=40, settle_frames=10), both, schedule)
+    np.testing.assert_array_equal(mixed.slopes_px[:20], record.slopes_px[:20])
+    np.testing.assert_array_equal(mixed.strehl[:22], record.strehl[:22])  # commands act two frames later
+    assert not np.array_equal(mixed.slopes_px[20], record.slopes_px[20])
+    assert mixed.mean_strehl(1) == pytest.approx(mixed.strehl[20:].mean())
     assert mixed.labels == ("plain", "tv")
 
 
@@ -114,7 +114,7 @@ def test_noise_free_loop_lies_between_fitting_error_and_its_budget() -> None:
 
 
 def test_open_loop_control() -> None:
-    loop = load_loop("open_loop").replace("run", frames=160, settle_frames=40)
+    loop = load_loop("open_loop").replace("run", frames=80, settle_frames=30)
     settings = fs.Settings("brightest", keep_brightest=150)
     bright = loop.replace("camera", photons_per_subaperture=2000.0)
     corrected = simulate_loop(bright, [Method("corrected", settings)])
@@ -123,7 +123,7 @@ def test_open_loop_control() -> None:
     assert corrected.mean_strehl() > not_corrected.mean_strehl()
     assert not corrected.closed
     # The sensor sees the whole wavefront: slopes do not shrink when the mirror acts.
-    assert np.std(corrected.slopes_px[100:]) > 0.7 * np.std(corrected.slopes_px[:3])
+    assert np.std(corrected.slopes_px[40:]) > 0.7 * np.std(corrected.slopes_px[:3])
 
 
 def test_centroid_gain_falls_with_noise_and_brightest_pixels() -> None:
@@ -140,6 +140,7 @@ def test_centroid_gain_falls_with_noise_and_brightest_pixels() -> None:
 
 def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
     loop = faint().replace("camera", read_noise_e=3.0, photons_per_subaperture=400.0)
+    loop = loop.replace("run", frames=100, settle_frames=40)
     settings = fs.Settings("brightest", keep_brightest=80)
     corrected, not_corrected = (
         simulate_loop(loop, [Method("k", settings, gain=0.3, correct_gain=flag)]) for flag in (True, False)
@@ -149,7 +150,7 @@ def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
 
 
 def test_smaller_windows_close_the_loop() -> None:
-    loop = load_loop("diffraction_limit").replace("run", frames=100, settle_frames=40)
+    loop = load_loop("diffraction_limit").replace("run", frames=60, settle_frames=30)
     method = Method("window", fs.Settings("brightest", keep_brightest=50), window_pixels=10)
     assert simulate_loop(loop.replace("camera", photons_per_subaperture=400.0), [method]).mean_strehl() > 0.3
 

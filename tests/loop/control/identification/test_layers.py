@@ -41,6 +41,7 @@ def expect_winds(found: Identified, within_m_per_s: float) -> None:
     assert found.turbulence.fraction[order] == pytest.approx(AIR.fraction, abs=0.12)
 
 
+@pytest.mark.slow
 def test_two_layers_are_found() -> None:
     found = Identification(observed(), UNKNOWN, RATE_HZ).layers()
     assert 2 <= len(found.turbulence.fraction) <= 3
