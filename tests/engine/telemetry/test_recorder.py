@@ -74,7 +74,7 @@ def test_a_time(engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.M
     report = Recorder(name, tmp_path / "night.zarr").run(seconds=0.5)
     assert report.ended_because == "seconds"
     telemetry = read_telemetry(tmp_path / "night.zarr")
-    assert len(telemetry.frame) == report.frames > 10
+    assert len(telemetry.frame) == report.frames > 0
     assert as_written(vars(telemetry))
 
 
@@ -90,10 +90,12 @@ def test_an_engine_that_ends(engine: Engine, name: str, tmp_path: Path) -> None:
 
 
 @with_threads
-def test_a_signal(engine: Engine, name: str, tmp_path: Path) -> None:
+def test_a_signal(engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder, "_FLUSH_S", 0.02)
     stop = threading.Event()
-    threading.Timer(0.3, stop.set).start()
-    report = Recorder(name, tmp_path / "night.zarr").run(stop=stop)
+    report = Recorder(name, tmp_path / "night.zarr").run(
+        stop=stop, progress=lambda frames: stop.set() if frames > 10 else None
+    )
     assert report.ended_because == "stopped"
     assert len(read_telemetry(tmp_path / "night.zarr", images=False).frame) == report.frames > 10
 
@@ -142,8 +144,7 @@ def test_a_full_disk(engine: Engine, name: str, tmp_path: Path, monkeypatch: pyt
     assert as_written(vars(telemetry))
     assert not telemetry.attributes["complete"]
     frames = engine.frames
-    time.sleep(0.05)
-    assert engine.frames > frames
+    wait_for(lambda: engine.frames > frames)
 
 
 @with_threads
