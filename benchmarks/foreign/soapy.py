@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from benchmarks.foreign.base import IMAGING_M, Floats, SteppedLoop
+from faintspot.adapters.spots import Spots
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 
 _READ_NOISE_E = 1.0
@@ -52,8 +54,6 @@ class SoapyLoop(SteppedLoop):
     winds = [(6.0, 0.0), (12.0, 90.0), (20.0, 270.0)]  # noqa: RUF012
 
     def __init__(self, flux_e: float, folder: Path) -> None:
-        from faintspot.adapters import soapy as adapter
-
         super().__init__(folder, "soapy")
         self.name = f"soapy-{flux_e:g}"
         magnitude = 12.0
@@ -64,7 +64,8 @@ class SoapyLoop(SteppedLoop):
         settings = fs.Settings("window", flux_e=flux_e, window_fwhm_px=3.0)
         camera = fs.Calibration(dark=0.0, read_noise_e=_READ_NOISE_E)
         spot_px = _SENSING_M / _LENSLET_M / (_FIELD_ARCSEC / _SUBAPERTURE_PX * ARCSEC)
-        adapter.attach(self._sensor, settings, camera, psf=fs.PSF.analytic(size=spot_px / 2))
+        count, psf = int(self._sensor.n_subaps), fs.PSF.analytic(size=spot_px / 2)
+        _measure_with(self._sensor, Spots("soapy", count, _SUBAPERTURE_PX, settings, camera, psf=psf))
         with contextlib.redirect_stdout(io.StringIO()):
             self._system.makeIMat(forceNew=True)
         self.unit_arcsec = self._tilt_arcsec()
@@ -125,6 +126,23 @@ class SoapyLoop(SteppedLoop):
         sight = self._system.sciCams[0].los
         sight.frame(screens, correction)
         return slopes, float(abs(np.exp(1j * sight.phase[self._pupil]).mean()) ** 2)
+
+
+def _measure_with(sensor: Any, spots: Spots) -> None:
+    """Make positions of spots the centroider of a sensor, which soapy looks up by name in its module."""
+
+    def centroid(images: Any, threshold: Any = None, ref: Any = None, **_: Any) -> Floats:
+        """Return positions as soapy's centroiders do: (2, n) px from the first pixel."""
+        config, static = sensor.config, sensor.staticData
+        noise_free = bool(sensor.iMat) or not (config.photonNoise or config.eReadNoise)
+        # soapy subtracts half a window, so that a centred spot has -1/2, part of the static slopes.
+        reference = np.full((2, len(images)), 0.5) + (0.0 if static is None else static)
+        found = spots.places(spots.checked(images), reference, noise_free=noise_free)
+        return np.asarray(found + 0.5 * (_SUBAPERTURE_PX - 1))
+
+    sys.modules[type(sensor).__module__].centroiders.faintspot = centroid
+    sensor.config.centMethod = "faintspot"
+    sensor.getStatic()
 
 
 def _simulation(winds: list[tuple[float, float]], r0_m: float, magnitude: float, seed: int) -> Any:

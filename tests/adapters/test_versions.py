@@ -4,15 +4,14 @@ import importlib.metadata
 import re
 import warnings
 from collections.abc import Callable, Iterator
-from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
-from tests.adapters import test_oopao, test_soapy
+from tests.adapters import test_oopao
 from tests.adapters.adapter_cases import EVERYTHING, needs
 
 from faintspot import InputError
-from faintspot.adapters import oopao, pyrtc, soapy
+from faintspot.adapters import oopao, pyrtc
 from faintspot.adapters.checks import UntestedVersionWarning, check_version
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -38,15 +37,6 @@ def said_once(make: Callable[[], Any], tool: str, version: str, tested: str) -> 
 
 def test_oopao_version(version: str) -> None:
     said_once(lambda: oopao.attach(test_oopao.StandIn(), EVERYTHING), "OOPAO", version, oopao.TESTED)
-
-
-def test_soapy_version(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = ModuleType("soapy_wfs")
-    module.centroiders = SimpleNamespace()  # type: ignore[attr-defined]
-    monkeypatch.setitem(__import__("sys").modules, "soapy_wfs", module)
-    monkeypatch.setattr(test_soapy.StandIn, "__module__", "soapy_wfs")
-    monkeypatch.setattr(test_soapy.StandIn, "getStatic", lambda self: None)
-    said_once(lambda: soapy.attach(test_soapy.StandIn(), EVERYTHING), "soapy", version, soapy.TESTED)
 
 
 @needs("pyrtc", "pyrtc")

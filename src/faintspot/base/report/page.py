@@ -27,10 +27,6 @@ class TableCell:
     """Outcome, on a coloured background."""
     small: str = ""
     """Small text below."""
-    items: Sequence[tuple[str, str]] = ()
-    """List of items: a text, and a small remark below it."""
-    link: tuple[str, str] | None = None
-    """Name of a section, and the text of the link to it."""
 
 
 @dataclass(frozen=True)

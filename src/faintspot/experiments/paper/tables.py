@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -69,21 +68,15 @@ def table_of_cells(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[
     return [*PARAMETERS, "mode", "method", "R_px", "R_se_px", *columns], rows
 
 
-def cases_section(judged: list[Verdict]) -> Section:
-    """Return the section of all cases that the verdicts rest on."""
-    cases = [
-        (item, finding.mode, case)
+def cases_csv(judged: Sequence[Verdict]) -> tuple[str, str]:
+    """Return name and text of the file with all cases that the verdicts rest on."""
+    data = [
+        [item.number, item.claim, finding.mode, case.where, case.finding, case.outcome.value]
         for item in judged
         for finding in (item.best, item.fixed)
         for case in finding.cases
     ]
-    rows, data = [], []
-    for item, mode, case in cases:
-        found = [case.where, case.finding, case.outcome.value]
-        rows.append([str(item.number), mode_in_words(mode), *found])
-        data.append([item.number, item.claim, mode, *found])
-    text = csv_text(["number", "claim", "mode", "where", "finding", "outcome"], data)
-    return _TEXT.section("cases", replace(_TEXT.table("cases", rows), csv=("verdicts.csv", text)))
+    return "verdicts.csv", csv_text(["number", "claim", "mode", "where", "finding", "outcome"], data)
 
 
 def baselines_section(dataset: xarray.Dataset) -> Section:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from faintspot.base.report.page import Section
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.night.verdicts import verdicts as night_verdicts
 from faintspot.experiments.paper.claims import fixed_mode, verdicts
+from faintspot.experiments.paper.tables import cases_csv
 from faintspot.experiments.study.curves import Judgement, Outcome, Verdict
 
 if TYPE_CHECKING:
@@ -63,9 +64,10 @@ def paper_rows(dataset: xarray.Dataset | None, night: Night | None) -> list[Pape
     return rows
 
 
-def paper_section(rows: Sequence[PaperRow]) -> Section:
-    """Return the section of the whole paper for a page."""
-    return _TEXT.section("paper", _TEXT.table("paper", rows))
+def paper_section(rows: Sequence[PaperRow], judged: Sequence[Verdict] = ()) -> Section:
+    """Return the section of the whole paper for a page, with all cases of verdicts as a file."""
+    table = _TEXT.table("paper", rows)
+    return _TEXT.section("paper", replace(table, csv=cases_csv(judged)) if judged else table)
 
 
 def paper_markdown(rows: Sequence[PaperRow]) -> str:

@@ -22,7 +22,6 @@ from faintspot.experiments.paper.figures import (
 )
 from faintspot.experiments.paper.tables import (
     baselines_section,
-    cases_section,
     gains_section,
 )
 from faintspot.experiments.paper.whole import paper_rows, paper_section
@@ -165,13 +164,12 @@ def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
 
 def _of_claims(dataset: xarray.Dataset, night: Night | None) -> list[Section]:
     return [
-        paper_section(paper_rows(dataset, night)),
+        paper_section(paper_rows(dataset, night), verdicts(dataset)),
         _TEXT.section("sections.guidance", *guidance(dataset)),
         baselines_section(dataset),
         gains_section(dataset),
         *_figure_sections(dataset),
         *([] if night is None else night_sections(night)),
-        cases_section(verdicts(dataset)),
     ]
 
 
