@@ -44,6 +44,7 @@ def test_commands_of_the_frames_around() -> None:
     assert acting == float(line.acting[0])
 
 
+@pytest.mark.slow
 def test_a_loop_closes_with_it() -> None:
     """The skew costs little: rows are late or early by up to half a frame."""
     without, rolled = (

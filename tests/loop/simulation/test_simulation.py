@@ -87,6 +87,7 @@ def test_slopes_follow_the_interaction_matrix() -> None:
     assert np.std(open_loop - expected) < 0.02 * np.std(expected)
 
 
+@pytest.mark.slow
 def test_noise_free_loop_lies_between_fitting_error_and_its_budget() -> None:
     """Never better than the best fit; worse by servo lag and aliasing.
 
@@ -183,6 +184,7 @@ def test_more_actuators_than_slopes_can_control_are_refused() -> None:
         prepare(quiet().replace("mirror", actuators=12))
 
 
+@pytest.mark.slow
 def test_eight_metres_are_made() -> None:
     """The optics of a large telescope, with fewer sub-apertures so that it takes seconds."""
     loop = load_loop("eight_metre").replace("sensor", subapertures=16, pixels=6)

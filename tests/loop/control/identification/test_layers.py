@@ -107,7 +107,7 @@ def test_turbulence_that_stands_still() -> None:
 
 
 def test_known_winds_have_their_strengths() -> None:
-    identification = Identification(observed(), UNKNOWN, RATE_HZ)
+    identification = Identification(observed(frames=500), UNKNOWN, RATE_HZ)
     found = identification.of_winds(AIR.wind_m_per_s)
     assert found.turbulence.fraction == pytest.approx(AIR.fraction, abs=0.1)
     assert found.criterion < identification.anywhere().criterion
