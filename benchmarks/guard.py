@@ -3,7 +3,8 @@
 7 x 7 sub-apertures and 52 actuators in frozen von Karman turbulence of plane waves, with noise. The filter
 assumes a centroid gain that is wrong by a factor: when it learns from a recording of the integrator, or as
 the gain changes after learning. Then both drive the loop through the same turbulence with the same noise;
-their residuals count from 1 s on.
+their residuals count from 1 s on. The same with sub-apertures that are dead, stuck, noisy or die on the way,
+with and without an actuator that does not move: there Strehl ratios count.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from faintspot.loop.control.identification.open_loop import open_loop_of
 from faintspot.loop.control.identification.predictive_control import (
     ObservedLoop,
     PredictiveControl,
+    learn,
     learn_observed,
 )
 from faintspot.loop.control.identification.recording import Recording, prepared
@@ -35,9 +37,13 @@ from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M, SPECTRUM
 
 Floats = NDArray[np.float64]
 Control = Callable[[Floats], Floats]
+Damage = Callable[[Floats, int, Floats], None]
+"""Changes the slopes of a frame, (2, n), given its number and random numbers."""
 
 RATE_HZ, DELAY, LEAK, CENTROID_GAIN = 250.0, 2, 0.01, 0.6
 FLUXES_E = 20.0, 60.0, 200.0, 1000.0
+_SIDE_M, _PIXEL_ARCSEC, _R0_M, _OUTER_SCALE_M, _WAVES = 0.6, 0.2, 0.2, 25.0, 1200
+FAULT_FLUXES_E = 20.0, 200.0
 FACTORS = 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0
 """Assumed centroid gain in the true one."""
 WINDS = {
@@ -51,7 +57,50 @@ SEEDS = 21, 22, 23
 LEARNING_FRAMES, FRAMES, SETTLED = 2000, 1000, 250
 _LEARNING_SEED, _STABLE = 1000, 0.8
 """Seed of the recordings; largest product of loop gain and centroid gain that is tried."""
-_SIDE_M, _PIXEL_ARCSEC, _R0_M, _OUTER_SCALE_M, _WAVES = 0.6, 0.2, 0.2, 25.0, 1200
+
+
+_RAD = _PIXEL_ARCSEC * ARCSEC * _SIDE_M * 2 * np.pi / 1.65e-6
+"""Phase at 1.65 um of a slope of one pixel over a sub-aperture."""
+_LOST = 0.02  # of Strehl ratio, at most
+_STILL_ACTUATOR, _FAULT_GAIN, _DIES_AT = 20, 0.3, 400
+
+
+def constant(*cells: int, value: float = 0.0, start: int = 0) -> Damage:
+    """Return what writes a constant into slopes of sub-apertures."""
+
+    def damage(slopes: Floats, frame: int, random: Floats) -> None:
+        if frame >= start:
+            slopes[:, cells] = value
+
+    return damage
+
+
+def noisy(cell: int, noise_px: float, start: int = 0) -> Damage:
+    """Return what adds noise to a sub-aperture."""
+
+    def damage(slopes: Floats, frame: int, random: Floats) -> None:
+        if frame >= start:
+            slopes[:, cell] += noise_px * random
+
+    return damage
+
+
+FAULTS: dict[str, Damage] = {
+    "none": constant(start=0),
+    "one at 0": constant(14),
+    "one at the edge at 0": constant(0),
+    "two at 0": constant(3, 20),
+    "one at .33": constant(14, value=0.33),
+    "one of 1 px of noise": noisy(14, 1.0),
+    "one of 5 px": noisy(14, 5.0),
+}
+LATER_FAULTS: dict[str, Damage] = {
+    "one dies": constant(14, start=_DIES_AT),
+    "one sticks at .33": constant(14, value=0.33, start=_DIES_AT),
+    "one becomes noisy, 1 px": noisy(14, 1.0, _DIES_AT),
+    "5 px": noisy(14, 5.0, _DIES_AT),
+}
+"""Faults that begin in the scored frames; the filter has learnt without."""
 
 
 class Geometry(NamedTuple):
@@ -115,17 +164,26 @@ class Run(NamedTuple):
 
 
 def drive(
-    control: Control, open_loop: Floats, flux_e: float, seed: int, centroid_gain: float = CENTROID_GAIN
+    control: Control,
+    open_loop: Floats,
+    flux_e: float,
+    seed: int,
+    centroid_gain: float = CENTROID_GAIN,
+    damage: Damage = FAULTS["none"],
+    still: tuple[int, ...] = (),
 ) -> Run:
-    """Drive the loop through open-loop slopes."""
-    interaction, phase = geometry().interaction, geometry().phase
+    """Drive the loop through open-loop slopes; actuators that are still do not move."""
+    mirror, phase = geometry().interaction.copy(), geometry().phase
+    mirror[:, still] = 0.0
+    random = np.random.default_rng([seed, 2]).standard_normal((len(open_loop), 2))
     noise = noise_px(flux_e) * np.random.default_rng([seed, 1]).standard_normal(open_loop.shape)
-    waiting = deque(np.zeros((DELAY, interaction.shape[1])))
+    waiting = deque(np.zeros((DELAY, mirror.shape[1])))
     true, slopes = np.empty_like(open_loop), np.empty_like(open_loop)
-    commands, predicting = np.empty((len(open_loop), interaction.shape[1])), np.zeros(len(open_loop))
+    commands, predicting = np.empty((len(open_loop), mirror.shape[1])), np.zeros(len(open_loop))
     for frame, turbulent in enumerate(open_loop):
-        true[frame] = turbulent + interaction @ waiting.popleft()
+        true[frame] = turbulent + mirror @ waiting.popleft()
         slopes[frame] = centroid_gain * true[frame] + noise[frame]
+        damage(slopes[frame].reshape(2, -1), frame, random[frame])
         predicting[frame] = getattr(control, "is_predicting", False)
         commands[frame] = control(slopes[frame])
         waiting.append(commands[frame])
@@ -160,10 +218,12 @@ def left_by_integrator(flux_e: float, loop_gain: float, seed: int, centroid_gain
 
 
 @cache
-def recorded(flux_e: float, loop_gain: float) -> Recording:
+def recorded(
+    flux_e: float, loop_gain: float, damage: Damage = FAULTS["none"], still: tuple[int, ...] = ()
+) -> Recording:
     """Return the recording of an integrator, from which the filter learns."""
     air = open_loop(loop_gain, _LEARNING_SEED, LEARNING_FRAMES)
-    run = drive(Integrator(loop_gain), air, flux_e, _LEARNING_SEED)
+    run = drive(Integrator(loop_gain), air, flux_e, _LEARNING_SEED, CENTROID_GAIN, damage, still)
     rows, where = slice(100, None), (geometry().interaction, geometry().cells, RATE_HZ)
     loop = Recording(run.slopes[rows], run.commands[rows], *where)
     return replace(loop, subaperture_m=_SIDE_M, pixel_scale_arcsec=_PIXEL_ARCSEC)
@@ -180,7 +240,39 @@ def learnt(
 
 def run() -> list[Table]:
     """Score all assumed gains and loop gains at all fluxes."""
-    return [_table(flux_e) for flux_e in FLUXES_E]
+    return [*(_table(flux_e) for flux_e in FLUXES_E), *(_fault_table(flux_e) for flux_e in FAULT_FLUXES_E)]
+
+
+def _fault_table(flux_e: float) -> Table:
+    rows = [
+        fault_row(name, damage, flux_e, still, name in LATER_FAULTS)
+        for still in ((), (_STILL_ACTUATOR,))
+        for name, damage in {**FAULTS, **LATER_FAULTS}.items()
+    ]
+    note = f"{len(SEEDS)} realisations of 3 s from 1 s on; Strehl ratio at 1.65 um of the fitted wavefront"
+    return Table(f"guard-faults-{flux_e:g}", f"Faults of sensor and mirror, {flux_e:g} e-", rows, [note])
+
+
+def fault_row(name: str, damage: Damage, flux_e: float, still: tuple[int, ...], is_later: bool) -> Row:
+    """Return the Strehl ratios of filter and integrator with a fault."""
+    control = learn(recorded(flux_e, _FAULT_GAIN, FAULTS["none"] if is_later else damage, still))
+    ratios, predicting = [], []
+    for seed in SEEDS:
+        control.reset()
+        rest = open_loop(_FAULT_GAIN, seed, FRAMES), flux_e, seed, CENTROID_GAIN, damage, still
+        runs = drive(control, *rest), drive(Integrator(_FAULT_GAIN), *rest)
+        ratios.append([float(np.exp(-(_RAD**2) * run.residual[SETTLED:]).mean()) for run in runs])
+        predicting.append(float(runs[0].predicting[SETTLED:].mean()))
+    (ours, plain), differences = np.mean(ratios, axis=0), np.array([a - b for a, b in ratios])
+    values = {
+        "Strehl ratio": float(ours),
+        "integrator's": float(plain),
+        "difference": float(differences.mean()),
+        "least": float(differences.min()),
+        "filter drives, part": float(np.mean(predicting)),
+    }
+    mirror = ", an actuator that does not move" if still else ""
+    return Row(f"{name}{mirror}", values, f"least >= -{_LOST}", bool(differences.min() >= -_LOST))
 
 
 def _table(flux_e: float) -> Table:

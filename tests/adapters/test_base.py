@@ -50,6 +50,17 @@ def test_calibration_does_not_depend_on_its_flux(name: str) -> None:
     assert 0.7 < gain < 1.2
 
 
+def test_a_recording_has_no_slopes_that_were_not_measured() -> None:
+    measured, stack = tool(EVERYTHING), images()
+    stack[2] = 0.0
+    slopes = measured.measure(tall(stack))
+    expected = np.where(np.arange(N) == 2, np.nan, slopes).ravel()
+    for given in (slopes, slopes.ravel()):
+        np.testing.assert_array_equal(measured.recorded(given), expected)
+    with pytest.raises(InputError, match="slopes: expected 18 of the last frame, got 4"):
+        measured.recorded(np.zeros(4))
+
+
 def test_calibrating_is_a_block_that_ends() -> None:
     measured = tool(Settings("window", flux_e=FAINT_E))
     bright = tall(images(1e5))

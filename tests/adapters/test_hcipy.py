@@ -145,6 +145,8 @@ def test_last_estimate_says_how_good_it_is(optics: Any) -> None:
     assert estimator.measured.last.flags[3] & fs.SubapertureFlag.NO_FLUX
     assert not estimator.measured.last.flags[4] & INVALID
     np.testing.assert_array_equal(slopes[:, 3], 0.0)
+    recorded = np.where(np.arange(49) == 3, np.nan, slopes)
+    np.testing.assert_allclose(estimator.recorded().reshape(2, 49)[:, 3:5], recorded[:, 3:5], rtol=1e-6)
     np.testing.assert_allclose(estimator.measured.last.x, slopes[0] / PIXEL_M, rtol=1e-6, atol=1e-7)
     errors = np.asarray(estimator.standard_errors)
     assert errors.shape == slopes.shape

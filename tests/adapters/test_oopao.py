@@ -100,13 +100,16 @@ def test_noise_switches_calibration_off_and_prediction_on() -> None:
 
 
 def test_a_spot_without_flux_has_slope_zero() -> None:
-    wfs = StandIn()
-    oopao.attach(wfs, EVERYTHING)
+    wfs: Any = StandIn()
+    attached = oopao.attach(wfs, EVERYTHING)
     wfs.sh_data["src_0"].reference_signal_2D += 0.3
     frame = images()
     frame[2] = 0.0
     found = signal(wfs, frame)
     np.testing.assert_allclose(found[:, 2], 0.0, atol=1e-12)
+    wfs.signal = found.ravel()
+    recorded = np.where(np.arange(N) == 2, np.nan, found)
+    np.testing.assert_array_equal(attached.recorded(), recorded.ravel())
     assert np.abs(found[:, 3]).max() > 0.1
 
 

@@ -83,7 +83,8 @@ class TestRealTool:
             np.testing.assert_allclose(self.slopes(ours, frame), expected, atol=1e-6)
             np.testing.assert_allclose(ours.slopes_map.value, theirs.slopes_map.value, atol=1e-6)
             assert ours.total_counts.value[0] == pytest.approx(theirs.total_counts.value[0], rel=1e-5)
-            assert set(ours.outputs) == set(theirs.outputs)
+            assert set(ours.outputs) == {*theirs.outputs, "out_recorded"}
+            np.testing.assert_array_equal(ours.recorded.slopes, ours.slopes.slopes)
             assert np.ptp(expected) > 0.2
 
     @pytest.mark.parametrize("name", ["tv", "window", "map"])
@@ -92,6 +93,18 @@ class TestRealTool:
         slopes = self.slopes(computer, frame_of(images(5e5))) * (SIDE / 2)
         assert 0.7 < np.polyfit(POSITIONS.T.ravel(), slopes, 1)[0] < 1.2
         assert computer.measured.last.valid.all()
+
+    @pytest.mark.parametrize("interleave", [False, True])
+    def test_a_recording_has_no_slopes_without_flux(self, subapertures: Any, interleave: bool) -> None:
+        stack = images()
+        stack[2] = 0.0
+        computer = self.made(subapertures, interleave=interleave)
+        slopes = self.slopes(computer, frame_of(stack))
+        recorded = computer.recorded
+        assert np.isnan([recorded.xslopes[2], recorded.yslopes[2]]).all()
+        kept = np.isfinite(recorded.slopes)
+        assert np.count_nonzero(~kept) == 2
+        np.testing.assert_array_equal(recorded.slopes[kept], slopes[kept])
 
     def test_commands_come_after_their_delay(self, specula: Any) -> None:
         from specula.data_objects.slopes import Slopes

@@ -10,7 +10,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, not_none, number_between
+from faintspot.base.checks import finite_array, not_none, number_between, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys
 from faintspot.slopes.camera.calibration import Calibration
@@ -250,6 +250,22 @@ class ToolSlopes:
         """Standard errors of the last slopes in the tool's unit, (2, n); infinite where unknown."""
         in_px = np.stack([self.last.standard_error_x, self.last.standard_error_y], dtype=np.float64)
         return in_px * np.abs(self.unit_per_px)
+
+    def recorded(self, slopes: ArrayLike) -> NDArray[np.float64]:
+        """Return the tool's slopes of the last frame for a recording: NaN where they were not measured.
+
+        The tool itself gets 0 there, or its reference, as it can do nothing with NaN.
+
+        Parameters
+        ----------
+        slopes : (2 n,) or (2, n) array
+            x and y one after the other, in either order.
+        """
+        array = real_array("slopes", slopes)
+        measured = self.last.measured
+        if array.size != 2 * len(measured):
+            raise InputError(f"slopes: expected {2 * len(measured)} of the last frame, got {array.size}")
+        return np.where(np.tile(measured, 2), array.ravel(), np.nan)
 
     @property
     def flux(self) -> MeanFlux | None:

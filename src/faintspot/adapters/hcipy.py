@@ -126,6 +126,11 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         self._slopes = hcipy.Field(self.measured.measure(frame, prior_px=prior_px), self.estimation_grid)
         return self._slopes
 
+    def recorded(self) -> NDArray[np.float64]:
+        """Return the slopes of the last image for a recording, (2 n,) m: NaN where not measured."""
+        last = self.measured.last
+        return self.measured.recorded(np.stack([last.x, last.y]) * self.measured.unit_per_px)
+
     def calibrating(self, flux_e: float | None = None) -> Any:
         """Measure noise-free images in a `with` block; see `ToolSlopes.calibrating`."""
         return self.measured.calibrating(flux_e)

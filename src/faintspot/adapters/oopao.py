@@ -48,7 +48,7 @@ def attach(
     Returns
     -------
     OOPAOAttachment
-        `calibrating`, `measured`; `detach()` restores OOPAO's own centroiding.
+        `calibrating`, `measured`, `recorded`; `detach()` restores OOPAO's own centroiding.
 
     Raises
     ------
@@ -118,6 +118,13 @@ class OOPAOAttachment:
     def measured(self) -> tuple[ToolSlopes, ...]:
         """Measurement of each source, with `last` slopes (px), `standard_errors` and `flux`."""
         return tuple(source.slopes for source in self._sources)
+
+    def recorded(self) -> NDArray[np.float64]:
+        """Return the last `wfs.signal` for a recording: NaN where not measured; OOPAO has 0 there."""
+        signal = np.ravel(np.asarray(self.wfs.signal, np.float64))
+        ends = np.cumsum([2 * len(each.last.measured) for each in self.measured])[:-1]
+        parts = zip(self.measured, np.split(signal, ends), strict=True)
+        return np.concatenate([each.recorded(part) for each, part in parts])
 
     def _integrate(self, src: object, sh_data: object) -> object:
         """Run OOPAO's own step, which calls `centroid`, and note its source."""

@@ -84,6 +84,10 @@ def slopes_process() -> type:
             """Return slopes as pyRTC's centroiders do: (2 N, N) px, the x map above the y map."""
             return self.measuring.maps(self, image, tool.open_stream)
 
+        def recorded(self) -> NDArray[np.float64]:
+            """Return the last signal for a recording: NaN where not measured, which is 0 in the stream."""
+            return self.measuring.tool.recorded(self.read(block=False))
+
         def calibrating(self, flux_e: float | None = None) -> AbstractContextManager[None]:
             """Measure as for calibration in a `with` block; see `ToolSlopes.calibrating`."""
             return self.measuring.tool.calibrating(flux_e)

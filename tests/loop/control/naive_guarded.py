@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from faintspot.loop.control.base import Controller, ExpectedSlopes
 from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.kalman.choice import SURPRISE
 from faintspot.loop.control.kalman.guarded import GuardedController
+from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.loop.control.telemetry import as_estimated, without_prior
 
 Floats = NDArray[np.float64]
@@ -61,12 +63,19 @@ class Guarded(GuardedController):
     ) -> None:
         """See `Controller`."""
         expected = self.expected().mean_px
-        slopes, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
+        errors = self._errors_to_use(slopes_px, standard_error_px)
+        slopes, variance, trust = without_prior(slopes_px, errors, expected, self.prior_std_px)
         open_loop = slopes - self._interaction @ self.line.acting
         error = np.sqrt(self._noise_factor * variance)
         covariance = None  # of an estimator with a prior, that of the frame alone is not known
         if covariance_xy_px2 is not None and self.prior_std_px is None:
             covariance = self._noise_factor * covariance_xy_px2
+        learnt = self._controllers[0].expected()
+        if learnt.std_px is not None:
+            surprise = open_loop + self._interaction @ self._lines[0].acting - learnt.mean_px
+            in_deviations = np.square(surprise) / (np.square(learnt.std_px) + np.square(error))
+            measured = np.square(error) < LARGEST_VARIANCE_PX2
+            self._guard[SURPRISE] = in_deviations[measured].sum() / max(1, np.count_nonzero(measured))
         variances = []
         for controller, line in zip(self._controllers, self._lines, strict=True):
             residual = open_loop + self._interaction @ line.acting

@@ -90,7 +90,12 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         self._tool: ToolSlopes | None = None
         self._idxs, self._frame_shape = np.empty((0, 0), np.int64), (0, 0)
         self.slopes.single_mask, self.slopes.display_map = subapdata.single_mask(), subapdata.display_map
+        self.recorded = Slopes(
+            self.nslopes(), interleave=interleave, target_device_idx=self.target_device_idx
+        )
+        """As `out_slopes`, but NaN where not measured."""
         self.inputs["in_predicted"] = InputValue(type=Slopes, optional=True)
+        self.outputs["out_recorded"] = self.recorded
         self.outputs["out_subapdata"] = subapdata
 
     @classmethod
@@ -103,8 +108,12 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
 
     @classmethod
     def output_names(cls) -> object:
-        """Return SPECULA's outputs."""
-        return {**super().output_names(), "out_subapdata": OutputDesc(SubapData, "Sub-apertures")}
+        """Return SPECULA's outputs, sub-apertures, and slopes for recordings and the predictive filter."""
+        return {
+            **super().output_names(),
+            "out_subapdata": OutputDesc(SubapData, "Sub-apertures"),
+            "out_recorded": OutputDesc(Slopes, "Slopes, NaN where not measured"),
+        }
 
     def nsubaps(self) -> int:
         """Return the number of sub-apertures."""
@@ -152,7 +161,11 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
     def post_trigger(self) -> None:
         """Set the time of the outputs."""
         super().post_trigger()
-        self.outputs["out_subapdata"].generation_time = self.current_time
+        unmeasured = self.to_xp(np.where(self.measured.last.measured, 0.0, np.nan), dtype=self.dtype)
+        self.recorded.xslopes = self.slopes.xslopes + unmeasured
+        self.recorded.yslopes = self.slopes.yslopes + unmeasured
+        for name in ("out_subapdata", "out_recorded"):
+            self.outputs[name].generation_time = self.current_time
 
     def _prepared(self, frame_shape: tuple[int, int]) -> tuple[ToolSlopes, NDArray[np.int64]]:
         """Create the pipeline for frames of a shape; return it, and its pixels as one tall frame."""

@@ -60,7 +60,9 @@ class Reconstructor:
         return self.modes @ (_estimator(self.slopes_of_modes, weighted) @ slopes)
 
 
-def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) -> Reconstructor:
+def make_reconstructor(
+    interaction: ArrayLike, largest_condition: float = 30.0, measured: NDArray[np.bool_] | None = None
+) -> Reconstructor:
     """Return the reconstructor of an interaction matrix, by truncated and damped singular values.
 
     Parameters
@@ -70,6 +72,8 @@ def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) 
     largest_condition : float
         Combinations whose slopes are smaller than the largest's by more than this are not driven: piston,
         what looks like waffle, and what tip-tilt mirror and actuators could do against each other.
+    measured : (2 n,) array of bool, optional
+        Slopes that `matrix` uses; `clean` is for predicted slopes and uses all. Default: all.
 
     Raises
     ------
@@ -94,7 +98,9 @@ def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) 
     left, size, right = np.linalg.svd(matrix, full_matrices=False)
     driven = size * limit >= size[0]
     modes, modal_slopes = right[driven].T, left[:, driven] * size[driven]
-    plain, clean = (modes @ _estimator(modal_slopes, modal_slopes, ridge) for ridge in (_RIDGE, _RIDGE_CLEAN))
+    used = modal_slopes if measured is None else measured[:, None] * modal_slopes
+    plain = modes @ _estimator(modal_slopes, used)
+    clean = modes @ _estimator(modal_slopes, modal_slopes, _RIDGE_CLEAN)
     return Reconstructor(
         plain, modes, modal_slopes, clean, _damping(modal_slopes.T @ modal_slopes, _RIDGE_CLEAN)
     )

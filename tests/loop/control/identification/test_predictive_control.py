@@ -72,6 +72,46 @@ def test_slopes_that_were_not_measured(control: PredictiveControl, recording: Re
     assert np.isfinite(control(np.full_like(slopes, np.nan))).all()
 
 
+@pytest.mark.parametrize("value", [np.inf, -np.inf, 1e300, -1e300, 1e5])
+def test_values_that_no_slope_has_count_as_not_measured(
+    control: PredictiveControl, recording: Recording, value: float
+) -> None:
+    """In that frame and in those after it."""
+    after = []
+    for wrong in (np.nan, value):
+        rows = recording.slopes[:80].copy()
+        rows[10, 3] = rows[40:45, 7] = wrong
+        after.append(commands(control, rows))
+    np.testing.assert_array_equal(after[0], after[1])
+
+
+@pytest.mark.parametrize("row", [None, np.zeros((2, 25)), np.zeros(49), "slopes", [[1.0], [2.0, 3.0]], 1j])
+def test_a_row_of_another_shape_is_one_line(control: PredictiveControl, row: Any) -> None:
+    control.reset()
+    for arguments in ((row,), (np.zeros(50), row)):
+        if arguments[-1] is None and len(arguments) == 2:
+            continue
+        with pytest.raises(InputError, match=r"^(slopes|standard_errors): expected .*") as caught:
+            control(*arguments)
+        assert "\n" not in str(caught.value)
+    assert np.isfinite(control(np.zeros(50))).all()
+
+
+def test_a_dead_sub_aperture_costs_little(recording: Recording, control: PredictiveControl) -> None:
+    """It is named, and left out of what is learnt and of the loop."""
+    slopes = recording.slopes.copy()
+    slopes[:, 12] = 0.0
+    dead = learn(replace(recording, slopes=slopes))
+    assert dead.left_out.tolist() == [12]
+    assert "sub-aperture 12 (row 2, column 2)" in dead.summary()
+    assert dead.centroid_gain.value == pytest.approx(control.centroid_gain.value, rel=0.05)
+    sent = commands(dead, recording.slopes[:200])
+    assert np.isfinite(sent).all()
+    wild = recording.slopes[:200].copy()
+    wild[:, [12, 37]] *= -3.0
+    np.testing.assert_array_equal(commands(dead, wild)[:60], sent[:60])  # the integrator drives
+
+
 @pytest.mark.slow
 def test_exported_matrices(control: PredictiveControl, recording: Recording, tmp_path: Path) -> None:
     """In the unit and with the sign of the recording, within 1e-6 of the largest command."""

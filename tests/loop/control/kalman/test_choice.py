@@ -3,8 +3,17 @@
 import math
 
 import numpy as np
+import pytest
 
-from faintspot.loop.control.kalman.choice import CHOOSE, CHOSEN, GUARD_NUMBERS, prepare
+from faintspot.loop.control.kalman.choice import (
+    AT_LIMIT,
+    CHOOSE,
+    CHOSEN,
+    GUARD_NUMBERS,
+    LEFT_OUT,
+    SURPRISE,
+    prepare,
+)
 
 
 def driven(filters: float, integrators: float, frames: int, computed: float = math.inf) -> np.ndarray:
@@ -73,3 +82,33 @@ def test_a_filter_that_becomes_worse_is_replaced_within_30_frames_without_false_
     assert np.flatnonzero(np.diff(chosen)).tolist()[0] < 100
     assert not np.any(chosen[100:9000])
     assert chosen[9030] == 1
+
+
+@pytest.mark.parametrize(
+    ("measure", "usual", "bad", "frames"),
+    [
+        (AT_LIMIT, 0.0, 1.0, 20),
+        (AT_LIMIT, 3.0, 3.0, None),
+        (SURPRISE, 1.0, 2.5, 20),
+        (SURPRISE, 1.3, 1.6, None),
+        (LEFT_OUT, 0.0, 2.5, 30),
+        (LEFT_OUT, 1.5, 1.8, None),
+    ],
+)
+def test_a_filter_is_replaced_though_it_leaves_little(
+    measure: int, usual: float, bad: float, frames: int | None
+) -> None:
+    """By commands at the limit, surprises, or slopes that are not used; not where the integrator has them."""
+    guard = np.zeros(GUARD_NUMBERS)
+    prepare(guard, False, math.inf, 60)
+    chosen = []
+    for number in range(400):
+        driving = guard[CHOSEN] == 0
+        guard[SURPRISE] = 1.0
+        guard[measure] = bad if driving and number > 100 else usual
+        CHOOSE(guard, 0.5, 1.0)
+        chosen.append(guard[CHOSEN])
+    assert not any(chosen[65:101])
+    assert any(chosen[101:]) == (frames is not None)
+    if frames is not None:
+        assert chosen[100 + frames] == 1

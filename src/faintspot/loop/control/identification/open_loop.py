@@ -109,13 +109,18 @@ def _of_fit(loop: Recording) -> tuple[Floats, Floats, NDArray[np.int64], SlopeTu
     Raises
     ------
     InputError
-        When no frame has most of its slopes.
+        When no sub-aperture was measured in most frames, or no frame has most of their slopes.
     """
-    rows = np.isfinite(loop.slopes).mean(axis=1) >= _LEAST_MEASURED
+    site, measured = site_of_loop(loop), np.isfinite(loop.slopes)
+    kept = np.flatnonzero(measured.mean(axis=0).reshape(2, -1).min(axis=0) >= _LEAST_MEASURED)
+    columns = np.concatenate([kept, kept + len(loop.cells)])
+    rows = measured[:, columns].mean(axis=1) >= _LEAST_MEASURED if len(kept) else np.zeros(1, np.bool_)
     if not rows.any():
         raise InputError("recording: expected frames with most slopes measured, got none")
-    slopes, mirror = np.nan_to_num(loop.slopes[rows]), loop.commands[rows] @ loop.interaction_matrix.T
-    return slopes, mirror, runs_of(loop.frame[rows]), site_of_loop(loop), loop.frame_rate_hz
+    slopes = np.nan_to_num(loop.slopes[rows][:, columns])
+    mirror = loop.commands[rows] @ loop.interaction_matrix[columns].T
+    site = replace(site, positions_m=site.positions_m[kept])
+    return slopes, mirror, runs_of(loop.frame[rows]), site, loop.frame_rate_hz
 
 
 def known_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay, str]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.checks import real_array
 from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays
 from faintspot.loop.control.commands import CommandDelayLine
@@ -36,6 +37,7 @@ Floats = NDArray[np.float64]
 _LEAK = 0.01
 _MEASURED_FRAMES = 60  # that the integrator drives the mirror first, so that its residual is measured
 _MOST_SIGMAS = 5.0  # of the commands that the turbulence asks for
+_ABSURD = 1e3  # of the rms of recorded slopes: no such slope is measured
 _CONTENTS = "a predictive controller"
 
 
@@ -46,7 +48,7 @@ class LoopOfControl:
     interaction: Floats
     """(2 n, commands): in slopes divided by the rms of the recording's and by their centroid gain."""
     standard_error: Floats
-    """(2 n,): of such slopes."""
+    """(2 n,): of such slopes; infinite where the recording has none, which are left out."""
     scale: Floats
     """(2 n,): such slopes in a unit of the user's."""
     sign: float
@@ -64,7 +66,11 @@ class LoopOfControl:
     def plant(self) -> LoopPlant:
         """Return the loop for which controllers are made."""
         frames = max(1, round(float(self.delay[0])))
-        return LoopPlant(self.interaction, make_reconstructor(self.interaction), frames, _LEAK)
+        reconstructor = make_reconstructor(self.interaction, measured=np.isfinite(self.standard_error))
+        # The integrator is that of the recording, whatever gain of x relative to y was found.
+        gains = np.exp(np.log(np.abs(self.scale)).mean()) / np.abs(self.scale)
+        reconstructor = replace(reconstructor, matrix=reconstructor.matrix * gains)
+        return LoopPlant(self.interaction, reconstructor, frames, _LEAK)
 
 
 class PredictiveControl:
@@ -112,6 +118,12 @@ class PredictiveControl:
         """Whether the filter drives the mirror; else the integrator does."""
         return self._controller.chosen == 0
 
+    @property
+    def left_out(self) -> NDArray[np.int64]:
+        """Numbers of sub-apertures not in use: without slopes in the recording, or stuck for 50 frames."""
+        learnt = np.isinf(self._loop.standard_error).reshape(2, -1).any(axis=0)
+        return np.flatnonzero(learnt | self._controller.is_stuck)
+
     def reset(self, command: ArrayLike | None = None) -> None:
         """Start again, without the memory of earlier frames.
 
@@ -140,20 +152,44 @@ class PredictiveControl:
         Parameters
         ----------
         slopes : (2 n,) array
-            Residual slopes as in the recording; NaN: not measured.
+            Residual slopes as in the recording. Not measured: NaN, infinite, or over 1000 times the rms of
+            those.
         standard_errors : (2 n,) array, optional
-            Standard errors of the slopes. Default: the noise of the recording.
+            Standard errors of the slopes; not measured unless positive. Default: the noise of the recording.
+
+        Raises
+        ------
+        InputError
+            When an array has another shape.
         """
         loop = self._loop
-        scaled = np.asarray(slopes, np.float64) * loop.scale
-        errors = loop.standard_error
+        scaled, errors = self._row("slopes", slopes), loop.standard_error
         if standard_errors is not None:
-            errors = np.asarray(standard_errors, np.float64) * loop.scale
-        unmeasured = np.isnan(scaled)
-        if unmeasured.any():
-            scaled, errors = np.where(unmeasured, 0.0, scaled), np.where(unmeasured, np.inf, errors)
+            stated = self._row("standard_errors", standard_errors)
+            errors = np.where((stated > 0) & np.isfinite(errors), stated, np.inf)
+        measured = np.abs(scaled) < _ABSURD
+        if not measured.all():  # NaN among them
+            scaled, errors = np.where(measured, scaled, 0.0), np.where(measured, errors, np.inf)
         self._controller.update(scaled, errors)
         return loop.sign * self._line.latest
+
+    def _row(self, name: str, values: ArrayLike) -> Floats:
+        """Return values of all slopes, scaled.
+
+        Raises
+        ------
+        InputError
+            When they have another shape.
+        """
+        scale = self._loop.scale
+        try:
+            row = np.asarray(values, np.float64)
+        except (TypeError, ValueError):
+            row = real_array(name, values).astype(np.float64)
+        if row.shape != scale.shape:
+            raise InputError(f"expected shape {scale.shape}, got {row.shape}", name=name)
+        with np.errstate(over="ignore"):
+            return row * scale
 
     def learn_again(self, recording: Recording) -> PredictiveControl:
         """Learn from another recording of the same loop, from the turbulence known so far; return itself.
@@ -234,6 +270,7 @@ class PredictiveControl:
             f"{gain.error:.3f}",
             self.model.description,  # not in files
             f"residual, noise included, {left / plain:.2f} of an integrator's",
+            f"sub-apertures {', '.join(map(str, self.left_out))} left out" if len(self.left_out) else "",
         ]
         return "; ".join(part for part in parts if part)
 
@@ -305,7 +342,7 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> P
     loop, gain, site = ready.recording, delay.gain, site_of_loop(ready.recording)
     described = LoopOfControl(
         loop.interaction_matrix,
-        np.sqrt(seen.variance),
+        np.where(np.isfinite(loop.slopes).any(axis=0), np.sqrt(seen.variance), np.inf),
         1 / (loop.unit * delay.gains(len(loop.cells))),
         ready.sign,
         delay.row(),
@@ -342,6 +379,6 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> P
 def _largest_command(loop: Recording, seen: OpenLoop, plant: LoopPlant) -> float:
     """Return the stroke limit: the loop's, or 5 sigma of what the recorded wavefront asks for."""
     asked = seen.telemetry.open_loop_px @ plant.reconstructor.matrix.T
-    static = np.abs(loop.commands.mean(axis=0))
+    static = np.abs(loop.commands.mean(axis=0)) * loop.interaction_matrix.any(axis=0)
     limit = float((static + _MOST_SIGMAS * asked.std(axis=0)).max())
     return limit if loop.largest_command is None else min(limit, loop.largest_command)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import finite_array, increasing, numbers_between, real_array
 from faintspot.base.config.options import Option
 from faintspot.base.errors import InputError
+from faintspot.loop.control.faults import followers, still_actuators, stuck_slopes
 from faintspot.loop.control.identification.cell_order import order_remark
 from faintspot.loop.control.reconstructor import make_reconstructor
 
@@ -23,6 +24,7 @@ _UNRELATED = 0.1  # correlation below which commands are not those of the loop
 _STEPS_FOR_TEST = 200  # fewest of them
 _PER_FRAME = ("slopes", "commands", "frame", "standard_errors", "covariance_xy")
 _MOST_CELLS = 1000  # rows or columns of the lenslet array
+_NAMED = 5  # sub-apertures in a remark
 _BROKEN = 1e6  # rms of a slope relative to the median one
 
 
@@ -196,10 +198,11 @@ def prepared(recording: Recording) -> Prepared:
     if not spread > 1e-12 * float(np.abs(slopes).max(initial=0.0)):
         raise InputError(f"{recording.name}: expected slopes that vary, got constant ones")
     _check_alike(recording)
-    scaled = recording.scaled(spread)
+    scaled = _without_unmeasured(recording).scaled(spread)
     if recording.commands is None or recording.interaction_matrix is None or not recording.is_closed:
         return Prepared(scaled, 1.0, 0, math.inf)
-    return _with_convention(scaled)
+    ready = _with_convention(scaled)
+    return ready._replace(recording=_without_still_actuators(ready.recording))
 
 
 def _check_alike(recording: Recording) -> None:
@@ -215,6 +218,60 @@ def _check_alike(recording: Recording) -> None:
             f"{recording.name}: expected slopes of similar size, got columns {columns} over {_BROKEN:g} "
             "times the median; flag them, or write NaN there"
         )
+
+
+def _without_unmeasured(recording: Recording) -> Recording:
+    """Return the recording without slopes that measure nothing, and with remarks that name them.
+
+    Raises
+    ------
+    InputError
+        When none are left.
+    """
+    n, stuck, matrix = len(recording.cells), stuck_slopes(recording.slopes), recording.interaction_matrix
+    slopes = np.where(np.tile(stuck, 2), np.nan, recording.slopes)
+    measured = np.isfinite(slopes)
+    known = measured.reshape(len(slopes), 2, n).any(axis=(0, 1))
+    reasons = {
+        "no slope was measured": ~np.isfinite(recording.slopes).reshape(len(slopes), 2, n).any(axis=(0, 1)),
+        "slopes are constant or take two or three values": stuck.any(axis=0) & ~known,
+        "slopes stick for a part of the time": stuck.any(axis=0) & known,
+        "slopes follow each other exactly": followers(slopes),
+    }
+    if matrix is not None:
+        answers = matrix.any(axis=1).reshape(2, n)
+        # A mirror may move one axis only.
+        reasons["rows of the interaction matrix are 0"] = (~answers & answers.any(axis=1)[:, None]).any(
+            axis=0
+        )
+    remarks = [f"{_named(mask, recording.cells)}: {why}" for why, mask in reasons.items() if mask.any()]
+    for why in tuple(reasons)[3:]:
+        slopes[:, np.tile(reasons[why], 2)] = np.nan
+    if not np.isfinite(slopes).any():
+        raise InputError(f"{recording.name}: expected slopes that measure something; {'; '.join(remarks)}")
+    return replace(recording, slopes=slopes, remarks=(*recording.remarks, *remarks)) if remarks else recording
+
+
+def _without_still_actuators(loop: Recording) -> Recording:
+    """Return a recording whose matrix is 0 for commands that slopes do not follow, with a remark."""
+    if not loop.is_closed or loop.commands is None or not np.ptp(loop.commands, axis=0).any():
+        return loop
+    is_still = still_actuators(np.nan_to_num(loop.slopes), loop.commands, loop.interaction_matrix)
+    if not is_still.any():
+        return loop
+    remark = (
+        f"command {', '.join(map(str, np.flatnonzero(is_still)))}: slopes do not follow, so it is not used"
+    )
+    matrix = np.where(is_still, 0.0, loop.interaction_matrix)
+    return replace(loop, interaction_matrix=matrix, remarks=(*loop.remarks, remark))
+
+
+def _named(mask: NDArray[np.bool_], cells: NDArray[np.int64]) -> str:
+    """Return sub-apertures with row and column as text."""
+    numbers = np.flatnonzero(mask)
+    shown = ", ".join(f"{k} (row {cells[k][0]}, column {cells[k][1]})" for k in numbers[:_NAMED])
+    more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
+    return f"sub-aperture{'s' if len(numbers) > 1 else ''} {shown}{more}"
 
 
 def _with_convention(loop: Recording) -> Prepared:

@@ -2,7 +2,9 @@
 
 The controller that drives the mirror has its measured residual. That of the other one is computed, and is as
 wrong as the model of the loop is. So a filter whose measured residual is above that of the integrator while
-it drove the mirror loses the mirror, whatever is computed, and for longer each time.
+it drove the mirror loses the mirror, whatever is computed, and for longer each time. So does one whose
+predictions fail more than they did then, that leaves more in slopes which it does not use, or whose commands
+stay at the limit: slopes that are used say little where the filter has made them small.
 
 Both decisions are cumulative sums (Page 1954, Biometrika 41, 100): of frames in which the other controller
 leaves less, and of residuals above those of the integrator. They notice a large change in a few frames and a
@@ -24,8 +26,11 @@ _ENOUGH = 16.0  # sum of the differences, in their standard deviations, for the 
 _LEAST_DEVIATION, _MOST_DEVIATIONS = 0.03, 5.0  # of a difference, and in one frame
 _SETTLING = 15  # frames after a change whose residuals belong to both
 _MEASURED, _MEASURED_MEMORY = 20, 200  # frames of the integrator's residual: fewest, and memory
-_ALLOWED, MOST_EXCESS, _IN_ONE_FRAME = 1.1, 16.0, 20.0
-"""Residual of the filter in those of the integrator: allowed; sum of the excess; largest that counts."""
+_MEASURES = 4
+"""Of the mirror's controller: residual, surprise, slopes that are not used, commands at the limit."""
+_ALLOWED, MOST_EXCESS, _IN_ONE_FRAME = (1.1, 1.5, 1.3, 1.1), 16.0, (20.0, 5.0, 2.0, 2.0)
+"""Measures of the filter in those of the integrator: allowed; sum of the excess; largest that counts."""
+_LEAST = 1e-30, 0.5, 1.0, 1.0  # measures of the integrator
 _LATE, _RUNAWAY = 10, 2.0
 """Frames, and their mean residual in those of the integrator, with which a filter fails for good."""
 _ASSUMED = 4.0  # residual of an integrator that was computed, by which it may be too small
@@ -34,12 +39,14 @@ _PROVEN = 2000  # frames after which the wait is the first one again
 
 # Numbers of the guard: 1 where the plain one's commands go out; the same of the frame before, or another
 # number; frames of late, mean difference, its mean square, evidence for the other controller; frames of the
-# handover that are left; frames since the last change, and what was chosen before it; measured residuals of
-# the integrator, its frames, and of the filter of late; sum of the filter's excess; the integrator's computed
-# residual; frames to wait, now and the next time.
+# handover that are left; frames since the last change, and what was chosen before it; frames of the
+# integrator that were measured; residual of the filter of late; the integrator's computed residual; frames to
+# wait, now and the next time. Then measures of this frame, the integrator's means, and sums of the filter's
+# excess.
 CHOSEN, SENT, FRAMES, _MEAN, _SQUARE, _EVIDENCE, BLENDED, _SINCE, _BEFORE = range(9)
-_PLAIN, _PLAIN_FRAMES, _OF_LATE, EXCESS, _COMPUTED, _WAIT, _NEXT_WAIT = range(9, 16)
-GUARD_NUMBERS = 16
+_PLAIN_FRAMES, _OF_LATE, _COMPUTED, _WAIT, _NEXT_WAIT = range(9, 14)
+_RESIDUAL, SURPRISE, LEFT_OUT, AT_LIMIT = range(14, 18)
+_PLAIN, EXCESS, GUARD_NUMBERS = 18, 22, 26
 
 
 @partial(compiled_with, source=__file__)
@@ -49,7 +56,8 @@ def choose(guard: Any, learnt: object, plain: Any) -> None:
     Parameters
     ----------
     guard : (GUARD_NUMBERS,) array
-        From `new_guard`.
+        With the measures of this frame but the residual: mean square of surprises in their expected
+        deviations, that of slopes that are not used in that of the others, number of commands at the limit.
     learnt, plain : float
         Squared residuals of this frame.
     """
@@ -60,17 +68,33 @@ def choose(guard: Any, learnt: object, plain: Any) -> None:
     guard[_SQUARE] += share * (difference * difference - guard[_SQUARE])
     if guard[_BEFORE] != guard[CHOSEN]:
         guard[_BEFORE], guard[_SINCE] = guard[CHOSEN], 0.0
-        guard[_EVIDENCE] = guard[EXCESS] = guard[_OF_LATE] = 0.0
+        guard[_EVIDENCE] = guard[_OF_LATE] = 0.0
+        for measure in range(_MEASURES):
+            guard[EXCESS + measure] = 0.0
     guard[_SINCE] += 1.0
+    guard[_RESIDUAL] = plain if guard[CHOSEN] > 0.0 else learnt
     if guard[CHOSEN] > 0.0:
         if guard[_SINCE] > _SETTLING:
             guard[_PLAIN_FRAMES] += 1.0
-            guard[_PLAIN] += (plain - guard[_PLAIN]) / min(guard[_PLAIN_FRAMES], _MEASURED_MEMORY)
+            for measure in range(_MEASURES):
+                change = guard[_RESIDUAL + measure] - guard[_PLAIN + measure]
+                guard[_PLAIN + measure] += change / min(guard[_PLAIN_FRAMES], _MEASURED_MEMORY)
     else:
-        usual = guard[_PLAIN] if guard[_PLAIN_FRAMES] >= _MEASURED else _ASSUMED * guard[_COMPUTED]
-        residual = min(learnt / max(usual, 1e-30), _IN_ONE_FRAME)
-        guard[_OF_LATE] += (residual - guard[_OF_LATE]) / min(guard[_SINCE], _LATE)
-        guard[EXCESS] = max(0.0, guard[EXCESS] + residual - _ALLOWED)
+        is_measured = guard[_PLAIN_FRAMES] >= _MEASURED
+        for measure in range(_MEASURES):
+            value, usual = guard[_RESIDUAL + measure], guard[_PLAIN + measure]
+            if measure == AT_LIMIT - _RESIDUAL:
+                value, usual = 1.0 + value, 1.0 + usual
+            elif not is_measured:
+                computed = guard[_COMPUTED] if measure == 0 else 1.0
+                usual = math.inf if measure == LEFT_OUT - _RESIDUAL else _ASSUMED * computed
+            ratio = min(value / max(usual, _LEAST[measure]), _IN_ONE_FRAME[measure])
+            if measure == 0:
+                guard[_OF_LATE] += (ratio - guard[_OF_LATE]) / min(guard[_SINCE], _LATE)
+            excess = max(0.0, guard[EXCESS + measure] + ratio - _ALLOWED[measure])
+            guard[EXCESS + measure] = excess
+            if excess > MOST_EXCESS:
+                guard[EXCESS] = max(guard[EXCESS], excess)
         if guard[EXCESS] > MOST_EXCESS:
             is_runaway = guard[_OF_LATE] > _RUNAWAY
             guard[CHOSEN], guard[_WAIT] = 1.0, _LONGEST_WAIT if is_runaway else guard[_NEXT_WAIT]
@@ -113,4 +137,4 @@ def prepare(guard: Any, prefers_plain: bool, plain_residual: float, plain_frames
 
 def restart(guard: Any) -> None:
     """Forget the differences of earlier frames; what was measured of the integrator stays."""
-    guard[FRAMES : _SINCE + 1] = guard[EXCESS] = 0.0
+    guard[FRAMES : _SINCE + 1] = guard[EXCESS:] = 0.0

@@ -137,7 +137,7 @@ class CompiledKalman(GuardedController):
         prior = self.prior_std_px
         total = FOLLOW(
             slopes_px,
-            standard_error_px,
+            self._errors_to_use(slopes_px, standard_error_px),
             self._independent if covariance_xy_px2 is None else covariance_xy_px2,
             _NO_PRIOR if prior is None else prior,
             self._noise_factor,

@@ -9,13 +9,16 @@ from numpy.typing import NDArray
 
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.faults import StuckWatch
 from faintspot.loop.control.kalman.choice import (
+    AT_LIMIT,
     BLENDED,
     CHOOSE,
     CHOSEN,
     EXCESS,
     GUARD_NUMBERS,
     HANDOVER_FRAMES,
+    LEFT_OUT,
     MOST_EXCESS,
     SENT,
     prepare,
@@ -66,6 +69,7 @@ class GuardedController(Controller):
         self._lines = [CommandDelayLine(*sizes) for _ in range(2)]
         self.prior_std_px, self._noise_factor = prior_std_px, float(noise_factor)
         self._guard, self._offset = np.zeros(GUARD_NUMBERS), np.zeros(interaction.shape[1])
+        self._watch = StuckWatch(len(interaction))
         prepare(
             self._guard, prefers_plain=prefers_plain, plain_residual=plain_residual, plain_frames=plain_frames
         )
@@ -97,6 +101,17 @@ class GuardedController(Controller):
         """See `Controller`."""
         self._guard[SENT] = -1.0
 
+    @property
+    def is_stuck(self) -> NDArray[np.bool_]:
+        """(n,): sub-apertures whose slopes are not used because they are stuck."""
+        return self._watch.is_stuck
+
+    def _errors_to_use(self, slopes_px: Floats, standard_error_px: Floats) -> Floats:
+        """Return standard errors, infinite for sub-apertures that are stuck."""
+        errors = self._watch(slopes_px, standard_error_px)
+        self._guard[LEFT_OUT] = self._watch.left_out
+        return errors
+
     def _choose(self, learnt: float, plain: float) -> bool:
         """Select a controller by the squared residuals; return whether the learnt one has failed.
 
@@ -118,3 +133,4 @@ class GuardedController(Controller):
             self._offset = self.line.latest - command
         guard[BLENDED] = max(0.0, guard[BLENDED] - 1.0)
         self.line.put(command + guard[BLENDED] / HANDOVER_FRAMES * self._offset)
+        guard[AT_LIMIT] = np.count_nonzero(np.abs(self.line.latest) >= self.line.largest)

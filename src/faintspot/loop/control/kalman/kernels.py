@@ -15,12 +15,14 @@ import numpy as np
 
 from faintspot.loop.control.kalman import choice
 from faintspot.loop.control.kalman.choice import (
+    AT_LIMIT,
     BLENDED,
     CHOSEN,
     EXCESS,
     HANDOVER_FRAMES,
     MOST_EXCESS,
     SENT,
+    SURPRISE,
     choose,
 )
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
@@ -125,6 +127,17 @@ def _correlate(covariance: Any, factor: Any, rows: Any) -> None:
 
 
 @_compiled
+def _failure(matrices: Any, rows: Any) -> float:
+    """Return the mean square of the surprises in their expected deviations."""
+    total, count = 0.0, 0.0
+    for s in range(rows.shape[1]):
+        if rows[_VARIANCE, s] < math.inf:
+            count += 1.0
+            total += rows[_SURPRISE, s] ** 2 / (matrices.uncertainty[s, s] + rows[_VARIANCE, s])
+    return total / max(count, 1.0)
+
+
+@_compiled
 def _solve(matrices: Any, rows: Any, steps: Any) -> None:
     """Write x with (S + V) x = surprise: S of the predicted slopes' error, V of this frame's noise.
 
@@ -211,8 +224,11 @@ def _send(command: Any, true: Any, row: Any, memory: Any, largest: Any) -> None:
             offset[c] = true[row - 1, c] - command[c]
     guard[BLENDED] = max(0.0, guard[BLENDED] - 1.0)
     share = guard[BLENDED] / HANDOVER_FRAMES
+    guard[AT_LIMIT] = 0.0
     for c in range(command.shape[0]):
         true[row, c] = min(max(command[c] + share * offset[c], -largest), largest)
+        if abs(true[row, c]) >= largest:
+            guard[AT_LIMIT] += 1.0
 
 
 @_compiled
@@ -287,6 +303,7 @@ def follow(
     gain, keep, largest, steps = numbers
     plainly = memory.guard[CHOSEN] > 0.0
     _take(slopes, errors, covariance, prior_std, noise_factor, memory.slopes, plainly)
+    memory.guard[SURPRISE] = _failure(matrices, memory.slopes)
     if plainly:
         total: float = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
     else:

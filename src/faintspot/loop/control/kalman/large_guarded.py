@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.loop.control.base import ExpectedSlopes
 from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.kalman.choice import SURPRISE
 from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.local_covariance import replies
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor
@@ -121,7 +122,8 @@ class LargeGuarded(GuardedController):
     ) -> None:
         """See `Controller`; the gains have the usual covariances of x and y."""
         expected = self.expected().mean_px
-        slopes, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
+        errors = self._errors_to_use(slopes_px, standard_error_px)
+        slopes, variance, trust = without_prior(slopes_px, errors, expected, self.prior_std_px)
         caused = self._of_line(_LEARNT, 1), self._of_line(_PLAIN, 1), self._of_line(_PLAIN, 0)
         open_loop, surprise = slopes - self._held, slopes - self._predicted
         self._frame = frame = _Frame(open_loop, surprise, self._noise_factor * variance, trust, *caused)
@@ -155,6 +157,7 @@ class LargeGuarded(GuardedController):
         frame, self._frame = self._frame, None
         if frame is not None:
             learnt, plain = self._compare.several(*self._follow_up(frame))
+            self._guard[SURPRISE] = self._predictor.failure(frame.surprise, frame.variance)
             self._predictor.correct(frame.open_loop, frame.variance)
             self._predictor.advance()
             if self._choose(float(learnt @ learnt), float(plain @ plain)):

@@ -96,6 +96,12 @@ class LocalPredictor:
         level = round(float(more)) + len(self._gains) // 2
         return np.where(measured, difference_px, 0.0), int(np.clip(level, 0, len(self._gains) - 1))
 
+    def failure(self, difference_px: Floats, variance_px2: Floats) -> float:
+        """Return the mean square of what slopes differ from the prediction, in its expected deviation."""
+        measured = variance_px2 < LARGEST_VARIANCE_PX2
+        total = np.square(self.std_px) + variance_px2
+        return float((np.square(difference_px) / total)[measured].sum() / max(measured.sum(), 1))
+
     def remaining(self, positions_m: Floats, level: int) -> float:
         """Return the part of an error that a frame leaves in the long run; the state is lost.
 

@@ -1,0 +1,124 @@
+"""Sub-apertures that measure nothing and actuators that do not move, in recordings and in the loop."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.loop.control.control_cases import INTERACTION, MODEL, PHASE, PLANT, telemetry
+from tests.loop.telemetry.loop_cases import recorded
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.faults import STUCK_FRAMES, followers, still_actuators
+from faintspot.loop.control.identification.recording import Recording, prepared
+from faintspot.loop.control.kalman.compiled import CompiledKalman
+from faintspot.loop.control.kalman.predictor import SlopePredictor
+
+N, DIES = 25, 300
+Damage = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+
+
+def x_of(number: int, values: Callable[[int, np.random.Generator], object], start: int = 0) -> Damage:
+    """Return what writes the x slopes of a sub-aperture."""
+
+    def damaged(slopes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        slopes = slopes.copy()
+        slopes[start:, number] = values(len(slopes) - start, rng)
+        return slopes
+
+    return damaged
+
+
+FAULTS: dict[str, tuple[Damage, list[int]]] = {
+    "0": (x_of(7, lambda frames, rng: 0.0), [7]),
+    "another value": (x_of(7, lambda frames, rng: 0.33), [7]),
+    "two values": (x_of(7, lambda frames, rng: rng.integers(2, size=frames)), [7]),
+    "three values": (x_of(7, lambda frames, rng: rng.integers(3, size=frames) - 1.0), [7]),
+    "not measured": (x_of(7, lambda frames, rng: np.nan), []),
+    "dies": (x_of(7, lambda frames, rng: 0.0, DIES), [7]),
+    "many values": (x_of(7, lambda frames, rng: np.round(rng.standard_normal(frames), 1)), []),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_recording_with_a_fault(name: str) -> None:
+    """What sticks is not measured, from its first frame on, nor is the other axis of the sub-aperture."""
+    damage, stuck = FAULTS[name]
+    loop = recorded(frames=900)
+    ready = prepared(replace(loop, slopes=damage(loop.slopes, np.random.default_rng(1)))).recording
+    missing = np.isnan(ready.slopes).reshape(-1, 2, N)
+    start = DIES if name == "dies" else 0
+    assert missing[start:, :, stuck].all()
+    assert not missing[: max(0, start - STUCK_FRAMES), :, stuck].any()
+    assert not np.delete(missing, 7, axis=2).any()
+    assert any("sub-aperture 7 (row 1, column 2)" in remark for remark in ready.remarks) == bool(stuck)
+
+
+def test_sub_apertures_with_the_same_slopes_and_rows_of_zero() -> None:
+    """Which of the two follows the other is not known."""
+    loop = recorded(frames=900)
+    slopes, matrix = loop.slopes.copy(), loop.interaction_matrix.copy()
+    slopes[:, 3] = 2.0 * slopes[:, N + 9] + 1.0
+    matrix[[20, N + 20]] = 0.0
+    ready = prepared(replace(loop, slopes=slopes, interaction_matrix=matrix)).recording
+    assert np.flatnonzero(np.isnan(ready.slopes[0, :N])).tolist() == [3, 9, 20]
+    assert sum("sub-aperture" in remark for remark in ready.remarks) == 2
+    assert not followers(loop.slopes).any()
+
+
+def test_a_recording_in_which_everything_is_stuck() -> None:
+    loop = recorded(frames=900)
+    with pytest.raises(InputError, match="expected slopes that measure something; sub-apertures 0 "):
+        prepared(replace(loop, slopes=np.sign(loop.slopes)))
+
+
+def loop_with(still: int | None, noise_px: float) -> Recording:
+    """Return a loop of an integrator, one of whose actuators does not move."""
+    loop, rng = recorded(frames=1500), np.random.default_rng(4)
+    interaction = np.asarray(loop.interaction_matrix)
+    mirror = interaction.copy()
+    if still is not None:
+        mirror[:, still] = 0.0
+    before = np.vstack([np.zeros((2, 36)), loop.commands[:-2]])
+    turbulence = loop.slopes - before @ interaction.T
+    slopes, commands = np.zeros_like(loop.slopes), np.zeros_like(loop.commands)
+    matrix = np.linalg.pinv(interaction, rcond=0.05)
+    for k in range(2, len(slopes)):
+        slopes[k] = turbulence[k] + mirror @ commands[k - 2] + noise_px * rng.standard_normal(2 * N)
+        commands[k] = 0.99 * commands[k - 1] - 0.35 * matrix @ slopes[k]
+    return replace(loop, slopes=slopes, commands=commands)
+
+
+@pytest.mark.parametrize("still", [None, 0, 14])
+@pytest.mark.parametrize("noise_px", [0.0, 0.5])
+def test_an_actuator_that_does_not_move(still: int | None, noise_px: float) -> None:
+    loop = loop_with(still, noise_px)
+    found = still_actuators(loop.slopes, loop.commands, np.asarray(loop.interaction_matrix))
+    assert np.flatnonzero(found).tolist() == ([] if still is None else [still])
+    ready = prepared(loop).recording
+    assert (
+        np.flatnonzero(~np.any(ready.interaction_matrix, axis=0)).tolist() == np.flatnonzero(found).tolist()
+    )
+
+
+@pytest.mark.parametrize("values", [[0.0], [0.33], [0.0, 1.0]])
+def test_a_sub_aperture_that_dies_in_the_loop_is_left_out_until_it_lives(values: list[float]) -> None:
+    """Noticed within 200 frames; then its slopes have no influence, also a single other value."""
+    lines, controllers, stuck = [CommandDelayLine(12, 2) for _ in range(2)], [], []
+    for line in lines:
+        predictor, reconstructor = SlopePredictor(MODEL, np.full(18, 0.25), np.zeros(9)), PLANT.reconstructor
+        of_loop = INTERACTION, reconstructor.matrix, PHASE, predictor, reconstructor.clean, 0.4, PLANT.leak
+        controllers.append(CompiledKalman(line, *of_loop))
+    for number, open_loop in enumerate(telemetry(450).open_loop_px):
+        for which, (controller, line) in enumerate(zip(controllers, lines, strict=True)):
+            slopes = open_loop + INTERACTION @ line.acting
+            if 100 <= number < 300:
+                slopes[4] = 5.0 if which and number == 250 else values[number % len(values)]
+            controller.update(slopes, np.full(18, 0.5))
+        if number < 300:
+            np.testing.assert_array_equal(lines[0].latest, lines[1].latest)
+        stuck.append(np.flatnonzero(controllers[0].is_stuck).tolist())
+    assert stuck[100] == []
+    assert stuck[199] == stuck[320] == [4]
+    assert stuck[-1] == []
