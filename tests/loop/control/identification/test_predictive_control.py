@@ -72,6 +72,7 @@ def test_slopes_that_were_not_measured(control: PredictiveControl, recording: Re
     assert np.isfinite(control(np.full_like(slopes, np.nan))).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [np.inf, -np.inf, 1e300, -1e300, 1e5])
 def test_values_that_no_slope_has_count_as_not_measured(
     control: PredictiveControl, recording: Recording, value: float
@@ -85,6 +86,7 @@ def test_values_that_no_slope_has_count_as_not_measured(
     np.testing.assert_array_equal(after[0], after[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", [None, np.zeros((2, 25)), np.zeros(49), "slopes", [[1.0], [2.0, 3.0]], 1j])
 def test_a_row_of_another_shape_is_one_line(control: PredictiveControl, row: Any) -> None:
     control.reset()
@@ -97,6 +99,7 @@ def test_a_row_of_another_shape_is_one_line(control: PredictiveControl, row: Any
     assert np.isfinite(control(np.zeros(50))).all()
 
 
+@pytest.mark.slow
 def test_a_dead_sub_aperture_costs_little(recording: Recording, control: PredictiveControl) -> None:
     """It is named, and left out of what is learnt and of the loop."""
     slopes = recording.slopes.copy()

@@ -109,10 +109,11 @@ def _of_fit(loop: Recording) -> tuple[Floats, Floats, NDArray[np.int64], SlopeTu
     Raises
     ------
     InputError
-        When no sub-aperture was measured in most frames, or no frame has most of their slopes.
+        When no frame has most of the slopes.
     """
     site, measured = site_of_loop(loop), np.isfinite(loop.slopes)
-    kept = np.flatnonzero(measured.mean(axis=0).reshape(2, -1).min(axis=0) >= _LEAST_MEASURED)
+    part = measured.mean(axis=0).reshape(2, -1).min(axis=0)
+    kept = np.flatnonzero((part > 0) & (part >= _LEAST_MEASURED * part.max()))
     columns = np.concatenate([kept, kept + len(loop.cells)])
     rows = measured[:, columns].mean(axis=1) >= _LEAST_MEASURED if len(kept) else np.zeros(1, np.bool_)
     if not rows.any():
