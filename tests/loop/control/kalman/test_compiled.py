@@ -78,7 +78,8 @@ def test_it_is_the_filter_in_numpy(
         np.testing.assert_array_equal(expected[1].std_px, expected[0].std_px)
         np.testing.assert_allclose(controllers[1][1].latest, controllers[0][1].latest, rtol=0, atol=tolerance)
     assert np.abs(controllers[0][1].latest).max() > 0.1
-    assert controllers[0][0].chosen == controllers[1][0].chosen == 0
+    assert controllers[0][0].chosen == controllers[1][0].chosen
+    assert prior is not None or controllers[0][0].chosen == 0  # these slopes were not drawn to a prior
 
 
 def test_nonsense_is_replaced_by_the_integrator() -> None:
