@@ -8,6 +8,7 @@ from tests.experiments.result_cases import LABELS, made_up_budget, made_up_magni
 from tests.refusals import refused
 
 from faintspot.experiments.closed_loop.budget import TERMS
+from faintspot.experiments.closed_loop.magnitude import save_recommended
 from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
 from faintspot.experiments.closed_loop.verdict import (
     NOWHERE,
@@ -20,7 +21,9 @@ from faintspot.experiments.closed_loop.verdict import (
     reference_methods,
     tv_method,
 )
+from faintspot.loop.simulation.configuration.configuration import load_loop
 from faintspot.loop.simulation.files import BUDGET_FILE, MAGNITUDE_FILE
+from faintspot.slopes.pipeline.settings import Settings
 
 pytest.importorskip("hcipy")
 
@@ -141,3 +144,25 @@ def test_the_simplest_of_equal_methods_is_recommended() -> None:
     assert "Recommended at magnitude 10.00 (50 e-): map+kalman (loop_gain 0.3)." in text
     nothing = replace(made, strehl=np.full(strehl.shape, np.nan))
     assert equal_methods(nothing, 0) == []
+
+
+def test_what_is_recommended_for_the_star_is_written(tmp_path: Path) -> None:
+    loop = load_loop("canary")
+    made = replace(
+        made_up_magnitude(),
+        names=("window",),
+        labels=("window",),
+        photons=np.array([0.1, 1.0]) * loop.photons,
+        magnitudes=np.array([12.5, 10.0]),
+        strehl=np.full((1, 2, 3), 0.4),
+        centroid_gain=np.ones((1, 2, 3)),
+        settings=np.full((1, 2), ""),
+        choices=np.array(
+            [['{"loop_gain": 0.1, "window_fwhm_px": 5.0}', '{"loop_gain": 0.3, "window_fwhm_px": 3.0}']]
+        ),
+    )
+    beside = save_recommended(made, loop, tmp_path / "faintspot.toml")
+    settings = Settings.load(tmp_path / "faintspot.toml")
+    assert (settings.estimator.name, settings.window_fwhm_px) == ("window", 3.0)
+    assert load_loop(beside).control.gain == 0.3
+    assert load_loop(beside).photons == pytest.approx(loop.photons)
