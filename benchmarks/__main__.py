@@ -48,6 +48,7 @@ _ORDER = (
     "wavefronts",
     "yardstick",
     "startup",
+    "loaded",
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
 LONG = {

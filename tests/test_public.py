@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from benchmarks import loaded
 
 import faintspot
 
@@ -78,3 +79,10 @@ def test_no_assert_checks_anything() -> None:
             assert not any(isinstance(node, ast.Assert) for node in ast.walk(ast.parse(path.read_text()))), (
                 path
             )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(loaded.TASKS))
+def test_tasks_load_no_more_code_than_they_need(name: str) -> None:
+    task = loaded.TASKS[name]
+    assert sum(loaded.loaded(task).values()) <= task.most_lines

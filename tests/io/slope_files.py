@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from tests.refusals import refused
 
+from faintspot.base.variables import VARIABLES
 from faintspot.io import SlopeWriter, create_writer, read_slopes
-from faintspot.io.stored.slopes_format import VARIABLES
 
 pytest.importorskip("astropy")
 pytest.importorskip("zarr")

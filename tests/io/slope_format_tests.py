@@ -28,11 +28,11 @@ from tests.refusals import refused
 
 from faintspot.base import files
 from faintspot.base.errors import InputError
+from faintspot.base.variables import VARIABLES, Variable
 from faintspot.io import read_slopes
 from faintspot.io.arrays import zarr_store
 from faintspot.io.references import read_reference
 from faintspot.io.stored import slopes_writer, slopes_zarr
-from faintspot.io.stored.slopes_format import VARIABLES, Variable
 
 CHANGED = {**result(), "x": result()["y"]}
 

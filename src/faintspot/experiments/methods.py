@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from faintspot.base.config.options import AUTO
+from faintspot.base.statistics import slope_statistics
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.estimators.base import Estimator, Need, Style
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
@@ -18,6 +23,13 @@ from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.psf import PSF
+
+_ROUNDS = 2  # of looking along each axis in turn
+
+Choice = Mapping[str, Any]
+"""Values of what is tuned, by name: options of the estimator and, in a closed loop, `LOOP_GAIN`."""
+Axes = Mapping[str, Sequence[Any]]
+"""Values of each option; the usual one first."""
 
 
 class Knowledge(IntEnum):
@@ -111,3 +123,35 @@ def knows_the_spot(method: str) -> bool:
 def keeps_every_k(kind: Kind) -> bool:
     """Whether all numbers of kept pixels are measured at once: its denoised images are known."""
     return issubclass(kind, KeepingBrightest) and kind.denoised is not KeepingBrightest.denoised
+
+
+def coordinate_search(axes: Axes, badness: Callable[[Choice, str, Sequence[Any]], Sequence[float]]) -> Choice:
+    """Look along each axis in turn, from the first values, and again along those for which others changed.
+
+    Parameters
+    ----------
+    axes : mapping
+    badness : callable
+        Called with a choice, the name of an option and values of it; returns how bad the choice is with each
+        of them.
+
+    Returns
+    -------
+    dict
+        The choice where the search ends.
+    """
+    best: Choice = {name: values[0] for name, values in axes.items()}
+    looked: dict[str, Choice] = {}
+    for name in list(axes) * (_ROUNDS if len(axes) > 1 else 1):
+        fixed = {key: value for key, value in best.items() if key != name}
+        if looked.get(name) != fixed:  # else nothing has changed since
+            looked[name] = fixed
+            best = {**best, name: axes[name][int(np.argmin(badness(best, name, axes[name])))]}
+    return best
+
+
+def corrected_badness(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> float:
+    """Return the gain-corrected rms; where nothing is measured, the rms, behind all that measure."""
+    statistics = slope_statistics(x, y, truth)
+    corrected = statistics.corrected_rms.value
+    return corrected if math.isfinite(corrected) else 1e6 + statistics.rms.value

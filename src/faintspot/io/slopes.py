@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import finite_array, number_between, one_of
 from faintspot.base.errors import InputError, MissingExtraError, errors_within
 from faintspot.base.files import check_regular, output_errors
+from faintspot.base.variables import VARIABLES, scaled_positions
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.formats.registry import slope_endings, slope_format
 from faintspot.io.formats.zarr_files import Zarr
@@ -22,13 +23,11 @@ from faintspot.io.stored.output_lock import OutputLock
 from faintspot.io.stored.slopes_format import (
     RESERVED_ATTRIBUTES,
     UNITS,
-    VARIABLES,
     RecordingHeader,
     StoredSlopes,
     check_memory,
     json_values,
     pixels_in,
-    scaled_positions,
 )
 from faintspot.io.stored.slopes_writer import SlopeWriter, StoreWriter
 from faintspot.io.stored.slopes_zarr import SlopeStore, describe_store, remove_store

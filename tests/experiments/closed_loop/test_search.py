@@ -1,6 +1,5 @@
 """The search for the best options."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,50 +8,15 @@ from tests.experiments.experiment_cases import SEARCH, small
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop import search as tuning
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Choice, MethodKind, method_kind
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, MethodKind, method_kind
 from faintspot.experiments.closed_loop.search import (
     FIRST_TUNING_REALISATION,
     Search,
     Tuned,
-    coordinate_search,
-    corrected_badness,
     smoothed,
     stored,
     tune,
 )
-
-
-def test_choice_follows_the_axes_to_the_minimum() -> None:
-    axes = {"a": [0.0, 1.0, 2.0], "b": [0.0, 1.0, 2.0]}
-
-    def badness(choice: Choice, name: str, values: Sequence[float]) -> list[float]:
-        each = [{**choice, name: value} for value in values]
-        return [(one["a"] - 2) ** 2 + 0.1 * (one["b"] - one["a"]) ** 2 for one in each]
-
-    assert coordinate_search(axes, badness) == {"a": 2.0, "b": 2.0}
-
-
-def test_one_axis_is_looked_at_once_and_none_not_at_all() -> None:
-    looks = []
-
-    def badness(choice: Choice, name: str, values: Sequence[str]) -> list[float]:
-        looks.append(name)
-        return [3.0, 1.0, 2.0]
-
-    assert coordinate_search({"rule": ["x", "y", "z"]}, badness) == {"rule": "y"}
-    assert coordinate_search({}, badness) == {}
-    assert looks == ["rule"]
-
-
-def test_what_measures_nothing_is_behind_all_that_measures_something() -> None:
-    truth = np.random.default_rng(1).uniform(-1, 1, (200, 2))
-    noise = np.random.default_rng(2).normal(0, 3, (2, 200))
-    nothing = corrected_badness(np.zeros(200), np.zeros(200), truth)
-    assert nothing > 1e5
-    assert corrected_badness(truth[:, 0] + noise[0], truth[:, 1] + noise[1], truth) < 1e3
-    half = corrected_badness(0.5 * truth[:, 0], 0.5 * truth[:, 1], truth)
-    assert half == pytest.approx(0.0, abs=1e-7)
-
 
 BRIGHTEST = method_kind("brightest")
 KEPT = BRIGHTEST.tuned(small())["keep_brightest"]

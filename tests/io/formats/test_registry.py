@@ -13,12 +13,13 @@ from tests.io.slope_files import assert_refused
 from tests.io.slope_format_tests import SlopeFormatTests
 from tests.refusals import refused
 
+from faintspot.base.variables import VARIABLES
 from faintspot.io import open_frames
 from faintspot.io.arrays.stored_array import StoredArray
 from faintspot.io.arrays.streams import StreamedArray
 from faintspot.io.formats import registry
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.stored.slopes_format import VARIABLES, StoredSlopes
+from faintspot.io.stored.slopes_format import StoredSlopes
 
 
 class Plain(FileFormat):

@@ -2,23 +2,43 @@
 
 from __future__ import annotations
 
+from functools import cache
+from importlib import import_module
+
 import click
 
-from faintspot.cli.realtime.calibrate import calibrate
-from faintspot.cli.realtime.control import load, send, status, stop_engine, unload
-from faintspot.cli.realtime.demo import demo
-from faintspot.cli.realtime.learn import learn
-from faintspot.cli.realtime.record import record
-from faintspot.cli.realtime.run import run
-from faintspot.cli.realtime.sources import bridge, replay
-from faintspot.cli.realtime.telescope import telescope
 from faintspot.cli.shared.needs import needs_linux
 
-_ENGINE = run, status, send, stop_engine, load, unload, calibrate, record
-_SOURCES = replay, bridge, telescope, demo
+_MODULES = {
+    **{name: name for name in ("calibrate", "demo", "learn", "record", "run", "telescope")},
+    **dict.fromkeys(("load", "send", "status", "stop", "unload"), "control"),
+    **dict.fromkeys(("bridge", "replay"), "sources"),
+}
+"""Modules of the commands."""
 
 
-@click.group("realtime")
+class _Commands(click.Group):
+    """Commands of the engine, imported when they are used or listed."""
+
+    def list_commands(self, context: click.Context) -> list[str]:
+        """Return all names."""
+        return sorted(_MODULES)
+
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        """Import one command."""
+        return _command(name) if name in _MODULES else None
+
+
+@cache
+def _command(name: str) -> click.Command:
+    module = import_module(f"faintspot.cli.realtime.{_MODULES[name]}")
+    found = next(
+        item for item in vars(module).values() if isinstance(item, click.Command) and item.name == name
+    )
+    return found if name == "learn" else needs_linux(found)  # that one reads a recording, elsewhere, too
+
+
+@click.group("realtime", cls=_Commands)
 def command() -> None:
     """Measure frames as they arrive and publish slopes and commands (Linux).
 
@@ -28,8 +48,3 @@ def command() -> None:
       faintspot realtime run --config faintspot.toml
       faintspot realtime status --watch
     """
-
-
-command.add_command(learn)  # from a recording, elsewhere, too
-for _each in (*_ENGINE, *_SOURCES):
-    command.add_command(needs_linux(_each))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.json_text import to_json
-from faintspot.experiments.closed_loop.methods import Choice, MethodKind, method_kind
+from faintspot.experiments.closed_loop.methods import MethodKind, method_kind
 from faintspot.experiments.closed_loop.search import (
     QUICK,
     Search,
@@ -24,6 +24,7 @@ from faintspot.experiments.closed_loop.search import (
     tuning_frames,
     with_integrator,
 )
+from faintspot.experiments.methods import Choice
 from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
 from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration

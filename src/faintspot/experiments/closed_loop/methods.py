@@ -11,6 +11,7 @@ import numpy as np
 from faintspot.base.checks import one_of
 from faintspot.base.config.options import AUTO, Option
 from faintspot.base.errors import InputError
+from faintspot.experiments.methods import Choice
 from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR, predicts
 from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
@@ -22,9 +23,6 @@ from faintspot.slopes.estimators.built_in.window import Window
 from faintspot.slopes.estimators.registry import estimator_named, estimators
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.psf import PSF, spot_psf
-
-Choice = Mapping[str, Any]
-"""Values of what is tuned, by name: `LOOP_GAIN` and options of the estimator."""
 
 LOOP_GAIN = "loop_gain"
 NOISE_SCALE = "noise_scale"

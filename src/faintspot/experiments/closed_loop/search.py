@@ -1,65 +1,28 @@
-"""Searches for settings: along each axis in turn, and, in closed loops, from the best of a coarse grid."""
+"""Search for the settings of a closed loop, from the best of a coarse grid."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
 from faintspot.base.checks import number_between
 from faintspot.base.json_text import parse_json, to_json
-from faintspot.base.statistics import slope_statistics
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Choice, MethodKind, Tunable
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, MethodKind, Tunable
+from faintspot.experiments.methods import Choice
 from faintspot.experiments.running import Advance
 from faintspot.loop.control.identification.models import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.simulation import simulate_loop
 
-_ROUNDS = 2  # of looking along each axis in turn
 _LEARNING_FRAMES = 3000  # that take as long as learning from telemetry
 _FEWEST_FLUXES = 3  # for a line
-
-Axes = Mapping[str, Sequence[Any]]
-"""Values of each option; the usual one first."""
-
-
-def coordinate_search(axes: Axes, badness: Callable[[Choice, str, Sequence[Any]], Sequence[float]]) -> Choice:
-    """Look along each axis in turn, from the first values, and again along those for which others changed.
-
-    Parameters
-    ----------
-    axes : mapping
-    badness : callable
-        Called with a choice, the name of an option and values of it; returns how bad the choice is with each
-        of them.
-
-    Returns
-    -------
-    dict
-        The choice where the search ends.
-    """
-    best: Choice = {name: values[0] for name, values in axes.items()}
-    looked: dict[str, Choice] = {}
-    for name in list(axes) * (_ROUNDS if len(axes) > 1 else 1):
-        fixed = {key: value for key, value in best.items() if key != name}
-        if looked.get(name) != fixed:  # else nothing has changed since
-            looked[name] = fixed
-            best = {**best, name: axes[name][int(np.argmin(badness(best, name, axes[name])))]}
-    return best
-
-
-def corrected_badness(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> float:
-    """Return the gain-corrected rms; where nothing is measured, the rms, behind all that measure."""
-    statistics = slope_statistics(x, y, truth)
-    corrected = statistics.corrected_rms.value
-    return corrected if math.isfinite(corrected) else 1e6 + statistics.rms.value
-
 
 FIRST_TUNING_REALISATION = 1000
 """Realisations of the air from this one on are tuned on; those before are scored."""

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.config.options import LIST, TEXTS, Options, number, setting
 from faintspot.base.errors import InputError
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Choice, MethodKind, method_kind
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, MethodKind, method_kind
+from faintspot.experiments.methods import Choice
 from faintspot.loop.control.identification.models import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import Method

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.experiments.closed_loop.methods import Choice
 from faintspot.experiments.closed_loop.search import QUICK, Search, stored, tune, tuning_frames
+from faintspot.experiments.methods import Choice
 from faintspot.experiments.night.blocks import NIGHT_STORE, Night
 from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan, kind_of
 from faintspot.experiments.night.seeing import r0_of_slopes

@@ -15,10 +15,15 @@ from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
 from faintspot.base.statistics import OUTLIER_PX, Estimate, SlopeStatistics, absolute_errors, slope_statistics
-from faintspot.experiments.closed_loop.methods import Choice
-from faintspot.experiments.closed_loop.search import coordinate_search, corrected_badness
 from faintspot.experiments.curves import Curve, limiting_flux, magnitude_gain
-from faintspot.experiments.methods import Knowledge, method_for_scene, tuned_options
+from faintspot.experiments.methods import (
+    Choice,
+    Knowledge,
+    coordinate_search,
+    corrected_badness,
+    method_for_scene,
+    tuned_options,
+)
 from faintspot.experiments.planner.answer import Answer, MethodResult
 from faintspot.experiments.planner.promise import Promise, check_promises
 from faintspot.experiments.planner.question import Question

@@ -8,10 +8,10 @@ from typing import IO
 import numpy as np
 
 from faintspot.base.files import check_file_size
+from faintspot.base.variables import VARIABLES
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.stored.slopes_format import (
     UNITS,
-    VARIABLES,
     ExistingOutput,
     StoredSlopes,
     most_slopes_bytes,

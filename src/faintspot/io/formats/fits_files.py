@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.json_text import parse_json, to_json
 from faintspot.base.sizes import check_bytes
+from faintspot.base.variables import VARIABLES
 from faintspot.io.arrays.fits_units import AOT_VERSION, HeaderDataUnit, units_of
 from faintspot.io.arrays.stored_array import StoredArray
 from faintspot.io.arrays.streams import (
@@ -34,7 +35,6 @@ from faintspot.io.optional_packages import load_fits
 from faintspot.io.stored.slopes_format import (
     COORDINATE_UNITS,
     REQUIRED,
-    VARIABLES,
     StoredSlopes,
     check_stated,
     most_slopes_bytes,

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, replace_file
+from faintspot.base.variables import VARIABLES
 from faintspot.io.stored.output_lock import OutputLock
-from faintspot.io.stored.slopes_format import VARIABLES, RecordingHeader, StoredSlopes, checked_block
+from faintspot.io.stored.slopes_format import RecordingHeader, StoredSlopes, checked_block
 from faintspot.io.stored.slopes_zarr import SlopeStore
 
 # A mark waits until the data are on the disk, which takes longer than measuring small blocks.

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import sync_file, sync_folder
+from faintspot.base.variables import VARIABLES
 from faintspot.io.arrays.zarr_store import (
     checked_codecs,
     chunk_files,
@@ -32,7 +33,6 @@ from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
 from faintspot.io.stored.slopes_format import (
     COORDINATE_UNITS,
-    VARIABLES,
     ExistingOutput,
     RecordingHeader,
     StoredSlopes,

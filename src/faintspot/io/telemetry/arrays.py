@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.io.stored.slopes_format import VARIABLES
+from faintspot.base.variables import VARIABLES
 
 
 class ArrayStorage(NamedTuple):

@@ -17,7 +17,6 @@ from faintspot.base.config.tables import ConfigurationTable, Tables, is_map, sav
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import derived
 from faintspot.base.npz import save_arrays
-from faintspot.io.frames import open_frames, read_array
 
 _BLOCK_PIXELS = 1 << 22  # processed at a time
 _ESTIMATED = ("dark", "gain_e_per_adu", "saturation_adu", "bad_pixels")
@@ -294,6 +293,8 @@ def read_map(key: str, location: str | Path) -> NDArray[Any]:
     InputError
         If the file cannot be read.
     """
+    from faintspot.io.frames import open_frames, read_array  # few calibrations have maps in files
+
     if key != "bad_pixels":
         with open_frames([location]) as frames:
             if key == "read_noise_e" and frames.n_frames > 1:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from functools import cache
+from importlib import import_module
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, TypeVar
-from unittest import mock
 
 from faintspot.base.discovery import import_modules
 from faintspot.base.errors import InputError
@@ -18,19 +17,19 @@ if TYPE_CHECKING:
 
 ENTRY_POINTS = "faintspot.estimators"
 _PACKAGE = "faintspot.slopes.estimators.built_in"
-_FIRST = (
-    "brightest",
-    "total_variation",
-    "smoothed",
-    "centroid",
-    "thresholded",
-    "window",
-    "weighted",
-    "matched",
-    "maximum_likelihood",
-    "maximum_a_posteriori",
-)
-"""Modules of `built_in` that are listed first, in this order."""
+_MODULES = {
+    "brightest": "brightest",
+    "tv": "total_variation",
+    "smoothed": "smoothed",
+    "centroid": "centroid",
+    "thresholded": "thresholded",
+    "window": "window",
+    "weighted": "weighted",
+    "matched": "matched",
+    "ml": "maximum_likelihood",
+    "map": "maximum_a_posteriori",
+}
+"""Modules of `built_in` by the names of estimators, in the order of lists; one is imported on first use."""
 
 Kind = TypeVar("Kind", bound="type[Estimator]")
 _kinds: dict[str, type[Estimator]] = {}
@@ -62,9 +61,13 @@ def register(kind: Kind) -> Kind:
     name = getattr(kind, "name", None)
     if not isinstance(name, str) or not name.isidentifier():
         raise InputError(f"estimator {kind.__name__}: name = {name!r}: expected a word")
-    other = _kinds.get(name)
+    other, taken = _kinds.get(name), None
     if other is not None and (other.__module__, other.__qualname__) != (kind.__module__, kind.__qualname__):
-        raise InputError(f"estimator {name!r}: {other.__module__} has one of that name already")
+        taken = other.__module__
+    if name in _MODULES and kind.__module__ != f"{_PACKAGE}.{_MODULES[name]}":
+        taken = f"{_PACKAGE}.{_MODULES[name]}"
+    if taken is not None:
+        raise InputError(f"estimator {name!r}: {taken} has one of that name already")
     _kinds[name] = kind
     return kind
 
@@ -102,16 +105,23 @@ def estimator_named(name: str) -> type[Estimator]:
     >>> estimator_named("map").label
     'maximum a posteriori'
     """
-    _load()
-    if not isinstance(name, str) or name not in _kinds:
-        raise InputError(f"expected one of {', '.join(map(repr, _kinds))}", name="estimator", value=name)
+    known = isinstance(name, str)
+    if known and name not in _kinds:
+        if name in _MODULES:
+            import_module(f"{_PACKAGE}.{_MODULES[name]}")
+        else:
+            _load()
+    if not known or name not in _kinds:
+        raise InputError(
+            f"expected one of {', '.join(map(repr, estimators()))}", name="estimator", value=name
+        )
     return _kinds[name]
 
 
 @cache
 def _load() -> None:
     """Import the built-in estimators and those of installed packages."""
-    first = [f"{_PACKAGE}.{module}" for module in _FIRST]
+    first = [f"{_PACKAGE}.{module}" for module in _MODULES.values()]
     modules = [*first, *(module for module in import_modules(_PACKAGE) if module not in first)]
     # User code that imported one of them directly has changed the order.
     places = {module: place for place, module in enumerate(modules)}
@@ -121,6 +131,5 @@ def _load() -> None:
     for point in entry_points(group=ENTRY_POINTS):
         package = point.dist.name if point.dist else "?"
         title = f"estimator {point.name!r} of the package {package} (mend or uninstall it)"
-        # A plugin that exits on import would end the process without a message.
-        with faults_of(title), mock.patch("os._exit", sys.exit):
+        with faults_of(title):
             point.load()

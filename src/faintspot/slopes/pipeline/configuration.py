@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from faintspot.base.config.tables import Tables, save_tables, tables_as_text
 from faintspot.base.errors import InputError, errors_within
@@ -21,8 +21,10 @@ from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.fixed_weights import FixedWeights
-from faintspot.slopes.spots.laser_spots import LaserSpots, matched_filter
 from faintspot.slopes.spots.psf import PSF
+
+if TYPE_CHECKING:
+    from faintspot.slopes.spots.laser_spots import LaserSpots
 
 _PACKED, _MOST_PACKED_BYTES = "faintspot.toml", 1 << 20
 _FILTER = "laser.matched_filter"
@@ -69,7 +71,11 @@ class Configuration(Tables):
     @cached_property
     def laser(self) -> LaserSpots | None:
         """Laser guide star, or None."""
-        return self.part(LaserSpots) if LaserSpots.table in self else None
+        if "laser" not in self:
+            return None
+        from faintspot.slopes.spots.laser_spots import LaserSpots  # few telescopes have one
+
+        return self.part(LaserSpots)
 
     @cached_property
     def psf(self) -> PSF | None:
@@ -109,6 +115,8 @@ class Configuration(Tables):
         """Return the linear matched filter of the laser guide star, if the configuration wants it."""
         if self.laser is None or not self.laser.matched_filter or self.psf is None:
             return None
+        from faintspot.slopes.spots.laser_spots import matched_filter
+
         layout, settings = self.layout, self.settings
         with errors_within(self.path):
             if layout.bin > 1:

@@ -14,7 +14,7 @@ from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.base.statistics import MAD_TO_STD
-from faintspot.io.stored.slopes_format import scaled_positions
+from faintspot.base.variables import scaled_positions
 from faintspot.slopes.camera.binning import binned
 from faintspot.slopes.kernels.driver.doubtful import flag_doubtful
 from faintspot.slopes.pipeline.light import MeanLight

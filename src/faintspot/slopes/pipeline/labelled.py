@@ -10,15 +10,9 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.variables import VARIABLES, scaled_positions
 from faintspot.io.formats.csv_files import column_name
-from faintspot.io.stored.slopes_format import (
-    COORDINATE_UNITS,
-    UNITS,
-    VARIABLES,
-    pixels_in,
-    scaled_positions,
-    unit_of,
-)
+from faintspot.io.stored.slopes_format import COORDINATE_UNITS, UNITS, pixels_in, unit_of
 from faintspot.slopes.sensor.layout import Layout
 
 if TYPE_CHECKING:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from faintspot.base.config.options import is_auto
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan
-from faintspot.slopes.estimators.python import PythonPlan
 from faintspot.slopes.estimators.sensor import Sensor
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.kernels.driver import groups
@@ -102,7 +101,11 @@ class Plan:
         self.estimator: Estimator = settings.estimator
         self.estimator.check(self.sensor)
         plan = self.estimator.prepared(self.sensor)
-        self.prepared: EstimatorPlan = PythonPlan(self.estimator, self.sensor) if plan is None else plan
+        if plan is None:
+            from faintspot.slopes.estimators.python import PythonPlan  # few estimators are in Python
+
+            plan = PythonPlan(self.estimator, self.sensor)
+        self.prepared: EstimatorPlan = plan
         self.variances: NDArray[np.float32] | None = None
         """Variance of each dark pixel for the kernel, if it differs: see `kernels.driver.groups.Task`."""
         if self.sensor.has_noise_map:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.flags import NO_FLAG, UNMEASURED, SubapertureFlag
 from faintspot.base.validity import are_valid
-from faintspot.io.stored.slopes_format import VARIABLES
+from faintspot.base.variables import VARIABLES
 
 if TYPE_CHECKING:
     import pandas

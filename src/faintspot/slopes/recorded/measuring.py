@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.flags import SubapertureFlag, kept_flags
+from faintspot.base.variables import scaled_positions
 from faintspot.base.version import __version__
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.io.locations import split_location
 from faintspot.io.references import read_reference
 from faintspot.io.slopes import create_writer
-from faintspot.io.stored.slopes_format import UNITS, pixels_in, scaled_positions
+from faintspot.io.stored.slopes_format import UNITS, pixels_in
 from faintspot.io.telemetry.aot_reading import is_aot, read_aot
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from faintspot.slopes.estimators.built_in.window import Window
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 
 Floats = NDArray[np.float64]
@@ -35,7 +34,7 @@ def response(pipeline: SlopePipeline, mean_frame: Floats, frames: Iterable[NDArr
         Blocks of frames from all over the recording.
     """
     dark = np.nan_to_num(pipeline.calibration.maps(mean_frame.shape)[0])
-    if isinstance(pipeline.settings.estimator, Window):
+    if pipeline.settings.estimator.name == "window":
         mean = np.where(np.isnan(mean_frame), np.nanmedian(mean_frame), mean_frame)
         changes = [_change(pipeline, mean[None], dark, _STEP_PX)]
     else:

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import tomlkit
 from numpy.typing import ArrayLike
@@ -19,14 +19,14 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings
-from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
 from faintspot.slopes.spots.fixed_weights import FixedWeights
-from faintspot.slopes.spots.laser_spots import LaserSpots
 from faintspot.slopes.spots.psf import PSF
 
-_Part = TypeVar("_Part")
+if TYPE_CHECKING:
+    from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+    from faintspot.slopes.spots.laser_spots import LaserSpots
 
 
 @dataclass
@@ -83,6 +83,8 @@ class StoredRun:
         InputError
             When the layout, the settings or something that the estimator needs are not known.
         """
+        from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline  # telemetry needs the layout only
+
         settings = self.settings
         if self.layout is None or settings is None or self.calibration is None:
             raise InputError(f"layout, settings or calibration of {self.path.name} are not known")

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from faintspot.base.checks import finite_array, number_between, one_of
 from faintspot.base.errors import InputError
-from faintspot.slopes.sensor.detection.lenslets import LensletGrid
+
+if TYPE_CHECKING:
+    from faintspot.slopes.sensor.detection.lenslets import LensletGrid
 
 CENTRE, PITCH, ANGLE = LATTICE = ("centre", "pitch", "angle")
 """Parameters of a lattice; the reference positions follow from them."""

@@ -1,0 +1,127 @@
+"""How much of faintspot a task loads: modules, and lines of code without docstrings, comments and blanks.
+
+Each task runs in a fresh interpreter and a folder of its own, after the commands that make its files. Child
+processes do not count. `python -m benchmarks.loaded TASK` lists the modules of one task.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.measuring import Row, Table
+
+_COUNT = """
+import ast, atexit, io, sys, tokenize
+
+def lines(path):
+    with open(path, encoding="utf-8") as file:
+        text = file.read()
+    ignored = "COMMENT NL NEWLINE INDENT DEDENT ENDMARKER".split()
+    code = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if tokenize.tok_name[token.type] not in ignored:
+            code.update(range(token.start[0], token.end[0] + 1))
+    for node in ast.walk(ast.parse(text)):
+        for part in node.body if isinstance(getattr(node, "body", None), list) else ():
+            if isinstance(part, ast.Expr) and isinstance(getattr(part.value, "value", None), str):
+                code.difference_update(range(part.lineno, part.end_lineno + 1))
+    return len(code)
+
+def report():
+    loaded = {name: module.__file__ for name, module in list(sys.modules.items())
+              if name.partition(".")[0] == "faintspot" and getattr(module, "__file__", None)}
+    with open("loaded.txt", "w") as file:
+        file.writelines(f"{lines(path)} {name}\\n" for name, path in sorted(loaded.items()))
+
+atexit.register(report)
+"""
+_COMMAND = "from faintspot.cli import main; main({arguments!r}.split())"
+_FRAMES = """
+import numpy as np
+y, x = np.mgrid[:16, :16] - 7.5
+spots = np.tile(8 * np.exp(-(x**2 + y**2) / 8), (4, 4)) + 1
+np.save("frames.npy", np.random.default_rng(1).poisson(spots, (300, 64, 64)).astype(np.float32))
+"""
+_FRAME = """
+import numpy as np, faintspot as fs
+layout = fs.Layout.grid((4, 4), pixels=16)
+frame = np.random.default_rng(1).poisson(2.0, layout.frame_shape).astype(np.float32)
+fs.SlopePipeline(layout, fs.Settings("tv", noise_std=0.5))(frame)
+"""
+_LAYOUT = "layout frames.npy --grid 4x4 -o faintspot.toml"
+_SLOPES = "slopes frames.npy -o slopes.zarr"
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a user does, the commands that make its files, and the most lines that it may load."""
+
+    run: str
+    """Python code, or arguments of the command line."""
+    most_lines: int
+    before: tuple[str, ...] = ()
+    beside: str = ""
+    """Command that runs at the same time."""
+
+
+TASKS = {
+    "SlopePipeline, one TV frame": Task(_FRAME, 8_000),
+    "slopes of a recording": Task(_SLOPES, 11_000, (_FRAMES, _LAYOUT)),
+    "telemetry": Task("telemetry slopes.zarr --frame-rate-hz 250", 13_000, (_FRAMES, _LAYOUT, _SLOPES)),
+    "loop magnitude": Task(
+        "loop magnitude diffraction_limit --quick --methods brightest --flux-e 20 --workers 0", 16_000
+    ),
+    "realtime run": Task(
+        "realtime run --frames 20 --name {name}",
+        16_000,
+        (_FRAMES, _LAYOUT),
+        "realtime replay frames.npy --name {name}",
+    ),
+    "tune": Task("tune --read-noise-e 1 --pixels 8 --fwhm-px 1.8 --flux-e 100 -o tuned.toml", 17_000),
+}
+
+
+def _arguments(run: str, first: str = "") -> list[str]:
+    code = run if "\n" in run else _COMMAND.format(arguments=run.format(name=f"loaded-{os.getpid()}"))
+    return [sys.executable, "-c", first + code]
+
+
+def loaded(task: Task) -> dict[str, int]:
+    """Return the lines of each module that a task loads."""
+    root = Path(__file__).parents[1] / "src"
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with tempfile.TemporaryDirectory() as folder:
+        options = {"cwd": folder, "env": os.environ | {"PYTHONPATH": str(root)}, **quiet}
+        for run in task.before:
+            subprocess.run(_arguments(run), check=True, **options)
+        beside = subprocess.Popen(_arguments(task.beside), **options) if task.beside else None
+        try:
+            subprocess.run(_arguments(task.run, _COUNT), check=True, **options)
+        finally:
+            if beside is not None:
+                beside.kill()
+                beside.wait()
+        lines = (line.split() for line in (Path(folder) / "loaded.txt").read_text().splitlines())
+        return {name: int(count) for count, name in lines}
+
+
+def run() -> list[Table]:
+    """Count for all tasks."""
+    rows = []
+    for name, task in TASKS.items():
+        lines = loaded(task)
+        total = sum(lines.values())
+        values = {"modules": float(len(lines)), "lines": float(total)}
+        rows.append(Row(name, values, f"{task.most_lines} lines", total <= task.most_lines))
+    return [Table("loaded", "Modules and lines of faintspot that a task loads", rows)]
+
+
+if __name__ == "__main__":
+    for module, count in loaded(TASKS[sys.argv[1]]).items():
+        print(f"{count:6} {module}")
