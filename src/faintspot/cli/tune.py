@@ -23,7 +23,6 @@ from faintspot.cli.shared.output import check_target, picture_file, results_tabl
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.experiments.planner import text as answer_text
 from faintspot.experiments.planner.question import Question, read_camera
-from faintspot.io.frames import open_frames
 from faintspot.slopes.camera.binning import binned, binned_calibration, camera_calibration
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline import configuration
@@ -252,6 +251,8 @@ def _question(
 
 def _read(paths: tuple[str, ...], key: str | None, *, time_axis: int | None, factor: int) -> NDArray[Any]:
     """Return the first frames of files, binned by a factor."""
+    from faintspot.io.frames import open_frames
+
     with open_frames(paths, key=key, time_axis=time_axis) as source:
         rows, columns = source.shape
         enough = max(2, min(_MOST_FRAMES, _MOST_PIXELS // (rows * columns)))

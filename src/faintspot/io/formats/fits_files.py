@@ -41,7 +41,6 @@ from faintspot.io.stored.slopes_format import (
     unit_of,
     with_absent,
 )
-from faintspot.io.telemetry.aot_reading import frames_of_aot
 
 _BLOCK_BYTES, _PIECE_BYTES = 2880, 1 << 20
 
@@ -59,6 +58,8 @@ class Fits(FileFormat):
         For a file of the AOT standard, return the frames of the sensor `key`, by default of the only one.
         """
         if AOT_VERSION in next(units_of(path)).header:
+            from faintspot.io.telemetry.aot_reading import frames_of_aot
+
             names = {name for unit in units_of(path) for name in (unit.name.upper(), str(unit.index))}
             if key is None or key.strip().upper() not in names:
                 key = frames_of_aot(path, key)

@@ -16,7 +16,6 @@ from faintspot.base.config.options import Options, setting
 from faintspot.base.config.tables import Tables, save_tables
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.toml_files import check_keys
-from faintspot.io.frames import read_array
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import CompiledIntegrator
@@ -399,6 +398,8 @@ def _of_table(configuration: Configuration, values: Mapping[str, Any]) -> Contro
 
 def _read(path: Path, name: str, location: object) -> NDArray[np.generic]:
     """Read an array from the file that the table names, relative to the configuration."""
+    from faintspot.io.frames import read_array  # few configurations name matrices
+
     if not isinstance(location, str):
         raise InputError(f"expected the name of a file, found {location!r:.80}", name=f"{TABLE}.{name}")
     with errors_within(f"{TABLE}.{name}"):

@@ -210,7 +210,7 @@ def control_of(
 
 def _of_slopes(path: Path) -> dict[str, Any]:
     """Return the values of slopes that `faintspot slopes` wrote, taken as those of an open loop."""
-    run = open_run(path)
+    run = open_run(path, layout_only=True)
     layout = run.layout
     if layout is None:
         raise InputError(f"{path}: expected slopes with their layout ({' '.join(run.notes)})")

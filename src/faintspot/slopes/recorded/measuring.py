@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,6 @@ from faintspot.io.stored.slopes_format import UNITS, pixels_in
 from faintspot.io.telemetry.aot_reading import is_aot, read_aot
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration
-from faintspot.slopes.pipeline.following import SpotFollower
 from faintspot.slopes.pipeline.labelled import layout_coordinates
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings, with_preset, without_denoising
@@ -37,6 +36,9 @@ from faintspot.slopes.recorded.response import response
 from faintspot.slopes.recorded.survey import stretches, survey
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
+
+if TYPE_CHECKING:
+    from faintspot.slopes.pipeline.following import SpotFollower
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
 
@@ -193,7 +195,7 @@ def measure_recorded(
         if isinstance(reference, str | Path):
             attributes["reference_file"] = str(reference)
         with errors_within(configuration_file):
-            measure = SpotFollower(pipeline) if follow else pipeline.with_dark(seen.mean)
+            measure = _follower(pipeline) if follow else pipeline.with_dark(seen.mean)
         if isinstance(measure, SlopePipeline) and source.n_frames >= _FRAMES_FOR_RESPONSE:
             with suppress(InputError):  # of a damaged frame, which is reported when it is measured
                 attributes["response"] = response(measure, seen.mean, stretches(source)).tolist()
@@ -219,6 +221,12 @@ def measure_recorded(
                     progress(start + len(block), source.n_frames)
     summary.failed_frames, summary.failure = prepared.faults - faults, prepared.fault
     return summary
+
+
+def _follower(pipeline: SlopePipeline) -> SpotFollower:
+    from faintspot.slopes.pipeline.following import SpotFollower
+
+    return SpotFollower(pipeline)
 
 
 def _settings(

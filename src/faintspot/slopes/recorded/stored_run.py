@@ -98,7 +98,7 @@ class StoredRun:
             raise InputError("; ".join(self.lost) or str(error)) from None
 
 
-def open_run(path: Path) -> StoredRun:
+def open_run(path: Path, *, layout_only: bool = False) -> StoredRun:
     """Read one file of slopes and rebuild what its attributes describe."""
     stored = read_slopes(path)
     if stored.n_finished == 0:
@@ -110,7 +110,7 @@ def open_run(path: Path) -> StoredRun:
         store.notes.append(f"{path.name} does not say with which configuration it was made.")
         return store
     try:
-        _rebuild(store)
+        _rebuild(store, layout_only)
     except InputError as error:
         store.notes.append(f"The configuration stored in {path.name} cannot be used: {error}.")
     if store.layout is not None and store.layout.doubts:
@@ -130,12 +130,14 @@ def open_run(path: Path) -> StoredRun:
     return store
 
 
-def _rebuild(store: StoredRun) -> None:
+def _rebuild(store: StoredRun, layout_only: bool) -> None:
     """Make layout, settings and calibration from the stored text, and maps from the original file."""
     stored = configuration.Configuration("", parse_text(store.text, "configuration"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtWarning)  # said as a note
         store.layout = stored.layout
+    if layout_only:
+        return
     store.settings = stored.settings
     table = stored.tables.get("calibration", {})
     if any(map(_is_map, table.values())):
