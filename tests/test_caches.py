@@ -10,12 +10,13 @@ import faintspot
 SOURCE = Path(faintspot.__file__).parent
 
 OF_THE_PROGRAM = {
-    "engine/streams/semaphores.py _libc",
-    "engine/streams/shared_streams.py _keeps_order",
     "adapters/checks.py check_version",
     "adapters/pyrtc.py camera",
     "adapters/pyrtc.py loop",
     "adapters/pyrtc.py slopes_process",
+    "cli/realtime/command.py _command",
+    "engine/streams/semaphores.py _libc",
+    "engine/streams/shared_streams.py _keeps_order",
     "slopes/camera/dark_frames.py _one_level_limit",
     "slopes/estimators/registry.py _load",
     "slopes/kernels/compilation/cached.py _tell_once",
