@@ -38,6 +38,14 @@ def test_names_of_derived_files(name: str, expected: str) -> None:
     assert files.derived(f"a.b/{name}", ".psf.npz") == Path("a.b") / expected
 
 
+def test_derived_from_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "night.zarr").mkdir()
+    monkeypatch.chdir(tmp_path / "night.zarr")
+    assert files.derived(".", ".csv") == tmp_path / "night.csv"
+    with pytest.raises(InputError, match="expected the name of a file"):
+        files.derived("/", ".csv")
+
+
 def test_only_regular_files_of_a_known_size_are_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "zero").symlink_to("/dev/zero")

@@ -1,6 +1,7 @@
 """Sizes that files state are limited: refused in one line before the memory is used."""
 
 import tracemalloc
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -82,6 +83,40 @@ def test_large_chunks(tmp_path: Path) -> None:
         file.create_dataset("frames", (100, 1000, 1000), "f8", chunks=(100, 1000, 1000))
     for name in ("a.zarr", "a.h5"):
         with refused(name, "a chunk of at most 8 MiB"):
+            open_frames([tmp_path / name])
+
+
+def test_chunks_that_inflate_to_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chunks of 20 kB that are inflated to 64 MiB: deflated twice, or once."""
+    monkeypatch.setattr("faintspot.io.formats.hdf5_files._MOST_SURE", 8 * MIB // 1032)
+    for name, times in (("once.h5", 1), ("twice.h5", 2)):
+        content = bytes(64 * MIB)
+        with h5py.File(tmp_path / name, "w") as file:
+            layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+            layout.set_chunk((1, 100, 100))
+            for _ in range(times):
+                layout.set_deflate(1)
+                content = zlib.compress(content, 1)
+            space, kind = h5py.h5s.create_simple((2, 100, 100)), h5py.h5t.NATIVE_UINT16
+            stored = h5py.h5d.create(file.id, b"frames", kind, space, layout)
+            stored.write_direct_chunk((0, 0, 0), zlib.compress(bytes(20000)))
+            stored.write_direct_chunk((1, 0, 0), content)
+        with refused(name), open_frames([tmp_path / name]) as frames:
+            assert not frames.block(0, 1).any()
+            frames.block(1, 2)
+
+
+def test_tiny_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = np.arange(6 * 8 * 8, dtype=np.uint16).reshape(6, 8, 8)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("frames", data=frames, chunks=(1, 2, 2))
+    zarr.create_array(str(tmp_path / "a.zarr"), data=frames, chunks=(1, 2, 2))
+    for name in ("a.h5", "a.zarr"):
+        monkeypatch.setattr("faintspot.io.arrays.stored_array.MOST_CHUNKS", 40)
+        with open_frames([tmp_path / name]) as source:
+            np.testing.assert_array_equal(source.block(0, 6), frames)
+        monkeypatch.setattr("faintspot.io.arrays.stored_array.MOST_CHUNKS", 15)
+        with refused(name, "16 chunks in a frame"):
             open_frames([tmp_path / name])
 
 

@@ -73,6 +73,11 @@ def read_bytes(path: str | Path, what: str, most: int) -> bytes:
         return stream.read(size)
 
 
+def read_lines(path: str | Path, what: str, most: int) -> list[str]:
+    """Return the lines of a text file; parameters and errors are those of `read_bytes`."""
+    return read_bytes(path, what, most).decode("utf-8").splitlines()
+
+
 def check_file_size(path: str | Path, what: str, most: int) -> int:
     """Return the size of a file of at most `most` bytes; errors are those of `read_bytes`."""
     if (size := check_regular(path)) > most:
@@ -89,6 +94,9 @@ def check_ending(path: Path, *endings: str) -> None:
 def derived(path: str | Path, ending: str) -> Path:
     """Return a path beside `path` in which `ending` replaces its known extension."""
     path = Path(path)
+    path = path if path.name else path.resolve()  # "." and ".." as parts of a path have no name
+    if not path.name:
+        raise InputError(f"{path}: expected the name of a file or folder, got the root of all")
     known_ending = next((ending for ending in _ENDINGS if path.name.lower().endswith(ending)), "")
     return path.with_name(f"{path.name[: len(path.name) - len(known_ending)]}{ending}")
 

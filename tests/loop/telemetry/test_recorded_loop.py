@@ -1,5 +1,6 @@
 """Recordings of loops from files of several formats, and files that are wrong."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -242,6 +243,15 @@ def test_a_first_row_that_is_not_measured_is_no_line_of_names(tmp_path: Path) ->
     (tmp_path / "system.toml").write_text('slope_unit = "px"\nframe_rate_hz = 9\ncells = [[0, 0]]')
     loop = read_recorded_loop(tmp_path / "night.csv", tmp_path / "system.toml")
     np.testing.assert_array_equal(loop.slopes, [[np.nan] * 2, [1, 2], [3, 4]])
+
+
+@pytest.mark.parametrize("ending", ["csv", "npy", "npz", "fits"])
+def test_named_pipe_is_refused(tmp_path: Path, ending: str) -> None:
+    os.mkfifo(tmp_path / f"slopes.{ending}")
+    (tmp_path / "night.toml").write_text(f'{WORDS}slopes = "slopes.{ending}"')
+    for name in ("night.toml", *([f"slopes.{ending}"] if ending != "fits" else [])):
+        with pytest.raises(InputError, match="expected a regular file, got a named pipe"):
+            read_recorded_loop(tmp_path / name)
 
 
 def test_slopes_of_very_different_size_are_broken() -> None:

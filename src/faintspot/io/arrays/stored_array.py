@@ -19,6 +19,9 @@ from faintspot.io.locations import one_line
 MOST_WHOLE_BYTES = 1 << 30
 """Largest size of an array, or of a part of one, that can only be read whole."""
 
+MOST_CHUNKS = 1 << 14
+"""Most chunks of a frame, and of a part that is read at once: libraries need kilobytes for each."""
+
 OpenArray = Callable[[ExitStack], Any]
 """Opens a file on a stack of contexts and returns an array that gives its items by ``array[start:stop]``."""
 
@@ -40,6 +43,15 @@ class StoredArray(Closing):
         How the file was understood, if that is not evident.
     matlab : bool
         Whether MATLAB's last axis was put first.
+    chunks : tuple of int, optional
+        Shape of the chunks in which the values are stored.
+    compressions : int
+        Number of times that a chunk is compressed.
+
+    Raises
+    ------
+    InputError
+        When a chunk is too large, compressed more than once, or there are too many for an item.
     """
 
     def __init__(
@@ -51,6 +63,8 @@ class StoredArray(Closing):
         *,
         note: str = "",
         matlab: bool = False,
+        chunks: tuple[int, ...] | None = None,
+        compressions: int = 0,
     ) -> None:
         self.note, self.matlab = note, matlab
         self.name, self.shape = name, tuple(int(side) for side in shape)
@@ -58,6 +72,21 @@ class StoredArray(Closing):
         self._open_array = open_array
         self._open_files = ExitStack()
         self._array: Any = None
+        self._most_items = math.inf
+        if chunks:
+            sides = zip(self.shape[1:], chunks[1:], strict=True)
+            of_item = max(math.prod(-(-side // max(chunk, 1)) for side, chunk in sides), 1)
+            check_bytes(name, math.prod(chunks) * dtype.itemsize, MOST_WHOLE_BYTES, "a chunk")
+            if of_item > MOST_CHUNKS:
+                raise InputError(
+                    f"{name}: has {of_item:,} chunks in a frame, expected at most {MOST_CHUNKS:,}; save it "
+                    "in larger chunks"
+                )
+            self._most_items = max(MOST_CHUNKS // of_item, 1) * max(chunks[0], 1)
+        if compressions > 1:
+            raise InputError(
+                f"{name}: is compressed {compressions} times, so that its size is not known; compress it once"
+            )
 
     @classmethod
     def whole(
@@ -89,7 +118,7 @@ class StoredArray(Closing):
                 warnings.simplefilter("ignore")
                 if self._array is None:
                     self._array = self._open_array(self._open_files)
-                values = np.asarray(self._array[start:stop])
+                values = self._values(start, stop)
             if values.shape != (stop - start, *self.shape[1:]):
                 raise ValueError(f"its shape is {values.shape[1:]} instead of {self.shape[1:]}")
         except (InputError, MissingExtraError):
@@ -103,6 +132,13 @@ class StoredArray(Closing):
             ) from None
         # Values without memory of their own are a part of a mapped or whole array.
         return np.array(values, self.dtype, order="C", copy=None if values.flags.owndata else True)
+
+    def _values(self, start: int, stop: int) -> NDArray[Any]:
+        if stop - start <= self._most_items:
+            return np.asarray(self._array[start:stop])
+        step = int(self._most_items)
+        parts = [self._array[first : min(first + step, stop)] for first in range(start, stop, step)]
+        return np.concatenate(parts)
 
     def close(self) -> None:
         """Close the file; a later `read` opens it again."""

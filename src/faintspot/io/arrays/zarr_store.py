@@ -20,6 +20,7 @@ from faintspot.io.optional_packages import load_zarr
 
 TELEMETRY = "faintspot telemetry"
 """Format attribute of a telemetry store."""
+_COMPRESSIONS = "zlib", "gzip", "zstd", "blosc", "lz4", "bz2", "lzma"
 _MARKS = ("zarr.json", ".zgroup", ".zarray")
 
 
@@ -39,8 +40,8 @@ def open_store(path: Path, key: str = "") -> Any:
     return load_zarr().open(str(path), mode="r", path=key, use_consolidated=False)
 
 
-def check_array(name: str, array: Any) -> None:
-    """Refuse an array of Python objects, or with chunks that are too large.
+def check_array(name: str, array: Any) -> int:
+    """Refuse an array of Python objects, or with too large chunks; return how often they are compressed.
 
     Raises
     ------
@@ -53,6 +54,7 @@ def check_array(name: str, array: Any) -> None:
     if "pickle" in codecs:
         raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
     check_bytes(name, math.prod(array.chunks) * array.dtype.itemsize, MOST_WHOLE_BYTES, "a chunk")
+    return sum(any(word in str(codec).lower() for word in _COMPRESSIONS) for codec in codecs)
 
 
 def stored_attributes(path: Path) -> dict[str, object]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import zlib
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -10,11 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.sizes import check_bytes
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.locations import choose_name
 from faintspot.io.optional_packages import load_hdf5
+
+_KEEPING_SIZE = (2, 3)  # shuffle, Fletcher's checksum
+_MOST_SURE = MOST_WHOLE_BYTES // 1032  # bytes that cannot inflate to more than the limit
+_SUM_BYTES, _PIECE_BYTES = 4, 1 << 20  # of a checksum; inflated at once
 
 
 class Hdf5(FileFormat):
@@ -30,17 +35,18 @@ class Hdf5(FileFormat):
         with h5py.File(path, "r") as file:
             chosen = choose_name(path, _dimensions(h5py, file), None if key is None else key.strip("/"))
             data_set = file[chosen]
-            name, shape = f"{path}:{chosen}", data_set.shape
-            _check(name, data_set)
+            name, shape, chunks = f"{path}:{chosen}", data_set.shape, data_set.chunks
+            compressions = _check(name, data_set)
             reverse = self.matlab and len(shape) > 1
             if reverse:  # MATLAB's (height, width, frames) is (frames, width, height) here
-                shape = (*shape[:-2], *shape[:-3:-1])
+                shape, chunks = (sides and (*sides[:-2], *sides[:-3:-1]) for sides in (shape, chunks))
 
             def open_array(files: ExitStack) -> object:
                 data_set = files.enter_context(h5py.File(path, "r"))[chosen]
-                return _Transposed(data_set) if reverse else data_set
+                return _DataSet(name, data_set, reverse)
 
-            return StoredArray(name, shape, data_set.dtype, open_array, matlab=self.matlab)
+            options: dict[str, Any] = {"matlab": self.matlab, "chunks": chunks, "compressions": compressions}
+            return StoredArray(name, shape, data_set.dtype, open_array, **options)
 
 
 class Matlab73(Hdf5):
@@ -63,24 +69,63 @@ def _dimensions(h5py: Any, file: Any) -> dict[str, int]:
     return dimensions
 
 
-def _check(name: str, data_set: Any) -> None:
-    """Refuse data in other files, Python objects and chunks that are too large."""
+def _check(name: str, data_set: Any) -> int:
+    """Refuse data in other files and Python objects; return how often chunks are compressed."""
     if data_set.is_virtual or data_set.external:
         raise InputError(f"{name}: expected data in this file, they are stored in other files")
     if data_set.dtype.hasobject:
         raise InputError(f"{name}: expected numbers, got {data_set.dtype}")
-    if data_set.chunks is not None:
-        n_bytes = int(np.prod(data_set.chunks, dtype=object)) * data_set.dtype.itemsize
-        check_bytes(name, n_bytes, MOST_WHOLE_BYTES, "a chunk")
+    filters = data_set.id.get_create_plist()
+    codes = [filters.get_filter(number)[0] for number in range(filters.get_nfilters())]
+    return sum(code not in _KEEPING_SIZE for code in codes)
 
 
-class _Transposed:
-    """A data set whose last two axes are exchanged."""
+class _DataSet:
+    """A data set, or one whose last two axes are exchanged, whose chunks are checked before they are read."""
 
-    def __init__(self, data_set: Any) -> None:
-        self._data_set = data_set
+    def __init__(self, name: str, data_set: Any, reverse: bool) -> None:
+        self._name, self._data_set, self._reverse = name, data_set, reverse
+        self._large: set[tuple[int, ...]] = set()  # chunks that may inflate to more than the limit
+        if data_set.compression == "gzip" and data_set.id.get_storage_size() > _MOST_SURE:
+            data_set.id.chunk_iter(self._note)
 
-    def __getitem__(self, part: slice) -> NDArray[Any]:
-        """Return items of the first axis."""
-        values = self._data_set[:, part] if self._data_set.ndim == 2 else self._data_set[part]
-        return np.asarray(values).swapaxes(-1, -2)
+    def _note(self, chunk: Any) -> None:
+        if chunk.size > _MOST_SURE:
+            self._large.add(chunk.chunk_offset)
+
+    def __getitem__(self, part: Any) -> NDArray[Any]:
+        """Return items of the first axis, or of a later one after numbers of the items of the first."""
+        across = self._reverse and self._data_set.ndim == 2
+        selection = (slice(None), part) if across else part if isinstance(part, tuple) else (part,)
+        for first in self._large and self._chunks_of(selection):
+            self._check_chunk(first)
+            self._large.remove(first)
+        values = np.asarray(self._data_set[selection])
+        return values.swapaxes(-1, -2) if self._reverse else values
+
+    def _chunks_of(self, selection: tuple[Any, ...]) -> list[tuple[int, ...]]:
+        """Return the large chunks that overlap a selection."""
+        spans = [
+            range(side)[item] if isinstance(item, slice) else range(item, item + 1)
+            for item, side in zip(selection, self._data_set.shape, strict=False)
+        ]
+        return [
+            first
+            for first in self._large
+            if all(
+                at < span.stop and span.start < at + side
+                for at, side, span in zip(first, self._data_set.chunks, spans, strict=False)
+            )
+        ]
+
+    def _check_chunk(self, first: tuple[int, ...]) -> None:
+        """Refuse a chunk that inflates to more than its size, before HDF5 makes room for it."""
+        inflating = zlib.decompressobj()
+        n_bytes = math.prod(self._data_set.chunks) * self._data_set.dtype.itemsize
+        mask, content = self._data_set.id.read_direct_chunk(first)
+        left = n_bytes + _SUM_BYTES + 1
+        while content and left > 0 and not mask & 1:
+            left -= len(inflating.decompress(content, min(left, _PIECE_BYTES)))
+            content = inflating.unconsumed_tail
+        if left <= 0:
+            raise InputError(f"{self._name}: damaged: a chunk of {n_bytes:,} bytes inflates to more")

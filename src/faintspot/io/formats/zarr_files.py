@@ -40,8 +40,8 @@ class Zarr(FileFormat):
             arrays = dict(node.arrays())
             node = arrays[choose_name(path, {name: array.ndim for name, array in arrays.items()}, None)]
         name = f"{path}:{node.path}" if node.path else str(path)
-        check_array(name, node)
-        return StoredArray(name, node.shape, np.dtype(node.dtype), lambda _: node)
+        options: dict[str, Any] = {"chunks": node.chunks, "compressions": check_array(name, node)}
+        return StoredArray(name, node.shape, np.dtype(node.dtype), lambda _: node, **options)
 
     def require(self) -> None:
         """Raise MissingExtraError when zarr is not installed."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.base.files import check_regular
 from faintspot.base.json_text import parse_json
 
 _MANIFEST = "session.json"
@@ -68,6 +69,9 @@ def _array(path: Path, record: object, kind: str) -> NDArray[Any]:
     if not file.is_relative_to(path.resolve()):
         raise InputError(f"{path}: expected files in this folder, got {name}")
     try:
-        return np.asarray(np.load(file, allow_pickle=False))
+        check_regular(file)
+        return np.asarray(np.load(file, mmap_mode="r", allow_pickle=False))  # no more than the file holds
+    except InputError:
+        raise
     except (OSError, ValueError, EOFError):
         raise InputError(f"{file}: expected an array (.npy), got something else") from None

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, increasing, one_of, real_array
 from faintspot.base.errors import InputError, errors_within
+from faintspot.base.files import read_lines
 from faintspot.base.flags import NO_FLAG, SubapertureFlag
 from faintspot.base.npz import read_arrays
 from faintspot.base.toml_files import check_keys, parse_file
 from faintspot.base.validity import leave_out
 from faintspot.io import StoredSlopes
+from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES
 from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.frames import read_array
 from faintspot.io.references import holds_slopes
@@ -133,13 +135,15 @@ def _array(location: str) -> NDArray[Any]:
     if not location.endswith((".csv", ".txt")):
         return read_array(location)
     try:
-        with Path(location).open(encoding="utf-8") as stream:
-            lines = [line for line in stream if line.split("#")[0].strip()]
+        lines = read_lines(location, "rows of numbers", MOST_WHOLE_BYTES // 4)
+        lines = [line for line in lines if line.split("#")[0].strip()]
         if lines and not any(map(_is_number, lines[0].split(","))):
             del lines[0]  # a line of names
         if not lines:
             raise ValueError("the file is empty")
         return np.loadtxt(lines, delimiter=",", ndmin=2, converters=_number)
+    except InputError:
+        raise
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{location}: expected rows of numbers with commas ({reason})") from None

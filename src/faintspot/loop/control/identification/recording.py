@@ -34,7 +34,7 @@ def _positive(meaning: str, unit: str, low: float, high: float) -> Option:
 
 NUMBERS = {
     "frame_rate_hz": _positive("Frame rate.", "Hz", 1e-3, 1e6),
-    "subaperture_m": _positive("Side of a sub-aperture.", "m", 1e-5, 100.0),
+    "subaperture_m": _positive("Side of a sub-aperture.", "m", 1e-3, 100.0),
     "diameter_m": _positive("Diameter of the pupil.", "m", 1e-4, 1000.0),
     "pixel_scale_arcsec": _positive("Angle of one unit of the slopes.", "arcsec", 1e-9, 1e9),
     "delay_frames": _positive("Delay of the loop.", "frames", 1e-3, 100.0),
