@@ -63,7 +63,12 @@ class TestEveryEstimator(EstimatorTests):
         kind = example_estimator() if self.kind == "power" else estimators()[self.kind]
         return kind(**OPTIONS.get(self.kind, {}))
 
+    @pytest.mark.slow  # compiled anew at another SIMD width
+    def test_does_not_depend_on_grouping_threads_and_width(self) -> None:
+        super().test_does_not_depend_on_grouping_threads_and_width()
 
+
+@pytest.mark.slow  # compiled anew at other SIMD widths
 @pytest.mark.parametrize("side", [8, 12, 16])
 def test_a_threshold_gives_the_same_at_every_width_bit_for_bit(side: int) -> None:
     """Real time measures what is left over from whole groups at a smaller width."""
