@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 import socket
 import subprocess
@@ -41,13 +42,13 @@ class Cluster:
         self.address = f"tcp://127.0.0.1:{self._port}"
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
 
-    def start(self) -> None:
+    def start(self, workers: int = 2) -> None:
         """Start what is not running; workers end with their scheduler, though not at once."""
         if self.processes and self.processes["scheduler"].poll() is not None:
             self.stop()
         at = ["--host", "127.0.0.1", "--port", str(self._port)]
         worker = [self.address, "--no-nanny", "--nthreads", "1"]
-        for name, arguments in (("scheduler", at), ("worker 1", worker), ("worker 2", worker)):
+        for name, arguments in (("scheduler", at), ("worker 1", worker), ("worker 2", worker))[: 1 + workers]:
             if name not in self.processes or self.processes[name].poll() is not None:
                 program = [sys.executable, "-m", f"distributed.cli.dask_{name.split()[0]}", "--no-dashboard"]
                 settings = environment() | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
@@ -55,7 +56,7 @@ class Cluster:
                     [*program, *arguments], env=settings, stderr=subprocess.DEVNULL
                 )
         with distributed.Client(self.address, set_as_default=False, timeout=120) as client:
-            client.wait_for_workers(2, timeout=120)
+            client.wait_for_workers(workers, timeout=120)
 
     def stop(self) -> None:
         for process in self.processes.values():
@@ -103,6 +104,28 @@ def test_a_cluster_gives_the_same(cluster: Cluster) -> None:
     assert cluster.address in said[0]
     with refused("refused"):
         run_units(impossible, UNITS, {}, cluster.pool())
+
+
+def where(number: int, advance: Callable[[int], None]) -> dict[str, NDArray[Any]]:
+    advance(number)
+    return {"process": np.asarray(os.getpid())}
+
+
+def test_one_worker_of_one_thread_runs_all_units() -> None:
+    """Never this process, although joblib runs units itself where it sees one processor."""
+    one = Cluster()
+    try:
+        one.start(workers=1)
+        store = run_units(where, UNITS, {}, one.pool())
+        assert {int(store[unit.key]["process"]) for unit in UNITS} == {one.processes["worker 1"].pid}
+    finally:
+        one.stop()
+
+
+def test_a_worker_of_another_version_is_refused(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(running, "_VERSION", "faintspot 0.0.1 on Python 3.9.1")
+    with refused("a worker has faintspot", "expected faintspot 0.0.1 on Python 3.9.1"):
+        run_units(double, UNITS, {}, cluster.pool())
 
 
 def test_studies_are_the_same_bit_for_bit_wherever_they_run(cluster: Cluster) -> None:

@@ -6,6 +6,7 @@ Work on this machine opens no network port.
 from __future__ import annotations
 
 import os
+import platform
 import signal
 import tempfile
 import threading
@@ -36,6 +37,7 @@ Advance = Callable[[int], None]
 _LOOK_S = 0.5  # between looks at how far workers are
 _ATTEMPTS = 3  # where workers die or a connection is lost
 _CONNECT_S = 10
+_VERSION = f"faintspot {__version__} on Python {platform.python_version()}"
 
 
 @dataclass(frozen=True)
@@ -206,7 +208,7 @@ def _by_joblib(
         own = [kind for kind in estimators().values() if not kind.__module__.startswith("faintspot.")]
         # In tuples: other large arguments would stay with one worker, and be lost with it.
         results = parallel(
-            delayed(_in_worker)((function, unit.arguments), (number, progress_file), (own, __version__))
+            delayed(_in_worker)((function, unit.arguments), (number, progress_file), (own, _VERSION))
             for number, unit in list(units.items())
         )
         try:
@@ -220,8 +222,8 @@ def _by_joblib(
 def _in_worker(work: tuple[Any, ...], place: tuple[int, Path | None], package: tuple[Any, ...]) -> object:
     """Run a unit with the estimators that are registered where the experiment was started."""
     (function, arguments), (number, progress_file), (own, version) = work, place, package
-    if version != __version__:
-        raise InputError("a worker has another version of faintspot: install the same one everywhere")
+    if version != _VERSION:
+        raise InputError(f"a worker has {_VERSION}, expected {version}: install the same ones everywhere")
     for kind in own:
         register(kind)
     done = np.zeros(number + 1) if progress_file is None else np.load(progress_file, mmap_mode="r+")
@@ -271,6 +273,10 @@ def _cluster(scheduler: str, say: Callable[[str], None]) -> Iterator[object]:
     from joblib._dask import DaskDistributedBackend
 
     class Backend(DaskDistributedBackend):  # type: ignore[misc]
+        def effective_n_jobs(self, n_jobs: int) -> int:
+            # Of 1, from a cluster with one thread so far, joblib would run all units in this process.
+            return max(2, int(super().effective_n_jobs(n_jobs)))
+
         def submit(self, func: object, callback: Any = None) -> object:
             future = super().submit(func, callback)
             future.add_done_callback(lambda done: done.exception() and callback(done.exception()))
