@@ -23,18 +23,14 @@ pytestmark = [
     [
         ("sources.bridge", signal.SIGINT),
         ("sources.replay", signal.SIGTERM),
-        ("camera.camera", signal.SIGINT),
-        ("camera.camera", signal.SIGTERM),
     ],
 )
 def test_ends_in_order(name: str, tmp_path: Path, command: str, number: signal.Signals) -> None:
     module, function = command.split(".")
     np.save(tmp_path / "frames.npy", np.ones((30, 6, 5), np.uint16))
-    (tmp_path / "faintspot.toml").write_text("[layout.grid]\nshape = [3, 4]\npixels = 8\n")
     options = {
         "bridge": [f"{name}_in"],
         "replay": [str(tmp_path / "frames.npy"), "--frame-rate-hz", "200", "--repeat"],
-        "camera": ["--config", str(tmp_path / "faintspot.toml"), "--frame-rate-hz", "200", "--distinct", "5"],
     }[function]
     stream = pyshmem.create(f"{name}_in", shape=(6, 5), dtype=np.uint16)
     code = f"from faintspot.cli.realtime.{module} import {function}; {function}()"
