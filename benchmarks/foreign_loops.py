@@ -25,7 +25,7 @@ from benchmarks.foreign import evaluation
 from benchmarks.foreign.evaluation import INTEGRATOR, Effort
 from benchmarks.foreign.magnitudes import in_magnitudes
 from benchmarks.foreign.rows import ROWS, TOOLS, Row, chosen_rows, is_installed
-from benchmarks.results import FOLDER, PAGES, publish_tables
+from benchmarks.results import FOLDER, PAGES, origin_now, publish_tables
 from faintspot.loop.telemetry.choices import FILTER
 
 _COLUMNS = (
@@ -147,13 +147,9 @@ def publish(folder: Path, pages: Path = PAGES) -> Path:
             rows.append([*cells, _signed(result["ahead"][INTEGRATOR])])
     columns = ["loop", "integrator (gain)", "learnt filter", "filter - integrator"]
     table = {"title": "Loops of other simulators", "columns": columns, "rows": rows}
-    origin = {
-        "command": "python -m benchmarks foreign_loops",
-        "processor": machine.fingerprint()["processor"],
-        "version": machine.versions()["faintspot"],
-        "measured": time.strftime("%Y-%m-%d"),
-    }
-    return publish_tables(pages / "foreign_loops.json", {"loops": table}, origin)
+    return publish_tables(
+        pages / "foreign_loops.json", {"loops": table}, origin_now("python -m benchmarks foreign_loops")
+    )
 
 
 def table_of(results: list[dict[str, Any]]) -> str:

@@ -6,10 +6,11 @@ import json
 import math
 import re
 from dataclasses import asdict, dataclass, field
+from datetime import date
 from pathlib import Path
 from typing import Any
 
-from benchmarks.machine import short
+from benchmarks.machine import fingerprint, short, versions
 from benchmarks.measuring import Row, Table
 from benchmarks.showing import grid
 
@@ -106,6 +107,16 @@ def publish(results: Results, benchmark: Benchmark, folder: Path = PAGES) -> Pat
         "measured": results.started[:10],
     }
     return publish_tables(folder / f"{benchmark.name}.json", tables, origin)
+
+
+def origin_now(command: str) -> dict[str, str]:
+    """Return command, processor, version and date of what is measured now."""
+    return {
+        "command": command,
+        "processor": fingerprint()["processor"],
+        "version": versions()["faintspot"],
+        "measured": date.today().isoformat(),
+    }
 
 
 def publish_tables(path: Path, tables: dict[str, dict[str, Any]], origin: dict[str, str]) -> Path:

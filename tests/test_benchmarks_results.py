@@ -8,7 +8,7 @@ from types import ModuleType
 
 import pytest
 from benchmarks import __main__ as command
-from benchmarks import machine, results
+from benchmarks import machine, night_frames, results
 from benchmarks.measuring import Table
 from click.testing import CliRunner
 from tests import benchmark_cases as cases
@@ -83,3 +83,10 @@ def test_an_interrupted_run_keeps_what_was_finished(tmp_path: Path) -> None:
     assert answer.exit_code == 1
     (path,) = results.newest_first(tmp_path)
     assert [each.name for each in results.read(path).benchmarks] == ["rivals"]
+
+
+def test_nights_of_all_packages_are_what_the_documentation_shows(tmp_path: Path) -> None:
+    table = "| frames | r0 / true |\n|---|---|\n| soapy, 20 e- | 0.92, 0.91 |\n\nWithin the goals: r0 50 %."
+    stored = json.loads(night_frames.publish(table, "now", tmp_path / "pages").read_text(encoding="utf-8"))
+    assert stored["tables"]["nights"]["columns"] == ["frames", "r0 / true"]
+    assert stored["tables"]["nights"]["rows"] == [["soapy, 20 e-", "0.92, 0.91"]]
