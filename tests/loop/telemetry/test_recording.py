@@ -170,7 +170,7 @@ def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("faintspot.io.read_telemetry", lambda *_, **__: recording())
     result = learn("--winds", "none")
     assert result.exception is None, result.exception
-    assert "658 frames at 250 a second: kalman leaves 0." in result.output
+    assert "658 frames at 250 a second: the filter leaves 0." in result.output
     assert "left out 1 of 9 sub-apertures: dark" in result.output
     control = load_control(path)
     assert control is not None
