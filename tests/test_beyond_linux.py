@@ -105,7 +105,7 @@ def test_modules_of_posix_are_imported_by_the_engine_only() -> None:
 def test_real_time_needs_linux(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(realtime, click.Group)
     commands = {name: command for name, command in realtime.commands.items() if name != "learn"}
-    assert {"run", "camera", "record", "send"} <= set(commands)
+    assert {"run", "telescope", "record", "send"} <= set(commands)
     monkeypatch.delattr(os, "sched_setscheduler", raising=False)
     for name, command in commands.items():
         assert command.callback is not None

@@ -39,9 +39,11 @@ COMMAND = [sys.executable, "-m", "faintspot", "realtime"]
 
 @pytest.fixture
 def processes(name: str, tmp_path: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Start camera and engine; end them."""
+    """Start an engine and recorded frames in place of a camera; end them."""
     (tmp_path / "faintspot.toml").write_text(CONFIGURATION)
-    camera = f"camera --name {name} --frame-rate-hz 200 --offset-adu 100 --bits 16 --seed 3".split()
+    frames = np.random.default_rng(3).poisson(103.0, (50, 32, 32)).astype(np.uint16)
+    np.save(tmp_path / "frames.npy", frames)
+    camera = f"replay frames.npy --name {name} --frame-rate-hz 200 --repeat".split()
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     started = []
     for arguments in (["run", "--name", name], camera):
