@@ -104,10 +104,13 @@ def test_modules_of_posix_are_imported_by_the_engine_only() -> None:
 
 def test_real_time_needs_linux(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(realtime, click.Group)
-    commands = {name: command for name, command in realtime.commands.items() if name != "learn"}
+    context = click.Context(realtime)
+    names = [name for name in realtime.list_commands(context) if name != "learn"]
+    commands = {name: realtime.get_command(context, name) for name in names}
     assert {"run", "telescope", "record", "send"} <= set(commands)
     monkeypatch.delattr(os, "sched_setscheduler", raising=False)
     for name, command in commands.items():
+        assert command is not None
         assert command.callback is not None
         with click.Context(command, info_name=name), pytest.raises(InputError, match=f"^{name} needs Linux$"):
             command.callback()
