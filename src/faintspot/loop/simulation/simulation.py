@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import ClassVar
 
 import numpy as np
@@ -151,11 +151,11 @@ def simulate_loop(
         learnt_control(switches.configuration(configuration), method, start, simulate_loop)
         for method in map(switches.method, methods)
     ]
-    arguments = configuration, ready, numbers, start, number, first, switches
+    loop = partial(_Loop, configuration, ready, numbers, start, number, first, switches)
     gains = None
     if switches.exact_gain:
-        gains = _Loop(*arguments).run(None).gains_in_run()
-    return _Loop(*arguments, gains).run(progress).record()
+        gains = loop().run(None).gains_in_run()
+    return loop(gains).run(progress).record()
 
 
 def measure_gains(
@@ -344,33 +344,33 @@ class _Loop:
         configuration, sensor = self.configuration, self.optics.sensor
         strehl, residual, r0 = self.truth
         return LoopRecord(
-            self.slopes,
-            self.valid,
-            self.errors,
-            self.covariances,
-            self.commands,
-            strehl,
-            residual,
-            self.zernike,
-            r0,
-            self.schedule.astype(np.int8),
-            self.optics.interaction,
-            self.gains,
-            np.array([method.correct_gain for method in self.methods]),
-            tuple(method.label for method in self.methods),
-            tuple(to_text(method.settings) for method in self.methods),
-            sensor.layout.cells,
-            sensor.illumination,
-            configuration.control.frame_rate_hz,
-            configuration.control.delay_frames,
-            configuration.run.settle_frames,
-            configuration.control.mode == CLOSED,
-            configuration.subaperture_m,
-            configuration.pixel_scale_rad,
-            configuration.sensor.wavelength_m,
-            configuration.to_text(),
-            self.seed,
-            self.realisation,
+            slopes_px=self.slopes,
+            valid=self.valid,
+            standard_error_px=self.errors,
+            covariance_xy_px2=self.covariances,
+            commands=self.commands,
+            strehl=strehl,
+            residual_nm=residual,
+            zernike_nm=self.zernike,
+            r0_m=r0,
+            method=self.schedule.astype(np.int8),
+            interaction_matrix=self.optics.interaction,
+            centroid_gain=self.gains,
+            corrected=np.array([method.correct_gain for method in self.methods]),
+            labels=tuple(method.label for method in self.methods),
+            method_settings=tuple(to_text(method.settings) for method in self.methods),
+            cells=sensor.layout.cells,
+            illumination=sensor.illumination,
+            frame_rate_hz=configuration.control.frame_rate_hz,
+            delay_frames=configuration.control.delay_frames,
+            settle_frames=configuration.run.settle_frames,
+            closed=configuration.control.mode == CLOSED,
+            subaperture_m=configuration.subaperture_m,
+            pixel_scale_rad=configuration.pixel_scale_rad,
+            wavelength_m=configuration.sensor.wavelength_m,
+            configuration=configuration.to_text(),
+            seed=self.seed,
+            realisation=self.realisation,
         )
 
 

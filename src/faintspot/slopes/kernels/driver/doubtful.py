@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from faintspot.base.flags import INVALID, UNMEASURED, SubapertureFlag
-from faintspot.slopes.kernels.compilation.compiling import compiled
+from faintspot.slopes.kernels.compilation.compiling import compiled, inlined
 from faintspot.slopes.kernels.driver.dark import flag_dark
 
 _UNMEASURED, _INVALID = int(UNMEASURED), int(INVALID)
@@ -61,19 +61,48 @@ def flag_doubtful(x: Any, y: Any, flux: Any, flags: Any, expected: Any, differen
     """
     zero, edge, n = expected.zero, expected.edge, x.shape[1]
     for f in range(x.shape[0]):
-        largest, second_spots = np.float32(0.0), 0
+        is_suspect = False
         for s in range(n):
-            differences[s] = -1.0
             if flags[f, s] & _UNMEASURED:
                 continue
             if abs(x[f, s] + zero[0, s]) > edge[0, s] or abs(y[f, s] + zero[1, s]) > edge[1, s]:
                 flags[f, s] |= AT_SEARCH_LIMIT
-            differences[s], least = _difference(f, s, x, y, flags, expected)
-            if least > expected.least:
-                largest = max(largest, differences[s])
-                second_spots += _has_second_spot(f, s, flux, flags, expected)
-        if second_spots > 0 or _exceeds(differences, n, np.float32(1.0 / TYPICAL) * largest):
-            _flag_unlike(f, x, y, flux, flags, expected, differences)
+            is_suspect = is_suspect or _is_suspect(f, s, x, y, flags, expected)
+        if is_suspect:  # seldom, and only then all lines of all spots are needed
+            _compare(f, x, y, flux, flags, expected, differences)
+
+
+@compiled
+def _is_suspect(f: Any, s: Any, x: Any, y: Any, flags: Any, expected: Any) -> Any:
+    """Return whether a slope may differ from each of its lines by more than the difference that counts."""
+    lines, found = expected.lines, False
+    like = np.float32(0.99) * expected.least * expected.least
+    for k in range(lines.shape[1]):
+        a, b = lines[s, k, 0], lines[s, k, 1]
+        if a == x.shape[1]:
+            break
+        if (flags[f, a] | flags[f, b]) & _UNMEASURED:
+            continue
+        if _away(f, s, k, x, y, expected)[0] < like:
+            return False
+        found = True
+    return found
+
+
+@compiled
+def _compare(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, differences: Any) -> None:
+    """Compare the slopes of a frame with their lines, and flag those unlike all their neighbours."""
+    n, largest, second_spots = x.shape[1], np.float32(0.0), 0
+    for s in range(n):
+        differences[s] = -1.0
+        if flags[f, s] & _UNMEASURED:
+            continue
+        differences[s], least = _difference(f, s, x, y, flags, expected)
+        if least > expected.least:
+            largest = max(largest, differences[s])
+            second_spots += _has_second_spot(f, s, flux, flags, expected)
+    if second_spots > 0 or _exceeds(differences, n, np.float32(1.0 / TYPICAL) * largest):
+        _flag_unlike(f, x, y, flux, flags, expected, differences)
 
 
 @compiled
@@ -172,13 +201,20 @@ def _difference(f: Any, s: Any, x: Any, y: Any, flags: Any, expected: Any) -> An
             break
         if (flags[f, a] | flags[f, b]) & _UNMEASURED:
             continue
-        near, far, variance = np.float32(0.5), np.float32(0.5), np.float32(1.5)
-        if expected.outside[s, k]:
-            near, far, variance = np.float32(2.0), np.float32(-1.0), np.float32(6.0)
-        away_x = x[f, s] - near * x[f, a] - far * x[f, b]
-        away_y = y[f, s] - near * y[f, a] - far * y[f, b]
-        away = away_x * away_x + away_y * away_y
+        away, variance = _away(f, s, k, x, y, expected)
         square, least = min(square, away / variance), min(least, away)
     if square == math.inf:
         return np.float32(-1.0), np.float32(0.0)
     return np.float32(math.sqrt(square)), np.float32(math.sqrt(least))
+
+
+@inlined
+def _away(f: Any, s: Any, k: Any, x: Any, y: Any, expected: Any) -> Any:
+    """Return the squared difference of a slope from a line, and its variance for slopes of error 1."""
+    a, b = expected.lines[s, k, 0], expected.lines[s, k, 1]
+    near, far, variance = np.float32(0.5), np.float32(0.5), np.float32(1.5)
+    if expected.outside[s, k]:
+        near, far, variance = np.float32(2.0), np.float32(-1.0), np.float32(6.0)
+    away_x = x[f, s] - near * x[f, a] - far * x[f, b]
+    away_y = y[f, s] - near * y[f, a] - far * y[f, b]
+    return away_x * away_x + away_y * away_y, variance
