@@ -61,13 +61,15 @@ def flag_doubtful(x: Any, y: Any, flux: Any, flags: Any, expected: Any, differen
     """
     zero, edge, n = expected.zero, expected.edge, x.shape[1]
     for f in range(x.shape[0]):
+        for s in range(n):
+            cut = (abs(x[f, s] + zero[0, s]) > edge[0, s]) | (abs(y[f, s] + zero[1, s]) > edge[1, s])
+            unmeasured = (flags[f, s] & np.uint8(_UNMEASURED)) != 0
+            flags[f, s] |= np.uint8(AT_SEARCH_LIMIT) if cut & (not unmeasured) else np.uint8(0)
         is_suspect = False
         for s in range(n):
-            if flags[f, s] & _UNMEASURED:
-                continue
-            if abs(x[f, s] + zero[0, s]) > edge[0, s] or abs(y[f, s] + zero[1, s]) > edge[1, s]:
-                flags[f, s] |= AT_SEARCH_LIMIT
-            is_suspect = is_suspect or _is_suspect(f, s, x, y, flags, expected)
+            if not flags[f, s] & _UNMEASURED and _is_suspect(f, s, x, y, flags, expected):
+                is_suspect = True
+                break
         if is_suspect:  # seldom, and only then all lines of all spots are needed
             _compare(f, x, y, flux, flags, expected, differences)
 
