@@ -44,7 +44,7 @@ def test_from_an_empty_folder_to_a_table(tmp_path: Path, name: str) -> None:
     """Interrupted, it gives a table of what it has seen, and leaves nothing behind."""
     arguments = ("realtime", "demo", "--frame-rate-hz", 50, "--seconds", 240, "--port", 0, "--name", name)
     process = command_line(*arguments, cwd=tmp_path)
-    too_late = threading.Timer(PATIENCE_S, process.kill)
+    too_late = threading.Timer(2 * PATIENCE_S, process.kill)
     too_late.start()
     try:
         assert process.stdout is not None
