@@ -206,35 +206,29 @@ def test_displaced_source_is_a_tilt(run: Commands, slopes: Path, no_picture: Non
     assert "slopes lack that frame's tilt" in run.ok("wavefront", "frames.npz").out
 
 
-def test_refused_maps_and_differences(run: Commands, slopes: Path) -> None:
-    run.refused("wavefront", slopes, "--map", "m.png", naming=("m.png", ".csv, .fits"))
-    run.refused("wavefront", slopes, "--minus", "nothing.npz", naming=("nothing.npz",))
+def test_one_line_names_an_argument_that_cannot_be_used(run: Commands, slopes: Path) -> None:
     text = CONFIGURATION.replace("[4, 4]", "[2, 2]")
     assert text != CONFIGURATION
     Path("other.toml").write_text(text)
     np.save("other.npy", simulated(2)[:, :16, :16])
     run.ok("slopes", "other.npy", "-c", "other.toml", "-o", "other.npz")
-    run.refused(
-        "wavefront", slopes, "--minus", "other.npz", naming=("other.npz", "16 sub-apertures", "same --config")
-    )
-
-
-def test_refused_units_and_mirrors(run: Commands, slopes: Path) -> None:
-    run.refused("wavefront", slopes, "--unit", "um", naming=("pixel_scale_arcsec",))
-    run.refused("wavefront", slopes, *SCALES, "--unit", "waves", naming=("wavelength_nm",))
-    run.refused("wavefront", slopes, *SCALES, "--wavelength-nm", 500, naming=("wavelength_nm",))
-    run.refused("wavefront", slopes, "--stroke", 1, naming=("--actuators",))
-    np.save("mirror.npy", np.ones((6, 32)))
-    run.refused("wavefront", slopes, "--actuators", "mirror.npy", naming=("mirror.npy", "(6, 32); transpose"))
-    run.refused("wavefront", slopes, "--actuators", "no.npy", naming=("no.npy",))
-    asked = ("--actuators", "mirror.npy", "--command", "c.txt")
-    run.refused("wavefront", slopes, *asked, naming=("c.txt", ".npy, .csv"))
-
-
-def test_refused(run: Commands, slopes: Path) -> None:
-    run.refused("wavefront", "nothing.npz", naming=("nothing.npz",))
-    run.refused("wavefront", slopes, "-o", "w.txt", naming=("w.txt", ".csv, .json, .fits"))
-    run.refused("wavefront", slopes, "--modes", 30, naming=("modes = 30", "from 2 to 24"))
-    run.refused("wavefront", slopes, "--pixel-scale-arcsec", -1, naming=("pixel_scale_arcsec", "-1"))
     run.ok("slopes", "frames.npy", "-o", "slopes.csv")
-    run.refused("wavefront", "slopes.csv", naming=("slopes.csv", "layout"))
+    np.save("mirror.npy", np.ones((6, 32)))
+    for arguments, naming in (
+        (("nothing.npz",), ("nothing.npz",)),
+        (("slopes.csv",), ("slopes.csv", "layout")),
+        ((slopes, "-o", "w.txt"), ("w.txt", ".csv, .json, .fits")),
+        ((slopes, "--map", "m.png"), ("m.png", ".csv, .fits")),
+        ((slopes, "--modes", 30), ("modes = 30", "from 2 to 24")),
+        ((slopes, "--pixel-scale-arcsec", -1), ("pixel_scale_arcsec", "-1")),
+        ((slopes, "--unit", "um"), ("pixel_scale_arcsec",)),
+        ((slopes, *SCALES, "--unit", "waves"), ("wavelength_nm",)),
+        ((slopes, *SCALES, "--wavelength-nm", 500), ("wavelength_nm",)),
+        ((slopes, "--minus", "nothing.npz"), ("nothing.npz",)),
+        ((slopes, "--minus", "other.npz"), ("other.npz", "16 sub-apertures", "same --config")),
+        ((slopes, "--stroke", 1), ("--actuators",)),
+        ((slopes, "--actuators", "mirror.npy"), ("mirror.npy", "(6, 32); transpose")),
+        ((slopes, "--actuators", "no.npy"), ("no.npy",)),
+        ((slopes, "--actuators", "mirror.npy", "--command", "c.txt"), ("c.txt", ".npy, .csv")),
+    ):
+        run.refused("wavefront", *arguments, naming=naming)

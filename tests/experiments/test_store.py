@@ -19,8 +19,6 @@ from faintspot.experiments.store import UnitStore, ZarrStore, kind_of_store
 
 pytest.importorskip("zarr")
 
-pytestmark = pytest.mark.slow
-
 RESULT = {
     "number": np.asarray(3.5),
     "image": np.arange(6, dtype=np.float32).reshape(2, 3),
@@ -82,7 +80,7 @@ def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
         ZarrStore(tmp_path / "no" / "s.zarr", "study", "one", ["a"])
 
 
-def test_damaged(tmp_path: Path) -> None:
+def test_a_damaged_store_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
     store = ZarrStore(path, "study", "one", ["a"])
     store["a"] = RESULT
@@ -98,6 +96,7 @@ def test_damaged(tmp_path: Path) -> None:
         ZarrStore(path, "study", "one", ["a"])
 
 
+@pytest.mark.slow
 def test_killed_while_it_writes(tmp_path: Path) -> None:
     """Whatever is done is whole after SIGKILL; remains are removed."""
     program = """

@@ -11,6 +11,7 @@ from tests.loop.control.control_cases import FRAME_S, INTERACTION, LAYERS, PLANT
 from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
+from faintspot.engine.background.background_process import _watch
 from faintspot.engine.background.learning import BackgroundLearning, background_learning
 from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.request_handlers import commands_of
@@ -99,6 +100,16 @@ def test_a_new_filter_goes_on_from_the_mirror(name: str, model: ControlModel) ->
         run.loop.renew(replace(model, arrays={**model.arrays, "first": np.eye(3)}))
     for each in (run, other):
         each.ring.close()
+
+
+@pytest.mark.parametrize("engine_ends", [True, False])
+def test_a_process_that_ends_before_the_engine_is_a_fault(engine_ends: bool) -> None:
+    def check() -> None:
+        raise InputError("learn: killed")
+
+    done, faults = iter([False, engine_ends]), list[str]()
+    _watch(SimpleNamespace(check=check), SimpleNamespace(wait=lambda _: next(done)), faults.append)  # type: ignore[arg-type]
+    assert faults == ([] if engine_ends else ["learn: killed"])
 
 
 def test_a_learnt_centroid_gain(name: str, model: ControlModel) -> None:
