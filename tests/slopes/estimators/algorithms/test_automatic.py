@@ -107,6 +107,14 @@ def test_kept_pixels_grow_with_contrast_and_with_the_spot(profile: str, method: 
     assert (np.diff(larger) > 0).all()
 
 
+def test_smoothing_is_about_half_a_pixel_and_more_for_faint_and_large_spots() -> None:
+    widths = automatic_smoothing([60.0, 200.0, 1000.0], 1.0, pixels=256, spot_fwhm_px=1.8)
+    assert (np.diff(widths) < 0).all()
+    assert 0.4 < widths[-1] < widths[0] < 0.9
+    small, large = automatic_smoothing([1000.0, 4000.0], 1.0, pixels=256, spot_fwhm_px=[1.8, 3.6])
+    assert small < large < 1.5 * small
+
+
 def test_without_flux_nothing_is_denoised_and_nearly_all_pixels_are_kept() -> None:
     arguments: dict[str, Any] = {"pixels": 256, "spot_fwhm_px": 2.0}
     assert automatic_strength(0.0, 3.0, **arguments) == 0
@@ -171,7 +179,7 @@ def test_bounds_over_the_whole_space(flux: float, read_noise: float, about: dict
 
 
 @pytest.mark.parametrize("function", [automatic_strength, automatic_smoothing, automatic_kept_pixels])
-def test_bad_arguments(function: Callable[..., Any]) -> None:
+def test_arguments_out_of_range_are_refused(function: Callable[..., Any]) -> None:
     good = partial(function, flux_e=100.0, read_noise_e=1.0, pixels=256, spot_fwhm_px=2.0)
     assert_each_refused(
         good,
@@ -189,6 +197,6 @@ def test_bad_arguments(function: Callable[..., Any]) -> None:
         good(flux_e=[1.0, 2.0], read_noise_e=[1.0, 2.0, 3.0])
 
 
-def test_unknown_method() -> None:
+def test_a_method_without_a_rule_is_refused() -> None:
     with refused("method"):
         automatic_kept_pixels(100.0, 1.0, pixels=256, spot_fwhm_px=2.0, method="median")
