@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, new_figure, styled
 from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import POSITIONS, Report, Section, configuration_section
-from faintspot.base.report.plots import Line, Panel, plot
+from faintspot.base.report.plots import Line, Panel
 from faintspot.base.report.texts import Texts
 from faintspot.base.validity import leave_out
 from faintspot.engine.telemetry.numbers import (
     PERCENTILES,
-    MethodDifference,
     change_rows,
     gaps,
     method_names,
@@ -40,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _TEXT = Texts("faintspot.slopes.recorded")
-_MOST_GAPS, _MOST_CHANGES = 20, 200
+_MOST_CHANGES = 200
 _BINS = 80
 # Points of the course in time, frames in each, and so many points that they are drawn as dots.
 _MOST_TIMES, _FEWEST_TOGETHER, _FEW_TIMES = 400, 50, 20
@@ -143,12 +140,7 @@ def _lost(telemetry: Telemetry) -> Section:
         restarts=restarts(telemetry),
         **{name: telemetry.attributes.get(f"dropped_{name}", 0) for name in ("records", "images", "changes")},
     )
-    shown = every[:_MOST_GAPS]
-    return _TEXT.section(
-        "lost",
-        _TEXT.table("lost.table", list(numbers.items())),
-        _TEXT.table("lost.gaps", shown, shown=len(shown), all=len(every)),
-    )
+    return _TEXT.section("lost", _TEXT.table("lost.table", list(numbers.items())))
 
 
 def _methods(telemetry: Telemetry) -> Section:
@@ -160,9 +152,7 @@ def _methods(telemetry: Telemetry) -> Section:
             difference = None if too_few else each.difference
             records.append({"quantity": name, **vars(each), "difference": difference, "too_few": too_few})
     first = next(iter(differences.values()))[0].method
-    return _TEXT.section(
-        "methods", _TEXT.table("methods", records, first=first), methods_figure(telemetry, differences)
-    )
+    return _TEXT.section("methods", _TEXT.table("methods", records, first=first))
 
 
 def _changes(telemetry: Telemetry) -> Section:
@@ -226,27 +216,3 @@ def _course(telemetry: Telemetry, latency: NDArray[np.float64], axes: Axes) -> s
     axes.set_yscale("log")
     together = len(parts[0])
     return f"median and longest of stretches of {together} frames" if together > 1 else "every frame"
-
-
-def methods_figure(telemetry: Telemetry, values: Mapping[str, Sequence[MethodDifference]]) -> FigureWithData:
-    """Draw by how much every method differs from the first, a panel for each quantity."""
-    panels, rows = [], []
-    names = [method.method for method in next(iter(values.values()))]
-    for name, compared in values.items():
-        lines = []
-        for row, method in enumerate(compared[1:]):
-            shift = not_none(method.difference)
-            spread = [[shift.value - shift.low], [shift.high - shift.value]]
-            style = {"fmt": "o", "color": METHOD_COLOURS[(row + 1) % len(METHOD_COLOURS)], "capsize": 3}
-            lines.append(Line("", [shift.value], [row], style=style, x_error=spread))
-            rows.append((name, method.method, shift.value, shift.low, shift.high, shift.count))
-        panels.append(Panel(lines, "", title=name, at={0.0: {}}, y_range=(len(names) - 1.4, -0.6)))
-    figure = plot([panels], 1.6 + 0.45 * len(names), legend="")
-    for panel in figure.axes:
-        panel.set_yticks(
-            range(len(names) - 1), names[1:] if panel is figure.axes[0] else [""] * (len(names) - 1)
-        )
-        panel.title.set_fontsize(10)
-        panel.tick_params(axis="x", labelsize=9)
-        panel.locator_params(axis="x", nbins=4)
-    return _TEXT.figure("methods.figure", figure, rows, first=names[0])

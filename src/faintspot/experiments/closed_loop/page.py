@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from faintspot.base.errors import InputError
@@ -11,12 +9,7 @@ from faintspot.base.report.page import POSITIONS, Report, Section, configuration
 from faintspot.base.report.texts import Texts
 from faintspot.base.report.words import with_interval
 from faintspot.base.statistics import paired_mean
-from faintspot.experiments.closed_loop.figures import (
-    budget_figure,
-    gain_figure,
-    magnitude_figure,
-    strehl_axis,
-)
+from faintspot.experiments.closed_loop.figures import magnitude_figure, strehl_axis
 from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
 from faintspot.experiments.closed_loop.tables import (
     budget_table,
@@ -29,7 +22,6 @@ from faintspot.experiments.closed_loop.tables import (
 from faintspot.experiments.closed_loop.verdict import (
     LoopResults,
     loop_verdict,
-    options_that_may_pay,
     reference_methods,
 )
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
@@ -79,9 +71,7 @@ def _sections(results: LoopResults, strehl: str) -> list[Section]:
         *([_TEXT.section("magnitude")] if magnitude is None else _of_magnitudes(magnitude, strehl)),
         _TEXT.section("budget")
         if budget is None
-        else _TEXT.section(
-            "budget", *_budget_lines(budget), budget_table(budget), budget_figure(budget, strehl)
-        ),
+        else _TEXT.section("budget", *_budget_lines(budget), budget_table(budget)),
     ]
 
 
@@ -91,16 +81,13 @@ def _of_magnitudes(result: MagnitudeResult, strehl: str) -> list[Section]:
     tables = [strehl_table(result)]
     for rank, reference in enumerate(references):
         compared = [method for method in range(len(result.labels)) if method not in references[: rank + 1]]
-        tables += [
-            gain_table(result, compared, reference),
-            difference_table(result, [(method, reference) for method in compared]),
-        ]
-    options = difference_table(result, [pair for _, *pair in options_that_may_pay(result)])
-    tables.append(replace(options, caption=_TEXT["tables.difference.options"] + options.caption))
+        tables.append(gain_table(result, compared, reference))
+        if rank:  # the figure has the differences from the first reference
+            tables.append(difference_table(result, [(method, reference) for method in compared]))
     figure = magnitude_figure(result, references[0], strehl)
     return [
         _TEXT.section("magnitude", *tables, figure, shape=result.strehl.shape, reference=base),
-        _TEXT.section("gain", centroid_gain_table(result), gain_figure(result)),
+        _TEXT.section("gain", centroid_gain_table(result)),
         _TEXT.section("settings", settings_table(result)),
     ]
 

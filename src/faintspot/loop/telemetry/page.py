@@ -13,8 +13,7 @@ from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import Report, Table
 from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.base.report.texts import Texts
-from faintspot.loop.control.identification.measured import R0, Measured, wind_errors
-from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER
+from faintspot.loop.control.identification.measured import R0, Measured
 from faintspot.loop.telemetry.over_time import Piece
 from faintspot.loop.telemetry.report import LoopReport, Part
 
@@ -35,9 +34,7 @@ def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> Report:
     """Return the page of a report, and of pieces of its recording."""
     figures: dict[str, Callable[[LoopReport], FigureWithData | None]] = {
         "noise": _noise_figure,
-        "turbulence": _wind_figure,
         "spectra": _spectra_figure,
-        "choices": _gain_figure,
     }
     sections = []
     if pieces:
@@ -128,31 +125,6 @@ def _noise_figure(report: LoopReport) -> FigureWithData | None:
     return _TEXT.figure("noise", figure, rows, ("row", "column", "noise x", "noise y"))
 
 
-@styled
-def _wind_figure(report: LoopReport) -> FigureWithData | None:
-    """Draw the wind of each layer, with errors."""
-    identified = report.turbulence
-    if identified is None or report.loop.subaperture_m is None or not identified.is_layered:
-        return None
-    figure = new_figure(WIDTH * 0.5, 5.4)
-    axes = figure.subplots()
-    winds, errors = identified.turbulence.wind_m_per_s, wind_errors(identified)
-    share = identified.turbulence.fraction
-    reach = 1.25 * float(np.hypot(*winds.T).max())
-    for radius in np.arange(5, reach, 5):
-        angle = np.linspace(0, 2 * np.pi, 181)
-        axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=GREY, lw=0.6, ls=":")
-    x, y = winds.T
-    axes.errorbar(x, y, 1.96 * errors[:, 1], 1.96 * errors[:, 0], fmt="none", color=GREY, capsize=2)
-    axes.scatter(x, y, 900 * share, color=METHOD_COLOURS[1], alpha=0.7)
-    for wind, part in zip(winds, share, strict=True):
-        axes.annotate(f"{part:.0%}", wind, textcoords="offset points", xytext=(12, 8))
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-    axes.set(xlabel="wind along x (m/s)", ylabel="wind along y (m/s)")
-    rows = [(*wind, *error, part) for wind, error, part in zip(winds, errors, share, strict=True)]
-    return _TEXT.figure("winds", figure, rows, ("x", "y", "error of x", "error of y", "share"))
-
-
 def _spectra_figure(report: LoopReport) -> FigureWithData | None:
     """Draw spectra of open-loop slopes and of the fitted model."""
     spectra = report.spectra
@@ -181,24 +153,3 @@ def _spectra_figure(report: LoopReport) -> FigureWithData | None:
     pairs = [panels[first : first + 2] for first in range(0, len(panels), 2)]
     figure = plot(pairs, 3.6 * len(pairs), legend="")
     return _TEXT.figure("spectra", figure, rows, ("slopes", "frequency", "measured", "found"))
-
-
-def _gain_figure(report: LoopReport) -> FigureWithData | None:
-    """Draw the residual of integrators against gain, and those of the loop and the filter."""
-    curve = [choice for choice in report.choices if np.isfinite(choice.gain) and choice.name != BEST]
-    curve = [choice for choice in curve if np.isfinite(choice.residual.value)]
-    if not curve:
-        return None
-    values = [(choice.gain, choice.residual.value, choice.residual.error) for choice in curve]
-    gain, residual, error = np.array(values).T
-    lines = [Line("integrator", gain, residual, 1.96 * error, _MEASURED)]
-    for name, colour in ((AS_RUN, "black"), (FILTER, METHOD_COLOURS[0])):
-        for choice in (choice for choice in report.choices if choice.name == name):
-            level, ends = choice.residual.value, np.array(choice.residual.interval)
-            spread = np.repeat(np.abs(ends - level)[:, None], 2, axis=1)
-            across = [gain.min(), gain.max()]
-            lines.append(Line(name, across, [level, level], spread, {"color": colour}, band=True))
-    label = f"residual ({curve[0].residual.unit})"
-    panel = Panel(lines, "gain of an integrator", label, y_range=(0, None), legend=True)
-    figure = plot([[panel]], 4.4, width=WIDTH * 0.7, legend="")
-    return _TEXT.figure("gains", figure, values, ("gain", "residual", "standard error"))

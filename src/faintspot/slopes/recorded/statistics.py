@@ -129,8 +129,6 @@ class SlopesSummary:
     x_px: Floats
     """Mean."""
     y_px: Floats
-    iterations: Floats
-    """Mean."""
 
 
 @dataclass(frozen=True)
@@ -159,13 +157,13 @@ class Jitter:
 def summarise(method: MeasuredSlopes) -> SlopesSummary:
     """Return the numbers of one method."""
     valid = method.valid
-    parts: dict[str, list[Any]] = {name: [] for name in ("flux", "x", "y", "iterations")}
+    parts: dict[str, list[Any]] = {name: [] for name in ("flux", "x", "y")}
     for block in column_blocks(method.n_frames, method.n_subapertures):
         kept = valid[:, block]
         parts["flux"].append(median_over_valid(method.flux[:, block], kept))
-        for name in ("x", "y", "iterations"):
+        for name in ("x", "y"):
             parts[name].append(mean_over_valid(getattr(method, name)[:, block], kept))
-    flux, x, y, iterations = (np.concatenate(part) for part in parts.values())
+    flux, x, y = (np.concatenate(part) for part in parts.values())
     any_valid = bool(valid.any())
     return SlopesSummary(
         valid_fraction=float(valid.mean()),
@@ -175,7 +173,6 @@ def summarise(method: MeasuredSlopes) -> SlopesSummary:
         flux_e=flux,
         x_px=x,
         y_px=y,
-        iterations=iterations,
     )
 
 

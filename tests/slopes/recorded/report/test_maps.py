@@ -1,4 +1,4 @@
-"""Maps over all frames: what is cut says so, and legends lie beside the data."""
+"""Maps over all frames: arrows that are cut, outlines, and maps of one frame."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import pytest
 from tests.slopes.recorded.recorded_cases import sensor, simulated, two_methods
 
 from faintspot.slopes.recorded.report import maps
-from faintspot.slopes.recorded.statistics import MeasuredSlopes, jitter, summarise, valid_in_all
+from faintspot.slopes.recorded.statistics import MeasuredSlopes, summarise
 from faintspot.slopes.sensor.layout import Layout
 
 
@@ -41,17 +41,6 @@ def test_outlines_are_left_out_of_big_sensors() -> None:
         return len(figure.axes[0].collections)
 
     assert drawn(30) == drawn(2) - 1
-
-
-def test_legend_of_the_jitter_lies_outside() -> None:
-    layout = sensor()
-    methods, _ = two_methods(layout, simulated(layout, 6)[0])
-    valid = valid_in_all(methods)
-    figure = maps.jitter_plot(methods, [jitter(method.x, method.y, valid) for method in methods])
-    assert all(panel.get_legend() is None for panel in figure.axes)
-    figure.draw_without_rendering()
-    legend = figure.legends[0].get_window_extent()
-    assert all(not legend.overlaps(panel.get_window_extent()) for panel in figure.axes)
 
 
 def test_one_frame_has_a_map_of_the_flux_alone() -> None:

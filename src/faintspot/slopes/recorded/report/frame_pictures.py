@@ -1,4 +1,4 @@
-"""Pictures of a frame: the sensor and single sub-apertures after every step."""
+"""Pictures of a frame: the sensor, and single sub-apertures after every step."""
 
 from __future__ import annotations
 
@@ -85,47 +85,24 @@ class Example:
 
 @styled
 def whole_sensor(example: Example) -> Figure:
-    """Draw all windows at their places after every step; on the last, the positions of the spots."""
-    layout, steps = example.layout, example.shown_steps
+    """Draw all windows of the calibrated frame at their places, with the positions of the spots."""
+    layout, images = example.layout, example.first.calibrated
     factor = coarseness(layout)
-    sheets = {
-        title: coarser(assembled(layout, getattr(example.first, key)), factor) for title, key in steps.items()
-    }
-    figure, axes = _step_panels(len(steps), sheets["raw"].shape)
-    start = layout.corners.min(axis=0) - 0.5
-    n_rows, n_columns = factor * np.array(sheets["raw"].shape)
+    sheet = coarser(assembled(layout, images), factor)
+    start, (n_rows, n_columns) = layout.corners.min(axis=0) - 0.5, factor * np.array(sheet.shape)
+    width = 0.62 * WIDTH
+    figure = new_figure(width, min(max(0.84 * width * n_rows / n_columns, 1.2), 9.0) + 0.7)
+    axes = figure.subplots()
+    low, high = limits_of(images, percent=99.8)
     extent = (start[1], start[1] + n_columns, start[0], start[0] + n_rows)
-    shown = _draw_steps(axes, sheets, example.raw_is_calibrated, extent)
-    _sheet_bars(axes, shown, example.raw_is_calibrated)
-    for panel in axes:
-        panel.label_outer()
+    image = axes.imshow(sheet, vmin=low, vmax=high, extent=extent, interpolation="nearest")
+    axes.set(xlabel="column (px)", ylabel="row (px)", facecolor=FLUX_GREY)
+    colour_bar(axes, image, "e- per pixel")
     if len(layout) <= MOST_MARKED:
         middles = layout.corners[:, ::-1] + 0.5 * (np.array(layout.window[::-1]) - 1)
-        _mark(axes[-1], {name: xy + middles for name, xy in example.positions().items()}, size=6)
-        _legend(figure, axes[-1])
+        _mark(axes, {name: xy + middles for name, xy in example.positions().items()}, size=6)
+        _legend(figure, axes)
     return figure
-
-
-def _sheet_bars(axes: list[Axes], shown: Mapping[str, object], one_unit: bool) -> None:
-    """Put colour bars beside the panels: electrons at the right end, ADU beside the raw frame."""
-    two_rows = len(axes) == 4
-    if not one_unit:
-        first, side = ([axes[0], axes[2]], "left") if two_rows else ([axes[0]], "right")
-        colour_bar(first, shown["raw"], "raw: ADU", location=side)
-    last = [axes[1], axes[3]] if two_rows else axes if one_unit else axes[1:]
-    colour_bar(last, list(shown.values())[-1], "e- per pixel")
-
-
-def _step_panels(number: int, shape: tuple[int, ...]) -> tuple[Figure, list[Axes]]:
-    """Return panels for the steps: four in two rows, fewer side by side."""
-    rows, columns = (2, 2) if number == 4 else (1, number)
-    wide = WIDTH if number > 1 else 0.62 * WIDTH
-    height = min(max(0.84 * wide / columns * shape[0] / shape[1], 1.2), 9.0) + 0.7
-    figure = new_figure(wide, rows * height)
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    for panel in grid.flat:
-        panel.set(xlabel="column (px)", ylabel="row (px)")
-    return figure, list(grid.flat)
 
 
 def coarseness(layout: Layout) -> int:

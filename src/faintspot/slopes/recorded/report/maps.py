@@ -1,4 +1,4 @@
-"""The maps and plots over all frames of a report: flux, validity, slopes, iterations, jitter."""
+"""Maps over all frames of a report: flux, validity, slopes, jitter."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from faintspot.base.report.drawing import (
     new_figure,
     styled,
 )
-from faintspot.base.report.plots import Line, Panel, plot
-from faintspot.slopes.recorded.statistics import Floats, Jitter, MeasuredSlopes, SlopesSummary, median
+from faintspot.slopes.recorded.statistics import Jitter, MeasuredSlopes, SlopesSummary, median
 from faintspot.slopes.sensor.drawing import (
     MOST_WITH_GAPS,
     Map,
@@ -31,8 +30,6 @@ from faintspot.slopes.sensor.layout import Layout
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PANEL_HEIGHT = 5.0
-_HISTOGRAM_BINS = 60
 ARROWS_WHOLE_PERCENT = 98
 """Percentage of slopes whose arrows are never cut."""
 _MOST_SHORT_ARROWS = 400  # of more sub-apertures, arrows within their own could not be seen
@@ -97,29 +94,6 @@ def slope_arrows(
 
 
 @styled
-def iteration_counts(
-    methods: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
-) -> Figure:
-    """Draw the mean iterations of every sub-aperture (first method) and how often each number occurred."""
-    figure, ((left, panel),) = _panels(1, 2, layout)
-    title = f"{methods[0].name}: {'mean ' if methods[0].n_frames > 1 else ''}iterations"
-    values = summaries[0].iterations
-    subaperture_map(left, layout, Map(values, "iterations", title, limits_of(values, low=0.0)))
-    most = max(int(method.iterations.max()) for method in methods)
-    step = max(1, -(-(most + 1) // _HISTOGRAM_BINS))
-    edges = np.arange(0, most + 1 + step, step) - 0.5
-    for method, colour in zip(methods, METHOD_COLOURS, strict=False):
-        counts = np.histogram(method.iterations[method.valid], edges)[0]
-        panel.stairs(100.0 * counts / max(1, counts.sum()), edges, fill=True, color=colour, label=method.name)
-    panel.set(xlabel="iterations", yscale="log", ylabel="valid measurements (%)", ylim=(None, 200))
-    panel.set_title("How many iterations it took")
-    panel.yaxis.set_major_formatter("{x:g}")
-    if len(methods) > 1:
-        panel.legend(frameon=False)
-    return figure
-
-
-@styled
 def jitter_maps(methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter], layout: Layout) -> Figure:
     """Draw the jitter of every sub-aperture, one map per method, on one scale."""
     limits = limits_of(*(item.px for item in jitters), low=0.0)
@@ -129,50 +103,6 @@ def jitter_maps(methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter], la
     ]
     maps = [Map(item.px, "jitter (px)", title, limits) for item, title in zip(jitters, titles, strict=True)]
     return _maps(layout, [maps])
-
-
-def jitter_plot(methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> Figure:
-    """Draw the jitter of the sub-apertures in order, and one method against another where there are two."""
-    order = np.argsort(jitters[-1].px)
-    lines, levels = [], {}
-    for method, item, colour in zip(methods, jitters, METHOD_COLOURS, strict=False):
-        order = order[item.measured[order]]
-        rank = np.arange(1, len(order) + 1)
-        dots, line = {"color": colour, "ls": "", "marker": "."}, {"color": colour, "lw": 1.3}
-        lines.append(Line(f"{method.name}: standard deviation", rank, item.px[order], style=dots))
-        lines.append(Line(f"{method.name}: robust", rank, _running_median(item.robust_px[order]), style=line))
-        levels[median(item.px)] = {"color": colour, "lw": 0.9, "ls": ":"}
-    label = f"sub-apertures, in order of the jitter of {methods[-1].name!r}"
-    ordered = Panel(lines, label, "jitter, rms of x and y (px)", y_range=(0, None), levels=levels)
-    panels = [ordered, _compared(methods, jitters)] if len(methods) == 2 else [ordered]
-    figure = plot([panels], _PANEL_HEIGHT, columns=6)  # the legend beside the data, never on it
-    if len(methods) == 2:
-        figure.axes[1].set_aspect("equal")
-    return figure
-
-
-def _compared(methods: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> Panel:
-    """Return the second method's jitter along x against the first's along y."""
-    across, up = jitters[1].px, jitters[0].px
-    stop = 1.08 * limits_of(across, up, low=0.0)[1]
-    dots = {"color": METHOD_COLOURS[1], "ls": "", "marker": ".", "ms": 7 if len(up) < 500 else 3}
-    diamond = {"color": METHOD_COLOURS[0], "ls": "", "marker": "D", "ms": 9, "mec": "black"}
-    lines = [
-        Line("", across, up, style=dots),
-        Line("equal", [0, stop], [0, stop], style={"color": GREY, "lw": 1}),
-        Line("medians", [median(across)], [median(up)], style=diamond),
-    ]
-    labels = (f"jitter, {methods[1].name} (px)", f"jitter, {methods[0].name} (px)")
-    title = "Below the line: the first method is steadier"
-    return Panel(lines, *labels, title, x_range=(0, stop), y_range=(0, stop))
-
-
-def _running_median(values: Floats) -> Floats:
-    """Return medians over a sixtieth of the values on both sides: few values stay as they are."""
-    reach = len(values) // 120
-    padded = np.pad(values, reach, constant_values=np.nan)
-    medians: Floats = np.nanmedian(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1), axis=1)
-    return medians
 
 
 def _maps(layout: Layout, rows: Sequence[Sequence[Map]]) -> Figure:

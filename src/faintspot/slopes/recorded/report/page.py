@@ -29,7 +29,7 @@ from faintspot.slopes.recorded.statistics import (
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.wavefront import fit_wavefront
 from faintspot.slopes.wavefront.figure import wavefront_figure
-from faintspot.slopes.wavefront.words import mode_table, remarks, rms_table
+from faintspot.slopes.wavefront.words import remarks, rms_table
 
 _TEXT = Texts("faintspot.slopes.recorded")
 _FLAGS_OF_DENOISING = (SubapertureFlag.INFEASIBLE_STRENGTH, SubapertureFlag.NOT_CONVERGED)
@@ -86,7 +86,7 @@ def _sensor_in_words(n: int, layout: Layout | None) -> str:
 
 def slopes_sections(run: SlopesRun) -> list[Section]:
     """Return the sections in the order of the page."""
-    makers = _frame, _flux, _slopes, _iterations, _jitter, _wavefront
+    makers = _frame, _flux, _slopes, _jitter, _wavefront
     made = (make(run) for make in makers)
     return [_key_numbers(run), *(section for section in made if section is not None)]
 
@@ -158,6 +158,8 @@ def _record(run: SlopesRun, index: int) -> dict[str, object]:
         "noise_at_equal_gain": None,
         "stated_error": method.standard_error_px,
         "jitter": median(run.jitters[index].px),
+        "robust": median(run.jitters[index].robust_px),
+        "iterations": run.summaries[index].median_iterations if method.is_denoised else None,
         "summary": run.summaries[index],
         **_against_truth(run, method),
     }
@@ -195,24 +197,17 @@ def _frame(run: SlopesRun) -> Section | None:
         return _TEXT.section("frame", missing=_NO_LAYOUT if run.layout is None else run.why_no_stages)
     truth = None if run.true_positions is None else run.true_positions[run.example_frame]
     example = frame_pictures.Example(run.layout, run.stages, truth, run.steps)
-    number, factor = len(example.shown_steps), frame_pictures.coarseness(run.layout)
-    marked, in_electrons = len(run.layout) <= frame_pictures.MOST_MARKED, example.raw_is_calibrated
+    factor = frame_pictures.coarseness(run.layout)
     values = {
         "frame": run.example_frame,
-        "shown": next(iter(run.stages)),
-        "in_electrons": in_electrons,
-        "all_alike": in_electrons and number > 1,
-        "both_scales": not in_electrons and number == 2,
-        "raw_apart": not in_electrons and number != 2,
-        "marked": marked,
-        "circles": "" if truth is None else " and circles true ones",
+        "marked": len(run.layout) <= frame_pictures.MOST_MARKED,
+        "circles": "" if truth is None else ", circles true ones",
         "coarse": factor if factor > 1 else None,
-        "several": number > 2,
     }
     return _TEXT.section(
         "frame",
         _TEXT.figure("sensor", frame_pictures.whole_sensor(example), **values),
-        _TEXT.figure("subapertures", frame_pictures.zoom(example), several=number > 2),
+        _TEXT.figure("subapertures", frame_pictures.zoom(example), shown=next(iter(run.stages))),
     )
 
 
@@ -258,21 +253,6 @@ def _slopes(run: SlopesRun) -> Section:
     return _TEXT.section("slopes", _TEXT.figure("slopes", figure, **values))
 
 
-def _iterations(run: SlopesRun) -> Section | None:
-    pairs = zip(run.methods, run.summaries, strict=True)
-    denoised = [(method, summary) for method, summary in pairs if method.is_denoised]
-    if not denoised:
-        return None
-    if run.layout is None:
-        return _TEXT.section("iterations", missing=_NO_LAYOUT)
-    if not any(method.valid.any() for method, _ in denoised):
-        return _TEXT.section("iterations")
-    medians = "; ".join(f"{method.name}: {summary.median_iterations:.0f}" for method, summary in denoised)
-    methods, summaries = zip(*denoised, strict=True)
-    figure = maps.iteration_counts(methods, summaries, run.layout)
-    return _TEXT.section("iterations", _TEXT.figure("iterations", figure, medians=medians))
-
-
 def _jitter(run: SlopesRun) -> Section | None:
     if not run.has_several_frames:
         return None
@@ -281,11 +261,10 @@ def _jitter(run: SlopesRun) -> Section | None:
     motion, truth = None, run.true_positions
     if truth is not None:
         motion = rms(jitter(truth[..., 0], truth[..., 1], run.valid[-1]).px)
-    figures = [_TEXT.figure("jitter", maps.jitter_plot(run.methods, run.jitters))]
-    if run.layout is not None:
-        shown = maps.jitter_maps(run.methods, run.jitters, run.layout)
-        figures.insert(0, _TEXT.figure("jitter-map", shown))
-    return _TEXT.section("jitter", *figures, motion=motion)
+    if run.layout is None:
+        return _TEXT.section("jitter", missing=_NO_LAYOUT)
+    figure = _TEXT.figure("jitter", maps.jitter_maps(run.methods, run.jitters, run.layout))
+    return _TEXT.section("jitter", figure, motion=motion)
 
 
 def _wavefront(run: SlopesRun) -> Section | None:
@@ -303,7 +282,6 @@ def _wavefront(run: SlopesRun) -> Section | None:
             continue
         text += [line for line in remarks(wavefront) if line not in text]
         tables.append(Table(*rms_table(wavefront), name))
-        tables.append(Table(*mode_table(wavefront), name, folded=f"Coefficients of {name!r}"))
         figures.append(wavefront_figure(wavefront, run.layout, name, file=f"wavefront-{number + 1}"))
     return Section("wavefront", "Wavefront", [*text, *tables, *figures], " ".join(missing))
 
