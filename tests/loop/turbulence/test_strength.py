@@ -69,3 +69,9 @@ def test_noise_alone_and_two_subapertures(slopes: np.ndarray) -> None:
     both = slopes[:, [0, 1, 36, 37]]
     strength = turbulence_strength(both, np.zeros_like(both), np.repeat(np.arange(4), FRAMES // 4), pair)
     assert abs(strength.r0_m - AIR.r0_m) < 3 * strength.r0_error_m
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_alone_has_no_strength(seed: int) -> None:
+    noise = np.random.default_rng(seed).standard_normal((1200, 72))
+    assert np.isnan(turbulence_strength(noise, noise, np.zeros(1200, np.int64), AIR).r0_m)

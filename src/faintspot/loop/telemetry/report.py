@@ -272,6 +272,8 @@ def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> Id
         return identification
     strength = _strength(loop, open_loop, delay, replace(identified.turbulence, r0_m=site.r0_m))
     part.values += strength
+    if not math.isfinite(strength[0].value) and len(strength) == 1:
+        return identification
     part.values += _winds(identified, next(value for value in strength if value.name == R0))
     return identification
 
@@ -295,6 +297,8 @@ def _strength(
         outer_scale_m=loop.outer_scale_m,
         frame_rate_hz=loop.frame_rate_hz,
     )
+    if not math.isfinite(strength.r0_m):
+        return [Measured(R0, "m", remark="no turbulence seen: the slopes are those of noise")]
     outer, r0 = outer_scale_and_r0(strength, loop.outer_scale_m)
     if not loop.is_closed:
         r0 = replace(r0, remark=f"for a centroid gain of 1 ± {delay.gain_error:.2g}")

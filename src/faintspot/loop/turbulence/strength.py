@@ -30,6 +30,7 @@ _GAIN_STEP = 0.05
 _COMMON_ERROR = 0.03  # of r0: centroids of speckled, partly illuminated spots are not quite mean gradients
 _ERROR_OF_DEGREE = 0.01  # of r0, for each degree: averaging within a sub-aperture
 _TO_R0 = 3 / 5
+_SEEN = 4.0  # standard deviations of the noise's, below which no variance is that of turbulence
 _LAGS, _MOST_LOST = 20, 0.8  # of `sampled`: nodes of its integrals, and a limit
 
 
@@ -93,6 +94,8 @@ def turbulence_strength(
     change = [_of_gain(atmosphere @ basis, residual @ basis, run) for basis in modes]
     sampling = [_sampling(atmosphere @ basis, run, value) for basis, value in zip(modes, signal, strict=True)]
     of_signal, of_noise = np.array(sampling).T
+    if of_noise.min() > 1 / _SEEN**2:
+        return TurbulenceStrength(math.nan, math.nan, outer_scale_m or OUTER_SCALE_M, math.nan)
     covariance, lost = np.diag(of_signal), np.zeros(len(modes))
     if frame_rate_hz is not None:
         lost, covariance = sampled(modes, site, len(atmosphere) / frame_rate_hz)

@@ -1,11 +1,15 @@
 """Orders of sub-apertures that do not fit the interaction matrix."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from tests.loop.telemetry.loop_cases import CELLS, CORNERS
+from tests.loop.control.frozen_flow import frozen_slopes
+from tests.loop.telemetry.loop_cases import AIR, CELLS, CORNERS, NOISE_PX, RATE_HZ
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.cell_order import order_remark, smoothness
+from faintspot.loop.control.identification.recording import Recording, prepared
 
 APART = CORNERS - CELLS[:, None]
 INSIDE = ((APART == 0) | (APART == 1)).all(axis=2)
@@ -49,6 +53,25 @@ def test_a_few_exchanged_cells_are_remarked() -> None:
     cells = CELLS.copy()
     cells[[6, 7, 17, 18]] = cells[[17, 18, 6, 7]]
     assert "check that row and column of each" in order_remark(ZONAL, cells)
+
+
+@pytest.fixture(scope="module")
+def turbulence() -> Recording:
+    slopes = frozen_slopes(AIR, 600, RATE_HZ, np.random.default_rng(1))
+    slopes += NOISE_PX * np.random.default_rng(2).standard_normal(slopes.shape)
+    return Recording(slopes, None, None, CELLS, RATE_HZ, subaperture_m=0.6, is_closed=False)
+
+
+def test_open_loops_are_judged_by_the_turbulence(turbulence: Recording) -> None:
+    assert prepared(turbulence).recording.remarks == ()
+    exchanged = replace(turbulence, slopes=np.roll(turbulence.slopes, 25, axis=1))
+    with pytest.raises(InputError, match="the turbulence fits slopes by columns, or with y before x"):
+        prepared(exchanged)
+    shuffled = np.random.default_rng(1).permutation(CELLS)
+    with pytest.raises(InputError, match="the turbulence makes no smooth wavefronts"):
+        prepared(replace(turbulence, cells=shuffled))
+    noise = np.random.default_rng(3).standard_normal(turbulence.slopes.shape)
+    assert prepared(replace(turbulence, slopes=noise, cells=shuffled)).recording.remarks == ()
 
 
 def test_large_sensors_are_judged_by_a_part() -> None:

@@ -23,12 +23,30 @@ orders 0 to .3, of two pairs of lenslets exchanged .6 to .8. With few polynomial
 _WRONG = 0.4  # below which nothing is learnt
 _MOST_SUBAPERTURES, _FEWEST_SUBAPERTURES = 60, 9
 _FEWEST_MODES = 5  # without tip and tilt: fewer need not be those with the most turbulence
+_OF_NOISE = 3.0  # times the noise's, for modes of turbulence
+_OF_TURBULENCE = 0.5, 0.25
+"""As `_FITS` and `_WRONG`, of the modes of 500 frames of turbulence: right orders .57 to .79, shuffled ones
+up to .05, with axes exchanged .09 to .4, with rows upwards .25 to .38."""
 _LEAST = 1e-3  # of the largest singular value, that counts as a mode of the mirror
 _OUTER_SCALE = 40.0  # sub-apertures
 
 
-def order_remark(interaction: Floats, cells: Cells) -> str:
+def modes_of_turbulence(slopes: Floats) -> Floats:
+    """Return the modes (2 n, k) that stand out of the noise of open-loop slopes (frames, 2 n).
+
+    Unknown slopes are NaN. White noise has covariances of consecutive frames of both signs.
+    """
+    moving = slopes - np.nanmean(np.where(np.isfinite(slopes).any(axis=0), slopes, 0.0), axis=0)
+    moving = np.nan_to_num(moving)
+    covariance = moving[1:].T @ moving[:-1]
+    values, vectors = np.linalg.eigh(covariance + covariance.T)
+    return np.asarray(vectors[:, values > _OF_NOISE * max(-values[0], 0.0)][:, -(len(values) // 4) :])
+
+
+def order_remark(interaction: Floats, cells: Cells, *, of_turbulence: bool = False) -> str:
     """Return a remark of one line if some cells may not be in the order of the slopes; else nothing.
+
+    `interaction` is that of a mirror, or of the turbulence: `modes_of_turbulence`.
 
     Raises
     ------
@@ -38,8 +56,11 @@ def order_remark(interaction: Floats, cells: Cells) -> str:
     n = len(cells)
     if n < _FEWEST_SUBAPERTURES or not np.any(interaction):
         return ""
+    source, fits_from, wrong_below = "the interaction matrix", _FITS, _WRONG
+    if of_turbulence:
+        source, (fits_from, wrong_below) = "the turbulence", _OF_TURBULENCE
     stated = smoothness(interaction, cells)
-    if stated >= _FITS:
+    if stated >= fits_from:
         return ""
     axes = np.roll(np.arange(2 * n), n)
     pairs = np.concatenate([np.arange(0, 2 * n, 2), np.arange(1, 2 * n, 2)])
@@ -51,17 +72,17 @@ def order_remark(interaction: Floats, cells: Cells) -> str:
     }
     fits = {name: max(smoothness(*order) for order in orders) for name, orders in others.items()}
     best = max(fits, key=lambda name: fits[name])
-    if fits[best] >= _FITS:
+    if fits[best] >= fits_from:
         raise InputError(
-            f"cells: the interaction matrix fits slopes {best} ({fits[best]:.2f} of 1, as given "
+            f"cells: {source} fits slopes {best} ({fits[best]:.2f} of 1, as given "
             f"{stated:.2f}); give slopes as all x, then all y, and row and column of each sub-aperture in "
             "that order"
         )
     remark = (
-        f"cells: with sub-apertures in this order the mirror makes no smooth wavefronts ({stated:.2f} of 1, "
-        f"expected {_FITS:g}); check that row and column of each are in the order of the slopes"
+        f"cells: with sub-apertures in this order {source} makes no smooth wavefronts ({stated:.2f} of 1, "
+        f"expected {fits_from:g}); check that row and column of each are in the order of the slopes"
     )
-    if stated < _WRONG:
+    if stated < wrong_below:
         raise InputError(remark)
     return remark
 

@@ -13,7 +13,7 @@ from faintspot.base.checks import finite_array, increasing, numbers_between, rea
 from faintspot.base.config.options import Option
 from faintspot.base.errors import InputError
 from faintspot.loop.control.faults import followers, still_actuators, stuck_slopes
-from faintspot.loop.control.identification.cell_order import order_remark
+from faintspot.loop.control.identification.cell_order import modes_of_turbulence, order_remark
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 Floats = NDArray[np.float64]
@@ -199,7 +199,12 @@ def prepared(recording: Recording) -> Prepared:
         raise InputError(f"{recording.name}: expected slopes that vary, got constant ones")
     _check_alike(recording)
     scaled = _without_unmeasured(recording).scaled(spread)
-    if recording.commands is None or recording.interaction_matrix is None or not recording.is_closed:
+    if not recording.is_closed:
+        modes = modes_of_turbulence(scaled.slopes)
+        remark = order_remark(modes, scaled.cells, of_turbulence=True) if modes.shape[1] else ""
+        remarks = (*scaled.remarks, *([remark] if remark else []))
+        return Prepared(replace(scaled, remarks=remarks), 1.0, 0, math.inf)
+    if recording.commands is None or recording.interaction_matrix is None:
         return Prepared(scaled, 1.0, 0, math.inf)
     ready = _with_convention(scaled)
     return ready._replace(recording=_without_still_actuators(ready.recording))
