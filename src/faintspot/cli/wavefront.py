@@ -22,9 +22,8 @@ from faintspot.slopes.recorded.difference import difference
 from faintspot.slopes.recorded.stored_run import open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.wavefront import Wavefront, ZonalMap, fit_wavefront, save_map, save_wavefront, zonal_map
-from faintspot.slopes.wavefront.files import check_wavefront_file
+from faintspot.slopes.wavefront.files import check_map_file, check_wavefront_file
 from faintspot.slopes.wavefront.fit import total
-from faintspot.slopes.wavefront.map_files import check_map_file
 from faintspot.slopes.wavefront.units import UNITS
 from faintspot.slopes.wavefront.words import (
     mode_table,
@@ -158,7 +157,7 @@ def command(
         write_picture(wavefront_figure(wavefront, layout, title).figure, drawing)
         if surface is not None:
             target_picture = drawing.with_stem(f"{drawing.stem}_zonal")
-            write_picture(zonal_figure(surface, wavefront, layout, title).figure, target_picture)
+            write_picture(zonal_figure(surface, wavefront, layout, title), target_picture)
     if flat is not None:
         _write_flattening(flat, target, measured, wavefront, layout)
 

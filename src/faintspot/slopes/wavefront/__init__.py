@@ -9,10 +9,10 @@ from faintspot.base.lazy import lazy_attributes
 if TYPE_CHECKING:
     from faintspot.slopes.wavefront.discrepancy import Discrepancy as Discrepancy
     from faintspot.slopes.wavefront.discrepancy import slope_discrepancy as slope_discrepancy
+    from faintspot.slopes.wavefront.files import save_map as save_map
     from faintspot.slopes.wavefront.files import save_wavefront as save_wavefront
     from faintspot.slopes.wavefront.fit import Wavefront as Wavefront
     from faintspot.slopes.wavefront.fit import fit_wavefront as fit_wavefront
-    from faintspot.slopes.wavefront.map_files import save_map as save_map
     from faintspot.slopes.wavefront.zernike import zernike as zernike
     from faintspot.slopes.wavefront.zonal import ZonalMap as ZonalMap
     from faintspot.slopes.wavefront.zonal import zonal_map as zonal_map
@@ -24,7 +24,7 @@ _HOMES = {
     "fit_wavefront": "faintspot.slopes.wavefront.fit",
     "save_wavefront": "faintspot.slopes.wavefront.files",
     "slope_discrepancy": "faintspot.slopes.wavefront.discrepancy",
-    "save_map": "faintspot.slopes.wavefront.map_files",
+    "save_map": "faintspot.slopes.wavefront.files",
     "zernike": "faintspot.slopes.wavefront.zernike",
     "zonal_map": "faintspot.slopes.wavefront.zonal",
 }

@@ -13,11 +13,13 @@ from faintspot.slopes.sensor.drawing import Map, subaperture_map
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import Pupil, lenslet_outlines
 from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
-from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
+from faintspot.slopes.wavefront.words import mode_records
+from faintspot.slopes.wavefront.zernike import mode_name, osa_index
 from faintspot.slopes.wavefront.zonal import ZonalMap, compared
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _SIGNED_COLOURS = "RdBu_r"
 _MOST_OUTLINED = 1500
@@ -54,17 +56,12 @@ def wavefront_figure(
         "Noll's order ± standard error, with the names of the modes and their indices (Noll | OSA/ANSI)"
         + (", and in grey the rms of each over the frames (motion and noise)." if several else ".")
     )
-    header = ("noll", "osa", "n", "m", "name", "coefficient", "standard_error", "rms_of_frames", "unit")
+    records = mode_records(wavefront)
     rows = [
-        (int(j), osa_index(int(j)), *noll_to_nm(int(j)), mode_name(int(j)), *numbers, wavefront.unit)
-        for j, *numbers in zip(
-            wavefront.modes,
-            wavefront.mean,
-            wavefront.mean_standard_error,
-            wavefront.rms_of_frames,
-            strict=True,
-        )
+        (*record.values(), of_frames, wavefront.unit)
+        for record, of_frames in zip(records, wavefront.rms_of_frames, strict=True)
     ]
+    header = (*records[0], "rms_of_frames", "unit")
     return FigureWithData(file, f"Wavefront of {name}", caption, figure, header, rows)
 
 
@@ -80,7 +77,7 @@ def wavefront_map(
 
 
 @styled
-def zonal_figure(zonal: ZonalMap, wavefront: Wavefront, layout: Layout, name: str) -> FigureWithData:
+def zonal_figure(zonal: ZonalMap, wavefront: Wavefront, layout: Layout, name: str) -> Figure:
     """Draw a zonal map, the wavefront of the modes, their difference, and standard errors."""
     figure = new_figure(WIDTH, 10.4)
     panels = figure.subplots(2, 2).ravel()
@@ -94,11 +91,7 @@ def zonal_figure(zonal: ZonalMap, wavefront: Wavefront, layout: Layout, name: st
     shown = Map(zonal.standard_errors, zonal.unit, title, (0.0, largest or 1.0))
     subaperture_map(panels[3], layout, shown)
     figure.suptitle(name, fontsize=14)
-    caption = "Mean wavefront without modes (zonal), of the fitted modes, and the first minus the second."
-    header = ("row", "column", "part", "value", "standard_error", "unit")
-    values = zonal.parts.tolist(), zonal.values.tolist(), zonal.standard_errors.tolist()
-    rows = [(*cell, *own, zonal.unit) for cell, *own in zip(layout.cells.tolist(), *values, strict=True)]
-    return FigureWithData("zonal", f"Zonal map of {name}", caption, figure, header, rows)
+    return figure
 
 
 def _map(

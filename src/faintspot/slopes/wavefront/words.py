@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from faintspot.base.report.words import number_or_dash, signed
 from faintspot.base.statistics import rms
 from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
 from faintspot.slopes.wavefront.units import UNITS
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
 from faintspot.slopes.wavefront.zonal import ZonalMap, compared
+
+
+def mode_records(wavefront: Wavefront) -> list[dict[str, Any]]:
+    """Return each mode of the mean wavefront: indices, name, coefficient and standard error."""
+    modes = zip(wavefront.modes.tolist(), wavefront.mean, wavefront.mean_standard_error, strict=True)
+    return [
+        {
+            "noll": j,
+            "osa": osa_index(j),
+            **dict(zip("nm", noll_to_nm(j), strict=True)),
+            "name": mode_name(j),
+            "mean": mean,
+            "standard_error": error,
+        }
+        for j, mean, error in modes
+    ]
 
 
 def mode_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
@@ -18,17 +37,16 @@ def mode_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
     header += ["± standard error"] + ([f"rms of frames ({wavefront.unit})"] if several else [])
     digits = _decimals(wavefront.rms_of_frames)
     rows = []
-    for j, mean, error, of_frames in zip(
-        wavefront.modes, wavefront.mean, wavefront.mean_standard_error, wavefront.rms_of_frames, strict=True
-    ):
-        n, m = noll_to_nm(int(j))
-        values = [
-            f"{mean:+.{digits}f}".replace("-", "−"),
-            f"{error:.{digits}f}" if np.isfinite(error) else "–",
+    for mode, of_frames in zip(mode_records(wavefront), wavefront.rms_of_frames, strict=True):
+        mean, error = signed(mode["mean"], digits), number_or_dash(mode["standard_error"], digits)
+        row = [
+            f"Z{mode['noll']}",
+            mode["name"],
+            *(str(mode[name]) for name in ("osa", "n", "m")),
+            mean,
+            error,
         ]
-        rows.append([f"Z{j}", mode_name(int(j)), str(osa_index(int(j))), str(n), str(m), *values])
-        if several:
-            rows[-1].append(f"{of_frames:.{digits}f}")
+        rows.append([*row, f"{of_frames:.{digits}f}"] if several else row)
     return header, rows
 
 
@@ -46,7 +64,14 @@ def rms_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
     all_values = [total(pair[0]) for pair in coefficients.values()]
     digits = _decimals(np.array(all_values))
     rows = [
-        [name, *(_cell(part, tilt, digits) for part in pair for tilt in (True, False))]
+        [
+            name,
+            *(
+                number_or_dash(float(total(part, tilt=tilt)), digits)
+                for part in pair
+                for tilt in (True, False)
+            ),
+        ]
         for name, pair in coefficients.items()
     ]
     header = [f"rms over the pupil ({wavefront.unit})", "all modes", "no tip, tilt"]
@@ -106,8 +131,7 @@ def zonal_table(zonal: ZonalMap, wavefront: Wavefront) -> tuple[list[str], list[
     digits = _decimals(np.array(values))
     for name, *numbers in zip(sheets[0], *values, strict=True):
         rows.append([name, *(f"{number:.{digits}f}" for number in numbers), ""])
-    error = rms(zonal.standard_errors)
-    rows[0][-1] = f"{error:.{digits}f}" if np.isfinite(error) else "–"
+    rows[0][-1] = number_or_dash(rms(zonal.standard_errors), digits)
     header = f"rms over the sub-apertures ({zonal.unit})"
     return [header, "with tip, tilt", "no tip, tilt", "standard error"], rows
 
@@ -136,11 +160,6 @@ def zonal_remarks(zonal: ZonalMap, wavefront: Wavefront) -> list[str]:
     if zonal.left_out not in ("", wavefront.left_out):
         lines.append(f"Of the zonal map {zonal.left_out}.")
     return lines
-
-
-def _cell(coefficients: Floats, tilt: bool, digits: int) -> str:
-    value = float(total(coefficients, tilt=tilt))
-    return f"{value:.{digits}f}" if np.isfinite(value) else "–"
 
 
 def _decimals(values: Floats) -> int:
