@@ -74,7 +74,7 @@ def test_ctrl_c_at_any_line_of_the_writer(tmp_path: Path, line: int, monkeypatch
     def trace(frame: Any, event: str, _: Any) -> Any:
         nonlocal n_lines
         code = frame.f_code
-        if code.co_filename != slopes_writer.__file__ or code.co_name not in ("append", "_write"):
+        if code.co_filename != slopes_writer.__file__ or code.co_name not in ("append", "_store_waiting"):
             return None
         if event != "line":
             return trace

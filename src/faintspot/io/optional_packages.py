@@ -8,6 +8,11 @@ from typing import Any
 from faintspot.base.errors import MissingExtraError
 
 
+def load_filelock() -> Any:
+    """Return the package filelock."""
+    return _load("filelock", "filelock", "Writing slopes that can be resumed")
+
+
 def load_fits() -> Any:
     """Return the package astropy.io.fits."""
     return _load("astropy.io.fits", "astropy", "Reading or writing a FITS file")

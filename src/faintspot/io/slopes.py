@@ -29,7 +29,7 @@ from faintspot.io.stored.slopes_format import (
     json_values,
     pixels_in,
 )
-from faintspot.io.stored.slopes_writer import SlopeWriter, StoreWriter
+from faintspot.io.stored.slopes_writer import SlopeWriter
 from faintspot.io.stored.slopes_zarr import SlopeStore, describe_store, remove_store
 
 _Result = TypeVar("_Result")
@@ -97,21 +97,25 @@ def create_writer(
         file_format.require()
         store_path = file_format.store(path)
         export = None if store_path == path else file_format.write
-        if not overwrite and _is_finished(path, file_format, run, resume=resume):
-            if export is not None:
-                _remove_leftovers(path, store_path, run)
+        is_finished = not overwrite and _is_finished(path, file_format, run, resume=resume)
+        if is_finished and (export is None or not store_path.exists()):
             return SlopeWriter(path, run)
+        if not has_zarr() and not store_path.exists():
+            check_memory(path, *run.sizes)
+            return SlopeWriter(path, run, export=export)
         lock = OutputLock(path)
         try:
-            if export is not None and not has_zarr() and not store_path.exists():
-                check_memory(path, *run.sizes)
-                return SlopeWriter(path, run, lock, export)
             output = describe_store(store_path)
+            if is_finished:  # ended between making the file and removing the store
+                if output is not None and (output.fingerprint, output.sizes) == (run.fingerprint, run.sizes):
+                    remove_store(store_path)
+                lock.release()
+                return SlopeWriter(path, run)
             if output is not None:
                 output = replace(output, complete=output.complete and export is None)
                 if not output.may_be_continued(store_path, run, resume=resume, overwrite=overwrite):
                     remove_store(store_path)
-            return StoreWriter(path, run, lock, export, SlopeStore(store_path, run))
+            return SlopeWriter(path, run, lock, export, SlopeStore(store_path, run))
         except BaseException:
             lock.release()
             raise
@@ -220,16 +224,3 @@ def _is_finished(path: Path, file_format: FileFormat, run: RecordingHeader, *, r
     """Return whether this run has completed the output before; refuse another run's output."""
     output = _read(path, file_format.finished)
     return output is not None and output.may_be_continued(path, run, resume=resume, overwrite=False)
-
-
-def _remove_leftovers(path: Path, store_path: Path, run: RecordingHeader) -> None:
-    """Remove the store that this run left if it ended between making the file and removing the store."""
-    if not store_path.exists():
-        return
-    lock = OutputLock(path)
-    try:
-        output = describe_store(store_path)
-        if output is not None and (output.fingerprint, output.sizes) == (run.fingerprint, run.sizes):
-            remove_store(store_path)
-    finally:
-        lock.release()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import read_bytes, replace_file
+from faintspot.base.files import read_bytes, replace_file, sync_file, sync_folder
 from faintspot.base.json_text import parse_json, to_json
 from faintspot.base.sizes import MOST_TEXT_BYTES, check_bytes
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES
@@ -38,6 +40,19 @@ def open_store(path: Path, key: str = "") -> Any:
         On broken metadata zarr raises many kinds of errors.
     """
     return load_zarr().open(str(path), mode="r", path=key, use_consolidated=False)
+
+
+@contextmanager
+def new_store(path: Path, attributes: Mapping[str, Any]) -> Iterator[Any]:
+    """Create a store (format 3): fill the group in the `with` block; only then does it appear at the path."""
+    hidden = path.with_name(f".{path.name}.new")
+    shutil.rmtree(hidden, ignore_errors=True)
+    hidden.mkdir()
+    yield load_zarr().create_group(str(hidden), zarr_format=3, attributes=dict(attributes))
+    for file in (*hidden.rglob("*"), hidden):
+        (sync_folder if file.is_dir() else sync_file)(file)
+    hidden.rename(path)
+    sync_folder(path.parent)
 
 
 def check_array(name: str, array: Any) -> int:

@@ -1,4 +1,4 @@
-"""Lock file beside an output, held through the operating system, so that only one program writes it."""
+"""Lock beside an output, so that only one program writes it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import socket
 from pathlib import Path
 
 from faintspot.base.errors import InputError
+from faintspot.io.optional_packages import load_filelock
 
-_OWNER_BYTES = 200
-_FAR = 1 << 30  # Windows locks bytes: one that nobody reads
-# File systems without locks: there only the mark in the output, read before every write, protects it.
+# On file systems without locks, a file that names its process is the lock.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS)
+_PATIENCE_S = 0.1  # a holder that ends may remove the file that was just opened
 
 
 class OutputLock:
@@ -33,71 +33,37 @@ class OutputLock:
     """
 
     def __init__(self, path: Path) -> None:
+        filelock = load_filelock()
         self._file = path.with_name(f".{path.name}.lock")
-        self._descriptor = -1
-        while not self._is_held():
-            self.release(keep_file=True)  # close the file if its holder removed it meanwhile
-            self._descriptor = os.open(self._file, os.O_RDWR | os.O_CREAT, 0o666)
-            self._take(path)
-        os.ftruncate(self._descriptor, 0)
-        os.lseek(self._descriptor, 0, os.SEEK_SET)
-        os.write(self._descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        self._lock = filelock.FileLock(self._file, timeout=_PATIENCE_S, fallback_to_soft=False)
+        advice = "wait until it has ended"
+        try:
+            try:
+                self._lock.acquire()
+                self._file.write_text(f"{os.getpid()}\n{socket.gethostname()}\n")
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                self._file.unlink(missing_ok=True)
+                self._file = path.with_name(f".{path.name}.process")
+                advice += f" (delete {self._file} if it has)"
+                self._lock = filelock.SoftFileLock(self._file, timeout=_PATIENCE_S)
+                self._lock.acquire()
+        except filelock.Timeout:
+            owner = "another program"
+            with contextlib.suppress(OSError):  # ended meanwhile, or Windows, which lets nobody read it
+                owner = "process " + " on ".join(self._file.read_text(errors="replace").split()[:2])
+            raise InputError(
+                f"{path}: is being written by {owner}; {advice} or choose another name"
+            ) from None
 
-    def release(self, *, keep_file: bool = False) -> None:
+    def release(self) -> None:
         """Release the lock; repeated calls do nothing."""
-        if self._descriptor >= 0:
-            if not keep_file:
-                with contextlib.suppress(PermissionError):  # Windows keeps open files
-                    self._file.unlink(missing_ok=True)
-            os.close(self._descriptor)
-            self._descriptor = -1
+        if self._lock.is_locked:
+            with contextlib.suppress(PermissionError):  # Windows keeps open files
+                self._file.unlink(missing_ok=True)
+            self._lock.release()
 
     def __del__(self) -> None:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, AttributeError):
             self.release()
-
-    def _take(self, path: Path) -> None:
-        try:
-            _lock(self._descriptor)
-        except (BlockingIOError, PermissionError):
-            os.lseek(self._descriptor, 0, os.SEEK_SET)
-            owner = os.read(self._descriptor, _OWNER_BYTES).decode(errors="replace").strip()
-            self.release(keep_file=True)
-            raise InputError(
-                f"{path}: is being written by {owner or 'another program'}; "
-                "wait until it has ended or choose another name"
-            ) from None
-        except OSError as error:
-            if error.errno not in _NO_LOCKS:
-                self.release(keep_file=True)
-                raise
-
-    def _is_held(self) -> bool:
-        """Return whether the locked file is still the one at its path."""
-        if self._descriptor < 0:
-            return False
-        try:
-            return os.path.samestat(os.fstat(self._descriptor), self._file.stat())
-        except FileNotFoundError:
-            return False
-
-
-def _lock(descriptor: int) -> None:
-    """Lock a file without waiting.
-
-    Raises
-    ------
-    BlockingIOError, PermissionError
-        When another program holds the lock; the second one on Windows.
-    OSError
-        When the file system has no locks.
-    """
-    try:
-        import fcntl
-    except ImportError:
-        import msvcrt
-
-        os.lseek(descriptor, _FAR, os.SEEK_SET)
-        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
-    else:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

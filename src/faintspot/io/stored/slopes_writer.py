@@ -1,4 +1,4 @@
-"""Writers of slopes: chunk by chunk into a Zarr store with marks of progress, or from memory."""
+"""Writer of slopes: chunk by chunk into a Zarr store with marks of progress, or from memory."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from faintspot.base.files import output_errors, replace_file
 from faintspot.base.variables import VARIABLES
 from faintspot.io.stored.output_lock import OutputLock
 from faintspot.io.stored.slopes_format import RecordingHeader, StoredSlopes, checked_block
-from faintspot.io.stored.slopes_zarr import SlopeStore
+from faintspot.io.stored.slopes_zarr import SlopeStore, remove_store
 
 # A mark waits until the data are on the disk, which takes longer than measuring small blocks.
 _MARK_SECONDS = 1.0
@@ -26,9 +26,9 @@ Export = Callable[[IO[bytes], StoredSlopes], None]
 
 
 class SlopeWriter(Closing):
-    """Writer of slopes, block by block; a `with` statement closes it.
+    """Writer of slopes, block by block, from where its store stopped; a `with` statement closes it.
 
-    This class keeps them in memory and writes the output when all frames are there.
+    Frames of an incomplete chunk are kept in memory until it is full, or until `close`; without a store, all.
 
     Parameters
     ----------
@@ -39,7 +39,10 @@ class SlopeWriter(Closing):
     lock : OutputLock, optional
         Lock, which `close` releases.
     export : callable, optional
-        Writes the output; None for an output that is complete already.
+        Writes the output when all frames are there; the store is then removed. By default, the store is the
+        output.
+    store : SlopeStore, optional
+        Store to fill. Without `export` and `store`, the output is complete already.
 
     Examples
     --------
@@ -59,11 +62,16 @@ class SlopeWriter(Closing):
         run: RecordingHeader,
         lock: OutputLock | None = None,
         export: Export | None = None,
+        store: SlopeStore | None = None,
     ) -> None:
-        self._path, self._run, self._lock, self._export = path, run, lock, export
-        self._is_open = export is not None
+        self._path, self._run, self._lock, self._export, self._store = path, run, lock, export, store
+        self._is_open = export is not None or store is not None
+        self._next_mark = 0.0
         # One attribute, so that an interruption finds both parts of it changed or neither.
         self._state: tuple[int, list[dict[str, NDArray[Any]]]] = (0 if self._is_open else run.n_frames, [])
+        if store is not None:
+            with output_errors(path):
+                self._state = store.resume()
 
     @property
     def _stored(self) -> int:
@@ -96,7 +104,7 @@ class SlopeWriter(Closing):
         copied = {name: values.copy() for name, values in variables.items()}
         self._state = (self._stored, [*self._waiting, copied])
         try:
-            self._write_chunks()
+            self._store_waiting()
         except InputError:
             self._state = before
             raise
@@ -107,112 +115,43 @@ class SlopeWriter(Closing):
             return
         self._is_open = False
         try:
-            self._finish()
+            self._store_waiting(is_last=True)
+            with output_errors(self._path):
+                self._finish()
         finally:
             if self._lock is not None:
                 self._lock.release()
 
+    def _finish(self) -> None:
+        store, export, run = self._store, self._export, self._run
+        if store is not None and store.marked != self._stored:
+            store.mark(self._stored)
+        if export is None or self.finished() < run.n_frames:
+            return
+        variables = self._joined() if store is None else store.variables()
+        slopes = StoredSlopes(variables, run.coordinates, run.attributes, True, run.n_frames)
+        replace_file(self._path, lambda stream: export(stream, slopes))
+        if store is not None:
+            remove_store(store.path)
+
     def _joined(self) -> dict[str, NDArray[Any]]:
         return {name: np.concatenate([block[name] for block in self._waiting]) for name in VARIABLES}
 
-    def _write_chunks(self) -> None:
-        """Write waiting frames to the disk, as far as they fill chunks."""
-
-    def _finish(self) -> None:
-        run = self._run
-        if self.finished() == run.n_frames:
-            self._write_output(
-                StoredSlopes(self._joined(), run.coordinates, run.attributes, True, run.n_frames)
-            )
-
-    def _write_output(self, slopes: StoredSlopes) -> None:
-        export = self._export
-        if export is not None:
-            with output_errors(self._path):
-                replace_file(self._path, lambda stream: export(stream, slopes))
-
-
-class StoreWriter(SlopeWriter):
-    """Writer of slopes to a Zarr store, from where it stopped.
-
-    Frames of an incomplete chunk are kept in memory until it is full, or until `close`. Before every write,
-    the mark on the disk must be the one that this writer has set; otherwise another program has replaced the
-    output. On file systems with locks, the lock prevents that.
-
-    Parameters
-    ----------
-    path, run, lock
-        As for `SlopeWriter`.
-    export : callable, optional
-        Writes the output from the complete store, which is then removed; by default the store is the output.
-    store : SlopeStore
-        Store to fill.
-    """
-
-    def __init__(
-        self, path: Path, run: RecordingHeader, lock: OutputLock, export: Export | None, store: SlopeStore
-    ) -> None:
-        super().__init__(path, run, lock, export)
-        self._is_open = True
-        self._store = store
-        self._next_mark = 0.0
-        with output_errors(path):
-            n_stored = store.marked()[1]
-            self._marks = {n_stored}
-            if n_stored == run.n_frames or n_stored % store.chunk == 0:
-                self._state = n_stored, []
-            else:  # take the incomplete chunk back into memory, to write the whole chunk again
-                start = n_stored - n_stored % store.chunk
-                incomplete_chunk = store.read(start, n_stored)
-                self._mark(start)
-                self._state = start, [incomplete_chunk]
-
-    def _write_chunks(self) -> None:
-        n_waiting = self.finished() - self._stored
-        is_last = self.finished() == self._run.n_frames
-        count = n_waiting if is_last else n_waiting - n_waiting % self._store.chunk
-        if count:
-            self._write(count)
-
-    def _finish(self) -> None:
-        n_waiting = self.finished() - self._stored
-        if n_waiting:
-            self._write(n_waiting)
-        with output_errors(self._path):
-            if self._marks != {self._stored}:
-                self._check_mark()
-                self._mark(self._stored)
-            if self._export is not None and self._stored == self._run.n_frames:
-                self._check_mark()
-                self._write_output(self._store.slopes())
-                self._store.remove()
-
-    def _write(self, count: int) -> None:
-        """Write the first `count` waiting frames and, if it is due, the mark."""
+    def _store_waiting(self, *, is_last: bool = False) -> None:
+        """Store waiting frames, as far as they fill chunks or are the last; and, if it is due, the mark."""
+        store, finished = self._store, self.finished()
+        if store is None or not self._waiting:
+            return
+        if not is_last and finished < self._run.n_frames:
+            finished -= (finished - self._stored) % store.chunk
+        count = finished - self._stored
+        if not count:
+            return
         joined = self._joined()
-        finished = self._stored + count
         with output_errors(self._path):
-            self._check_mark()
-            self._store.write(self._stored, {name: values[:count] for name, values in joined.items()})
+            store.write(self._stored, {name: values[:count] for name, values in joined.items()})
             if finished == self._run.n_frames or time.monotonic() >= self._next_mark:
-                self._mark(finished)
+                store.mark(finished)
+                self._next_mark = time.monotonic() + _MARK_SECONDS
         rest = {name: values[count:] for name, values in joined.items()}
         self._state = finished, [rest] if len(rest["x"]) else []
-
-    def _mark(self, finished: int) -> None:
-        self._marks.add(finished)  # after an interruption either may be on the disk
-        self._store.mark(finished)
-        self._marks = {finished}
-        self._next_mark = time.monotonic() + _MARK_SECONDS
-
-    def _check_mark(self) -> None:
-        try:
-            fingerprint, finished = self._store.marked()
-            is_ours = fingerprint == self._run.fingerprint and finished in self._marks
-        except (OSError, ValueError, KeyError):
-            is_ours = False
-        if not is_ours:
-            raise InputError(
-                f"{self._path}: another program has replaced the output of this run, which ends here; "
-                "choose another name for it"
-            )

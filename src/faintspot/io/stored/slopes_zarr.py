@@ -24,6 +24,7 @@ from faintspot.io.arrays.zarr_store import (
     checked_codecs,
     chunk_files,
     is_store,
+    new_store,
     open_store,
     read_items,
     replace_attributes,
@@ -70,7 +71,7 @@ class SlopeStore:
 
     def __init__(self, path: Path, run: RecordingHeader) -> None:
         zarr = load_zarr()
-        self._path, self._run = path, run
+        self.path, self._n_frames = path, run.n_frames
         self._not_synchronised: set[Path] = set()
         if not path.exists():
             _create(path, run)
@@ -86,10 +87,20 @@ class SlopeStore:
         self.chunk = int(self._arrays["x"].chunks[0])
         """Number of frames in a chunk."""
 
-    def marked(self) -> tuple[str, int]:
-        """Return the fingerprint and the number of complete frames."""
-        attributes = _stored_attributes(self._path)
-        return attributes["fingerprint"], attributes[_MARK]
+        self.marked: int = _stored_attributes(path)[_MARK]
+        """Number of frames that the store states to be complete."""
+
+    def resume(self) -> tuple[int, list[dict[str, NDArray[Any]]]]:
+        """Return the number of frames to keep, and those of an incomplete chunk, to be written again."""
+        n_stored = self.marked
+        start = n_stored if n_stored == self._n_frames else n_stored - n_stored % self.chunk
+        if start == n_stored:
+            return n_stored, []
+        incomplete_chunk = {
+            name: read_items(self.path, array, start, n_stored) for name, array in self._arrays.items()
+        }
+        self.mark(start)
+        return start, [incomplete_chunk]
 
     def mark(self, finished: int) -> None:
         """Wait for the disk, then write the number of complete frames."""
@@ -98,28 +109,19 @@ class SlopeStore:
         for folder in {file.parent for file in self._not_synchronised}:
             sync_folder(folder)
         self._not_synchronised.clear()
-        replace_attributes(self._path, {_MARK: finished, _COMPLETE: finished == self._run.n_frames})
-
-    def read(self, start: int, stop: int) -> dict[str, NDArray[Any]]:
-        """Return stored frames."""
-        return {name: read_items(self._path, array, start, stop) for name, array in self._arrays.items()}
+        replace_attributes(self.path, {_MARK: finished, _COMPLETE: finished == self._n_frames})
+        self.marked = finished
 
     def write(self, start: int, variables: Mapping[str, NDArray[np.generic]]) -> None:
         """Store whole chunks."""
         for name, values in variables.items():
             array = self._arrays[name]
             array[start : start + len(values)] = values
-            self._not_synchronised.update(chunk_files(self._path, array, start, start + len(values)))
+            self._not_synchronised.update(chunk_files(self.path, array, start, start + len(values)))
 
-    def slopes(self) -> StoredSlopes:
-        """Return the slopes, each variable read in parts from the store."""
-        run = self._run
-        variables: Any = {name: _StoredVariable(self._path, array) for name, array in self._arrays.items()}
-        return StoredSlopes(variables, run.coordinates, run.attributes, True, run.n_frames)
-
-    def remove(self) -> None:
-        """Remove the store."""
-        remove_store(self._path)
+    def variables(self) -> Any:
+        """Return the variables, each read in parts from the store."""
+        return {name: _StoredVariable(self.path, array) for name, array in self._arrays.items()}
 
 
 class _StoredVariable:
@@ -194,23 +196,6 @@ def read_store(path: Path) -> StoredSlopes:
 
 
 def _create(path: Path, run: RecordingHeader) -> None:
-    """Create a store under a hidden name and rename it, so that it never appears incomplete."""
-    zarr = load_zarr()
-    hidden = path.with_name(f".{path.name}.new")
-    shutil.rmtree(hidden, ignore_errors=True)
-    hidden.mkdir()
-    _create_arrays(hidden, run)
-    with warnings.catch_warnings():
-        # Consolidated metadata are not yet in the standard of Zarr; xarray warns when they are missing.
-        warnings.simplefilter("ignore")
-        zarr.consolidate_metadata(str(hidden))
-    for file in (*hidden.rglob("*"), hidden):
-        (sync_folder if file.is_dir() else sync_file)(file)
-    hidden.rename(path)
-    sync_folder(path.parent)
-
-
-def _create_arrays(path: Path, run: RecordingHeader) -> None:
     attributes = {
         **run.attributes,
         "n_frames": run.n_frames,
@@ -219,32 +204,36 @@ def _create_arrays(path: Path, run: RecordingHeader) -> None:
         _COMPLETE: False,
         _COORDINATES: " ".join(run.coordinates),
     }
-    group = load_zarr().create_group(str(path), zarr_format=3, attributes=attributes)
     chunk = min(run.n_frames, max(1, _CHUNK_NUMBERS // run.n_subapertures))
-    for name, variable in VARIABLES.items():
-        group.create_array(
-            name,
-            shape=(run.n_frames, run.n_subapertures),
-            chunks=(chunk, run.n_subapertures),
-            dtype=variable.dtype,
-            compressors=checked_codecs(),
-            chunk_key_encoding=_CHUNK_NAMES,
-            fill_value=np.nan if variable.dtype == "float32" else 0,
-            dimension_names=("frame", "subaperture"),
-            attributes={"units": unit_of(name, run.attributes), "long_name": variable.long_name},
-        )
-    for name, values in run.coordinates.items():
-        array = group.create_array(
-            name,
-            shape=values.shape,
-            dtype=values.dtype,
-            compressors=checked_codecs(),
-            chunk_key_encoding=_CHUNK_NAMES,
-            dimension_names=("subaperture",),
-            attributes={"units": COORDINATE_UNITS[name]} if name in COORDINATE_UNITS else {},
-            config={"write_empty_chunks": True},
-        )
-        array[:] = values
+    with new_store(path, attributes) as group:
+        for name, variable in VARIABLES.items():
+            group.create_array(
+                name,
+                shape=(run.n_frames, run.n_subapertures),
+                chunks=(chunk, run.n_subapertures),
+                dtype=variable.dtype,
+                compressors=checked_codecs(),
+                chunk_key_encoding=_CHUNK_NAMES,
+                fill_value=np.nan if variable.dtype == "float32" else 0,
+                dimension_names=("frame", "subaperture"),
+                attributes={"units": unit_of(name, run.attributes), "long_name": variable.long_name},
+            )
+        for name, values in run.coordinates.items():
+            array = group.create_array(
+                name,
+                shape=values.shape,
+                dtype=values.dtype,
+                compressors=checked_codecs(),
+                chunk_key_encoding=_CHUNK_NAMES,
+                dimension_names=("subaperture",),
+                attributes={"units": COORDINATE_UNITS[name]} if name in COORDINATE_UNITS else {},
+                config={"write_empty_chunks": True},
+            )
+            array[:] = values
+        with warnings.catch_warnings():
+            # Consolidated metadata are not yet in the standard of Zarr; xarray warns when they are missing.
+            warnings.simplefilter("ignore")
+            load_zarr().consolidate_metadata(group.store)
 
 
 def _stored_attributes(path: Path) -> dict[str, Any]:

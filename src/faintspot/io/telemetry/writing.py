@@ -6,7 +6,6 @@ are replaced. However the recording ends, the store is valid and the counters co
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors
-from faintspot.io.arrays.zarr_store import TELEMETRY, checked_codecs, replace_attributes
+from faintspot.io.arrays.zarr_store import TELEMETRY, checked_codecs, new_store, replace_attributes
 from faintspot.io.optional_packages import load_zarr
 from faintspot.io.telemetry.recording import ARRAYS, CONTROL, FRAMES, IMAGES, PARTS, stored_names
 
@@ -86,22 +85,14 @@ class TelemetryStore:
 
 
 def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mapping[str, object]) -> None:
-    """Create the store under a hidden name and rename it, so that it never appears incomplete."""
-    hidden = path.with_name(f".{path.name}.new")
-    shutil.rmtree(hidden, ignore_errors=True)
-    hidden.mkdir()
     rest = {name: value for name, value in attributes.items() if name not in _WRITTEN_ONCE}
-    group = zarr.create_group(str(hidden), zarr_format=3, attributes=rest)
-    group.create_group(PARTS, attributes={name: attributes.get(name) for name in _WRITTEN_ONCE})
-    for kind in kinds:
-        for name, values in _columns(np.empty(0, kind)):
+    with new_store(path, rest) as group:
+        group.create_group(PARTS, attributes={name: attributes.get(name) for name in _WRITTEN_ONCE})
+        for name, values in (column for kind in kinds for column in _columns(np.empty(0, kind))):
             row = values.shape[1:]
-            size = int(np.prod(row)) * values.itemsize
-            length = (
-                _CHUNK_BYTES // size
-                if ARRAYS[name].dimensions[0] == "image"
-                else _CHUNK_NUMBERS // (size // values.itemsize)
-            )
+            size = int(np.prod(row))
+            is_image = ARRAYS[name].dimensions[0] == "image"
+            length = _CHUNK_BYTES // (size * values.itemsize) if is_image else _CHUNK_NUMBERS // size
             group.create_array(
                 name,
                 shape=(0, *row),
@@ -111,7 +102,6 @@ def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mappin
                 dimension_names=ARRAYS[name].dimensions,
                 attributes={"units": ARRAYS[name].units},
             )
-    hidden.rename(path)
 
 
 def _columns(items: NDArray[Any]) -> list[tuple[str, NDArray[Any]]]:
