@@ -130,20 +130,15 @@ def night_sections(night: Night) -> list[Section]:
     compared = _TEXT.table(
         "night-differences", differences(night), effect="paired" if night.is_paired else "measured", **names
     )
-    of_ranges = _TEXT.table("strengths", [each for _, each in by_strength(night)], **names)
     settings = list(zip(night.labels, night.settings, strict=True))
     panels = _TEXT.section("night-panels", panels_figure(night), strengths=night.has_strengths)
     means = _TEXT.section("night-means", _means_table(night))
-    conclusions = _conclusions(night)
-    if statements:
-        judged = _TEXT.section("night-verdicts", conclusions, statements)
-        between = _TEXT.section("night-differences", compared, of_ranges, **names)
-        main = [judged, panels, means, between]
-    else:
-        between = _TEXT.section("night-differences", conclusions, compared, of_ranges, **names)
-        main = [between, panels, means]
+    between = _TEXT.section("night-differences", compared, **names)
     return [
-        *main,
+        *([_TEXT.section("night-verdicts", statements)] if statements else [between]),
+        panels,
+        means,
+        *([between] if statements else []),
         _TEXT.section("night-r0", _TEXT.table("night-r0", lines(night)), **_quality_of_r0(night)),
         _TEXT.section("night-settings", _TEXT.table("night-settings", settings)),
     ]

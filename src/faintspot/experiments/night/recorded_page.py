@@ -66,15 +66,8 @@ def phase_differences(recorded: RecordedNight) -> list[Difference]:
 
 def _phase_section(recorded: RecordedNight) -> Section:
     night = recorded.night
-    means = [
-        {"method": label, "mean": float(np.nanmean(night.phase_rad2[night.method == number]))}
-        for number, label in enumerate(night.labels)
-    ]
-    return _TEXT.section(
-        "phase",
-        _TEXT.table("phase_means", means, um=night.wavelength_m * 1e6),
-        _TEXT.table("phase", phase_differences(recorded), reference=night.labels[night.reference]),
-    )
+    table = _TEXT.table("phase", phase_differences(recorded), reference=night.labels[night.reference])
+    return _TEXT.section("phase", table)
 
 
 def _blocks_section(recorded: RecordedNight) -> Section:

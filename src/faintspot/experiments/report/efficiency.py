@@ -56,41 +56,24 @@ def findings(dataset: xarray.Dataset) -> list[str]:
     return found + (_near_the_best(speckled) if speckled.sizes["cell"] else [])
 
 
-def result_sections(dataset: xarray.Dataset) -> list[Section]:
-    """Return the tables of a study: efficiency, calibration of the stated errors, speckled spots."""
-    cells, speckled = (_in_order(_finished(dataset, speckled=speckled)) for speckled in (False, True))
-    methods = _methods(dataset)
-    knowing = [method for method in methods if knows_the_spot(method)]
-    sections = []
-    if cells.sizes["cell"]:
-        efficiency = cells["photon_efficiency"].sel(mode=BEST).values
-        rows = [
-            [f"{bound:.4f}", *map(number_or_dash, of_cell)]
-            for bound, of_cell in zip(cells["bound"].values, efficiency, strict=True)
-        ]
-        sections.append(_section(cells, "efficiency-table", rows, methods))
-        stated = [cells[f"stated_over_actual{part}"].sel(estimator=knowing).values for part in ("", "_all")]
-        rows = [
-            [
+def calibration_sections(dataset: xarray.Dataset) -> list[Section]:
+    """Return the table of stated over actual errors of estimators that know the spot; none without cells."""
+    cells = _in_order(_finished(dataset, speckled=False))
+    if not cells.sizes["cell"]:
+        return []
+    knowing = [method for method in _methods(dataset) if knows_the_spot(method)]
+    stated = [cells[f"stated_over_actual{part}"].sel(estimator=knowing).values for part in ("", "_all")]
+    rows = [
+        [
+            words,
+            *(
                 f"{number_or_dash(inliers)} ({number_or_dash(every)})"
                 for inliers, every in zip(*pair, strict=True)
-            ]
-            for pair in zip(*stated, strict=True)
+            ),
         ]
-        sections.append(_section(cells, "calibration-table", rows, knowing))
-    if speckled.sizes["cell"]:
-        values, ratio = _corrected_rms(speckled)
-        best = np.nanargmin(values, axis=1)
-        rows = [
-            [
-                f"{values[i, of_cell]:.4f}",
-                methods[of_cell],
-                *(number_or_dash(x, 0) for x in 100 * (ratio[i] - 1)),
-            ]
-            for i, of_cell in enumerate(best)
-        ]
-        sections.append(_section(speckled, "speckled-table", rows, methods))
-    return sections
+        for words, *pair in zip(_in_words(cells), *stated, strict=True)
+    ]
+    return [_TEXT.section("calibration-table", _TEXT.table("calibration-table", rows, knowing))]
 
 
 def _finished(dataset: xarray.Dataset, *, speckled: bool) -> xarray.Dataset:
@@ -183,12 +166,6 @@ def _near_the_best(cells: xarray.Dataset) -> list[str]:
             counts = {"which": words, "cells": part.sum(), "near": 100 * (NEAR_BEST - 1)}
             sentences.append(_TEXT("findings.near_best", **counts, ranked=listed))
     return sentences
-
-
-def _section(cells: xarray.Dataset, name: str, rows: list[list[str]], methods: list[str]) -> Section:
-    """Return the section of a table with a row for each cell."""
-    named = [[words, *row] for words, row in zip(_in_words(cells), rows, strict=True)]
-    return _TEXT.section(name, _TEXT.table(name, named, methods))
 
 
 def corrected_mode(dataset: xarray.Dataset) -> str:

@@ -25,7 +25,7 @@ from faintspot.experiments.paper.tables import (
     gains_section,
 )
 from faintspot.experiments.paper.whole import paper_rows, paper_section
-from faintspot.experiments.report.efficiency import compares_estimators, findings, result_sections
+from faintspot.experiments.report.efficiency import calibration_sections, compares_estimators, findings
 from faintspot.experiments.report.estimator_figures import estimator_figures
 from faintspot.experiments.study.specification import StudySpecification
 from faintspot.experiments.study.sweep import PARAMETERS
@@ -157,7 +157,7 @@ def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
     return [
         _TEXT.section("sections.findings", findings(dataset)),
         *_figure_sections(dataset),
-        *result_sections(dataset),
+        *calibration_sections(dataset),
         baselines_section(dataset),
     ]
 

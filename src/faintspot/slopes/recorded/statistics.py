@@ -122,7 +122,6 @@ class SlopesSummary:
     valid_fraction: float
     median_flux_e: float
     """Over all valid measurements; NaN when there is none."""
-    median_iterations: float
     valid_frames: NDArray[np.int64]
     flux_e: Floats
     """Median."""
@@ -168,7 +167,6 @@ def summarise(method: MeasuredSlopes) -> SlopesSummary:
     return SlopesSummary(
         valid_fraction=float(valid.mean()),
         median_flux_e=float(np.median(method.flux[valid])) if any_valid else np.nan,
-        median_iterations=float(np.median(method.iterations[valid])) if any_valid else np.nan,
         valid_frames=valid.sum(axis=0),
         flux_e=flux,
         x_px=x,

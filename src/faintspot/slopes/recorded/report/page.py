@@ -159,7 +159,6 @@ def _record(run: SlopesRun, index: int) -> dict[str, object]:
         "stated_error": method.standard_error_px,
         "jitter": median(run.jitters[index].px),
         "robust": median(run.jitters[index].robust_px),
-        "iterations": run.summaries[index].median_iterations if method.is_denoised else None,
         "summary": run.summaries[index],
         **_against_truth(run, method),
     }
