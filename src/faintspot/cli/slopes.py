@@ -182,6 +182,12 @@ def describe(summary: Summary, output: str) -> list[str]:
             f"  values pile up at {summary.saturation_adu:g} ADU, taken as saturation; saturation_adu in "
             "[calibration] states it"
         )
+    if summary.background:
+        lines.append(f"  {summary.background}")
+    if summary.repeated_frames:
+        lines.append(
+            f"  {_count(summary.repeated_frames, 'frame')} repeated: every pixel as in the one before"
+        )
     if summary.reference:
         lines.append(f"  {summary.reference}")
     if not any(summary.flag_counts.values()) and not summary.doubtful:

@@ -207,7 +207,7 @@ def _sensor(grid: str | None, config: str | None, target: Path, given: dict[str,
             found["layout"] = described.layout
         found["calibration"] = calibration
         default = Calibration()
-        if calibration.read_noise_e is not None:
+        if calibration.read_noise_e is not None and "read_noise_e" not in calibration.estimated:
             found["read_noise_e"] = calibration.typical_read_noise_e
         for name in ("gain_e_per_adu", "em_gain", "background_e"):
             if getattr(calibration, name) != getattr(default, name):

@@ -136,7 +136,8 @@ def test_exists_already_and_overwrite_keeps_the_calibration(folder: Path, run: C
     assert (folder / "new.toml").read_bytes() == before
     run.ok("layout", "a.npy", "-o", "new.toml", "--overwrite", "--pixels", "10", "--dark", "90")
     assert Layout.load("new.toml").window == (10, 10)
-    assert Calibration.load("new.toml") == Calibration(dark=90.0, gain_e_per_adu=2.0)
+    kept = replace(Calibration.load("new.toml"), read_noise_e=None, estimated=())
+    assert kept == Calibration(dark=90.0, gain_e_per_adu=2.0)
 
 
 @pytest.mark.usefixtures("no_picture")
@@ -427,3 +428,45 @@ def test_doubts_are_repeated_until_they_are_accepted(folder: Path, run: Commands
     assert "every slope is valid" in run.ok("slopes", "a.npy", "-c", "new.toml", "-o", "b.npz").out
     run.refused("layout", "a.npy", "--accept", "-o", "new.toml", naming=("--accept",))
     run.refused("layout", "-o", "new.toml", naming=("FRAME", "--accept"))
+
+
+@pytest.mark.usefixtures("no_picture")
+@pytest.mark.parametrize("bad", [0, 3, 7])
+def test_one_bad_frame_does_not_decide_the_settings(folder: Path, run: Commands, bad: int) -> None:
+    """Overexposed, with stray light, or without flux; and frames that a grabber wrote twice."""
+    good = np.concatenate([frames(n_frames=7), frames(n_frames=1)]).astype(np.float64)
+    expected = good[:7].round().astype(np.uint16)
+    np.save("good.npy", expected)
+    run.ok("layout", "good.npy", "-o", "good.toml", "--pixels", 16)
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    stray = 500 * np.exp(-0.5 * ((row - 60) ** 2 + (column - 100) ** 2) / 40**2)
+    for index, wrong in enumerate(
+        (6 * (expected[0] - OFFSET_ADU) + OFFSET_ADU + stray, expected[0] * 0 + 100)
+    ):
+        cube = np.insert(expected, [min(bad, 6), 5], [wrong, expected[4]], axis=0)
+        np.save(f"{index}.npy", cube.astype(np.uint16))
+        out = run.ok("layout", f"{index}.npy", "-o", f"{index}.toml", "--pixels", 16).out
+        assert out.count("left out") == 2
+        assert Settings.load(f"{index}.toml") == Settings.load("good.toml")
+        assert Calibration.load(f"{index}.toml") == Calibration.load("good.toml")
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_the_noise_goes_into_the_configuration(folder: Path, run: Commands) -> None:
+    """So that slopes have standard errors; estimated again by another layout, and not stated to tune."""
+    np.save("a.npy", frames())
+    run.ok("layout", "a.npy", "-o", "new.toml", "--pixels", 16)
+    camera = Calibration.load("new.toml")
+    assert camera.read_noise_e == pytest.approx(3.0, rel=0.1)
+    assert "read_noise_e" in camera.estimated
+    run.ok("slopes", "a.npy", "-c", "new.toml", "-o", "s.npz")
+    assert np.isfinite(read_slopes("s.npz").variables["standard_error_x"]).all()
+    run.ok("layout", "a.npy", "-o", "new.toml", "--pixels", 16, "--overwrite", "--read-noise-e", 4)
+    assert Calibration.load("new.toml").read_noise_e == 4
+
+
+def test_frames_read_with_wrong_bytes(folder: Path, run: Commands) -> None:
+    raw = frames(n_frames=1)[0].round().astype("<u2") + 200
+    for name, wrong in (("swapped", raw.byteswap()), ("wide", raw.view(np.uint8))):
+        np.save(f"{name}.npy", wrong)
+        run.refused("layout", f"{name}.npy", "-o", "new.toml", naming=(f"{name}.npy", "bytes"))

@@ -46,3 +46,15 @@ def test_noise_is_no_variation() -> None:
     background = smooth_background(image, SPOTS, PITCH_PX, SPOT_PX)
     column, row = SPOTS.astype(int).T
     assert not varies(image, background[row, column], 300.0, PITCH_PX, SPOT_PX)
+
+
+@pytest.mark.parametrize("width", [0.2, 0.255])
+def test_wings_of_wide_spots_are_no_background(width: float) -> None:
+    """A third of the peak between two spots, and none of it outside the array."""
+    spot_px = width * PITCH_PX
+    spots = sum(np.exp(-0.5 * ((COLUMN - x) ** 2 + (ROW - y) ** 2) / spot_px**2) for x, y in SPOTS)
+    image = 170 * spots + np.random.default_rng(1).normal(30, 0.5, (SIDE, SIDE))
+    background = smooth_background(image, SPOTS, PITCH_PX, 1.1 * spot_px)
+    column, row = SPOTS.astype(int).T
+    assert np.abs(background[row, column] - 30).max() < 0.05 * 170
+    assert not varies(image, background[row, column], 170 * 2 * np.pi * spot_px**2, PITCH_PX, spot_px)

@@ -174,3 +174,28 @@ def test_mean_flux_of_an_estimator_that_does_not_use_it(files: tuple[Path, Path,
     frames, configuration, output = files
     with pytest.raises(InputError, match="'brightest' does not use the flux"):
         measure_recorded([frames], configuration, output, changes={"estimator": "brightest"}, mean_flux=True)
+
+
+def test_frames_written_twice_are_counted(files: tuple[Path, Path, Path]) -> None:
+    """Across blocks, too."""
+    frames, configuration, output = files
+    np.save(frames, np.repeat(simulated(), 2, axis=0))
+    assert measure_recorded([frames], configuration, output, block_frames=3).repeated_frames == 30
+
+
+@pytest.mark.parametrize("away", [-19.0, 400.0])
+def test_estimated_dark_of_other_frames_is_moved(files: tuple[Path, Path, Path], away: float) -> None:
+    """An estimated dark that does not fit gives the slopes of one that does; a stated one is named."""
+    frames, configuration, output = files
+    text = CONFIGURATION + "\n[calibration]\ndark = {}\n"
+    configuration.write_text(text.format(20.0))
+    measure_recorded([frames], configuration, output, overwrite=True)
+    right = read_slopes(output).variables
+    configuration.write_text(text.format(20.0 - away) + 'estimated = ["dark"]\n')
+    summary = measure_recorded([frames], configuration, output, overwrite=True)
+    assert summary.background
+    moved = read_slopes(output).variables
+    assert moved["valid"].mean() > right["valid"].mean() - 0.01
+    assert np.abs(moved["x"] - right["x"])[moved["valid"] & right["valid"]].mean() < 0.1
+    configuration.write_text(text.format(420.0))
+    assert "420" in measure_recorded([frames], configuration, output, overwrite=True).background

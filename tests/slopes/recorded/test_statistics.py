@@ -127,3 +127,13 @@ def test_methods_that_do_not_fit_are_refused_in_one_line(change: dict[str, np.nd
     arrays = {name: np.zeros((2, 3)) for name in ("x", "y", "flux", "flags", "iterations")} | change
     with refused("TV"):
         MeasuredSlopes("TV", **arrays)
+
+
+def test_frames_written_twice_do_not_lower_the_noise() -> None:
+    method = make_method(400, 5, dark_fraction=0.0)
+    twice = np.repeat(np.arange(400), 2)
+    columns = [getattr(method, name)[twice] for name in statistics.ARRAYS]
+    repeated = MeasuredSlopes("TV", *columns)
+    assert np.count_nonzero(repeated.repeated) == 400
+    single, double = (statistics.frame_to_frame_noise(each, each.valid) for each in (method, repeated))
+    np.testing.assert_allclose(double, single)

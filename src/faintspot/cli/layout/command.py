@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,6 +14,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.cli.layout import grid as layout_grid
 from faintspot.cli.layout import options as layout_options
@@ -39,10 +40,11 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.colour_mosaic import mosaic_contrast
 from faintspot.slopes.camera.hot_pixels import find_hot_pixels
 from faintspot.slopes.camera.mean_frame import MeanFrame
-from faintspot.slopes.camera.saturation import LargestValues
+from faintspot.slopes.camera.wrong_bytes import misread
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, first_settings
+from faintspot.slopes.recorded.survey import survey
 from faintspot.slopes.sensor.found_layout import FoundLayout, find_layout
 from faintspot.slopes.sensor.known_grid import KnownGrid
 from faintspot.slopes.sensor.layout import GEOMETRIES, LARGEST_BIN, OPTICS, Layout
@@ -212,7 +214,7 @@ def command(
     with open_frames(frames, key=key, time_axis=time_axis) as source:
         calibration = layout_options.calibration(target, of_camera)
         stated = layout_options.kept_calibration(calibration, of_camera)
-        mean, values = _mean_frame(source, calibration)
+        mean, first, saturation_adu, notes = _seen_frames(source, calibration)
         hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
         mean[tuple(hot.T)] = np.nan
         factor, shown = factor or 1, mean
@@ -234,14 +236,14 @@ def command(
             layout = replace(found.layout, **optics, doubts=doubts_of(found))
         else:
             layout = replace(found.layout[kept], **optics, doubts=(found.doubt,) if found.doubt else ())
-        first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
-    calibration, notes = completed(calibration, found, layout, mean, hot)
+    calibration, lines = completed(calibration, found, layout, mean, hot)
+    notes += lines
     if source.note:
         notes.append(f"  {source.description}: {source.note}")
-    if calibration.saturation_adu is None and values.saturation_adu is not None:
+    if calibration.saturation_adu is None and saturation_adu is not None:
         estimated = (*calibration.estimated, "saturation_adu")
-        calibration = replace(calibration, saturation_adu=values.saturation_adu, estimated=estimated)
-        notes.append(f"  saturation {values.saturation_adu:g} ADU, at which values pile up")
+        calibration = replace(calibration, saturation_adu=saturation_adu, estimated=estimated)
+        notes.append(f"  saturation {saturation_adu:g} ADU, at which values pile up")
     unit = "ADU" if of_camera["gain_e_per_adu"] is None and calibration.gain_e_per_adu == 1.0 else "e-"
     seen = first_settings(layout, calibration, first)
     if unit == "ADU" and 0 < seen.flux < _FEWEST_E:
@@ -254,6 +256,15 @@ def command(
         keeps_noise = of_camera["read_noise_e"] is not None
         calibration, lines = with_measured_pixels(calibration, measured, keeps_noise=keeps_noise)
         notes += lines
+    if not seen.flux > 0:
+        raise InputError(
+            f"{source.description}: expected spots, found none in the {len(layout)} windows of the layout; "
+            "average more frames, or look whether the frames are read right"
+        )
+    if calibration.read_noise_e is None and seen.noise > 0:
+        noise = float(f"{seen.noise * calibration.em_gain:.3g}")
+        estimated = (*calibration.estimated, "read_noise_e")
+        calibration = replace(calibration, read_noise_e=noise, estimated=estimated)
     settings = Settings.load(target) if keeps_settings else seen.settings
     if keeps_settings:
         notes.append(f"  the settings that {output} has are kept")
@@ -265,6 +276,8 @@ def command(
 
         layout_picture(np.where(np.isnan(mean), np.nanmedian(mean), mean), layout, drawing, **marks)
     # The layout last: it may be long, and whatever is saved after it reads it again.
+    if seen.psf is not None and not keeps_settings:
+        save_tables(target, {"psf": seen.psf})
     for item in (settings, calibration, layout):
         configuration.save(target, item)
     if isinstance(found, KnownGrid):
@@ -311,15 +324,40 @@ def _found(description: str, mean: NDArray[np.float64], options: Mapping[str, ob
     return found
 
 
-def _mean_frame(source: FrameSource, calibration: Calibration) -> tuple[NDArray[np.float64], LargestValues]:
-    """Return the mean of the first frames in electrons, NaN where none is finite, and the largest values."""
-    frames, values = MeanFrame(source.shape), LargestValues()
-    for _, block in source.blocks(0, min(_MOST_FRAMES, source.n_frames), _FIRST_FRAMES):
-        values.add(block)
-        frames.add(block)
-    mean = frames.mean
+def _seen_frames(
+    source: FrameSource, calibration: Calibration
+) -> tuple[NDArray[np.float64], NDArray[np.generic], float | None, list[str]]:
+    """Return the mean of the first usual frames [electrons], the first of them, their saturation, and notes.
+
+    The mean is NaN where no frame is finite.
+    """
+    count = min(_MOST_FRAMES, source.n_frames)
+
+    def blocks() -> Iterator[NDArray[np.generic]]:
+        return (block for _, block in source.blocks(0, count, _FIRST_FRAMES))
+
+    seen, notes = survey(source.shape, blocks()), []
+    if not seen.usual.any():
+        seen = replace(seen, usual=np.ones(count, bool), unlike=0)
+    if reason := misread(source.block(int(seen.usual.argmax()), int(seen.usual.argmax()) + 1)[0]):
+        raise InputError(f"{source.description}: {reason}")
+    mean = seen.mean
+    if not seen.usual.all():
+        usual, flags = MeanFrame(source.shape), iter(seen.usual)
+        for block in blocks():
+            usual.add(block[[next(flags) for _ in block]])
+        mean = usual.mean
+        if seen.unlike:
+            notes.append(
+                f"  {seen.unlike} of {count} frames left out: at least twice as bright or half as bright as "
+                "most, or with another background"
+            )
+    if repeated := int(np.count_nonzero(~seen.usual)) - seen.unlike:
+        notes.append(f"  {repeated} of {count} frames left out: repeated, the same as the one before")
     if np.isnan(mean).all():
         raise InputError(f"{source.description}: expected a frame with spots, every pixel is NaN or infinite")
     dark, electrons_per_adu = calibration.maps(source.shape)
     electrons: NDArray[np.float64] = (mean - dark) * electrons_per_adu
-    return electrons, values
+    chosen = np.flatnonzero(seen.usual)[:_FIRST_FRAMES]
+    first = source.block(int(chosen[0]), int(chosen[-1]) + 1)[chosen - chosen[0]]
+    return electrons, first, seen.saturation_adu, notes

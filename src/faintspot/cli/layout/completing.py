@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from faintspot.cli.layout import grid as layout_grid
 from faintspot.cli.layout.options import plain
-from faintspot.slopes.camera.background import smooth_background, varies
+from faintspot.slopes.camera.background import overlap, smooth_background, varies
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.sensor.found_layout import FoundLayout
 from faintspot.slopes.sensor.known_grid import KnownGrid
@@ -31,7 +31,11 @@ def completed(
     adu_per_electron = calibration.em_gain / calibration.gain_e_per_adu
     level = float(np.nanmedian(edges)) * adu_per_electron
     spread = float(np.nanmedian(np.abs(edges - np.nanmedian(edges))))
-    background = _varying_background(found, mean)
+    background = None
+    if isinstance(found, FoundLayout):
+        levels, background = _background(found, mean)
+        if overlap(found.lenslets.pitch_px, found.lenslets.spot_px):
+            level = float(np.median(levels)) * adu_per_electron
     if background is not None and calibration.dark is not None:
         low, high = np.quantile(background, [0.02, 0.98]) * adu_per_electron
         notes.append(
@@ -60,15 +64,12 @@ def completed(
     return calibration, notes
 
 
-def _varying_background(
-    found: FoundLayout | KnownGrid, mean: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """Return the background around the spots, if it varies enough to change slopes."""
-    if isinstance(found, KnownGrid):
-        return None
+def _background(
+    found: FoundLayout, mean: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Return the background at each spot, and of all pixels, if it varies enough to change slopes."""
     grid = found.lenslets
     background = smooth_background(mean, grid.spots, grid.pitch_px, grid.spot_px)
     column, row = np.clip(np.rint(grid.spots).astype(int), 0, np.array(mean.shape[::-1]) - 1).T
-    levels = background[row, column]
-    flux = float(np.median(grid.flux))
-    return background if varies(mean, levels, flux, grid.pitch_px, grid.spot_px) else None
+    levels, flux = background[row, column], float(np.median(grid.flux))
+    return levels, background if varies(mean, levels, flux, grid.pitch_px, grid.spot_px) else None

@@ -19,7 +19,7 @@ from faintspot.base.files import derived
 from faintspot.base.npz import save_arrays
 
 _BLOCK_PIXELS = 1 << 22  # processed at a time
-_ESTIMATED = ("dark", "gain_e_per_adu", "saturation_adu", "bad_pixels")
+_ESTIMATED = ("dark", "gain_e_per_adu", "saturation_adu", "bad_pixels", "read_noise_e")
 _MAPS = ("dark", "flat", "bad_pixels", "read_noise_e")
 # Limit of values that the kernels square in float32, with a wide margin; no camera reaches it.
 _GAINS = 1e-9, 1e9
@@ -145,7 +145,7 @@ class Calibration(ConfigurationTable, table="calibration"):
         own, theirs = vars(self), vars(other)
         return all(
             (own[name] is None) == (theirs[name] is None)
-            and (own[name] is None or np.array_equal(own[name], theirs[name], equal_nan=True))
+            and (own[name] is None or np.array_equal(own[name], theirs[name], equal_nan=name != "estimated"))
             for name in own
         )
 

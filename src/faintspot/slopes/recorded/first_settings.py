@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
@@ -13,11 +15,11 @@ from faintspot.slopes.camera.binning import binned, binned_calibration
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.algorithms.noise import pixel_noise
 from faintspot.slopes.estimators.algorithms.spot_width import SeenSpots, like_most, seen_spots
-from faintspot.slopes.estimators.spot_tables import gaussian_psf
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
 Floats = NDArray[np.float64]
@@ -27,6 +29,10 @@ _WIDTH_OF_WINDOW = 0.25  # of the window's side, where no spot is seen
 _LEAST_NOISE, _LARGEST_GAIN = 1e-6, 100.0  # noise over flux; of `Window.centroid_gain`
 ASSUMED_NOISE_E = 3.0  # of a dark pixel, which gives the gain of a single frame
 _WEIGHTS = (1.25, 1.6)  # width of the weight over the spot's: best where read noise, photon noise dominates
+# Likewise where spots overlap (width over the pitch), and where they are sharper than Nyquist sampling, whose
+# slopes depend on where in its pixel a spot lies: by so much at most, if any weight reaches it.
+_OVERLAPPING, _NARROW_WEIGHTS = 0.35, (0.5, 0.7, 0.9)
+_SHARP_PX, _WIDE_WEIGHTS, _MOST_BY_PHASE_PX = 2.2, (2.5, 4.0, 6.0), 0.015
 _WINDOWS = (1.0, 1.5, 2.2, 3.2)  # width of a fixed window over the spot's: wide where spots move far
 _LEAST_RESPONSE = 0.05  # below, the displacements are not known well enough to choose the width
 _LEAST_DISPLACEMENT = 0.15  # rms over the spot's width: frames to come may move more than static ones
@@ -37,6 +43,7 @@ _LEAST_RANGE_PX = 1.0
 _BETTER = 0.8
 _FAINT, _AS_GOOD = 0.8, 1.1  # response below which a fixed window is tried, and its error over the best one
 _SPOTS = 512
+_SHARPEST_PX = 0.1  # standard deviation of a spot before its pixels blur it
 
 
 @dataclass(frozen=True)
@@ -52,12 +59,15 @@ class FirstSettings:
         Of a spot in a frame; 0 where no spots are seen.
     response : float
         Slope shown for a displacement of 1 px; below 1 where slopes would else be worse than none.
+    psf : mapping, optional
+        Table [psf] of the configuration, where the settings need it.
     """
 
     settings: Settings
     noise: float
     flux: float
     response: float = 1.0
+    psf: dict[str, object] | None = None
 
 
 def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[np.generic]) -> FirstSettings:
@@ -100,8 +110,10 @@ def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[np.
         )
         return FirstSettings(unseen, noise, 0.0, 0.0)
     noise = max(noise, _LEAST_NOISE * spots.flux)
-    settings, response = _Trial(images, layout, noise, spots).best()
-    return FirstSettings(settings, noise, spots.flux, response)
+    trial = _Trial(images, layout, noise, spots)
+    settings, response = trial.best()
+    psf = trial.psf if settings.estimator.name == "ml" else None
+    return FirstSettings(settings, noise, spots.flux, response, psf)
 
 
 def _seen(images: Floats) -> SeenSpots | None:
@@ -147,14 +159,48 @@ class _Trial:
 
     def __init__(self, images: Floats, layout: Layout, noise: float, spots: SeenSpots) -> None:
         rng = np.random.default_rng(1)
-        self._spots, self._window = spots, layout.window
+        self._spots, self._window, self._noise = spots, layout.window, noise
         self._fwhm = math.sqrt(spots.fwhm_x_px * spots.fwhm_y_px)
         self._displacement = max(_displacement(images, layout, spots), _LEAST_DISPLACEMENT * self._fwhm)
         self._truth = self._displacement * rng.standard_normal((_SPOTS, 2))
-        psf = gaussian_psf(np.array([[spots.fwhm_x_px, spots.fwhm_y_px]]))
-        mean = np.maximum(psf.images(self._truth, self._window, spots.flux), 0.0)
+        mean = self._spots_at(self._truth)
+        overlap = layout.pitch_px is not None and self._fwhm > _OVERLAPPING * layout.pitch_px
+        if overlap:
+            mean += self._neighbours(layout, rng)
         variance = noise**2 + _photon_noise(images, noise, spots.flux) * mean
         self._images = mean + np.sqrt(variance) * rng.standard_normal(mean.shape)
+        self._weights = (*(_NARROW_WEIGHTS if overlap else ()), *_WEIGHTS)
+        if self._fwhm < _SHARP_PX:
+            self._weights += _WIDE_WEIGHTS
+
+    @property
+    def psf(self) -> dict[str, Any]:
+        """Table [psf] of round Gaussian spots, without the blur of the pixels."""
+        std = math.sqrt(max((self._fwhm * FWHM_TO_STD) ** 2 - 1 / 12, _SHARPEST_PX**2))
+        return {"profile": "gaussian", "size": _rounded(0.5 * std / FWHM_TO_STD), "radius_px": 8.0}
+
+    def _spots_at(self, positions: Floats) -> Floats:
+        """Return images (n, ny, nx) of Gaussian spots, integrated over the pixels, without noise."""
+        axes = []
+        for axis, width in enumerate((self._spots.fwhm_x_px, self._spots.fwhm_y_px)):
+            side = self._window[1 - axis]
+            edges = np.arange(side + 1) - 0.5 * side - positions[:, axis, None]
+            std = math.sqrt(max((width * FWHM_TO_STD) ** 2 - 1 / 12, _SHARPEST_PX**2))
+            axes.append(np.diff(scipy.special.ndtr(edges / std)))
+        return np.asarray(self._spots.flux * axes[0][:, None, :] * axes[1][:, :, None])
+
+    def _neighbours(self, layout: Layout, rng: np.random.Generator) -> Floats:
+        """Return the neighbours of spots: of half of them on one side only, as at the pupil's edge."""
+        around = np.array([1, 1j, -1, -1j, 1 + 1j, -1 + 1j, -1 - 1j, 1 - 1j])
+        if layout.geometry == "hexagonal":
+            around = np.exp(1j * np.pi / 3 * np.arange(6))
+        away = float(layout.pitch_px or 0.0) * around * np.exp(1j * np.radians(layout.angle_deg))
+        inwards = np.exp(2j * np.pi * rng.random(_SPOTS))
+        images = np.zeros((_SPOTS, *self._window))
+        for vector in away:
+            lit = (np.arange(_SPOTS) % 2 == 0) | ((inwards.conj() * vector).real > 0)
+            images += lit[:, None, None] * self._spots_at(self._truth + np.array([vector.real, vector.imag]))
+        return images
 
     def best(self) -> tuple[Settings, float]:
         """Return the settings of the smallest error, and the slope that they show for 1 px."""
@@ -166,8 +212,15 @@ class _Trial:
         following = [
             Settings("weighted", weight_fwhm_px=_rounded(factor * self._fwhm), search_range_px=reach, **width)
             for reach in (None, tight)
-            for factor in _WEIGHTS
+            for factor in self._weights
         ]
+        if self._fwhm < _SHARP_PX:
+            by_phase = [self._by_phase(each) for each in following]
+            fit = Settings("ml", search_range_px=tight)
+            if min(by_phase) > max(_MOST_BY_PHASE_PX, self._by_phase(fit)):
+                return fit, 1.0
+            most = max(_MOST_BY_PHASE_PX, min(by_phase))
+            following = [each for each, error in zip(following, by_phase, strict=True) if error <= most]
         windows = [
             self._reduced(
                 Settings(
@@ -198,15 +251,23 @@ class _Trial:
         gain = min(float((shown**2).sum()) / product, _LARGEST_GAIN)
         return window.replace(centroid_gain=_rounded(gain)), response
 
+    def _by_phase(self, settings: Settings) -> float:
+        """Return the largest error that depends on where in its pixel a spot lies."""
+        truth = np.stack([np.linspace(-0.5, 0.5, 32), np.zeros(32)], axis=1)
+        errors = (self._measured(settings, self._spots_at(truth)) - truth)[:, 0]
+        return float(0.5 * np.ptp(errors))
+
     def _error(self, positions: Floats) -> float:
         return float(np.abs(positions - self._truth).mean())
 
-    def _measured(self, settings: Settings) -> Floats:
-        """Return the positions (n, 2) of the simulated spots."""
-        images, (ny, nx) = self._images, self._window
+    def _measured(self, settings: Settings, images: Floats | None = None) -> Floats:
+        """Return the positions (n, 2) of the simulated spots, or of those in other images."""
+        images, (ny, nx) = self._images if images is None else images, self._window
         layout = Layout.stacked(len(images), (ny, nx))
         frame = images.reshape(len(images) * ny, nx).astype(np.float32)
-        slopes = SlopePipeline(layout, settings, Calibration(dark=0.0))(frame)
+        psf = PSF.analytic(**self.psf) if settings.estimator.name == "ml" else None
+        camera = Calibration(dark=0.0, read_noise_e=self._noise)
+        slopes = SlopePipeline(layout, settings, camera, psf=psf)(frame)
         return np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64)
 
 

@@ -6,7 +6,6 @@ import hashlib
 import itertools
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import one_of
+from faintspot.base.config.tables import is_map
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.flags import SubapertureFlag, kept_flags
+from faintspot.base.statistics import MAD_TO_STD
 from faintspot.base.variables import scaled_positions
 from faintspot.base.version import __version__
 from faintspot.io.frames import FrameSource, open_frames
@@ -25,15 +26,16 @@ from faintspot.io.references import read_reference
 from faintspot.io.slopes import create_writer
 from faintspot.io.stored.slopes_format import UNITS, pixels_in
 from faintspot.io.telemetry.aot_reading import is_aot, read_aot
+from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.labelled import layout_coordinates
 from faintspot.slopes.pipeline.mean_flux import MeanFlux
-from faintspot.slopes.pipeline.settings import Settings, with_preset, without_denoising
+from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px, with_preset, without_denoising
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.response import response
-from faintspot.slopes.recorded.survey import stretches, survey
+from faintspot.slopes.recorded.survey import are_repeated, stretches, survey
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
 
@@ -45,6 +47,9 @@ _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small
 _FOLLOWED_FRAMES = 32  # of a block, one after the other: for the progress bar
 
 _LOOKS_FOR_FLUX, _FRAMES_FOR_FLUX = 20, 50  # stretches of frames over the whole recording
+# Differences from the dark that count, over their scatter and the largest value; width of wide spots over the
+# side of the window.
+_OTHER_DARK, _ROUNDED, _WIDE = 3.0, 1e-6, 0.35
 _FRAMES_FOR_RESPONSE = 200  # fewest, as of the statistics that need it
 
 Progress = Callable[[int, int], None]
@@ -74,6 +79,10 @@ class Summary:
     """Description of the reference where it was fitted to a frame."""
     saturation_adu: float | None = None
     """Saturation level found in the frames, where the configuration states none."""
+    background: str = ""
+    """What was taken off instead of an estimated dark that does not fit the frames."""
+    repeated_frames: int = 0
+    """Frames of this call that are the same as the one before."""
     doubtful: bool = False
     """Whether the layout has doubts that nobody has settled."""
 
@@ -179,10 +188,15 @@ def measure_recorded(
         summary = Summary(source.n_frames, len(layout), origin=origin, doubtful=bool(layout.doubts))
         if positions is None:
             summary.reference = reference_in_words(layout.fitted)
-        seen = survey(source)
+        seen = survey(source.shape, stretches(source))
+        calibration, last = described.calibration, None
         if described.calibration.saturation_adu is None and seen.saturation_adu is not None:
             summary.saturation_adu = seen.saturation_adu
-            calibration = replace(described.calibration, saturation_adu=seen.saturation_adu)
+            calibration = replace(calibration, saturation_adu=seen.saturation_adu)
+        calibration, summary.background = _with_fitting_dark(
+            calibration, layout, seen.mean, is_wide=_are_wide(settings, layout)
+        )
+        if calibration is not described.calibration:
             pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
         if mean_flux:
             pipeline = _with_mean_flux(pipeline, source)
@@ -197,8 +211,7 @@ def measure_recorded(
         with errors_within(configuration_file):
             measure = _follower(pipeline) if follow else pipeline.with_dark(seen.mean)
         if isinstance(measure, SlopePipeline) and source.n_frames >= _FRAMES_FOR_RESPONSE:
-            with suppress(InputError):  # of a damaged frame, which is reported when it is measured
-                attributes["response"] = response(measure, seen.mean, stretches(source)).tolist()
+            attributes["response"] = response(measure, seen.mean, stretches(source)).tolist()
         prepared = measure.plan.prepared
         faults = prepared.faults
         with create_writer(
@@ -217,6 +230,8 @@ def measure_recorded(
                 if start >= done:
                     writer.append(start, scaled_positions(slopes.variables, factor))
                     summary.add(slopes)
+                    summary.repeated_frames += int(np.count_nonzero(are_repeated(block, last)))
+                last = block[-1]
                 if progress is not None:
                     progress(start + len(block), source.n_frames)
     summary.failed_frames, summary.failure = prepared.faults - faults, prepared.fault
@@ -291,6 +306,36 @@ def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str
     roi = [] if is_whole else ["--roi", f"{left},{top},{right},{bottom}"]
     words = ["faintspot", "layout", str(frames), "--grid", f"{rows}x{columns}", *roi, "-o", str(path)]
     return shlex.join(words)
+
+
+def _with_fitting_dark(
+    calibration: Calibration, layout: Layout, mean: NDArray[np.float64], *, is_wide: bool
+) -> tuple[Calibration, str]:
+    """Move an estimated dark level to the background of these frames, if that is elsewhere; say so.
+
+    The background is that of the first and last rows of windows, as in the frames of the layout. A dark that
+    is stated stays, but is named where it lies above the frames. Wings of wide spots are no background.
+    """
+    if calibration.dark is None or not np.isfinite(mean).any():
+        return calibration, ""
+    edges = layout.images(mean - calibration.dark)[:, [0, -1]]
+    away = float(np.nanmedian(edges))
+    scatter = MAD_TO_STD * float(np.nanmedian(np.abs(edges - away)))
+    wings = away > 0 and (is_wide or calibration.dark_is_known)  # or sky, where the dark is known
+    if wings or abs(away) <= max(_OTHER_DARK * scatter, _ROUNDED * float(np.nanmax(np.abs(mean)))):
+        return calibration, ""
+    level = float(np.nanmedian(calibration.dark))
+    found = f"the background of these frames is {level + away:.4g} ADU, the dark {level:.4g} ADU"
+    if calibration.dark_is_known:
+        return calibration, f"{found}: pixels below it have no flux; give the dark of these frames"
+    moved = calibration.dark + away if is_map(calibration.dark) else float(f"{level + away:.7g}")
+    return replace(calibration, dark=moved), f"{found} as estimated with the layout: the former is taken off"
+
+
+def _are_wide(settings: Settings, layout: Layout) -> bool:
+    """Return whether spots are so wide that their wings reach the border of windows."""
+    width = np.nan_to_num(spot_fwhm_px(settings, len(layout), layout.pixels))
+    return bool(width.max() > _WIDE * min(layout.window))
 
 
 def _with_mean_flux(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeline:

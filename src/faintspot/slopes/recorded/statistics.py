@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -87,6 +88,12 @@ class MeasuredSlopes:
     def number(self) -> NDArray[np.int64]:
         """Number of each frame."""
         return np.arange(len(self.x)) if self.frames is None else self.frames
+
+    @cached_property
+    def repeated(self) -> NDArray[np.bool_]:
+        """Mask of frames, from the second on, whose slopes are those of the one before: written twice."""
+        same = (self.x[1:] == self.x[:-1]).all(axis=1) & (self.y[1:] == self.y[:-1]).all(axis=1)
+        return np.asarray(same)
 
     @property
     def n_frames(self) -> int:
@@ -234,7 +241,8 @@ def relative_gain(
 
 def _successive(method: MeasuredSlopes, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return where a measurement and that of the next frame are valid, (n_frames - 1, n)."""
-    are_valid: NDArray[np.bool_] = valid[1:] & valid[:-1] & (np.diff(method.number) == 1)[:, None]
+    following = (np.diff(method.number) == 1) & ~method.repeated
+    are_valid: NDArray[np.bool_] = valid[1:] & valid[:-1] & following[:, None]
     return are_valid
 
 

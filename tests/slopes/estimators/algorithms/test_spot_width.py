@@ -60,3 +60,22 @@ def test_structures_are_unlike_most_spots(flux_e: float) -> None:
     kept = like_most(images[None])
     assert not kept[[3, 17, 40]].any()
     assert np.count_nonzero(kept) >= 55
+
+
+@pytest.mark.parametrize("fwhm_px", [0.6, 1.0, 1.6])
+def test_spots_sharper_than_nyquist(fwhm_px: float) -> None:
+    """Width with the blur of the pixels, sqrt(12) of whose standard deviation are one of them."""
+    images, _ = subapertures(
+        300,
+        shape=(12, 12),
+        flux_e=5000.0,
+        profile="gaussian",
+        size=0.5 * fwhm_px,
+        position_range_px=1.0,
+        detector=Detector(3.0),
+        rng=np.random.default_rng(1),
+    )
+    found = seen_spots(images)
+    blurred = np.hypot(fwhm_px, 2.3548 / np.sqrt(12))
+    assert found[:2] == pytest.approx([blurred, blurred], rel=0.04)
+    assert found.flux == pytest.approx(5000, rel=0.05)

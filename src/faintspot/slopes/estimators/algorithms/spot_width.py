@@ -5,16 +5,21 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy.special
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import image_stack
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import MAD_TO_STD
+from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
 _NARROWEST_PX, _WIDEST = 0.5, 0.75  # full width at half maximum; the latter of the window's side
 # Squared flux and width of a spot relative to the median of the lenslets, and standard deviations of the
 # former: what is beyond is no spot.
 _MOST_SQUARED_FLUX, _WIDEST_SPOT, _OUTLYING = 9.0, 1.6, 6.0
+# Below this width, the pixels blur a spot to a shape of their own: it is found in a table of the standard
+# deviation before. A correlation at lag 1 above this part of that at lag 0 is that of spots, not of noise.
+_SHARP_PX, _STD_PX, _CORRELATED = 2.0, np.linspace(0.16, 0.96, 81), 0.05
 _AREA_OF_SQUARED_FWHM = np.pi / (2 * np.log(2))  # noise-equivalent area of a Gaussian spot
 
 
@@ -63,16 +68,32 @@ def _along(images: NDArray[np.float64]) -> tuple[float, float]:
     side = images.shape[-1]
     correlation = np.array([np.vdot(images[..., : side - lag], images[..., lag:]) for lag in range(side)])
     width = 0.0
+    is_sharp = correlation[1] > _CORRELATED * correlation[0] and not correlation[2] > 0
     if correlation[1] > correlation[2] > 0:
-        correlation[0] = correlation[1] * (correlation[1] / correlation[2]) ** (1 / 3)
-        relative = correlation / correlation[0]
+        lag_0 = correlation[1] * (correlation[1] / correlation[2]) ** (1 / 3)
+        relative = np.append(1.0, correlation[1:] / lag_0)
         beyond = int(np.argmax(relative < 0.5))
         if beyond > 0:
             before, after = np.log(relative[beyond - 1]), np.log(max(relative[beyond], 1e-9))
             width = float(np.sqrt(2.0) * (beyond - 1 + (before - np.log(0.5)) / (before - after)))
+        is_sharp, correlation[0] = 0 < width < _SHARP_PX, lag_0
+    if is_sharp:
+        model = np.array([_correlation_of_sharp(lag) for lag in (0, 1, 2)])
+        ratio = max(correlation[2], 0.0) / correlation[1]
+        std = np.interp(ratio, model[2] / model[1], _STD_PX)
+        correlation[0] = correlation[1] * np.interp(std, _STD_PX, model[0] / model[1])
+        width = float(np.sqrt(std**2 + 1 / 12)) / FWHM_TO_STD
     if not _NARROWEST_PX < width < _WIDEST * side:
         raise InputError("images: expected spots whose width can be measured, found none")
     return width, float(correlation[0]) / len(images)
+
+
+def _correlation_of_sharp(lag: int) -> NDArray[np.float64]:
+    """Return the autocorrelation along an axis of Gaussians integrated over pixels, for each width tried."""
+    std = np.sqrt(2.0) * _STD_PX
+    places = np.arange(lag - 1, lag + 2)[:, None] / std
+    integral = places * scipy.special.ndtr(places) + np.exp(-0.5 * places**2) / np.sqrt(2 * np.pi)
+    return np.asarray(std * np.diff(integral, 2, axis=0)[0])
 
 
 def like_most(images: ArrayLike) -> NDArray[np.bool_]:
