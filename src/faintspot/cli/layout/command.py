@@ -256,7 +256,7 @@ def command(
         keeps_noise = of_camera["read_noise_e"] is not None
         calibration, lines = with_measured_pixels(calibration, measured, keeps_noise=keeps_noise)
         notes += lines
-    if not seen.flux > 0:
+    if isinstance(found, FoundLayout) and not seen.flux > 0:
         raise InputError(
             f"{source.description}: expected spots, found none in the {len(layout)} windows of the layout; "
             "average more frames, or look whether the frames are read right"

@@ -50,6 +50,7 @@ _LOOKS_FOR_FLUX, _FRAMES_FOR_FLUX = 20, 50  # stretches of frames over the whole
 # Differences from the dark that count, over their scatter and the largest value; width of wide spots over the
 # side of the window.
 _OTHER_DARK, _ROUNDED, _WIDE = 3.0, 1e-6, 0.35
+_FEWEST_PX = 4  # of a window's side; below, as in quad cells, no pixel shows the background only
 _FRAMES_FOR_RESPONSE = 200  # fewest, as of the statistics that need it
 
 Progress = Callable[[int, int], None]
@@ -316,7 +317,7 @@ def _with_fitting_dark(
     The background is that of the first and last rows of windows, as in the frames of the layout. A dark that
     is stated stays, but is named where it lies above the frames. Wings of wide spots are no background.
     """
-    if calibration.dark is None or not np.isfinite(mean).any():
+    if calibration.dark is None or not np.isfinite(mean).any() or min(layout.window) < _FEWEST_PX:
         return calibration, ""
     edges = layout.images(mean - calibration.dark)[:, [0, -1]]
     away = float(np.nanmedian(edges))
