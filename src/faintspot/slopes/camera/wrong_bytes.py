@@ -41,7 +41,7 @@ def misread(frame: NDArray[np.generic]) -> str:
 
 def _smoothness(image: NDArray[np.generic]) -> float:
     """Return the mean correlation of neighbours along both axes; hot pixels count like bright ones."""
-    image = np.minimum(image, np.quantile(image, _CENTRAL[1]))
+    image = np.minimum(image, np.quantile(image.astype(np.float64), _CENTRAL[1]))
     return 0.5 * (_correlation(image[:, :-1], image[:, 1:]) + _correlation(image[:-1], image[1:]))
 
 

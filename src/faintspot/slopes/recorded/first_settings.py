@@ -67,7 +67,7 @@ class FirstSettings:
     noise: float
     flux: float
     response: float = 1.0
-    psf: dict[str, object] | None = None
+    psf: dict[str, Any] | None = None
 
 
 def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[np.generic]) -> FirstSettings:
