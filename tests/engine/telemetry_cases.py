@@ -30,7 +30,7 @@ def slopes_of(frame: int) -> Slopes:
 
 def write(ring: TelemetryRing, frame: int) -> None:
     """Write the record of a frame."""
-    ring.write(frame, frame % 2, frame // 10, 10**6 * frame + 7, 10**6 * frame + 507, slopes_of(frame))
+    ring.write(frame, frame % 2, frame // 10, (10**6 * frame + 7, 10**6 * frame + 507), slopes_of(frame))
 
 
 def write_images(ring: TelemetryRing, frame: int) -> None:

@@ -425,7 +425,7 @@ class Engine:
         cause = self._cause(late, path)
         causes = cause, *self._lost
         self._telemetry.write(
-            number, method, change, moment, published, slopes, causes=causes, loop=state, commands=commands
+            number, method, change, (moment, published), slopes, causes=causes, loop=state, commands=commands
         )
         self._lost = 0, IN_TIME
         self._dark.take(path.frame)

@@ -74,7 +74,7 @@ class Run:
             self.loop.look_after(slopes.flux)
             self._sent.append(sent[-1])
             now = round(number * FRAME_S * 1e9)
-            self.ring.write(number, 0, 0, now, now, slopes, loop=2, commands=sent[-1])
+            self.ring.write(number, 0, 0, (now, now), slopes, loop=2, commands=sent[-1])
         self._number += count
         return np.array(sent)
 

@@ -43,7 +43,7 @@ def is_stale(reader: TelemetryRing) -> bool:
 def test_commands_and_the_loops_state(name: str) -> None:
     with TelemetryRing.create(name, LAYOUT, commands=3, reference=np.arange(2.0), records=4) as ring:
         for frame in range(6):
-            ring.write(frame, 0, 0, 0, 0, slopes_of(frame), loop=frame % 3, commands=np.arange(3.0) + frame)
+            ring.write(frame, 0, 0, (0, 0), slopes_of(frame), loop=frame % 3, commands=np.arange(3.0) + frame)
         reader = TelemetryRing.attach(name)
         assert reader.description["reference"] == [0.0, 1.0]
         records, _, _ = reader.records.since(2)
@@ -94,7 +94,7 @@ def test_what_is_written_is_read(name: str) -> None:
 def test_records_of_a_frame_are_copies(name: str) -> None:
     with TelemetryRing.create(name, LAYOUT, records=4) as ring:
         reader, slopes = TelemetryRing.attach(name), slopes_of(0)
-        ring.write(0, 0, 0, 7, 507, slopes)
+        ring.write(0, 0, 0, (7, 507), slopes)
         slopes.x[:] = -1
         kept = reader.records.since(0)[0]
         for frame in range(1, 9):

@@ -257,8 +257,7 @@ def _measure(
     output: str | None,
     quick: bool,
     overwrite: bool,
-    workers: int | None,
-    scheduler: str | None,
+    **processes: Any,
 ) -> Any:
     """Run an experiment with a progress bar, print its summary, write its page, and return the result."""
     from faintspot.experiments.closed_loop.page import loop_page
@@ -267,7 +266,7 @@ def _measure(
 
     loop = load_loop(configuration)
     folder = output or (f"{loop.name}-quick" if quick else loop.name)
-    with worker_pool("loop", workers, scheduler) as pool:
+    with worker_pool("loop", **processes) as pool:
         result = run(loop, folder, *what, quick=quick, pool=pool, overwrite=overwrite)
     click.echo(loop_summary(LoopResults(**{name: result})))
     page = Path(folder) / "report.html"

@@ -15,7 +15,7 @@ import struct
 import time
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,6 +42,21 @@ _OF_SLOPES = (
 )
 _VALUES = attrgetter(*_OF_SLOPES)
 _RECORD_BYTES, _IMAGE_BYTES = 1 << 25, 1 << 24  # small enough for a container's 64 MiB of shared memory
+
+
+class Described(TypedDict, total=False):
+    """Values of an engine for the readers of its telemetry."""
+
+    settings: str
+    """Initial settings: TOML text (`faintspot.slopes.pipeline.configuration.to_text`)."""
+    methods: Sequence[str]
+    """Names of the interleaved configurations."""
+    reference: ArrayLike | None
+    """Reference slopes that were subtracted, (2 n,) [px]."""
+    parts: Mapping[str, str] | None
+    """Calibration, PSF and score (`faintspot.slopes.pipeline.configuration.packed`)."""
+    control: Mapping[str, object] | None
+    """Interaction matrix and options (`faintspot.loop.control.recorded.packed_control`)."""
 
 
 class TelemetryRing(Segment):
@@ -99,14 +114,10 @@ class TelemetryRing(Segment):
         name: str,
         layout: Layout,
         *,
-        settings: str = "",
-        methods: Sequence[str] = (),
         commands: int = 0,
-        reference: ArrayLike | None = None,
-        parts: Mapping[str, str] | None = None,
-        control: Mapping[str, object] | None = None,
         records: int | None = None,
         image_slots: int | None = None,
+        **described: Unpack[Described],
     ) -> TelemetryRing:
         """Create the rings of an engine.
 
@@ -115,23 +126,15 @@ class TelemetryRing(Segment):
         name : str
             Name of the engine; the segment is /dev/shm/NAME_telemetry.
         layout : Layout
-        settings : str
-            The initial settings, for readers: TOML text (`faintspot.slopes.pipeline.configuration.to_text`).
-        methods : sequence of str, optional
-            Names of the interleaved configurations, for readers.
         commands : int
             Number of the mirror's commands; 0: none.
-        reference : (2 n,) array, optional
-            Reference slopes that were subtracted, px, for readers.
-        parts : mapping, optional
-            Calibration, PSF and score, for readers (`faintspot.slopes.pipeline.configuration.packed`).
-        control : mapping, optional
-            Interaction matrix and options, for readers (`faintspot.loop.control.recorded.packed_control`).
         records : int, optional
             Number of records, about 60 + 29 n bytes each: a reader may lag by one frame less. Default: as
             many as fit into 32 MiB, up to 4096.
         image_slots : int, optional
             Number of images. Default: as many as fit into 16 MiB, 2 to 16.
+        **described
+            Values of `Described`; default: none.
 
         Raises
         ------
@@ -145,14 +148,16 @@ class TelemetryRing(Segment):
         if image_slots is None:
             size = image_type(layout.frame_shape, n, layout.window).itemsize
             image_slots = min(16, max(2, _IMAGE_BYTES // size))
+        reference = described.get("reference")
         description = {
+            "settings": "",
+            "parts": None,
+            "control": None,
+            **described,
             "layout": layout_values(layout),
-            "settings": settings,
-            "methods": list(methods),
+            "methods": list(described.get("methods", ())),
             "commands": commands,
             "reference": None if reference is None else np.asarray(reference).tolist(),
-            "parts": parts,
-            "control": control,
             "records": int(number_between("records", records, 2, 1 << 24, integer=True)),
             "image_slots": int(number_between("image_slots", image_slots, 2, 1 << 16, integer=True)),
         }
@@ -174,8 +179,7 @@ class TelemetryRing(Segment):
         frame: int,
         method: int,
         change: int,
-        last_row_ns: int,
-        published_ns: int,
+        times_ns: tuple[int, int],
         slopes: Slopes,
         *,
         causes: tuple[int, int, int] = (0, 0, 0),
@@ -190,8 +194,8 @@ class TelemetryRing(Segment):
             Frame number of the camera.
         method, change : int
             Numbers of the interleaved configuration and of the last change of settings that applies.
-        last_row_ns, published_ns : int
-            Times of CLOCK_MONOTONIC, ns.
+        times_ns : (int, int)
+            Times of CLOCK_MONOTONIC of the last row and of publication, ns.
         slopes : Slopes
             Slopes of one frame; copied.
         causes : (int, int, int)
@@ -210,8 +214,7 @@ class TelemetryRing(Segment):
             frame,
             method,
             change,
-            last_row_ns,
-            published_ns,
+            *times_ns,
             time.time_ns() - time.monotonic_ns(),
             *causes,
         )

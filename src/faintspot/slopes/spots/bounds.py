@@ -46,7 +46,7 @@ class _Spot(NamedTuple):
     along_y: Floats
 
 
-class _Noise(NamedTuple):
+class _PixelNoise(NamedTuple):
     """Noise of each pixel [photo-electrons]; maps are flattened: (pixels,)."""
 
     read_noise_e: Floats
@@ -300,7 +300,7 @@ def _with_derivatives(render: Any, positions: Floats, step: float) -> _Spot:
     return _Spot(np.where(illuminated, image, 0.0), along_x * illuminated, along_y * illuminated)
 
 
-def _noise(detector: object, shape: tuple[int, int], exact: bool) -> _Noise:
+def _noise(detector: object, shape: tuple[int, int], exact: bool) -> _PixelNoise:
     """Return the noise of each pixel in photo-electrons, flattened."""
     if detector is None:
         detector = Detector(read_noise_e=0.1)
@@ -313,11 +313,11 @@ def _noise(detector: object, shape: tuple[int, int], exact: bool) -> _Noise:
     read_variance = (np.square(detector.read_noise_e) + converter) / detector.em_gain**2
     background = np.maximum(dark - read_variance, 0.0) / excess
     read_noise = np.broadcast_to(np.sqrt(read_variance), shape)
-    return _Noise(read_noise.ravel(), background.ravel(), excess, exact and excess == 1)
+    return _PixelNoise(read_noise.ravel(), background.ravel(), excess, exact and excess == 1)
 
 
 def _covariances(
-    flux: float, spot: _Spot, noise: _Noise, unknown_flux: bool, unknown_background: bool, prior: float
+    flux: float, spot: _Spot, noise: _PixelNoise, unknown_flux: bool, unknown_background: bool, prior: float
 ) -> Floats:
     """Return the bound on the covariance of x and y at each position, (m, 2, 2)."""
     weight = _pixel_information(flux * spot.image + noise.background_e, noise)
@@ -340,7 +340,7 @@ def _covariances(
     return covariances
 
 
-def _pixel_information(mean_e: Floats, noise: _Noise) -> Floats:
+def _pixel_information(mean_e: Floats, noise: _PixelNoise) -> Floats:
     """Return the Fisher information of each pixel value about its mean [1 / e-^2]; (m, pixels)."""
     if not noise.exact:
         # The floor avoids division by zero for noise-free pixels.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Required, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +27,24 @@ _TRUTHS = ("gradient", "centre_of_gravity")
 _BLOCK_POINTS = 1 << 18  # image samples processed at a time: the temporary arrays stay in the cache
 
 
+class Speckles(TypedDict, total=False):
+    """Turbulence, image and spot of `speckled_spots`."""
+
+    d_over_r0: Required[ArrayLike]
+    """Side of the sub-aperture in units of the Fried parameter at the sensing wavelength, 0 to 10."""
+    shape: tuple[int, int]
+    """Rows and columns (ny, nx) of each image [px] [default: (16, 16)]."""
+    size: ArrayLike
+    """lambda / d = 2 px * size, at least 0.05 [default: 1]. In images wider than 40 lambda / d too much of
+    the flux is in the outer parts."""
+    flux_e: ArrayLike
+    """Electrons in the whole, infinite spot, as in `faintspot.slopes.spots.shapes` [default: 1]."""
+    outer_scale_d: float | None
+    """Outer scale in units of the sub-aperture's side d, 0.1 to 1e5 [default: infinite (Kolmogorov)]."""
+    natural_tilt: bool
+    """Whether the mean gradient of the turbulence itself is kept and added to the position."""
+
+
 class _PhaseModes(NamedTuple):
     """Square root of a joint covariance for d = r0: phases and mean gradients are root @ white noise."""
 
@@ -37,16 +55,11 @@ class _PhaseModes(NamedTuple):
 def speckled_spots(
     n: int,
     *,
-    d_over_r0: ArrayLike,
-    shape: tuple[int, int] = (16, 16),
-    size: ArrayLike = 1.0,
     position_range_px: float = 1.0,
     positions: ArrayLike | None = None,
-    flux_e: ArrayLike = 1.0,
-    outer_scale_d: float | None = None,
-    natural_tilt: bool = False,
     truth: str = "gradient",
     rng: np.random.Generator | None = None,
+    **speckles: Unpack[Speckles],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return noiseless short-exposure images behind square sub-apertures, and the positions of their spots.
 
@@ -62,23 +75,10 @@ def speckled_spots(
     ----------
     n : int
         Number of images.
-    d_over_r0 : float or array_like, shape (n,)
-        Side of the sub-aperture in units of the Fried parameter at the sensing wavelength, 0 to 10.
-    shape : (int, int)
-        Rows and columns (ny, nx) of each image, px.
-    size : float or array_like, shape (n,)
-        lambda / d = 2 px * size, at least 0.05. In images wider than 40 lambda / d too much of the flux is in
-        the outer parts.
     position_range_px : float
         Positions are uniform within plus and minus this, on each axis, px.
     positions : array_like, shape (n, 2), optional
         x and y in px, instead of random ones.
-    flux_e : float or array_like, shape (n,)
-        Electrons in the whole, infinite spot, as in `faintspot.slopes.spots.shapes`.
-    outer_scale_d : float, optional
-        Outer scale in units of the sub-aperture's side d, 0.1 to 1e5. Default: infinite (Kolmogorov).
-    natural_tilt : bool
-        Whether the mean gradient of the turbulence itself is kept and added to the position.
     truth : {"gradient", "centre_of_gravity"}
         "gradient": mean gradient of the phase over the sub-aperture as a displacement of the spot. This is
         the quantity that a wavefront sensor is to measure, and the centre of gravity of all flux in and
@@ -86,6 +86,8 @@ def speckled_spots(
         noise.
     rng : numpy.random.Generator, optional
         Generator from which separate ones for positions and phases are spawned.
+    **speckles
+        Values of `Speckles`, of which `d_over_r0` is required; one each, or arrays of n.
 
     Returns
     -------
@@ -119,16 +121,7 @@ def speckled_spots(
         points = finite_array("positions", positions).astype(np.float64)
         if points.shape != (n, 2):
             raise InputError(f"positions: expected shape ({n}, 2), got {points.shape}")
-    images, gradients = speckled_images(
-        points,
-        d_over_r0=d_over_r0,
-        shape=shape,
-        size=size,
-        flux_e=flux_e,
-        outer_scale_d=outer_scale_d,
-        natural_tilt=natural_tilt,
-        rng=phase_rng,
-    )
+    images, gradients = speckled_images(points, rng=phase_rng, **speckles)
     return images, gradients if kind_of_truth == "gradient" else _centres_of_gravity(images)
 
 
@@ -136,9 +129,9 @@ def speckled_images(
     positions: Floats,
     *,
     d_over_r0: ArrayLike,
-    shape: tuple[int, int],
-    size: ArrayLike,
-    flux_e: ArrayLike,
+    shape: tuple[int, int] = (16, 16),
+    size: ArrayLike = 1.0,
+    flux_e: ArrayLike = 1.0,
     outer_scale_d: float | None = None,
     natural_tilt: bool = False,
     rng: np.random.Generator,

@@ -108,7 +108,7 @@ class LargeGuarded(GuardedController):
         """See `Controller`."""
         self.complete()
         if self._chosen == _PLAIN:
-            return ExpectedSlopes(self._held - self._of_line(_PLAIN, 0), None)
+            return ExpectedSlopes(self._held - self._of_latest(_PLAIN), None)
         return ExpectedSlopes(self._predicted, self._predictor.std_px)
 
     def begin(self) -> None:
@@ -124,7 +124,7 @@ class LargeGuarded(GuardedController):
         expected = self.expected().mean_px
         errors = self._errors_to_use(slopes_px, standard_error_px)
         slopes, variance, trust = without_prior(slopes_px, errors, expected, self.prior_std_px)
-        caused = self._of_line(_LEARNT, 1), self._of_line(_PLAIN, 1), self._of_line(_PLAIN, 0)
+        caused = self._of_acting(_LEARNT), self._of_acting(_PLAIN), self._of_latest(_PLAIN)
         open_loop, surprise = slopes - self._held, slopes - self._predicted
         self._frame = frame = _Frame(open_loop, surprise, self._noise_factor * variance, trust, *caused)
         if self._chosen == _LEARNT:
@@ -139,7 +139,7 @@ class LargeGuarded(GuardedController):
         if self._frame is not None or self._held_at != self.line.next_row or self.prior_std_px is not None:
             return ()
         if self._chosen == _PLAIN:
-            return self._reconstruct.parts(threads, scale, self._held - self._of_line(_PLAIN, 1))
+            return self._reconstruct.parts(threads, scale, self._held - self._of_acting(_PLAIN))
         return self._replies[self._level].parts(threads, scale, self._predicted)
 
     def _predict(self, frame: _Frame) -> None:
@@ -183,22 +183,30 @@ class LargeGuarded(GuardedController):
         """Compute the slopes that commands cause and, if the latest are new, the prediction."""
         lines, mirror = self._lines, self.line
         commands = [line.latest for line in lines] if is_new else []
-        same = [np.array_equal(line.acting, mirror.acting) for line in lines]
-        if not any(same):
+        followed = next(
+            (k for k, line in enumerate(lines) if np.array_equal(line.acting, mirror.acting)), None
+        )
+        if followed is None:
             commands.append(mirror.acting)
-        all_caused = self._product.several(*commands) if commands else np.zeros((0, 0))
+        new_slopes = self._product.several(*commands) if commands else np.zeros((0, 0))
         if is_new:
-            for caused, line, newest in zip(self._caused, lines, all_caused, strict=False):
+            for caused, line, newest in zip(self._caused, lines, new_slopes, strict=False):
                 caused[slice(None) if self._restarted else line.next_row - 1] = newest
             self._restarted = False
             self._mean = self._predictor.mean_px
-            open_loop = self._predictor.ahead(lines[_LEARNT].delay_frames) + self._of_line(_LEARNT, 0)
+            open_loop = self._predictor.ahead(lines[_LEARNT].delay_frames) + self._of_latest(_LEARNT)
             self._if_as_predicted = lines[_LEARNT].latest - self._clean(open_loop)
-        self._held = self._of_line(same.index(True), 1) if any(same) else all_caused[-1]
+        # Those of the mirror's own commands are the last, after those of both lines.
+        self._held = new_slopes[-1] if followed is None else self._of_acting(followed)
         self._held_at, self._predicted = mirror.next_row, self._held + self._mean
 
-    def _of_line(self, line: int, acting: int) -> Floats:
-        """Return the slopes that the latest command of a line causes, or the one that acts in this frame."""
+    def _of_latest(self, line: int) -> Floats:
+        """Return the slopes that the latest command of a line causes."""
+        slopes: Floats = self._caused[line, self._lines[line].next_row - 1]
+        return slopes
+
+    def _of_acting(self, line: int) -> Floats:
+        """Return the slopes that the command of a line that acts in this frame causes."""
         rows = self._caused[line]
-        slopes: Floats = rows[(self._lines[line].next_row + (2 * acting - 1)) % len(rows)]
+        slopes: Floats = rows[(self._lines[line].next_row + 1) % len(rows)]
         return slopes

@@ -239,28 +239,17 @@ def _checked(name: str, value: object, low: float, low_open: bool = False) -> _V
     return numbers_between(name, value, low, _LARGEST, low_open=low_open)[()]
 
 
-def _sensor(
-    flux_e: ArrayLike,
-    read_noise_e: ArrayLike,
-    *,
-    pixels: ArrayLike,
-    spot_fwhm_px: ArrayLike,
-    elongation: ArrayLike = 1.0,
-    excess_noise: ArrayLike = 1.0,
-    background_e: ArrayLike = 0.0,
-    position_range_px: ArrayLike = 1.0,
-    profile: str = "diffraction",
-) -> _Sensor:
+def _sensor(flux_e: ArrayLike, read_noise_e: ArrayLike, **conditions: Unpack[Conditions]) -> _Sensor:
     """Check the arguments and convert them to electrons and pixels."""
-    one_of("profile", profile, PROFILES)
+    profile = one_of("profile", conditions.get("profile", PROFILES[0]), PROFILES)
     flux = _checked("flux_e", flux_e, 0.0)
     read_noise = _checked("read_noise_e", read_noise_e, 0.0)
-    n_pixels = np.rint(_checked("pixels", pixels, 4))
-    fwhm = _checked("spot_fwhm_px", spot_fwhm_px, SMALLEST_FWHM_PX)
-    excess = _checked("excess_noise", excess_noise, 1.0)
-    background = _checked("background_e", background_e, 0.0)
-    range_px = _checked("position_range_px", position_range_px, 0.0, low_open=True)
-    long_axis = _checked("elongation", elongation, 1.0)
+    n_pixels = np.rint(_checked("pixels", conditions["pixels"], 4))
+    fwhm = _checked("spot_fwhm_px", conditions["spot_fwhm_px"], SMALLEST_FWHM_PX)
+    excess = _checked("excess_noise", conditions.get("excess_noise", 1.0), 1.0)
+    background = _checked("background_e", conditions.get("background_e", 0.0), 0.0)
+    range_px = _checked("position_range_px", conditions.get("position_range_px", 1.0), 0.0, low_open=True)
+    long_axis = _checked("elongation", conditions.get("elongation", 1.0), 1.0)
     given = (flux, read_noise, n_pixels, fwhm, excess, background, range_px, long_axis)
     if any(np.ndim(value) for value in given):
         try:

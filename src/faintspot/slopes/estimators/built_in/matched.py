@@ -63,10 +63,10 @@ class Matched(Fitted):
 
     def prepared(self, sensor: Sensor) -> PSFPlan:
         """See `Estimator`."""
-        return _Plan(self, sensor)
+        return _MatchedPlan(self, sensor)
 
 
-class _Plan(PSFPlan):
+class _MatchedPlan(PSFPlan):
     """Weights that differ only by the read noise, so that the filter stays linear in the image."""
 
     def fill(self, table: NDArray[np.float32]) -> None:

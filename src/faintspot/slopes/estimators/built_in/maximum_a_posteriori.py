@@ -73,10 +73,10 @@ class MaximumAPosteriori(Likelihood):
 
     def prepared(self, sensor: Sensor) -> LikelihoodPlan:
         """See `Estimator`."""
-        return _Plan(self, sensor)
+        return _MaximumAPosterioriPlan(self, sensor)
 
 
-class _Plan(LikelihoodPlan):
+class _MaximumAPosterioriPlan(LikelihoodPlan):
     """Tables of the fit and of the posterior for each level of flux."""
 
     kernel = staticmethod(spot_fits.posterior_of_groups)

@@ -80,10 +80,10 @@ class Smoothed(KeepingBrightest):
 
     def prepared(self, sensor: Sensor) -> GravityPlan:
         """See `Estimator`."""
-        return _Plan(self, sensor)
+        return _SmoothedPlan(self, sensor)
 
 
-class _Plan(GravityPlan):
+class _SmoothedPlan(GravityPlan):
     """Tables of a smoothing followed by a centre of gravity."""
 
     @cached_property

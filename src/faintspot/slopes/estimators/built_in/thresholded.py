@@ -60,10 +60,10 @@ class Thresholded(Centroid):
 
     def prepared(self, sensor: Sensor) -> GravityPlan:
         """See `Estimator`."""
-        return _Plan(self, sensor)
+        return _ThresholdedPlan(self, sensor)
 
 
-class _Plan(GravityPlan):
+class _ThresholdedPlan(GravityPlan):
     """Thresholds of a centre of gravity."""
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:

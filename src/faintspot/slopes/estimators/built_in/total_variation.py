@@ -164,10 +164,10 @@ class TotalVariation(KeepingBrightest):
 
     def prepared(self, sensor: Sensor) -> GravityPlan:
         """See `Estimator`."""
-        return _Plan(self, sensor)
+        return _TotalVariationPlan(self, sensor)
 
 
-class _Plan(GravityPlan):
+class _TotalVariationPlan(GravityPlan):
     """Strengths, and the starting point of the denoising."""
 
     estimator: TotalVariation

@@ -58,10 +58,10 @@ class Weighted(Stepping):
 
     def prepared(self, sensor: Sensor) -> SpotPlan:
         """See `Estimator`."""
-        return _Plan(self, sensor)
+        return _WeightedPlan(self, sensor)
 
 
-class _Plan(SpotPlan):
+class _WeightedPlan(SpotPlan):
     """Profiles of the weights."""
 
     kernel = staticmethod(spot_fits.weighted_of_groups)

@@ -113,10 +113,10 @@ class Window(Estimator):
 
     def prepared(self, sensor: Sensor) -> EstimatorPlan:
         """See `Estimator`."""
-        return _Plan(self, sensor)
+        return _WindowPlan(self, sensor)
 
 
-class _Plan(EstimatorPlan):
+class _WindowPlan(EstimatorPlan):
     """Weights of each sub-aperture and the tables derived from them."""
 
     setting_rows = window.SETTING_ROWS
