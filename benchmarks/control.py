@@ -25,8 +25,7 @@ from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import CompiledIntegrator
 from faintspot.loop.control.identification.learning import learn_controller
-from faintspot.loop.control.identification.models import LoopPlant
-from faintspot.loop.control.identification.models.kalman import Kalman
+from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.identification.predictive_control import LoopOfControl, PredictiveControl
 from faintspot.loop.control.identification.relearning import relearn
 from faintspot.loop.control.kalman.compiled import CompiledKalman
@@ -250,9 +249,9 @@ def learning_table() -> Table:
     rate_hz = configuration.control.frame_rate_hz
     _, telemetry = case.observed(partial(plant.integrator, TELEMETRY_GAIN), *_LEARNING)
     first, rest = telemetry.part(0, _LEARNT), telemetry.part(_LEARNT, None)
-    learn_controller(Kalman, plant, first.part(0, _LEARNT // 8), site, rate_hz)  # compile
+    learn_controller(plant, first.part(0, _LEARNT // 8), site, rate_hz)  # compile
     begun = time.process_time()
-    learnt = learn_controller(Kalman, plant, first, site, rate_hz)
+    learnt = learn_controller(plant, first, site, rate_hz)
     cold = time.process_time()
     found = relearn(plant, learnt, rest, site, rate_hz, learnt.identified)
     warm = time.process_time()

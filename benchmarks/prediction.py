@@ -24,8 +24,7 @@ from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.base import LEARNT, Controller, ExpectedSlopes
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.learning import GAINS, learn_controller
-from faintspot.loop.control.identification.models import ControlModel, LoopPlant
-from faintspot.loop.control.identification.models.kalman import Kalman
+from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.phase import residual_phase
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
@@ -160,9 +159,9 @@ class Case:
             run.step(controller)
         return float(run.strehl[SETTLE:].mean()), run.telemetry(SETTLE, frames)
 
-    def learnt(self, telemetry: OpenLoopTelemetry, winds: str = LEARNT) -> ControlModel:
+    def learnt(self, telemetry: OpenLoopTelemetry, winds: str = LEARNT) -> Kalman:
         """Return our filter."""
-        return learn_controller(Kalman, self.plant, telemetry, self.site, self.rate_hz, winds)
+        return learn_controller(self.plant, telemetry, self.site, self.rate_hz, winds)
 
     def telemetry(self) -> tuple[OpenLoopTelemetry, OpenLoopTelemetry]:
         """Return telemetry with an integrator, to learn from and to tune with."""

@@ -26,8 +26,9 @@ from benchmarks.realtime_processes import engine_and_telescope
 from faintspot import Calibration, Layout, Settings, SlopePipeline
 from faintspot.engine.engine import Engine
 from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.loop.control.base import CONTROLS
 from faintspot.loop.control.configuration import Control, ControlOptions, load_control
-from faintspot.loop.control.identification.models import CONTROLS, MODELS
+from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.kalman.slope_model import SlopeModel
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.control import slope_turbulence
@@ -62,7 +63,7 @@ def _latency() -> Table:
         },
     }
     for kind, arrays in learnt.items():
-        known = MODELS[kind](arrays, 0.3, 1.0, (1.0, 2.0), np.zeros_like(interaction.T))
+        known = Kalman(arrays, 0.3, 1.0, (1.0, 2.0), np.zeros_like(interaction.T))
         control = Control(interaction, None, ControlOptions(controller=kind), known)
         rows.append(_row(CONTROLS[kind], layout, control, TARGETS_US[1]))
     return Table("realtime-commands", "From slopes to commands, us", rows)

@@ -20,8 +20,7 @@ from benchmarks.prediction import Make, rivals
 from faintspot.base.statistics import mean_by_blocks
 from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.models import LoopPlant
-from faintspot.loop.control.identification.models.kalman import Kalman
+from faintspot.loop.control.identification.model import LoopPlant
 from faintspot.loop.control.identification.open_loop import open_loop_of, site_of_loop
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.replay import replayed_frames
@@ -65,7 +64,7 @@ def _replayed(delay: int) -> Table:
     if importlib.util.find_spec("pyrtc"):
         earlier = first.part(0, half - TUNED_FRAMES)
         makes["least_squares"] = best(list(rivals("least_squares", plant, earlier)))
-    learnt = learn_controller(Kalman, plant, first, site, RATE_HZ)
+    learnt = learn_controller(plant, first, site, RATE_HZ)
     makes["learnt"] = partial(learnt.controller, plant)
     makes["learnt, guarded"] = partial(learnt.guarded, plant)
     left = {"as it ran": np.square(seen.residual[half:]).sum(axis=1)}

@@ -17,7 +17,7 @@ from faintspot.base.statistics import paired_mean
 from faintspot.engine.loop.successor import ControllerSuccessor, PreparedController
 from faintspot.loop.control.base import ASSUMED, WINDS, Controller
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.models import ControlModel
+from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.relearning import RelearntControl, relearn
 from faintspot.loop.control.kalman.choice import HANDOVER_FRAMES
 
@@ -85,7 +85,7 @@ class Drifted(NamedTuple):
     """Largest rms change of commands from frame to frame: at a handover, and otherwise."""
 
 
-def drifting(case: Case, learnt: ControlModel, realisation: int) -> Drifted:
+def drifting(case: Case, learnt: Kalman, realisation: int) -> Drifted:
     """Simulate a run; filters are learnt and handed over as beside an engine."""
     every, later = (round(each * case.rate_hz) for each in (LEARN_EVERY_S, LEARNING_TAKES_S))
     run = Run(case, realisation, round(DRIFT_S * case.rate_hz))

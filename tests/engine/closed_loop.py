@@ -20,8 +20,8 @@ from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope.simulated_telescope import TRUTH, SimulatedTelescope
+from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.control.configuration import Control, load_control
-from faintspot.loop.control.identification.models import INTEGRATOR
 from faintspot.loop.simulation.engine_files import write_engine_files
 from faintspot.slopes.pipeline import configuration as configuration_file
 

@@ -21,8 +21,7 @@ from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.loop.control.base import ASSUMED, SETTLE_FRAMES
 from faintspot.loop.control.configuration import Control, ControlOptions, save_control
 from faintspot.loop.control.identification.learning import learn_controller
-from faintspot.loop.control.identification.models import ControlModel, LoopPlant
-from faintspot.loop.control.identification.models.kalman import Kalman
+from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.identification.relearning import RelearntControl
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.slopes.pipeline import configuration as configuration_file
@@ -37,12 +36,12 @@ OPTIONS = ControlOptions(controller="kalman")
 
 
 @pytest.fixture(scope="module")
-def model() -> ControlModel:
+def model() -> Kalman:
     frames = telemetry(500, NOISE_PX, seed=9, model=LAYERS)
-    return learn_controller(Kalman, PLANT, frames, TURBULENCE, 1 / FRAME_S, ASSUMED)
+    return learn_controller(PLANT, frames, TURBULENCE, 1 / FRAME_S, ASSUMED)
 
 
-def outdated(model: ControlModel) -> ControlModel:
+def outdated(model: Kalman) -> Kalman:
     """Return the model of slopes that are forgotten from frame to frame."""
     arrays = {**model.arrays, "first": 0.1 * model.arrays["first"], "second": 0.0 * model.arrays["second"]}
     return Kalman(arrays, 0.4, 1.0, model.left, model.phase_of_commands)
@@ -52,7 +51,7 @@ class Run:
     """A loop on known open-loop slopes, whose records go into telemetry."""
 
     def __init__(
-        self, name: str, model: ControlModel, centroid_gain: float = 1.0, records: int | None = None
+        self, name: str, model: Kalman, centroid_gain: float = 1.0, records: int | None = None
     ) -> None:
         self._gain = centroid_gain
         self.loop = ControlLoop(Control(INTERACTION, None, OPTIONS, model), LAYOUT)
@@ -83,7 +82,7 @@ def engine_of(run: Run) -> Any:
     return SimpleNamespace(loop=run.loop, learning=None, estimators=None)
 
 
-def test_a_new_filter_goes_on_from_the_mirror(name: str, model: ControlModel) -> None:
+def test_a_new_filter_goes_on_from_the_mirror(name: str, model: Kalman) -> None:
     """No step is larger than those before; in the end commands are those of one that was always there."""
     run, other = Run(name, outdated(model)), Run(f"{name}_2", model)
     before, others = run.frames(100), other.frames(100 + SETTLE_FRAMES + 100)
@@ -112,7 +111,7 @@ def test_a_process_that_ends_before_the_engine_is_a_fault(engine_ends: bool) -> 
     assert faults == ([] if engine_ends else ["learn: killed"])
 
 
-def test_a_learnt_centroid_gain(name: str, model: ControlModel) -> None:
+def test_a_learnt_centroid_gain(name: str, model: Kalman) -> None:
     """Slopes are half as large: a filter that knows it sends the same commands, also after it took over."""
     knowing = replace(model, centroid_gain=0.5)
     other, run, late = Run(name, model), Run(f"{name}_2", knowing, 0.5), Run(f"{name}_3", model, 0.5)
@@ -133,13 +132,11 @@ def test_a_learnt_centroid_gain(name: str, model: ControlModel) -> None:
 
 
 def test_a_better_filter_is_handed_to_the_engine(
-    name: str, model: ControlModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, model: Kalman, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same is found twice, which is better than what runs only the first time."""
 
-    def relearnt(
-        plant: LoopPlant, running: ControlModel, frames: OpenLoopTelemetry, *_: Any
-    ) -> RelearntControl:
+    def relearnt(plant: LoopPlant, running: Kalman, frames: OpenLoopTelemetry, *_: Any) -> RelearntControl:
         found = frames.open_loop_px
         rows = [OPEN_LOOP[first : first + 298] for first in (2, 302)]
         assert any(np.allclose(found, slopes - slopes.mean(axis=0), atol=1e-3) for slopes in rows)
@@ -195,7 +192,7 @@ def test_a_process_that_dies_is_one_line(name: str, tmp_path: Path) -> None:
 
 
 def test_it_never_learns_across_records_that_were_lost(
-    name: str, model: ControlModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, model: Kalman, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Frames before and after a gap are no time series: what waits is forgotten, and it begins anew."""
     monkeypatch.setattr("faintspot.engine.background.learning.FEWEST_FRAMES", 90)

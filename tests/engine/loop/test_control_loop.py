@@ -15,11 +15,11 @@ from faintspot.base.errors import InputError
 from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.loop.control import slope_product
-from faintspot.loop.control.base import Controller
+from faintspot.loop.control.base import CONTROLS, INTEGRATOR, Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.configuration import Control, ControlOptions
 from faintspot.loop.control.identification.learning import learn_controller
-from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR, MODELS, ControlModel
+from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.integrator import Integrator
 from faintspot.slopes.kernels.driver.products import add_slopes
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
@@ -46,8 +46,8 @@ class PlainControl(Control):
 
 
 @cache
-def learnt(kind: str) -> ControlModel:
-    return learn_controller(MODELS[kind], PLANT, telemetry(200, 0.3), TURBULENCE, 1 / FRAME_S)
+def learnt() -> Kalman:
+    return learn_controller(PLANT, telemetry(200, 0.3), TURBULENCE, 1 / FRAME_S)
 
 
 def scaled(draw: Any, array: np.ndarray) -> np.ndarray:
@@ -72,11 +72,11 @@ def controls(draw: Any) -> Control:
     kind = draw(st.sampled_from(list(CONTROLS)))
     model = None
     if kind != INTEGRATOR:
-        own = learnt(kind)
+        own = learnt()
         arrays = {name: scaled(draw, array) for name, array in own.arrays.items()}
         gain, factor = (draw(st.sampled_from([usual] * 20 + [*EXTREMES])) for usual in (0.4, 1.0))
         left = draw(st.sampled_from([(1.0, 2.0), (2.0, 1.0)]))
-        model = MODELS[kind](arrays, gain, factor, left, scaled(draw, own.phase_of_commands))
+        model = Kalman(arrays, gain, factor, left, scaled(draw, own.phase_of_commands))
     options = {
         "controller": kind,
         "gain": draw(st.sampled_from([0.4, 0.0, 2.0])),

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from faintspot.loop.control.identification.models import LoopPlant
+from faintspot.loop.control.identification.model import LoopPlant
 from faintspot.loop.control.kalman.slope_model import SlopeModel
 from faintspot.loop.control.phase import phase_of_commands
 from faintspot.loop.control.reconstructor import make_reconstructor

@@ -5,7 +5,7 @@ from tests.loop.control.control_cases import TURBULENCE, telemetry
 
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.models import LoopPlant
+from faintspot.loop.control.identification.model import LoopPlant
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 from faintspot.loop.control.kalman.slope_model import SlopeModel

@@ -7,8 +7,8 @@ from tests.experiments.experiment_cases import small
 import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, NOISE_SCALE, method_kind
+from faintspot.loop.control.base import CONTROLS, INTEGRATOR
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR
 from faintspot.loop.control.identification.open_loop import open_loop_of
 from faintspot.loop.simulation import LoopConfiguration, Method, simulate_loop
 from faintspot.loop.simulation.control import learnt_control, recorded_loop

@@ -175,4 +175,3 @@ def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     control = load_control(path)
     assert control is not None
     assert (control.options.controller, control.prediction) == ("kalman", "controller")
-    assert control.model.kind == "kalman"

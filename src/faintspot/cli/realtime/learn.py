@@ -86,10 +86,9 @@ def _learn_from(store: Path, config: str, winds: str, layers: tuple[tuple[float,
     """Learn from a recording."""
     from faintspot.base.validity import leave_out
     from faintspot.io import read_telemetry
-    from faintspot.loop.control.base import ASSUMED
+    from faintspot.loop.control.base import ASSUMED, KALMAN
     from faintspot.loop.control.configuration import load_control, prior_std_px, save_control
     from faintspot.loop.control.identification.learning import learn_controller
-    from faintspot.loop.control.identification.models.kalman import Kalman
     from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
     from faintspot.loop.telemetry.recording import recorded_loop, site_of
     from faintspot.slopes.pipeline.configuration import Configuration
@@ -105,10 +104,10 @@ def _learn_from(store: Path, config: str, winds: str, layers: tuple[tuple[float,
     telemetry, rate_hz = open_loop_of(loop, delay).telemetry, loop.frame_rate_hz
     known = site_of(layout, layers), rate_hz, ASSUMED if layers else winds
     with progress_bar("Filter", "steps") as show:
-        learnt = learn_controller(Kalman, control.plant, telemetry, *known, progress=show)
+        learnt = learn_controller(control.plant, telemetry, *known, progress=show)
     path = derived(config, ".model.npz")
     replace(learnt, centroid_gain=delay.gain).save(path)
-    save_control(config, controller=Kalman.kind, model=path.name)
+    save_control(config, controller=KALMAN, model=path.name)
     left, left_out = learnt.left, leave_out(recording.flags)[1]
     if left_out:
         click.echo(left_out)

@@ -161,10 +161,10 @@ def run(
 
 def _learning(engine: Engine, config: str) -> AbstractContextManager[None]:
     """The process that learns for the engine, as a context, if it can learn and shall."""
-    from faintspot.loop.control.identification.models import predicts
+    from faintspot.loop.control.base import KALMAN
 
     options = None if engine.loop is None else engine.loop.control.options
-    if options is None or not predicts(options.controller) or not options.learn_every_s:
+    if options is None or options.controller != KALMAN or not options.learn_every_s:
         return nullcontext()
     from faintspot.engine.background.learning import background_learning
 

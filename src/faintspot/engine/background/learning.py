@@ -20,8 +20,8 @@ from faintspot.engine.background.background_process import BackgroundProcess, ba
 from faintspot.engine.engine import Engine
 from faintspot.engine.requests.requests import request
 from faintspot.io.telemetry.recording import Telemetry, stored_names
+from faintspot.loop.control.base import KALMAN
 from faintspot.loop.control.configuration import Control, load_control, prior_std_px
-from faintspot.loop.control.identification.models import predicts
 from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
 from faintspot.loop.control.identification.relearning import FEWEST_FRAMES, RelearntControl, relearn
 from faintspot.loop.telemetry.recording import CLOSED, recorded_loop, site_of
@@ -56,7 +56,7 @@ class BackgroundLearning(BackgroundProcess):
     def __init__(self, name: str, config: str | Path, every_s: float) -> None:
         described = Configuration(config)
         control = load_control(described)
-        if control is None or not predicts(control.options.controller):
+        if control is None or control.options.controller != KALMAN:
             raise InputError(f'{config}: expected controller = "kalman" in [control], to learn it again')
         self._control: Control = control
         self._site, self._layout = site_of(described.layout), described.layout

@@ -15,11 +15,11 @@ from faintspot.engine.loop.guard import Guard
 from faintspot.engine.loop.successor import ControllerSuccessor, PreparedController
 from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.timing import Latencies
-from faintspot.loop.control.base import Controller
+from faintspot.loop.control.base import KALMAN, Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import MEAN_SQUARE, true_slopes
 from faintspot.loop.control.configuration import Control
-from faintspot.loop.control.identification.models import ControlModel
+from faintspot.loop.control.identification.model import Kalman
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.kernels.driver.products import ProductPart
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
@@ -261,7 +261,7 @@ class ControlLoop:
             return
         self._ready[kind] = _prepared(self.control.with_controller(kind))
 
-    def renew(self, model: ControlModel) -> None:
+    def renew(self, model: Kalman) -> None:
         """Replace the model of a learnt controller.
 
         While the loop is closed, a new filter first follows it, see `ControllerSuccessor`.
@@ -275,7 +275,7 @@ class ControlLoop:
         if ready.controller.is_guarded:
             self._successor = ControllerSuccessor(ready)
         else:
-            self._ready[model.kind] = ready
+            self._ready[KALMAN] = ready
         self.control = replace(self.control, model=model)
 
     @property

@@ -24,9 +24,8 @@ from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope.simulated_telescope import TRUTH
+from faintspot.loop.control.base import INTEGRATOR, KALMAN
 from faintspot.loop.control.configuration import CONTROLLER, save_control
-from faintspot.loop.control.identification.models import INTEGRATOR
-from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
 from faintspot.loop.simulation.engine_files import fixed_window, write_engine_files
 from faintspot.loop.simulation.methods import Method
@@ -107,7 +106,7 @@ class LiveDemonstration:
         return {
             "brightest": f"brightest+{INTEGRATOR}",
             "window": f"estimator=window+{options}+{INTEGRATOR}",
-            f"map+{Kalman.kind}": f"map+{Kalman.kind}",
+            f"map+{KALMAN}": f"map+{KALMAN}",
         }
 
     def write_files(self) -> tuple[Path, Path]:
@@ -130,7 +129,7 @@ class LiveDemonstration:
         settings = Settings("map", prior_std_px=_PRIOR_PX, flux_e=self.photons)
         engine = self.folder / "faintspot.toml"
         save(engine, settings)
-        write_engine_files(observed, self.folder, Kalman.kind)
+        write_engine_files(observed, self.folder, KALMAN)
         save_control(engine, gain=_GAIN, centroid_gain=1.0, prediction=CONTROLLER)
         return loop, engine
 

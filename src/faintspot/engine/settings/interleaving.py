@@ -10,7 +10,7 @@ from faintspot.base.checks import number_between
 from faintspot.base.config.written_changes import parse_changes
 from faintspot.base.errors import InputError
 from faintspot.engine.settings.running_settings import check_names
-from faintspot.loop.control.identification.models import CONTROLS
+from faintspot.loop.control.base import CONTROLS
 from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.pipeline.settings import Settings, without_denoising
 

@@ -12,8 +12,7 @@ from faintspot.base.checks import one_of
 from faintspot.base.config.options import AUTO, Option
 from faintspot.base.errors import InputError
 from faintspot.experiments.methods import Choice
-from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR, predicts
-from faintspot.loop.control.identification.models.kalman import Kalman
+from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED
 from faintspot.loop.simulation.methods import PRIOR, Method
@@ -98,7 +97,7 @@ class MethodKind:
     @property
     def name(self) -> str:
         """Name in commands and results."""
-        implied = [_PREDICTED] if predicts(self.control) else []
+        implied = [_PREDICTED] if self.control == KALMAN else []
         variants = [variant for variant in self.variants if variant not in implied]
         slopes = "".join([self.estimator.name, *variants])
         return slopes if self.control == INTEGRATOR else f"{slopes}{CONTROL_SIGN}{self.control}"
@@ -125,14 +124,14 @@ class MethodKind:
         if PRIOR in declared:
             reach = configuration.position_range_px(predicted=_PREDICTED in self.variants)
             options[PRIOR] = [part * reach for part in _PRIORS]
-        if predicts(self.control):
+        if self.control == KALMAN:
             options.pop(PRIOR, None)  # the filter knows it
         if _FILTER in self.variants:
             options = {}  # the spots determine it
         tuned = {LOOP_GAIN: Tunable(_LOOP_GAINS, _FIRST_LOOP_GAINS)}
         if self.control != INTEGRATOR:
             tuned[LOOP_GAIN] = Tunable(_TELEMETRY_GAINS, _FIRST_TELEMETRY_GAINS)
-        if predicts(self.control) and self.estimator.takes_prior:
+        if self.control == KALMAN and self.estimator.takes_prior:
             tuned[NOISE_SCALE] = Tunable(_NOISE_SCALES, _FIRST_NOISE_SCALES)
         for number, (name, values) in enumerate(options.items()):
             tuned[name] = _spread(values, _FIRST_VALUES[min(number, len(_FIRST_VALUES) - 1)])
@@ -208,7 +207,7 @@ def method_kind(name: str) -> MethodKind:
         raise InputError(f"method = {name!r}: expected an estimator that takes a prior, {base!r} takes none")
     if _FILTER in variants and estimator is not Window:
         raise InputError(f"method = {name!r}: expected estimator {Window.name!r} for {_FILTER!r}")
-    if predicts(control) and estimator.takes_prior:
+    if control == KALMAN and estimator.takes_prior:
         variants.add(_PREDICTED)
     return MethodKind(estimator, tuple(variant for variant in VARIANTS if variant in variants), control)
 
@@ -234,7 +233,7 @@ def default_methods(configuration: LoopConfiguration) -> list[str]:
         if configuration.control.mode != CLOSED and not kind.needs:
             names.append(f"{name}_uncorrected")
     kalman = [Window.name, MaximumAPosteriori.name] if configuration.control.mode == CLOSED else []
-    return names + [f"{name}{CONTROL_SIGN}{Kalman.kind}" for name in kalman]
+    return names + [f"{name}{CONTROL_SIGN}{KALMAN}" for name in kalman]
 
 
 def _wider(values: Sequence[Any], option: Option) -> Sequence[Any]:

@@ -17,7 +17,7 @@ from faintspot.base.json_text import parse_json, to_json
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, MethodKind, Tunable
 from faintspot.experiments.methods import Choice
 from faintspot.experiments.running import Advance
-from faintspot.loop.control.identification.models import INTEGRATOR
+from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.simulation import simulate_loop
 

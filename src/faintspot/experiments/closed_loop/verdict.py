@@ -22,7 +22,7 @@ from faintspot.experiments.closed_loop.results import (
 )
 from faintspot.experiments.closed_loop.tables import budget_table, in_columns, strehl_table
 from faintspot.experiments.methods import Knowledge
-from faintspot.loop.control.identification.models import INTEGRATOR
+from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.files import BUDGET_FILE, MAGNITUDE_FILE
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation

@@ -15,7 +15,7 @@ from faintspot.base.config.options import LIST, TEXTS, Options, number, setting
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, MethodKind, method_kind
 from faintspot.experiments.methods import Choice
-from faintspot.loop.control.identification.models import INTEGRATOR
+from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.toml_files import parse_text
 from faintspot.io.telemetry.recording import Telemetry
+from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN
 from faintspot.loop.control.configuration import ControlOptions
-from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR, predicts
 from faintspot.loop.control.recorded import RecordedControl
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.slopes.estimators.registry import estimators
@@ -60,7 +60,7 @@ class RecordedMethods:
         predicted = [
             label
             for label, (part, kind) in zip(labels, parts, strict=True)
-            if predicts(kind) and _takes_prior(part, usual)
+            if kind == KALMAN and _takes_prior(part, usual)
         ]
         gains = [
             change["changes"][_GAIN]

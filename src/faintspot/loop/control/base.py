@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+INTEGRATOR, KALMAN = "integrator", "kalman"
+CONTROLS = {INTEGRATOR: "integrator with one gain", KALMAN: "predictive Kalman filter"}
+"""Kinds of control and their names in reports; only the Kalman filter learns and predicts slopes."""
+
 LEARNT, ASSUMED, NONE = "learnt", "assumed", "none"
 WINDS = LEARNT, ASSUMED, NONE
 """Winds of a predictive model: found in telemetry, given, or from all directions alike."""

@@ -16,17 +16,10 @@ from faintspot.base.config.options import Options, setting
 from faintspot.base.config.tables import Tables, save_tables
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.toml_files import check_keys
-from faintspot.loop.control.base import Controller
+from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.compiled import CompiledIntegrator
-from faintspot.loop.control.identification.models import (
-    CONTROLS,
-    INTEGRATOR,
-    MODELS,
-    ControlModel,
-    LoopPlant,
-    predicts,
-)
+from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.loop.control.removed_modes import REMOVED_MODES, TIP_TILT_FOCUS, RemovedModes
 from faintspot.slopes.camera.calibration import Calibration
@@ -157,7 +150,7 @@ class Control:
         Reference slopes [px] from each sub-aperture's centre. Default: 0.
     options : ControlOptions
     model : path, optional
-        Learnt model of the controller, a file written by `ControlModel.save`. The integrator ignores it.
+        Learnt model of the controller, a file written by `Kalman.save`. The integrator ignores it.
     positions : (n, 2) array, optional
         x and y of the sub-apertures in any unit, if focus is removed from the slopes.
 
@@ -205,7 +198,7 @@ class Control:
                 name="removed_modes",
                 value=self.removed_modes.name,
             )
-        if predicts(kind) and self.options.prediction == STREAM:
+        if kind == KALMAN and self.options.prediction == STREAM:
             raise InputError(
                 'expected "controller", as a Kalman filter predicts itself', name="prediction", value=STREAM
             )
@@ -214,11 +207,8 @@ class Control:
         if self.model is None:
             raise InputError(f"expected a file with the model of {CONTROLS[kind]}, got none", name=MODEL)
         model = self.model
-        if not isinstance(model, ControlModel):
-            model = ControlModel.load(model, self.plant)
-        if model.kind != kind:
-            got = repr(model.kind)
-            raise InputError(f"expected a model of controller {kind!r}, got one of {got}", name=MODEL)
+        if not isinstance(model, Kalman):
+            model = Kalman.load(model, self.plant)
         model.check(self.plant)
         return model
 
@@ -252,7 +242,7 @@ class Control:
     @property
     def prediction(self) -> str:
         """Source of predictions: NONE, CONTROLLER or STREAM."""
-        usual = CONTROLLER if predicts(self.options.controller) else NONE
+        usual = CONTROLLER if self.options.controller == KALMAN else NONE
         return self.options.prediction or usual
 
     def with_controller(self, kind: str) -> Control:
@@ -267,7 +257,7 @@ class Control:
             return self
         return replace(self, options=self.options.replaced({"controller": kind}))
 
-    def with_model(self, model: ControlModel) -> Control:
+    def with_model(self, model: Kalman) -> Control:
         """Return the same configuration with a learnt controller.
 
         Raises
@@ -275,7 +265,7 @@ class Control:
         InputError
             If the model belongs to another loop.
         """
-        return replace(self, options=self.options.replaced({"controller": model.kind}), model=model)
+        return replace(self, options=self.options.replaced({"controller": KALMAN}), model=model)
 
     @property
     def commands(self) -> int:
@@ -312,7 +302,7 @@ class Control:
             It says what is missing.
         """
         kind = kind or self.options.controller
-        if kind in MODELS and calibration.read_noise_photoelectrons is None:
+        if kind == KALMAN and calibration.read_noise_photoelectrons is None:
             raise InputError(
                 f"{TABLE}.controller = {kind!r}: expected standard errors of the slopes, which need the "
                 "camera's read noise: calibration.read_noise_e"

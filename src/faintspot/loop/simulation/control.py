@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.base import Controller
+from faintspot.loop.control.base import INTEGRATOR, Controller
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.models import INTEGRATOR, MODELS, ControlModel, LoopPlant
+from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.identification.open_loop import measured_delay, open_loop_of
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import Integrator
@@ -43,7 +43,7 @@ def make_controller(
     configuration: LoopConfiguration,
     optics: LoopOptics,
     method: Method,
-    learnt: ControlModel | None,
+    learnt: Kalman | None,
     line: CommandDelayLine,
 ) -> Controller:
     """Return the controller of a method, which sends its commands to `line`."""
@@ -64,7 +64,7 @@ def make_controller(
 
 def learnt_control(
     configuration: LoopConfiguration, method: Method, seed: int, simulate: Simulate
-) -> tuple[Method, ControlModel | None]:
+) -> tuple[Method, Kalman | None]:
     """Return the learnt controller of a method (None for the integrator), and the adapted method.
 
     The prior of an estimator that has one becomes as wide as the control is sure.
@@ -89,12 +89,11 @@ def learnt_control(
     learnt = _learnt(
         replace(configuration, name="-", run=RunLength()),
         _TelemetryMethod.of(method),
-        method.control,
         method.noise_scale,
         seed,
         simulate,
     )
-    if learnt.expected_std_px is not None and _has_prior(method):
+    if _has_prior(method):
         std = np.sqrt(np.square(learnt.expected_std_px).reshape(2, -1).mean(axis=0))
         method = _with_prior(method, std)
     return method, learnt
@@ -151,20 +150,19 @@ class _TelemetryMethod:
 def _learnt(
     configuration: LoopConfiguration,
     method: _TelemetryMethod,
-    kind: str,
     noise_scale: float,
     seed: int,
     simulate: Simulate,
-) -> ControlModel:
+) -> Kalman:
     from faintspot.loop.simulation.telescope.model import prepare
 
     if noise_scale != 1.0:  # learning takes long
-        return _learnt(configuration, method, kind, 1.0, seed, simulate).with_noise(noise_scale)
+        return _learnt(configuration, method, 1.0, seed, simulate).with_noise(noise_scale)
     optics, control = prepare(configuration), configuration.control
     telemetry, gain = _telemetry(_without_assumed(configuration), method, seed, simulate)
     site = slope_turbulence(configuration, optics.sensor.layout.cells)
     known = site, control.frame_rate_hz, control.winds
-    learnt = learn_controller(MODELS[kind], _plant(configuration, optics), telemetry, *known)
+    learnt = learn_controller(_plant(configuration, optics), telemetry, *known)
     return replace(learnt, centroid_gain=gain)
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
+from faintspot.loop.control.base import INTEGRATOR, KALMAN
 from faintspot.loop.control.configuration import TABLE, save_control
-from faintspot.loop.control.identification.models import INTEGRATOR, predicts
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.control import learnt_control
 from faintspot.loop.simulation.methods import PRIOR, Method
@@ -50,7 +50,7 @@ def write_engine_files(
     folder : path
         Made where there is none.
     control : str
-        Kind of control, see `control.identification.models.CONTROLS`. All but the integrator learn from
+        Kind of control, see `control.base.CONTROLS`. All but the integrator learn from
         telemetry of the simulated loop, in other turbulence, which takes up to a minute: control_model.npz.
 
     Returns
@@ -110,7 +110,7 @@ def fixed_window(configuration: LoopConfiguration, **options: object) -> Setting
 
 def _method(settings: Settings, psf: PSF, score: FixedWeights | None, control: str) -> Method:
     """Return the method of the simulated loop that equals the engine's."""
-    with_prior = predicts(control) and settings.estimator.takes_prior
+    with_prior = control == KALMAN and settings.estimator.takes_prior
     if with_prior and PRIOR in settings.declared() and getattr(settings, PRIOR) is None:
         anything: dict[str, Any] = {PRIOR: 1.0}  # it becomes what the filter is sure of
         settings = settings.replace(**anything)

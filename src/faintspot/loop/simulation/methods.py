@@ -8,7 +8,7 @@ from typing import Any
 
 from faintspot.base.config.options import REQUIRED, TEXT, Options, number, setting
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR
+from faintspot.loop.control.base import CONTROLS, INTEGRATOR
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.fixed_weights import FixedWeights
@@ -46,7 +46,7 @@ class Method(Options, table="method"):
     true_slopes : bool
         Whether slopes are the wavefront's true mean gradients instead of measured ones.
     control : str
-        What makes commands of the slopes, see `learning.CONTROLS`. All but the integrator
+        What makes commands of the slopes, see `control.base.CONTROLS`. All but the integrator
         learn from telemetry of a loop with the integrator, in other turbulence.
     noise_scale : float
         What control multiplies the variance of the slopes' noise by that telemetry shows.

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
+from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.models import INTEGRATOR, ControlModel
+from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED, RunLength
 from faintspot.loop.simulation.control import learnt_control, make_controller
@@ -183,7 +184,7 @@ class _Loop:
     def __init__(
         self,
         configuration: LoopConfiguration,
-        ready: Sequence[tuple[Method, ControlModel | None]],
+        ready: Sequence[tuple[Method, Kalman | None]],
         schedule: NDArray[np.int64],
         seed: int,
         realisation: int,

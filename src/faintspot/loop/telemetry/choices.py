@@ -24,8 +24,7 @@ from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.measured import Measured
-from faintspot.loop.control.identification.models import LoopPlant
-from faintspot.loop.control.identification.models.kalman import Kalman
+from faintspot.loop.control.identification.model import LoopPlant
 from faintspot.loop.control.identification.open_loop import OpenLoop
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.kalman.predictor import steady_covariance
@@ -124,7 +123,7 @@ def compared_choices(
     first = open_loop.telemetry.part(0, frames // 2)
     if len(open_loop.variance) <= _MOST_SLOPES:
         known = plant, first, site, loop.frame_rate_hz
-        learnt = learn_controller(Kalman, *known)
+        learnt = learn_controller(*known)
         choices.append(compare(BEST, *integrators([learnt.plain_gain]), gain=learnt.plain_gain))
         expected = math.nan
         if identified is not None:

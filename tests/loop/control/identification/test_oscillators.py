@@ -10,8 +10,7 @@ from tests.loop.control.driven import driven, oscillator
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.loop_delay import DelayFits
-from faintspot.loop.control.identification.models import LoopPlant
-from faintspot.loop.control.identification.models.kalman import Kalman
+from faintspot.loop.control.identification.model import LoopPlant
 from faintspot.loop.control.identification.open_loop import site_of_loop
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.reconstructor import make_reconstructor
@@ -41,7 +40,7 @@ def test_the_vibration_is_found_and_the_learnt_filter_beats_the_best_integrator(
         OpenLoopTelemetry(slopes, np.full(slopes.shape, _NOISE**2), np.ones(slopes.shape))
         for slopes in map(_seen, (2, 3))
     )
-    learnt = learn_controller(Kalman, plant, learning, _SITE, _RATE_HZ)
+    learnt = learn_controller(plant, learning, _SITE, _RATE_HZ)
     assert learnt.identified is not None
     assert learnt.identified.noise_factor == pytest.approx(1.0, rel=0.1)
     for mode in ("tip", "tilt"):

@@ -9,8 +9,7 @@ from faintspot.base.errors import InputError
 from faintspot.loop.control.base import ASSUMED
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.models import ControlModel
-from faintspot.loop.control.identification.models.kalman import Kalman
+from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.relearning import relearn
 
 RATE_HZ = 1 / FRAME_S
@@ -18,15 +17,13 @@ FRAMES = telemetry(1200, 0.3, model=LAYERS)
 
 
 @pytest.fixture(scope="module")
-def now() -> ControlModel:
+def now() -> Kalman:
     """Return a filter for the present turbulence, from other frames."""
-    return learn_controller(
-        Kalman, PLANT, telemetry(800, 0.3, seed=9, model=LAYERS), TURBULENCE, RATE_HZ, ASSUMED
-    )
+    return learn_controller(PLANT, telemetry(800, 0.3, seed=9, model=LAYERS), TURBULENCE, RATE_HZ, ASSUMED)
 
 
 @pytest.mark.slow
-def test_a_filter_for_other_turbulence_is_replaced(now: ControlModel) -> None:
+def test_a_filter_for_other_turbulence_is_replaced(now: Kalman) -> None:
     """The running filter takes slopes for nearly constant."""
     arrays = now.arrays
     slow = {**arrays, "first": 0.1 * arrays["first"], "second": 0.0 * arrays["second"]}
@@ -38,20 +35,20 @@ def test_a_filter_for_other_turbulence_is_replaced(now: ControlModel) -> None:
 
 
 @pytest.mark.slow
-def test_a_filter_that_is_as_good_stays(now: ControlModel) -> None:
+def test_a_filter_that_is_as_good_stays(now: Kalman) -> None:
     found = relearn(PLANT, now, FRAMES, TURBULENCE, RATE_HZ, now.identified)
     assert not found.is_better
     assert found.residual == pytest.approx(found.by_running, rel=0.05)
 
 
-def test_too_few_frames_are_refused(now: ControlModel) -> None:
+def test_too_few_frames_are_refused(now: Kalman) -> None:
     with pytest.raises(InputError, match="frames to judge a filter, got 300"):
         relearn(PLANT, now, FRAMES.part(0, 300), TURBULENCE, RATE_HZ)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("gain", "taken"), [(0.5, True), (0.97, False)])
-def test_another_centroid_gain_is_taken(now: ControlModel, gain: float, taken: bool) -> None:
+def test_another_centroid_gain_is_taken(now: Kalman, gain: float, taken: bool) -> None:
     """A filter for the same turbulence is replaced if its gain is wrong beyond the error."""
     found = relearn(PLANT, now, FRAMES, TURBULENCE, RATE_HZ, now.identified, LoopDelay(2.0, 0.0, gain, 0.03))
     assert found.is_better == found.gain_changed == taken

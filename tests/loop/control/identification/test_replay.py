@@ -7,7 +7,6 @@ from tests.loop.control.control_cases import FRAME_S, LAYERS, PHASE, PLANT, TURB
 
 from faintspot.loop.control.base import ASSUMED
 from faintspot.loop.control.identification.learning import learn_controller
-from faintspot.loop.control.identification.models.kalman import Kalman
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 
 FRAMES = telemetry(400, 0.5, model=LAYERS)
@@ -33,7 +32,7 @@ def test_integrators_are_replayed_together() -> None:
 
 def test_the_compiled_filter_is_replayed() -> None:
     """Four steps of conjugate gradients are within 1e-3 of the solution."""
-    model = learn_controller(Kalman, PLANT, FRAMES, TURBULENCE, 1 / FRAME_S, ASSUMED)
+    model = learn_controller(PLANT, FRAMES, TURBULENCE, 1 / FRAME_S, ASSUMED)
     seen = partly_trusted()
     expected = PLANT.replayed(partial(model.controller, PLANT), seen.scaled(model.noise_factor), PHASE)
     np.testing.assert_allclose(model.replayed(PLANT, seen, PHASE), expected, rtol=0.02, atol=1e-3)

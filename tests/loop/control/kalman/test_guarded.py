@@ -7,7 +7,7 @@ from tests.loop.control.naive_guarded import Guarded
 
 from faintspot.loop.control.base import Controller
 from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.identification.models.base import Make
+from faintspot.loop.control.identification.model import Make
 from faintspot.loop.control.kalman.choice import EXCESS, MOST_EXCESS
 
 FRAMES = telemetry(900, 0.2)

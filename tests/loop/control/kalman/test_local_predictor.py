@@ -11,9 +11,9 @@ from tests.loop.control.frozen_flow import frozen_slopes
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification import model as models
 from faintspot.loop.control.identification.learning import learn_controller
-from faintspot.loop.control.identification.models import kalman
-from faintspot.loop.control.identification.models.kalman import Kalman
+from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.kalman import local_covariance, local_model
 from faintspot.loop.control.kalman import local_predictor as local_kalman
 from faintspot.loop.control.kalman.local_model import LocalModel, at_most, neighbours_within, solve_locally
@@ -241,11 +241,11 @@ def test_it_begins_with_given_slopes_and_looks_ahead(arrays: dict[str, Any]) -> 
 
 def test_large_sensors_learn_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Learnt, saved and read again it sends the same commands, and leaves less than the integrator."""
-    monkeypatch.setattr(kalman, "_MOST_SLOPES", 10)
+    monkeypatch.setattr(models, "_MOST_SLOPES", 10)
     frames = telemetry(600, 0.3, model=LAYERS)
     shown: list[tuple[int, int]] = []
     learnt = learn_controller(
-        Kalman, PLANT, frames, TURBULENCE, 1 / FRAME_S, progress=lambda *each: shown.append(each)
+        PLANT, frames, TURBULENCE, 1 / FRAME_S, progress=lambda *each: shown.append(each)
     )
     assert shown[-1][0] == shown[-1][1] == len(shown)
     assert learnt.is_local

@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
 from faintspot.loop.control.base import ASSUMED, LEARNT
 from faintspot.loop.control.identification.layers import AVERAGED, Identification, Identified
-from faintspot.loop.control.identification.models import ControlModel, Lesson, LoopPlant
+from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.phase import phase_of_commands
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
-
-Kind = TypeVar("Kind", bound=ControlModel)
 
 GAINS = (0.03, 0.05, 0.07, 0.1, 0.13, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5, 0.6, 0.7, 0.8)
 """Gains of an integrator that are tried."""
@@ -24,7 +21,6 @@ _MOST_REPLAYED, _FEWEST_REPLAYED = 1_200_000, 500  # slopes, and frames, by whic
 
 
 def learn_controller(
-    kind: type[Kind],
     plant: LoopPlant,
     telemetry: OpenLoopTelemetry,
     site: SlopeTurbulence,
@@ -33,13 +29,11 @@ def learn_controller(
     start: Identified | None = None,
     progress: Callable[[int, int], None] | None = None,
     identification: Identification | None = None,
-) -> Kind:
-    """Return the model of a controller of the given kind, learnt from telemetry.
+) -> Kalman:
+    """Return a Kalman filter learnt from telemetry.
 
     Parameters
     ----------
-    kind : type
-        One of `MODELS`.
     plant : Plant
     telemetry : OpenLoopTelemetry
     site : SlopeTurbulence
@@ -60,13 +54,9 @@ def learn_controller(
     frames = max(_FEWEST_REPLAYED, _MOST_REPLAYED // len(site.positions_m) // 2)
     part = telemetry.part(-frames, None)
     gain, plain_residual = plant.best_gain(GAINS, part, of_commands @ plant.reconstructor.matrix)
-    model = kind({}, gain, 1.0, (math.inf, plain_residual), of_commands)
-
-    def fits() -> list[Identified]:
-        known = Identification(telemetry, site, rate_hz) if identification is None else identification
-        return _fits(known.among(AVERAGED[:1]), site, winds, start)
-
-    return model.learnt(Lesson(plant, part, fits, progress))
+    model = Kalman({}, gain, 1.0, (math.inf, plain_residual), of_commands)
+    known = Identification(telemetry, site, rate_hz) if identification is None else identification
+    return model.learnt(plant, part, _fits(known.among(AVERAGED[:1]), site, winds, start), progress)
 
 
 def _fits(

@@ -19,8 +19,7 @@ from faintspot.loop.control.identification.layers import Identification, Identif
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.measured import Measured, Wind, winds_of
-from faintspot.loop.control.identification.models import LoopPlant
-from faintspot.loop.control.identification.models.kalman import Kalman
+from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.identification.open_loop import (
     OpenLoop,
     measured_delay,
@@ -354,7 +353,6 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> P
     )
     plant = described.plant()
     learnt = learn_controller(
-        Kalman,
         plant,
         seen.telemetry,
         site,

@@ -13,7 +13,7 @@ from faintspot.loop.control.base import SETTLE_FRAMES
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.models import ControlModel, LoopPlant
+from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 
@@ -35,7 +35,7 @@ class RelearntControl:
     All are computed for the centroid gain that was found.
     """
 
-    learnt: ControlModel
+    learnt: Kalman
     residual: float
     by_running: float
     by_integrator: float
@@ -70,7 +70,7 @@ class RelearntControl:
 
 def relearn(
     plant: LoopPlant,
-    running: ControlModel,
+    running: Kalman,
     telemetry: OpenLoopTelemetry,
     site: SlopeTurbulence,
     rate_hz: float,
@@ -106,7 +106,7 @@ def relearn(
     if frames < FEWEST_FRAMES:
         raise InputError(f"telemetry: expected {FEWEST_FRAMES} frames to judge a filter, got {frames}")
     first = frames - round(JUDGED_PART * frames)
-    new = learn_controller(type(running), plant, telemetry.part(0, first), site, rate_hz, start=start)
+    new = learn_controller(plant, telemetry.part(0, first), site, rate_hz, start=start)
     identified, begin = new.identified, max(0, first - SETTLE_FRAMES)
     replayed = telemetry.part(begin, None)  # all have settled when the part begins that they are judged on
     phase = new.phase(plant)

@@ -12,17 +12,16 @@ from faintspot.base.errors import InputError
 from faintspot.loop.control.commands import CommandDelayLine
 from faintspot.loop.control.configuration import Control, ControlOptions
 from faintspot.loop.control.identification.learning import learn_controller
-from faintspot.loop.control.identification.models import CONTROLS, INTEGRATOR, MODELS, ControlModel
+from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.slopes.camera.calibration import Calibration
 
-KINDS = [kind for kind in CONTROLS if kind != INTEGRATOR]
 FRAMES = telemetry(600, 0.3)
 
 
 @pytest.fixture(scope="module")
-def learnt() -> dict[str, ControlModel]:
-    return {kind: learn_controller(MODELS[kind], PLANT, FRAMES, TURBULENCE, 1 / FRAME_S) for kind in KINDS}
+def learnt() -> Kalman:
+    return learn_controller(PLANT, FRAMES, TURBULENCE, 1 / FRAME_S)
 
 
 def commands(controller: Any, line: CommandDelayLine, frames: int = 60) -> np.ndarray:
@@ -34,27 +33,25 @@ def commands(controller: Any, line: CommandDelayLine, frames: int = 60) -> np.nd
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, ControlModel], tmp_path: Path) -> None:
+def test_from_a_file_it_is_the_same(learnt: Kalman, tmp_path: Path) -> None:
     path = tmp_path / "model.npz"
-    learnt[kind].save(path)
+    learnt.save(path)
     lines = [CommandDelayLine(12, 2) for _ in range(2)]
-    models = zip((learnt[kind], ControlModel.load(path, PLANT)), lines, strict=True)
+    models = zip((learnt, Kalman.load(path, PLANT)), lines, strict=True)
     sent = [commands(model.guarded(PLANT, line), line) for model, line in models]
     np.testing.assert_array_equal(sent[0], sent[1])
     assert np.abs(sent[0]).max() > 0.1
-    options = ControlOptions(controller=kind, leak=PLANT.leak, gain=1.0)
+    options = ControlOptions(controller="kalman", leak=PLANT.leak, gain=1.0)
     control = Control(INTERACTION, None, options, path)
     line = control.line()
     engines = commands(control.controller(line), line)
     np.testing.assert_allclose(engines, sent[0], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, ControlModel]) -> None:
+def test_it_goes_on_from_what_the_mirror_holds(learnt: Kalman) -> None:
     """Slopes of a mirror that takes off all there is: the next command is nearly the same."""
     line = CommandDelayLine(12, 2)
-    controller = learnt[kind].guarded(PLANT, line)
+    controller = learnt.guarded(PLANT, line)
     commands(controller, line)
     held = -PLANT.reconstructor.clean @ COVARIANCES[0] @ np.random.default_rng(2).standard_normal(18)
     line.hold(held)
@@ -63,9 +60,9 @@ def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, Cont
     assert np.linalg.norm(line.latest - held) < 0.35 * np.linalg.norm(held)
 
 
-def test_another_controller_of_the_same_loop(learnt: dict[str, ControlModel]) -> None:
+def test_another_controller_of_the_same_loop(learnt: Kalman) -> None:
     """The integrator needs no model; only the filter tells estimators what it expects, if nothing is said."""
-    control = Control(INTERACTION, None, ControlOptions(gain=0.3), learnt["kalman"])
+    control = Control(INTERACTION, None, ControlOptions(gain=0.3), learnt)
     filtered = control.with_controller("kalman")
     assert isinstance(filtered.controller(filtered.line()), CompiledKalman)
     assert (control.prediction, filtered.prediction) == ("none", "controller")
@@ -73,9 +70,9 @@ def test_another_controller_of_the_same_loop(learnt: dict[str, ControlModel]) ->
     assert control.with_controller("integrator") is control
 
 
-def test_what_is_refused(learnt: dict[str, ControlModel], tmp_path: Path) -> None:
+def test_what_is_refused(learnt: Kalman, tmp_path: Path) -> None:
     path = tmp_path / "model.npz"
-    model = learnt["kalman"]
+    model = learnt
 
     def refused(message: str, options: ControlOptions, file: Any = path) -> None:
         with pytest.raises(InputError) as caught:
@@ -104,16 +101,16 @@ def test_what_is_refused(learnt: dict[str, ControlModel], tmp_path: Path) -> Non
     refused("model.npz", kalman)
 
 
-def test_centroid_gain_in_the_file(learnt: dict[str, ControlModel], tmp_path: Path) -> None:
+def test_centroid_gain_in_the_file(learnt: Kalman, tmp_path: Path) -> None:
     """Slopes are divided by it and by the configured one; the integrator knows the latter only."""
     path = tmp_path / "model.npz"
-    replace(learnt["kalman"], centroid_gain=0.4).save(path)
+    replace(learnt, centroid_gain=0.4).save(path)
     control = Control(INTERACTION, None, ControlOptions(controller="kalman", centroid_gain=0.5), path)
     assert control.centroid_gain == pytest.approx(0.2)
     assert control.with_controller("integrator").centroid_gain == 0.5
     arrays = dict(np.load(path))
     np.savez(path, **{name: array for name, array in arrays.items() if name != "centroid_gain"})
-    assert ControlModel.load(path, PLANT).centroid_gain == 1.0
+    assert Kalman.load(path, PLANT).centroid_gain == 1.0
     np.savez(path, **{**arrays, "centroid_gain": 0.0})
     with pytest.raises(InputError, match="centroid_gain"):
-        ControlModel.load(path, PLANT)
+        Kalman.load(path, PLANT)

@@ -1,0 +1,320 @@
+"""Model of the predictive Kalman filter, which can be saved to a file, and the controllers made from it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.checks import numbers_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.base.npz import read_arrays, save_arrays
+from faintspot.loop.control.base import KALMAN, SETTLE_FRAMES, Controller, Predictor
+from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.identification.layers import Identified
+from faintspot.loop.control.identification.replay import mean_residual, replayed_frames, replayed_integrators
+from faintspot.loop.control.integrator import Integrator
+from faintspot.loop.control.kalman.compiled import CompiledKalman
+from faintspot.loop.control.kalman.guarded import GuardedController
+from faintspot.loop.control.kalman.large_guarded import LargeGuarded
+from faintspot.loop.control.kalman.local_covariance import STEPS
+from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter, local_shapes
+from faintspot.loop.control.kalman.predictive import Predictive
+from faintspot.loop.control.kalman.predictor import SlopePredictor, steady_covariance
+from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.control.reconstructor import Reconstructor
+from faintspot.loop.control.telemetry import OpenLoopTelemetry, usual_noise
+
+Floats = NDArray[np.float64]
+Make = Callable[[CommandDelayLine], Controller]
+
+_MOST_SLOPES = 300  # whose filter lets each correct all others
+_LAYERS = "first", "second", "driving_px2"
+_NOISE = "variance_px2", "covariance_xy_px2"
+_LOCAL = "near", "around", "weights", "corrections", "variance_px2", "predicted_px2", "share"
+_DENSE_FORM, _LOCAL_FORM = KALMAN, f"local {KALMAN}"
+_FORMS = {_DENSE_FORM: (*_LAYERS, *_NOISE), _LOCAL_FORM: _LOCAL}
+"""Names in files, and the arrays of each."""
+_NUMBERS, _GAIN = ("plain_gain", "noise_factor", "left", "phase_of_commands"), "centroid_gain"
+_ANY, _COVARIANCE_PX2 = (-1e6, 1e6), (-1e8, 1e8)
+_RANGES = {
+    "plain_gain": (0.0, 2.0),
+    "noise_factor": (1e-6, 1e6),
+    _GAIN: (1e-3, 1e3),
+    **dict.fromkeys(("first", "second", "weights", "corrections"), _ANY),
+    **dict.fromkeys(("driving_px2", "covariance_xy_px2"), _COVARIANCE_PX2),  # those of slopes of 1e4 px
+    "variance_px2": (1e-12, 1e8),
+    "predicted_px2": (0.0, 1e8),
+    "share": (0.0, 1.0),
+}
+"""Accepted ranges of arrays; other values are damaged or in another unit, and products may overflow."""
+
+
+def settled(telemetry: OpenLoopTelemetry) -> int:
+    """Return the number of frames at the start of a replay that are not scored."""
+    return min(SETTLE_FRAMES, len(telemetry) // 3)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopPlant:
+    """Properties of the loop that a controller needs: matrices, delay, leak."""
+
+    interaction: Floats
+    """(m, commands): slopes [px] per unit of each command."""
+    reconstructor: Reconstructor
+    delay_frames: int
+    leak: float
+
+    def integrator(self, gain: float, line: CommandDelayLine) -> Controller:
+        """Return an integrator of this loop."""
+        return Integrator(line, self.interaction, self.reconstructor, gain, self.leak)
+
+    def replayed(self, make: Make, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
+        """Return the squared residual that a controller would have left; see `replayed_frames`."""
+        return replayed_frames(make, telemetry, self.interaction, phase, self.delay_frames)
+
+    def replayed_integrators(
+        self, gains: Sequence[float], telemetry: OpenLoopTelemetry, phase: Floats
+    ) -> Floats:
+        """Return the squared residuals of integrators, (gains, frames)."""
+        of_loop = self.interaction, self.reconstructor, phase, self.delay_frames, self.leak
+        return replayed_integrators(gains, telemetry, *of_loop)
+
+    def best_gain(
+        self, gains: Sequence[float], telemetry: OpenLoopTelemetry, phase: Floats
+    ) -> tuple[float, float]:
+        """Return the gain of the integrator that leaves the least phase variance, and that variance."""
+        residuals = self.replayed_integrators(gains, telemetry, phase)
+        variances = [mean_residual(residual, telemetry, settled(telemetry)) for residual in residuals]
+        best = int(np.argmin(variances))
+        return gains[best], variances[best]
+
+    def residual(self, make: Make, telemetry: OpenLoopTelemetry, phase: Floats) -> float:
+        """Return the phase variance that a controller would have left; see `mean_residual`."""
+        return mean_residual(self.replayed(make, telemetry, phase), telemetry, settled(telemetry))
+
+
+@dataclass(frozen=True, eq=False)
+class Kalman:
+    """Kalman filter of open-loop slopes, learnt from telemetry, of frozen flow where winds were found.
+
+    Its arrays are layers first, second, driving_px2 (layers, m, m), and the noise of slopes: variance_px2
+    (m,) and covariance_xy_px2 (m / 2,). For large sensors, in which only near sub-apertures interact, they
+    are those of `local_filter`.
+    """
+
+    arrays: Mapping[str, Floats]
+    """Those of its form in files."""
+    plain_gain: float
+    """Gain of the fallback integrator."""
+    noise_factor: float
+    """Factor on the variances of standard errors."""
+    left: tuple[float, float]
+    """Residual phase variance of the filter and the integrator on the telemetry, noise included."""
+    phase_of_commands: Floats
+    """(commands, commands): matrix of the measure that compares both; see `phase_of_commands`."""
+    description: str = ""
+    centroid_gain: float = 1.0
+    """Centroid gain of the slopes, by which they are divided before they come to the controller."""
+    covariance: Floats | None = None
+    """(states, states) px^2: as from `steady_covariance`, where it is known already."""
+    identified: Identified | None = None
+    """Turbulence that the model follows from; None for models read from a file."""
+
+    def learnt(
+        self,
+        plant: LoopPlant,
+        telemetry: OpenLoopTelemetry,
+        fits: Sequence[Identified],
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Kalman:
+        """Return the filter of the turbulence that leaves least.
+
+        Parameters
+        ----------
+        plant : LoopPlant
+        telemetry : OpenLoopTelemetry
+            Frames by which filters are compared.
+        fits : sequence of Identified
+            Turbulence as identified from all frames, in one way or several.
+        progress : callable, optional
+            Called with the steps done and their number while filters of many slopes are computed.
+        """
+        done, total = itertools.count(1), len(fits) * sum(steps for _, steps in STEPS)
+
+        def advance() -> None:
+            if progress is not None:
+                progress(next(done), total)
+
+        def with_filter(fit: Identified) -> Kalman:
+            variance, covariance = usual_noise(telemetry.scaled(fit.noise_factor))
+            if len(variance) > _MOST_SLOPES:
+                arrays = local_filter(fit.layers, 1 / fit.rate_hz, variance, advance, covariance)
+            else:
+                slopes = fit.slope_model()
+                values = slopes.first, slopes.second, slopes.driving, variance, covariance
+                arrays = dict(zip((*_LAYERS, *_NOISE), values, strict=True))
+            text = f"{fit.summary()}, noise variance x {fit.noise_factor:.2f}"
+            model = replace(
+                self, arrays=arrays, noise_factor=fit.noise_factor, description=text, identified=fit
+            )
+            return model.scored(plant, telemetry)
+
+        return min(map(with_filter, fits), key=lambda model: model.left[0])
+
+    def controller(self, plant: LoopPlant, line: CommandDelayLine) -> Predictive:
+        """Return the controller, in double precision."""
+        filtered, clean = self.predictor(), plant.reconstructor.clean
+        return Predictive(line, plant.interaction, filtered, clean, from_latest=self.is_local)
+
+    def guarded(self, plant: LoopPlant, line: CommandDelayLine, **options: Any) -> GuardedController:
+        """Return the compiled controller with the integrator beside it; options are those of the guard."""
+        options |= {
+            "noise_factor": self.noise_factor,
+            "prefers_plain": self.left[1] < self.left[0],
+            "plain_residual": self.left[1],
+        }
+        if not self.is_local:
+            return self._compiled(plant, line, self.phase(plant), **options)
+        of_loop = plant.interaction, plant.reconstructor, self.phase_of_commands
+        return LargeGuarded(line, *of_loop, self.arrays, self.plain_gain, plant.leak, **options)
+
+    def _compiled(
+        self, plant: LoopPlant, line: CommandDelayLine, phase: Floats, **options: Any
+    ) -> CompiledKalman:
+        reconstruct, clean = plant.reconstructor.matrix, plant.reconstructor.clean
+        of_filter = phase, self.slope_predictor, clean, self.plain_gain, plant.leak
+        return CompiledKalman(line, plant.interaction, reconstruct, *of_filter, **options)
+
+    def replayed(self, plant: LoopPlant, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
+        """Return the squared residual that the filter would have left; see `replayed_frames`."""
+        if self.is_local:
+            return plant.replayed(partial(self.controller, plant), telemetry.scaled(self.noise_factor), phase)
+        line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames)
+        return self._compiled(plant, line, phase, noise_factor=self.noise_factor).replayed(telemetry)
+
+    def phase(self, plant: LoopPlant) -> Floats:
+        """Return the matrix (commands, m) from slopes to what is compared."""
+        return np.asarray(self.phase_of_commands @ plant.reconstructor.matrix)
+
+    def scored(self, plant: LoopPlant, telemetry: OpenLoopTelemetry) -> Kalman:
+        """Return the filter with its residual on telemetry, and with the covariance that this needed."""
+        squares = self.replayed(plant, telemetry, self.phase(plant))
+        residual = mean_residual(squares, telemetry, settled(telemetry))
+        covariance = self.covariance if self.is_local else self._covariance
+        return replace(self, left=(residual, self.left[1]), covariance=covariance)
+
+    @property
+    def is_local(self) -> bool:
+        """Whether it is a filter for large sensors, in which only near sub-apertures interact."""
+        return "around" in self.arrays
+
+    @property
+    def expected_std_px(self) -> Floats:
+        """(m,): standard deviations of the predicted slopes."""
+        return self.predictor().std_px
+
+    def predictor(self) -> Predictor:
+        """Return the filter itself."""
+        return LocalPredictor(self.arrays) if self.is_local else self.slope_predictor
+
+    @property
+    def slope_predictor(self) -> SlopePredictor:
+        """Filter of a small sensor."""
+        return SlopePredictor(self._slopes, *self._noise, covariance=self._covariance)
+
+    def with_noise(self, scale: float) -> Kalman:
+        """Return the filter with the noise variances scaled by a factor."""
+        if scale == 1.0:
+            return self
+        arrays = self.arrays
+        if not self.is_local:  # which has gains for several variances
+            arrays = {**arrays, **{name: scale * arrays[name] for name in _NOISE}}
+        text, factor = f"{self.description}, and {scale:g} of that", scale * self.noise_factor
+        return replace(self, arrays=arrays, noise_factor=factor, description=text, covariance=None)
+
+    @cached_property
+    def _slopes(self) -> SlopeModel:
+        return SlopeModel(*(self.arrays[name] for name in _LAYERS))
+
+    @cached_property
+    def _covariance(self) -> Floats:
+        if self.covariance is not None:
+            return self.covariance
+        return steady_covariance(self._slopes, *self._noise)
+
+    @property
+    def _noise(self) -> tuple[Floats, Floats]:
+        """Variances and covariances of the slopes' noise."""
+        variance, covariance = (self.arrays[name] for name in _NOISE)
+        return variance, covariance
+
+    def save(self, path: str | Path, others: Mapping[str, object] = MappingProxyType({})) -> None:
+        """Write the model to a NumPy file (.npz), with other arrays beside it.
+
+        Raises
+        ------
+        InputError
+            When it cannot be written.
+        """
+        numbers = {name: np.asarray(getattr(self, name), np.float64) for name in (*_NUMBERS, _GAIN)}
+        form = _LOCAL_FORM if self.is_local else _DENSE_FORM
+        save_arrays(path, {"kind": np.array(form), **numbers, **self.arrays, **others})
+
+    @classmethod
+    def load(cls, path: str | Path, plant: LoopPlant) -> Self:
+        """Read a model for a loop.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read, is of another kind or loop, or has numbers out of range.
+        """
+        contents = "what control has learnt"
+        own = _FORMS[one_of("kind", str(read_arrays(path, contents, ("kind",))["kind"]), list(_FORMS))]
+        names = *_NUMBERS, *own, _GAIN
+        numbers = _checked(read_arrays(path, contents, names, optional=(_GAIN,)), plant)
+        learnt, plain = numbers["left"]
+        return cls(
+            {name: numbers[name] for name in own},
+            float(numbers["plain_gain"]),
+            float(numbers["noise_factor"]),
+            (float(learnt), float(plain)),
+            numbers["phase_of_commands"],
+            centroid_gain=float(numbers.get(_GAIN, 1.0)),
+        )
+
+    def check(self, plant: LoopPlant) -> None:
+        """Refuse a model of another loop, or with numbers out of range.
+
+        Raises
+        ------
+        InputError
+            One line.
+        """
+        numbers = {name: getattr(self, name) for name in (*_NUMBERS, _GAIN)}
+        _checked({**self.arrays, **numbers}, plant)
+
+
+def _checked(arrays: Mapping[str, object], plant: LoopPlant) -> dict[str, Floats]:
+    """Return a model's arrays as float64, with checked shapes and ranges."""
+    slopes, commands = plant.interaction.shape
+    ranges = {**_RANGES, **dict.fromkeys(("near", "around"), (0, slopes // 2))}
+    numbers = {name: numbers_between(name, value, *ranges.get(name, ())) for name, value in arrays.items()}
+    shapes = {"left": (2,), "phase_of_commands": (commands, commands), "variance_px2": (slopes,)}
+    if "around" in numbers:
+        shapes |= local_shapes(numbers, slopes)
+    else:
+        layers = len(numbers["first"]) if numbers["first"].ndim == 3 else 1
+        shapes |= {**dict.fromkeys(_LAYERS, (layers, slopes, slopes)), "covariance_xy_px2": (slopes // 2,)}
+    for name, array in numbers.items():
+        if array.shape != shapes.get(name, ()):
+            raise InputError(f"{name}: expected shape {shapes.get(name, ())}, got {array.shape}")
+    return numbers
