@@ -20,10 +20,10 @@ def sections() -> list[Section]:
         FigureWithData("data", "With data", "Caption 1.", new_figure(1, 1), ["x", "y"], [[1, 2.5]]),
         FigureWithData("picture", "Without", "Caption 2.", new_figure(2, 1)),
     ]
-    folded = Table(["c"], [["d"]], csv=("rows.csv", "c\nd,é\n"), folded="1 row")
+    with_file = Table(["c"], [["d"]], csv=("rows.csv", "c\nd,é\n"))
     return [
         Section("first", "First <1>", ["A paragraph & more.", ["a point"]], missing="None of it."),
-        Section("tables", "Tables", [Table(["", "b"], [["<a>", cell]], "A caption."), folded]),
+        Section("tables", "Tables", [Table(["", "b"], [["<a>", cell]], "A caption."), with_file]),
         Section("last", "Last", figures),
         configuration_section("noise_std = 1 # <b>"),
     ]
@@ -47,7 +47,6 @@ def test_everything_is_on_the_page() -> None:
         "holds",
         "small",
         "A caption.",
-        "1 row",
         "Caption 2.",
         "The configuration as TOML text",
         "noise_std = 1 # <b>",

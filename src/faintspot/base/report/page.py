@@ -44,8 +44,6 @@ class Table:
         Whether all columns are prose.
     csv : tuple of str, optional
         Name of a file and its text, for readers to save.
-    folded : str
-        Line to click on to show the table; "" shows it always.
     """
 
     header: Sequence[str]
@@ -54,7 +52,6 @@ class Table:
     words: bool = False
     prose: bool = False
     csv: tuple[str, str] | None = None
-    folded: str = ""
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -90,13 +90,10 @@ class Texts:
             known = [n for n in range(len(header)) if n == 0 or any(row[n] != NOTHING for row in rows)]
             header, rows = [header[n] for n in known], [[row[n] for n in known] for row in rows]
         options = {key: declared[key] for key in ("words", "prose") if key in declared}
-        folded = self(f"{name}.folded", count=len(rows)) if "folded" in declared else ""
         about = [
             _filled(text, scope) for column, text in declared.get("about", {}).items() if column in header
         ]
-        return Table(
-            header, rows, " ".join([self(f"{name}.caption", **values), *about]), folded=folded, **options
-        )
+        return Table(header, rows, " ".join([self(f"{name}.caption", **values), *about]), **options)
 
     def section(self, name: str, /, *parts: Part | None, missing: str = "", **values: object) -> Section:
         """Return a section: title, text and the parts that there are, or the reason why there are none."""

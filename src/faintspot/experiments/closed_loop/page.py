@@ -28,7 +28,6 @@ from faintspot.loop.simulation.configuration.configuration import LoopConfigurat
 
 _TEXT = Texts("faintspot.experiments")
 _FEW_REALISATIONS = 5
-_SLOPE_ERROR = "slope error"
 
 
 def loop_page(results: LoopResults) -> Report:
@@ -93,14 +92,8 @@ def _of_magnitudes(result: MagnitudeResult, strehl: str) -> list[Section]:
 
 
 def _budget_lines(result: BudgetResult) -> list[str]:
-    """Describe which term costs each method most Strehl, and how differences between methods change."""
+    """Return how the differences between methods change with each term switched off."""
     lines = []
-    for name, strehl in zip(result.labels, result.strehl, strict=True):
-        gains = {term: paired_mean(runs - strehl[0]) for term, runs in zip(result.terms, strehl, strict=True)}
-        most = sorted(result.terms[1:], key=lambda term: -np.nan_to_num(gains[term].value))[:3]
-        parts = [f"{term} {with_interval(gains[term])}" for term in most if gains[term].decided > 0]
-        values = {"parts": ", then ".join(parts) or None, "change": gains.get(_SLOPE_ERROR)}
-        lines += _TEXT.lines("loop.budget", name=name, **values)
     for name, strehl in zip(result.labels[1:], result.strehl[1:], strict=True):
         less = map(paired_mean, strehl - result.strehl[0])
         where = ["in the whole loop", *(f"without {term}" for term in result.terms[1:])]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,6 +11,7 @@ import numpy as np
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
+from faintspot.base.report.figure_data import csv_text
 from faintspot.loop.control.identification.measured import Measured
 from faintspot.loop.control.identification.open_loop import FEWEST_FRAMES
 from faintspot.loop.control.identification.recording import Recording
@@ -84,17 +83,14 @@ def table_of_pieces(pieces: Sequence[Piece]) -> str:
     """Return a CSV table: a row for each piece, with value and standard error of each quantity."""
     names = {name: value.unit for piece in pieces for name, value in piece.values.items()}
     header = [f"{name} ({unit})" if unit else name for name, unit in names.items()]
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(
-        ["start_s", "duration_s", *(f"{kind}{text}" for text in header for kind in ("", "error of "))]
-    )
+    rows = []
     for piece in pieces:
         known = [piece.values.get(name, Measured(name, "")) for name in names]
         numbers = [number for value in known for number in (value.value, value.error)]
         shown = [f"{number:.6g}" if math.isfinite(number) else "" for number in numbers]
-        writer.writerow([f"{piece.start_s:g}", f"{piece.duration_s:g}", *shown])
-    return stream.getvalue()
+        rows.append([f"{piece.start_s:g}", f"{piece.duration_s:g}", *shown])
+    columns = (f"{kind}{text}" for text in header for kind in ("", "error of "))
+    return csv_text(["start_s", "duration_s", *columns], rows)
 
 
 def _piece(loop: Recording, rows: slice, start_s: float, duration_s: float) -> Piece:

@@ -14,7 +14,6 @@ from faintspot.base.report.texts import Texts
 from faintspot.base.report.words import percentage
 from faintspot.base.statistics import Estimate, rms
 from faintspot.slopes.recorded.report import frame_pictures, maps
-from faintspot.slopes.recorded.report.followed_picture import followed_picture
 from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.statistics import (
     Floats,
@@ -187,7 +186,7 @@ def _against_truth(run: SlopesRun, method: MeasuredSlopes) -> dict[str, object]:
 
 def _frame(run: SlopesRun) -> Section | None:
     if run.followed is not None and run.layout is not None:
-        picture = followed_picture(run.followed, run.layout)
+        picture = frame_pictures.followed_picture(run.followed, run.layout)
         figure = _TEXT.figure("followed-frame", picture, frame=run.followed.number)
         return _TEXT.section("followed", figure, largest=run.followed.largest_pitches(run.layout))
     if not run.stages and not run.why_no_stages:

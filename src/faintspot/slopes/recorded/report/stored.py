@@ -17,7 +17,7 @@ from faintspot.io import open_frames
 from faintspot.io.frames import FrameSource
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slopes import Slopes, Stages
-from faintspot.slopes.recorded.report.followed_picture import Followed, farthest_frame
+from faintspot.slopes.recorded.report.frame_pictures import Followed, farthest_frame
 from faintspot.slopes.recorded.report.page import slopes_report
 from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.report.sodium_section import sodium_section_of_frames
