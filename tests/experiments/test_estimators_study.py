@@ -23,7 +23,7 @@ from faintspot.experiments.study.built_in import estimators_study
 from faintspot.experiments.study.sweep import Cell
 
 METHODS = ("brightest", "tv", "ml", "map", "weighted")
-KINDS = ("error", "photon-efficiency", "gain", "outlier-fraction")
+KINDS = ("error", "photon-efficiency", "gain")
 
 
 def error(cell: dict[str, Any], method: str, mode: str) -> float:
@@ -134,4 +134,4 @@ def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     html = written[0].read_text(encoding="utf-8")
     assert "What was found" in html
     assert 'id="paper"' not in html
-    assert html.count("<figcaption>") == 5
+    assert html.count("<figcaption>") == 4

@@ -81,8 +81,6 @@ class Panel:
         Labels with units.
     x_ticks, y_ticks : sequence of float
         Make an axis logarithmic, with these ticks.
-    y_linear_below : float
-        Height below which the logarithmic axis is linear.
     x_range, y_range : pair of float or None
         Limits; None is found from the lines.
     levels, at : mapping
@@ -99,7 +97,6 @@ class Panel:
     title: str = ""
     x_ticks: Sequence[float] = ()
     y_ticks: Sequence[float] = ()
-    y_linear_below: float = 0.0
     x_range: tuple[float | None, float | None] = (None, None)
     y_range: tuple[float | None, float | None] = (None, None)
     levels: Mapping[float, Mapping[str, object]] = field(default_factory=dict)
@@ -123,8 +120,7 @@ class Panel:
             axes.set_xscale("log")
             plain_ticks(axes.xaxis, self.x_ticks)
         if self.y_ticks:
-            linear = self.y_linear_below
-            axes.set_yscale(**({"value": "symlog", "linthresh": linear} if linear else {"value": "log"}))
+            axes.set_yscale("log")
             plain_ticks(axes.yaxis, self.y_ticks)
         ranges = {"xlim": self.x_range, "ylim": self.y_range}
         fixed = {name: limits for name, limits in ranges.items() if limits != (None, None)}

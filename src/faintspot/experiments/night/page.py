@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,34 +33,22 @@ from faintspot.loop.simulation.configuration.configuration import LoopConfigurat
 
 SUMMARY_FILE, PAGE_FILE = "night.json", "night.html"
 _TEXT = Texts("faintspot.experiments.night")
-# Names in JSON, and the attributes that they stand for.
+# Attributes in JSON, and the names of those that have another one there.
 _MEAN = ("mean", "standard_deviation", "blocks")
-_DIFFERENCE = {
-    "method": "name",
-    "blocks": "blocks",
-    "at_equal_r0": "measured",
-    "without_r0": "without_r0",
-    "in_the_same_turbulence": "paired",
-    "hours": "hours",
-    "hours_needed": "hours_needed",
-    "is_long_enough": "is_long_enough",
-}
-_LINE = {
-    "method": "name",
-    "slope_per_m": "slope_per_m",
-    "intercept": "intercept",
-    "correlation": "correlation",
-    "blocks": "blocks",
-}
-_VERDICT = {
-    "statement": "statement",
-    "outcome": "outcome",
-    "measured": "measured",
-    "significance": "significance",
-    "in_the_same_turbulence": "paired",
-    "outcome_in_the_same_turbulence": "paired_outcome",
-    "hours_needed": "hours_needed",
-}
+_DIFFERENCE = (
+    "name",
+    "blocks",
+    "measured",
+    "without_r0",
+    "paired",
+    "hours",
+    "hours_needed",
+    "is_long_enough",
+)
+_DIFFERENCE_NAMES = {"name": "method", "measured": "at_equal_r0", "paired": "in_the_same_turbulence"}
+_LINE = ("name", "slope_per_m", "intercept", "correlation", "blocks")
+_VERDICT = ("statement", "outcome", "measured", "significance", "paired", "paired_outcome", "hours_needed")
+_VERDICT_NAMES = {"paired": "in_the_same_turbulence", "paired_outcome": "outcome_in_the_same_turbulence"}
 
 
 def write_night(night: Night, folder: str | Path) -> list[Path]:
@@ -99,13 +87,13 @@ def night_summary(night: Night) -> dict[str, Any]:
             ]
             for name, rows in _compared(night).items()
         },
-        "differences": [_plain_record(each, _DIFFERENCE) for each in differences(night)],
+        "differences": [_plain_record(each, _DIFFERENCE, _DIFFERENCE_NAMES) for each in differences(night)],
         "by_strength": [
-            {"mean_strength_e": plain(strength), **_plain_record(each, _DIFFERENCE)}
+            {"mean_strength_e": plain(strength), **_plain_record(each, _DIFFERENCE, _DIFFERENCE_NAMES)}
             for strength, each in by_strength(night)
         ],
-        "against_r0": [_plain_record(line, _LINE) for line in lines(night)],
-        "verdicts": [_plain_record(each, _VERDICT) for each in verdicts(night)],
+        "against_r0": [_plain_record(line, _LINE, _DIFFERENCE_NAMES) for line in lines(night)],
+        "verdicts": [_plain_record(each, _VERDICT, _VERDICT_NAMES) for each in verdicts(night)],
     }
 
 
@@ -230,8 +218,8 @@ def _facts(night: Night) -> Mapping[str, str]:
     )
 
 
-def _plain_record(record: object, names: Mapping[str, str]) -> dict[str, Any]:
-    return {name: plain(getattr(record, attribute)) for name, attribute in names.items()}
+def _plain_record(record: object, attributes: Sequence[str], names: Mapping[str, str]) -> dict[str, Any]:
+    return {names.get(name, name): plain(getattr(record, name)) for name in attributes}
 
 
 def _plain_estimate(estimate: Estimate) -> dict[str, Any] | None:

@@ -1,4 +1,4 @@
-"""The figures of a study that compares estimators: error, efficiency, gain and outliers, speckled spots."""
+"""The figures of a study that compares estimators: error, efficiency, gain, speckled spots."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def estimator_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
     Cells that differ in flux (or, speckled ones, in d/r0) alone are a line, where there are at least three.
     """
     for group in _groups(dataset, "flux_e", ("read_noise_e",), speckled=False):
-        for kind in ("error", "photon_efficiency", "gain", "outlier_fraction"):
+        for kind in ("error", "photon_efficiency", "gain"):
             yield _figure(dataset, group, kind, "flux_e")
     for group in _groups(dataset, "d_over_r0", ("read_noise_e", "flux_e"), speckled=True):
         yield _figure(dataset, group, "corrected_rms", "d_over_r0")
@@ -119,9 +119,6 @@ def _panel(cells: xarray.Dataset, kind: str, axis: str, title: str) -> Panel:
         lines.append(Line("Cramer-Rao bound", x, cells["bound"].values, style=_BOUND))
         scale["levels"] = {float(cells["position_range_px"][0]) / 2: {"ls": ":"}}
         scale["y_ticks"] = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2)
-    elif kind == "outlier_fraction":
-        highest = max(2e-3, min(1.0, 1.5 * float(np.nanmax(values))))
-        scale = {"y_ticks": (0, 1e-3, 1e-2, 0.1, 0.5), "y_linear_below": 1e-3, "y_range": (-1e-4, highest)}
     elif kind == "corrected_rms":
         best = values.min("estimator").values
         lines.append(Line("", x, best, style={**_BEST_OF_CELL, "zorder": 4}))
