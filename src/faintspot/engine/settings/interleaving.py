@@ -10,7 +10,7 @@ from faintspot.base.checks import number_between
 from faintspot.base.config.written_changes import parse_changes
 from faintspot.base.errors import InputError
 from faintspot.engine.settings.running_settings import check_names
-from faintspot.loop.control.base import CONTROLS
+from faintspot.loop.control.base import CONTROLS, split_control
 from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.pipeline.settings import Settings, without_denoising
 
@@ -116,12 +116,9 @@ def methods_after(
 
 def _parsed_method(text: str) -> InterleavedMethod:
     """Return a method: settings, a controller, or both joined with "+"."""
-    if text in CONTROLS:
-        return InterleavedMethod(text, {}, control=text)
-    measured, _, control = text.rpartition("+")
-    if measured and control in CONTROLS:
-        return replace(_parsed_settings(measured), label=text, control=control)
-    return _parsed_settings(text)
+    measured, control = split_control(text)
+    method = _parsed_settings(measured or _SET if control else text)
+    return replace(method, label=text, control=control or None)
 
 
 def _parsed_settings(text: str) -> InterleavedMethod:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.toml_files import parse_text
 from faintspot.io.telemetry.recording import Telemetry
-from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN
+from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, split_control
 from faintspot.loop.control.configuration import ControlOptions
 from faintspot.loop.control.recorded import RecordedControl
 from faintspot.loop.telemetry.recording import CLOSED
@@ -54,7 +54,8 @@ class RecordedMethods:
         labels = tuple(dict.fromkeys(names[number] for number in seen))
         number = np.full(len(names), -1)
         number[seen] = [labels.index(names[each]) for each in seen]
-        parts = [_parts(label, control.options.controller) for label in labels]
+        split, usual_control = map(split_control, labels), control.options.controller
+        parts = [(part or _SET, kind or usual_control) for part, kind in split]
         measured = list(dict.fromkeys(part for part, _ in parts))
         usual = _estimator(str(telemetry.attributes.get("settings", "")))
         predicted = [
@@ -116,14 +117,6 @@ def conditions_of(telemetry: Telemetry) -> tuple[NDArray[np.int64], list[str]]:
     order = np.argsort(frames, kind="stable")
     number = np.searchsorted(np.array(frames, np.int64)[order], telemetry.frame, side="right")
     return number.astype(np.int64), [names[0], *(names[1 + place] for place in order)]
-
-
-def _parts(label: str, usual: str) -> tuple[str, str]:
-    """Return what measures the slopes, and the controller."""
-    if label in CONTROLS:
-        return _SET, label
-    measured, _, control = label.rpartition("+")
-    return (measured, control) if measured and control in CONTROLS else (label, usual)
 
 
 def _estimator(settings: str) -> str:

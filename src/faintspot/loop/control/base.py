@@ -27,6 +27,13 @@ SETTLE_FRAMES = 200
 """Frames after which a controller has settled; predictive filters take longer than integrators."""
 
 
+def split_control(method: str) -> tuple[str, str]:
+    """Split a method as recordings name it, "map+kalman"; either part is "" where the name lacks it."""
+    measured, _, control = method.rpartition("+")
+    is_split = control in CONTROLS and (measured or method == control)
+    return (measured, control) if is_split else (method, "")
+
+
 class ExpectedSlopes(NamedTuple):
     """Predicted slopes of the next frame, the prior of an estimator."""
 

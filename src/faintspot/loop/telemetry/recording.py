@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import numbers_between
 from faintspot.base.errors import InputError
-from faintspot.loop.control.base import INTEGRATOR, KALMAN
+from faintspot.loop.control.base import INTEGRATOR, KALMAN, split_control
 from faintspot.loop.control.configuration import NONE, STREAM, Control
 from faintspot.loop.control.identification.open_loop import FEWEST_FRAMES
 from faintspot.loop.control.identification.recording import Recording
@@ -59,7 +59,7 @@ def recorded_loop(
     predicted = prior_std_px is not None and control.prediction != NONE
     unknown = options.controller != INTEGRATOR or control.prediction == STREAM
     methods = map(str, recording.attributes.get("methods", []))
-    in_turn = any(method.rpartition("+")[2] == KALMAN for method in methods)
+    in_turn = any(split_control(method)[1] == KALMAN for method in methods)
     if (predicted and unknown) or (prior_std_px is not None and in_turn):
         raise InputError(
             "recording: expected a loop closed with an integrator, as the prior that another controller or "
