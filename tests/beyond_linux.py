@@ -19,7 +19,6 @@ import signal
 import socket
 import sys
 import time
-import types
 from typing import Any
 
 LINUX_ONLY: dict[Any, str] = {
@@ -77,34 +76,18 @@ def _opened(event: str, arguments: tuple[Any, ...]) -> None:
 
 def take_posix_away() -> None:
     """Do it, to this process, for good."""
-    original, locks = builtins.__import__, _locks_of_windows()
+    original = builtins.__import__
 
     def visible(name: str, variables: Any = None, *arguments: Any, **options: Any) -> Any:
         importer = str((variables or {}).get("__name__", ""))
         if name.split(".")[0] in POSIX_MODULES and importer.startswith("faintspot"):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-        if name == "msvcrt" and importer.startswith("faintspot"):
-            return locks
         return original(name, variables, *arguments, **options)
 
     builtins.__import__ = visible  # type: ignore[assignment]
     for name in POSIX_FUNCTIONS:
         if hasattr(os, name):
             delattr(os, name)
-
-
-def _locks_of_windows() -> types.ModuleType:
-    """Return a module that locks bytes of a file from its position on, as msvcrt does."""
-    fcntl: Any = importlib.import_module("fcntl")
-    module: Any = types.ModuleType("msvcrt")
-    module.LK_NBLCK = 2
-
-    def locking(descriptor: int, mode: int, count: int) -> None:
-        assert mode == module.LK_NBLCK
-        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, count, 0, os.SEEK_CUR)
-
-    module.locking = locking
-    return module  # type: ignore[no-any-return]
 
 
 def main(left_out: tuple[str, ...], commands: list[str]) -> None:

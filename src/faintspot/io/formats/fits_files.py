@@ -9,7 +9,6 @@ from __future__ import annotations
 import gzip
 import warnings
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -156,65 +155,54 @@ def _image(name: str, path: Path, unit: HeaderDataUnit) -> StoredArray:
     if bits not in fits.BITPIX2DTYPE:
         raise InputError(f"{name}: BITPIX = {bits}: expected one of {', '.join(map(str, fits.BITPIX2DTYPE))}")
     stored_type = np.dtype(fits.BITPIX2DTYPE[bits])
-    scaling = _Scaling.of(name, unit.header, stored_type)
+    image = _Image(name, unit.header, stored_type)
 
     def open_array(files: ExitStack) -> Any:
         stream = files.enter_context(open_plain_or_gzip(path))
         if unit.compressed:
             units = fits.open(stream, memmap=False, do_not_scale_image_data=True)
-            return _Image(files.enter_context(units)[unit.index].section, scaling)
-        big_endian = stored_type.newbyteorder(">")
-        numbers = StreamedArray(stream, unit.data_start, big_endian, unit.shape, compressed=compressed_file)
-        return _Image(numbers, scaling)
+            image.stored = files.enter_context(units)[unit.index].section
+        else:
+            numbers, start = stored_type.newbyteorder(">"), unit.data_start
+            image.stored = StreamedArray(stream, start, numbers, unit.shape, compressed=compressed_file)
+        return image
 
-    return StoredArray(name, unit.shape, scaling(np.zeros(1, stored_type)).dtype, open_array)
+    return StoredArray(name, unit.shape, image[:].dtype, open_array)
 
 
-@dataclass(frozen=True)
 class _Image:
-    """Physical values of an image."""
+    """Physical values of an image, from stored numbers and the cards of its header.
 
-    stored: Any
-    scaling: _Scaling
+    astropy leaves BLANK aside in unsigned integers, and so cannot scale.
+    """
 
-    def __getitem__(self, part: slice) -> NDArray[Any]:
-        stored = np.asarray(self.stored[part])
-        return self.scaling(stored.astype(stored.dtype.newbyteorder("="), copy=False))
-
-
-@dataclass(frozen=True)
-class _Scaling:
-    """Conversion of stored numbers to physical values."""
-
-    scale: float
-    zero: float
-    blank: int | None
-
-    @classmethod
-    def of(cls, name: str, header: Any, stored_type: np.dtype[np.generic]) -> _Scaling:
+    def __init__(self, name: str, header: Any, stored_type: np.dtype[np.generic]) -> None:
+        self.stored: Any = np.zeros(1, stored_type)
         try:
-            blank = int(header["BLANK"]) if "BLANK" in header and stored_type.kind != "f" else None
-            return cls(float(header.get("BSCALE", 1.0)), float(header.get("BZERO", 0.0)), blank)
+            self._scale, self._zero = float(header.get("BSCALE", 1.0)), float(header.get("BZERO", 0.0))
+            self._blank = int(header["BLANK"]) if "BLANK" in header and stored_type.kind != "f" else None
         except Exception as error:  # cards are parsed on access and may be broken
             raise InputError(f"{name}: BSCALE, BZERO and BLANK must be numbers ({one_line(error)})") from None
 
-    def __call__(self, stored: NDArray[np.generic]) -> NDArray[np.generic]:
-        if self.blank is None and self.scale == 1.0 and self.zero == 0.0:
+    def __getitem__(self, part: Any) -> NDArray[np.generic]:
+        stored = np.asarray(self.stored[part])
+        stored = stored.astype(stored.dtype.newbyteorder("="), copy=False)
+        if self._blank is None and self._scale == 1.0 and self._zero == 0.0:
             return stored
         bits = 8 * stored.itemsize
-        if self.blank is None and self.scale == 1.0 and stored.dtype.kind != "f":
+        if self._blank is None and self._scale == 1.0 and stored.dtype.kind != "f":
             # An offset of half the range flips one bit: FITS stores the other signedness so.
             other = np.dtype(f"{'i' if bits == 8 else 'u'}{stored.itemsize}")
-            if self.zero == (-128.0 if bits == 8 else 2.0 ** (bits - 1)):
+            if self._zero == (-128.0 if bits == 8 else 2.0 ** (bits - 1)):
                 unsigned = stored.view(f"u{stored.itemsize}")
                 flipped: NDArray[np.generic] = unsigned ^ unsigned.dtype.type(1 << (bits - 1))
                 return flipped.view(other)
         is_single = bits <= 16 or (stored.dtype.kind == "f" and bits == 32)
         values: NDArray[np.floating[Any]] = stored.astype(np.float32 if is_single else np.float64)
-        values *= self.scale
-        values += self.zero
-        if self.blank is not None:
-            values[stored == self.blank] = np.nan
+        values *= self._scale
+        values += self._zero
+        if self._blank is not None:
+            values[stored == self._blank] = np.nan
         return values
 
 

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.sizes import check_bytes, memory_bytes
 from faintspot.base.validity import are_valid
+from faintspot.base.variables import VARIABLES
 from faintspot.io.arrays.zarr_store import (
     TELEMETRY,
     is_store,
@@ -23,7 +24,6 @@ from faintspot.io.arrays.zarr_store import (
 )
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
-from faintspot.io.telemetry.arrays import ArrayStorage, array, of_slopes
 
 zarr = load_zarr()
 FRAMES, IMAGES = "finished_frames", "finished_images"
@@ -31,6 +31,26 @@ FRAMES, IMAGES = "finished_frames", "finished_images"
 PARTS, CONTROL = "parts", "control"
 """Large attributes, in a group of their own: the others are replaced with every block of frames."""
 _NOT_STORED = "sequence"  # used by the rings only
+
+
+class ArrayStorage(NamedTuple):
+    """Storage of an array of telemetry."""
+
+    dtype: np.dtype[np.generic]
+    dimensions: tuple[str, ...]
+    units: str
+    in_all: bool
+    """Whether all recordings have it; else it is read as zeros, e.g. commands of an engine without any."""
+
+
+def array(dtype: Any, dimensions: str, units: str = "1", *, in_all: bool = True) -> dict[str, ArrayStorage]:
+    """Return the metadata of a field of `Telemetry`; dimensions are words."""
+    return {"stored": ArrayStorage(np.dtype(dtype), tuple(dimensions.split()), units, in_all)}
+
+
+def of_slopes(name: str, dtype: object, *, in_all: bool = True) -> dict[str, ArrayStorage]:
+    """Return those of a quantity of each slope."""
+    return array(dtype, "frame subaperture", VARIABLES[name].units, in_all=in_all)
 
 
 @dataclass(frozen=True, repr=False)
