@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px, with_pres
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.response import response
-from faintspot.slopes.recorded.survey import are_repeated, stretches, survey
+from faintspot.slopes.recorded.survey import Survey, are_repeated, stretches, survey
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
 
@@ -96,25 +96,52 @@ class Summary:
             self.flag_counts[flag] = self.flag_counts.get(flag, 0) + count
 
 
+class Reading(TypedDict, total=False):
+    """Choice of arrays in files of frames, see `faintspot.io.open_frames`."""
+
+    key: str | None
+    """Which array of the files to read, where they hold several."""
+    time_axis: int | None
+    """Axis of cubes that counts the frames: 0, 1 or 2."""
+
+
+class Choices(Reading, total=False):
+    """Choices on which the slopes depend: with others, it is another run."""
+
+    denoise: bool
+    """False switches the denoising off for all sub-apertures."""
+    preset: str | None
+    """"accurate" or "fast", instead of that in the configuration."""
+    changes: Mapping[str, Any] | None
+    """New values of settings by name, instead of those in the configuration; "estimator" is one."""
+    unit: str
+    """Of positions and standard errors in the output: "px" (default), or "arcsec", which needs the layout's
+    `pixel_scale_arcsec`."""
+    mean_flux: bool
+    """Whether to tell the estimator the mean flux of every sub-aperture over the recording, instead of
+    letting it take that of each frame: better where the star is faint and steady; see
+    `faintspot.MeanFlux`."""
+    follow: bool
+    """Whether to follow spots out of their windows, see `faintspot.SpotFollower`; not together with
+    `mean_flux`. When resumed, the frames before are measured again, to find the spots."""
+    keep: Sequence[str]
+    """Doubtful slopes that stay valid: those at their search limit or cut by their window ("limited"), and
+    those unlike all neighbours ("unlike")."""
+    reference: NDArray[Any] | str | Path | None
+    """Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key", or
+    slopes of which they are the mean; see `faintspot.io.references.read_reference`."""
+
+
 def measure_recorded(
     frames: Sequence[str | Path],
     configuration_file: str | Path,
     output: str | Path,
     *,
-    denoise: bool = True,
-    preset: str | None = None,
-    changes: Mapping[str, Any] | None = None,
-    unit: str = "px",
-    mean_flux: bool = False,
-    follow: bool = False,
-    keep: Sequence[str] = (),
-    reference: NDArray[Any] | str | Path | None = None,
-    key: str | None = None,
-    time_axis: int | None = None,
     threads: int | None = None,
     block_frames: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
+    **choices: Unpack[Choices],
 ) -> Summary:
     """Measure the slopes of all frames in some files and write them to a file.
 
@@ -131,30 +158,6 @@ def measure_recorded(
         such file, the settings, too.
     output : path
         .zarr, .fits, .npz or .csv.
-    denoise : bool
-        False switches the denoising off for all sub-apertures.
-    changes : mapping, optional
-        New values of settings by name, instead of those in the configuration; "estimator" is one.
-    preset : str, optional
-        "accurate" or "fast", instead of that in the configuration.
-    unit : {"px", "arcsec"}
-        Of positions and standard errors in the output; arcsec needs the layout's `pixel_scale_arcsec`.
-    mean_flux : bool
-        Tell the estimator the mean flux of every sub-aperture over the recording, instead of letting it take
-        that of each frame: better where the star is faint and steady; see `faintspot.MeanFlux`.
-    follow : bool
-        Follow spots out of their windows, see `faintspot.SpotFollower`; not together with `mean_flux`. When
-        resumed, the frames before are measured again, to find the spots.
-    keep : sequence of {"limited", "unlike"}
-        Doubtful slopes that stay valid: those at their search limit or cut by their window, and those unlike
-        all neighbours.
-    reference : array or path, optional
-        Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key", or
-        slopes of which they are the mean; see `faintspot.io.references.read_reference`.
-    key : str, optional
-        Which array of the files to read, where they hold several.
-    time_axis : {0, 1, 2}, optional
-        Axis of cubes that counts the frames, see `faintspot.io.open_frames`.
     threads : int, optional
         Most threads to use; default all processors.
     block_frames : int, optional
@@ -163,57 +166,47 @@ def measure_recorded(
         Replace an existing output of another run.
     progress : callable, optional
         Called with finished and all frames after every block.
+    **choices
+        Values of `Choices`.
 
     Raises
     ------
     InputError
         When a file cannot be read or written, or frames and configuration do not fit together.
     """
-    kept = kept_flags(keep)
-    if follow and mean_flux:
+    kept, follow = kept_flags(choices.get("keep", ())), choices.get("follow", False)
+    if follow and choices.get("mean_flux", False):
         raise InputError("follow (--follow) and mean_flux (--mean-flux): expected one of them, got both")
-    described, origin, stored_reference = _configured(configuration_file, frames, key)
-    layout, settings = described.layout, _settings(described.settings, changes, denoise, preset)
-    positions = read_reference(reference) if isinstance(reference, str | Path) else reference
-    if positions is None:
-        positions = stored_reference
-    options: dict[str, Any] = {**described.spot, "threads": threads}
-    try:
-        pipeline = SlopePipeline(layout, settings, described.calibration, positions, **options)
-    except InputError as error:
-        about_reference = positions is not None and error.name == "reference"
-        file = reference if about_reference and isinstance(reference, str | Path) else configuration_file
-        raise error.within(file) from None
-    with open_frames(frames, key=key, time_axis=time_axis) as source:
+    key, reference = choices.get("key"), choices.get("reference")
+    described, origin, positions = _configured(configuration_file, frames, key)
+    if reference is not None:
+        positions = read_reference(reference) if isinstance(reference, str | Path) else reference
+    layout, settings = described.layout, _settings(described.settings, choices)
+    with open_frames(frames, key=key, time_axis=choices.get("time_axis")) as source:
         _check_files(source, frames, output, layout, configuration_file)
         summary = Summary(source.n_frames, len(layout), origin=origin, doubtful=bool(layout.doubts))
         if positions is None:
             summary.reference = reference_in_words(layout.fitted)
         seen = survey(source.shape, stretches(source))
-        calibration, last = described.calibration, None
-        if described.calibration.saturation_adu is None and seen.saturation_adu is not None:
-            summary.saturation_adu = seen.saturation_adu
-            calibration = replace(calibration, saturation_adu=seen.saturation_adu)
-        calibration, summary.background = _with_fitting_dark(
-            calibration, layout, seen.mean, is_wide=_are_wide(settings, layout)
-        )
-        if calibration is not described.calibration:
-            pipeline = SlopePipeline(layout, settings, calibration, positions, **options)
-        if mean_flux:
+        try:
+            calibration = _calibration(described.calibration, settings, layout, seen, summary)
+            spot: dict[str, Any] = described.spot
+            pipeline = SlopePipeline(layout, settings, calibration, positions, **spot, threads=threads)
+        except InputError as error:
+            about_reference = positions is not None and error.name == "reference"
+            file = reference if about_reference and isinstance(reference, str | Path) else configuration_file
+            raise error.within(file) from None
+        if choices.get("mean_flux", False):
             pipeline = _with_mean_flux(pipeline, source)
-        attributes = _attributes(pipeline, source, frames, described, key, unit, keep, follow)
-        factor = pixels_in(one_of("unit", unit, UNITS), attributes)
-        if time_axis is not None:
-            attributes["source_time_axis"] = time_axis
+        attributes = _attributes(pipeline, source, frames, described, choices)
+        factor = pixels_in(one_of("unit", attributes["unit"], UNITS), attributes)
         if positions is not None:
             attributes["reference"] = np.asarray(positions).tolist()
-        if isinstance(reference, str | Path):
-            attributes["reference_file"] = str(reference)
         with errors_within(configuration_file):
             measure = _follower(pipeline) if follow else pipeline.with_dark(seen.mean)
         if isinstance(measure, SlopePipeline) and source.n_frames >= _FRAMES_FOR_RESPONSE:
             attributes["response"] = response(measure, seen.mean, stretches(source)).tolist()
-        prepared = measure.plan.prepared
+        prepared, last = measure.plan.prepared, None
         faults = prepared.faults
         with create_writer(
             output,
@@ -245,15 +238,27 @@ def _follower(pipeline: SlopePipeline) -> SpotFollower:
     return SpotFollower(pipeline)
 
 
-def _settings(
-    settings: Settings, changes: Mapping[str, Any] | None, denoise: bool, preset: str | None
-) -> Settings:
+def _settings(settings: Settings, choices: Choices) -> Settings:
     """Return the settings as changed by the arguments."""
-    if changes:
+    if changes := choices.get("changes"):
         settings = settings.replace(**changes)
-    if not denoise:
+    if not choices.get("denoise", True):
         settings = without_denoising(settings, "denoise = False (--no-denoise)")
+    preset = choices.get("preset")
     return settings if preset is None else with_preset(settings, preset)
+
+
+def _calibration(
+    calibration: Calibration, settings: Settings, layout: Layout, seen: Survey, summary: Summary
+) -> Calibration:
+    """Return the calibration with what the frames show: saturation, where none is stated, and the dark."""
+    calibration.maps(layout.frame_shape)  # refuses maps of another shape
+    if calibration.saturation_adu is None and seen.saturation_adu is not None:
+        summary.saturation_adu = seen.saturation_adu
+        calibration = replace(calibration, saturation_adu=seen.saturation_adu)
+    is_wide = _are_wide(settings, layout)
+    calibration, summary.background = _with_fitting_dark(calibration, layout, seen.mean, is_wide=is_wide)
+    return calibration
 
 
 def _configured(
@@ -387,12 +392,12 @@ def _attributes(
     source: FrameSource,
     frames: Sequence[str | Path],
     described: Configuration,
-    key: str | None,
-    unit: str,
-    keep: Sequence[str],
-    follow: bool,
+    choices: Choices,
 ) -> dict[str, Any]:
     """Return the attributes of the output; the fingerprint decides whether a run may be continued."""
+    key, unit, follow = choices.get("key"), choices.get("unit", "px"), choices.get("follow", False)
+    keep, time_axis = sorted(choices.get("keep", ())), choices.get("time_axis")
+    reference = choices.get("reference")
     text = configuration.to_text(pipeline.layout, pipeline.settings, pipeline.calibration)
     paths = [str(Path(path).resolve()) for path in frames]
     state = hashlib.sha256()
@@ -401,7 +406,7 @@ def _attributes(
         text,
         str(key),
         *([] if unit == "px" else [unit]),
-        *sorted(keep),
+        *keep,
         *(["follow"] if follow else []),
         *paths,
         *(_version(split_location(path)[0]) for path in frames),
@@ -419,10 +424,12 @@ def _attributes(
         **_files_of_the_spot(described),
         "sources": paths,
         "source_key": key or "",
-        "keep": sorted(keep),
+        "keep": keep,
         **({"followed": True} if follow else {}),
         "faintspot_version": __version__,
         "fingerprint": state.hexdigest(),
+        **({} if time_axis is None else {"source_time_axis": time_axis}),
+        **({"reference_file": str(reference)} if isinstance(reference, str | Path) else {}),
     }
 
 
