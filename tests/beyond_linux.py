@@ -34,7 +34,7 @@ LINUX_ONLY: dict[Any, str] = {
 PLACES = ("/proc", "/dev/shm")
 
 POSIX_MODULES = {"fcntl", "grp", "pty", "pwd", "readline", "resource", "syslog", "termios", "tty"}
-POSIX_FUNCTIONS = ("pread", "pwrite", "mkfifo", "getuid", "geteuid", "sched_getaffinity", "O_CLOEXEC")
+POSIX_FUNCTIONS = ("pread", "pwrite", "mkfifo", "getuid", "sched_getaffinity", "O_CLOEXEC")
 NEED_POSIX = (
     "faintspot.engine",
     "faintspot.cli.realtime",
@@ -88,6 +88,15 @@ def take_posix_away() -> None:
     for name in POSIX_FUNCTIONS:
         if hasattr(os, name):
             delattr(os, name)
+    effective_user = os.geteuid
+
+    def geteuid() -> int:
+        """Return the user to other packages, which see POSIX and lock files as there."""
+        if sys._getframe(1).f_globals["__name__"].startswith("faintspot"):
+            raise AttributeError("module 'os' has no attribute 'geteuid'")
+        return effective_user()
+
+    os.geteuid = geteuid
 
 
 def main(left_out: tuple[str, ...], commands: list[str]) -> None:
