@@ -57,12 +57,7 @@ class _LazyGroup(click.Group):
         """Import one command."""
         if name not in self.commands:
             return None
-        try:
-            command: click.Command = import_module(module_of(name)).command
-        except ModuleNotFoundError as error:
-            if error.name not in _OF_POSIX:
-                raise
-            raise InputError(f"faintspot {name} needs Linux") from None
+        command: click.Command = import_module(module_of(name)).command
         command.name = name  # in the modules all are called "command"
         return command
 
@@ -70,6 +65,10 @@ class _LazyGroup(click.Group):
         """Run a command."""
         try:
             return super().invoke(context)
+        except ModuleNotFoundError as error:
+            if error.name not in _OF_POSIX:
+                raise
+            raise InputError(f"faintspot {context.invoked_subcommand} needs Linux") from None
         except KeyboardInterrupt:
             raise _Interrupted from None
 
