@@ -73,3 +73,22 @@ def test_a_few_spots_anywhere_are_no_lattice(seed: int) -> None:
 @pytest.mark.parametrize("index", range(6))
 def test_random_arrays_are_right_or_doubtful(index: int) -> None:
     assert verdict(random_array(99, index))[0] != "WRONG"
+
+
+@pytest.mark.parametrize(("bend", "doubtful"), [(0.02, False), (0.5, True)])
+def test_few_lenslets_do_not_tell_the_pitch_under_aberrations(bend: float, doubtful: bool) -> None:
+    """Coma of half a pitch at the edge of 5 x 5 lenslets."""
+    at = nodes("square", 5, 20.0, angle_deg=0.0)
+    away = at / np.abs(at).max()
+    coma = 2 * away * away.real + np.abs(away) ** 2
+    at = at + bend * 20.0 / 2 * coma + 60 * (1 + 1j)
+    frame = spot_frame(at, (120, 120), flux_e=4000.0, width_px=1.6)
+    assert bool(find_lenslets(frame).doubt) == doubtful
+
+
+def test_bright_spots_at_no_node_of_many_lenslets_are_doubtful() -> None:
+    at = nodes("square", 15, 12.0) + 100 * (1 + 1j)
+    at[[40, 60, 80, 100]] += 6 * (1 + 1j) * np.exp(1j * np.radians(4.0))
+    grid = find_lenslets(spot_frame(at, (200, 200), flux_e=4000.0, width_px=1.3))
+    assert len(grid.elsewhere) == 4
+    assert grid.doubt

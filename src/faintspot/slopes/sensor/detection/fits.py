@@ -41,6 +41,11 @@ _BETWEEN, _CUT = 0.45, 0.5
 _EXPLAINED, _SUFFICIENT, _CERTAIN, _LITTLE = 0.8, 0.6, 0.85, 0.4
 # Median distance of the spots from their nodes (pitches) above which a fit to them makes a lattice worse.
 _LOOSE = 0.18
+# Bright spots at no node, at least so many and this part of the lenslets, from which there is a doubt as well.
+_SPARE, _SPARE_PART = 3, 0.02
+# Relative standard error of the pitch from which it is doubtful, and from which it is if a spot lies this far
+# (pitches) from its node: jitter of 0.08 pitch in 4 x 4 lenslets stays below.
+_LARGEST_ERROR, _ERROR, _DISPLACED = 0.03, 0.015, 0.32
 # Fewest lit lenslets, and fewest pairs of neighbouring spots in each direction: one pair is a coincidence.
 FEWEST, _PAIRS = 4, 1.4
 # Minimum shape similarity: fraction of the squared flux explained, relative to illuminated spots.
@@ -85,6 +90,16 @@ class LatticeFit:
         sizes = np.bincount(scipy.ndimage.label(dark, joined)[0][dark])[2:]
         # The largest enclosed part may be the central obstruction.
         return far, int(sizes.sum() - sizes.max(initial=0))
+
+    @property
+    def displacements(self) -> tuple[float, float]:
+        """Largest distance of a spot from its node, and standard error of the pitch, in pitches."""
+        lit = self.illuminated.nodes
+        nodes = self.lattice.positions(self.spots.cells)[lit]
+        off = self.spots.positions[lit] - nodes
+        off -= off.mean()
+        error = np.linalg.norm(off) / np.linalg.norm(nodes - nodes.mean()) / np.sqrt(max(len(off) - 2, 1))
+        return float(np.abs(off).max()) / self.lattice.pitch_px, float(error)
 
     @property
     def explained(self) -> float:
@@ -165,11 +180,19 @@ def _fitted(
 
 
 def _unclear(fit: LatticeFit) -> str:
-    """Return a one-line warning if the lattice explains only a part of the spots."""
-    if fit.explained > _CERTAIN or fit.explained == 0:
+    """Return a one-line warning if the lattice explains only a part of the spots, or hardly tells its pitch."""
+    if fit.explained == 0:
         return ""
     elsewhere, dark = fit.unexplained
-    count = np.count_nonzero(fit.illuminated.nodes)
+    count = fit.lit
+    if fit.explained > _CERTAIN and elsewhere < max(_SPARE, _SPARE_PART * count):
+        largest, error = fit.displacements
+        if error < (_ERROR if largest > _DISPLACED else _LARGEST_ERROR):
+            return ""
+        return (
+            f"spots lie up to {largest:.2f} of the pitch from the lattice, of which {count} lit lenslets tell "
+            f"the pitch to {error:.1%} only; give pitch_px if it is known"
+        )
     return (
         f"the lattice explains only a part of the flux: {elsewhere} bright spots belong to none of its "
         f"{count} lit lenslets, and {dark} dark ones lie between these; its pitch or geometry may be wrong, "
