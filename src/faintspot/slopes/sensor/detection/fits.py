@@ -41,7 +41,7 @@ _BETWEEN, _CUT = 0.45, 0.5
 _EXPLAINED, _SUFFICIENT, _CERTAIN, _LITTLE = 0.8, 0.6, 0.85, 0.4
 # Median distance of the spots from their nodes (pitches) above which a fit to them makes a lattice worse.
 _LOOSE = 0.18
-# Bright spots at no node, at least so many and this part of the lenslets, from which there is a doubt as well.
+# Bright spots at no node, at least so many and this part of the lenslets, that also raise a doubt.
 _SPARE, _SPARE_PART = 3, 0.02
 # Relative standard error of the pitch from which it is doubtful, and from which it is if a spot lies this far
 # (pitches) from its node: jitter of 0.08 pitch in 4 x 4 lenslets stays below.
@@ -180,7 +180,7 @@ def _fitted(
 
 
 def _unclear(fit: LatticeFit) -> str:
-    """Return a one-line warning if the lattice explains only a part of the spots, or hardly tells its pitch."""
+    """Return a one-line warning if the lattice explains only a part of the spots or its pitch is unclear."""
     if fit.explained == 0:
         return ""
     elsewhere, dark = fit.unexplained
@@ -190,8 +190,8 @@ def _unclear(fit: LatticeFit) -> str:
         if error < (_ERROR if largest > _DISPLACED else _LARGEST_ERROR):
             return ""
         return (
-            f"spots lie up to {largest:.2f} of the pitch from the lattice, of which {count} lit lenslets tell "
-            f"the pitch to {error:.1%} only; give pitch_px if it is known"
+            f"spots lie up to {largest:.2f} of the pitch from the lattice, and {count} lit lenslets tell its "
+            f"pitch to {error:.1%} only; give pitch_px if it is known"
         )
     return (
         f"the lattice explains only a part of the flux: {elsewhere} bright spots belong to none of its "
