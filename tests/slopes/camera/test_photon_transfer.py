@@ -71,6 +71,15 @@ def test_without_darks_the_darkest_pixels_serve() -> None:
     assert "dark level: given" in known.notes
 
 
+def test_frames_written_twice_are_left_out() -> None:
+    frames, darks = recorded(CAMERA, 5000.0, n_frames=10)
+    found = measure_detector(frames, darks, layout=LAYOUT)
+    twice = measure_detector(np.repeat(frames, 2, axis=0), np.repeat(darks, 2, axis=0), layout=LAYOUT)
+    assert twice.gain_e_per_adu == found.gain_e_per_adu
+    assert twice.read_noise_adu == found.read_noise_adu
+    assert any("10 of 20" in note for note in twice.notes)
+
+
 def test_hot_pixels_and_a_drifting_level_do_not_matter() -> None:
     rng = np.random.default_rng(3)
     hot = [(3, 5, 4000.0), (40, 41, 900.0), (70, 12, 20000.0)]

@@ -20,6 +20,7 @@ from faintspot.experiments.planner.question import (
     default_search_range_px,
 )
 from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.camera.mean_frame import are_repeated
 from faintspot.slopes.camera.photon_transfer import DetectorMeasurement, measure_detector
 from faintspot.slopes.estimators.algorithms.noise import pixel_noise
 from faintspot.slopes.sensor.layout import Layout
@@ -100,6 +101,11 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **st
     stated.pop("pixels", None)
     _check_stated(layout, stated)
     stack = stack[: 2 * frames_to_check(layout)]  # every second one; more cost memory and tell nothing
+    if (repeated := are_repeated(stack, None)).any():
+        facts.append(
+            f"{np.count_nonzero(repeated)} of {len(stack)} frames left out, repeated by the recorder"
+        )
+        stack = stack[~repeated]
     calibration = _calibration(stack, dark_stack, layout, stated, facts)
     stated["em_gain"] = calibration.em_gain
     whole, (usable, left_out) = layout, usable_subapertures(stack, layout, calibration)

@@ -1,4 +1,4 @@
-"""Mean of frames, some of whose pixels are not finite."""
+"""Mean of frames, some of whose pixels are not finite; frames that were written twice."""
 
 from __future__ import annotations
 
@@ -29,3 +29,10 @@ class MeanFrame:
         """(h, w), NaN in pixels that were never finite."""
         unknown = np.full(self._total.shape, np.nan)
         return np.asarray(np.divide(self._total, self._count, where=self._count > 0, out=unknown))
+
+
+def are_repeated(frames: NDArray[np.generic], before: NDArray[np.generic] | None) -> NDArray[np.bool_]:
+    """Return which frames (n, h, w) are the same as the one before, as a grabber writes them twice."""
+    same = (frames[1:] == frames[:-1]).all(axis=(1, 2))
+    first = before is not None and np.array_equal(frames[0], before)
+    return np.concatenate([[first], same])

@@ -14,6 +14,7 @@ from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.camera.dark_frames import DarkPixels, dark_pixels
+from faintspot.slopes.camera.mean_frame import are_repeated
 from faintspot.slopes.camera.transfer_curve import LineFit, TransferCurve, fit_line, photon_transfer
 from faintspot.slopes.sensor.layout import Layout
 
@@ -100,7 +101,7 @@ def measure_detector(
     flux. The variance is half the mean square of the difference between successive frames, so that slow
     drifts have no effect. Changes of brightness and small movements common to a sub-aperture (without
     `layout`: to an area of 16 x 16 px) are fitted and removed, in proportion to the mean image and its
-    first and second derivatives.
+    first and second derivatives. Frames that are the same as the one before are left out.
 
     Parameters
     ----------
@@ -139,18 +140,18 @@ def measure_detector(
     >>> print(f"read noise {found.read_noise_e:.1f} e-, gain {found.gain_e_per_adu:.2f} e-/ADU")
     read noise 3.0 e-, gain 0.50 e-/ADU
     """
-    multiplication = number_between("em_gain", em_gain, 1.0)
+    multiplication, repeated = number_between("em_gain", em_gain, 1.0), list[str]()
     if frames is None:
         if darks is None:
             raise InputError("frames, darks: expected at least one of them, got neither")
-        dark, read_noise = _measure_dark(_frames("darks", darks))
-        return _result(dark, read_noise, None, (None, None), multiplication, [_BY_DARKS])
-    stack = _frames("frames", frames)
+        dark, read_noise = _measure_dark(_frames("darks", darks, repeated))
+        return _result(dark, read_noise, None, (None, None), multiplication, [*repeated, _BY_DARKS])
+    stack = _frames("frames", frames, repeated)
     if darks is None:
         dark, note = _dark_without_darks(stack, dark_level_adu)
         notes = [note, "read noise: darkest pixels of the frames, less their photon noise"]
     else:
-        dark, read_noise = _measure_dark(_frames("darks", darks))
+        dark, read_noise = _measure_dark(_frames("darks", darks, repeated))
         notes = [_BY_DARKS]
         if np.shape(dark.level) != stack.shape[1:]:
             raise InputError(f"darks: expected frames of {stack.shape[1:]}, got {np.shape(dark.level)}")
@@ -161,16 +162,24 @@ def measure_detector(
         read_noise = _read_noise_without_darks(everything, line)
     coarse = fit_line(photon_transfer(stack, dark.level, layout, order=1).within(range_adu))
     halves = tuple(fit_line(half) for half in curve.halves())
+    notes += repeated
     notes.append("gain: slope of variance against mean")
     problem = _problem(line, coarse, halves)
     return _result(dark, read_noise, line, halves, multiplication, notes, problem)
 
 
-def _frames(name: str, value: object) -> Floats:
+def _frames(name: str, value: object, notes: list[str]) -> Floats:
+    """Return checked frames without repeated ones, whose noise would be zero, and note their number."""
     frames: Floats = finite_array(name, value, minimum_dimensions=3).astype(np.float64)
     if frames.ndim != 3 or len(frames) < 2 or min(frames.shape[1:]) < 4:
         raise InputError(f"{name}: expected at least 2 frames of 4 x 4 pixels or more, got {frames.shape}")
-    return frames
+    repeated = are_repeated(frames, None)
+    if not repeated.any() or np.count_nonzero(~repeated) < 2:
+        return frames
+    notes.append(
+        f"{name}: {np.count_nonzero(repeated)} of {len(frames)} left out, the same as the one before"
+    )
+    return frames[~repeated]
 
 
 def _measure_dark(darks: Floats) -> tuple[_Dark, _Value]:

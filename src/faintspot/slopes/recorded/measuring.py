@@ -27,6 +27,7 @@ from faintspot.io.slopes import create_writer
 from faintspot.io.stored.slopes_format import UNITS, pixels_in
 from faintspot.io.telemetry.aot_reading import is_aot, read_aot
 from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.camera.mean_frame import are_repeated
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.labelled import layout_coordinates
@@ -35,7 +36,7 @@ from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px, with_pres
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.response import response
-from faintspot.slopes.recorded.survey import Survey, are_repeated, stretches, survey
+from faintspot.slopes.recorded.survey import Survey, stretches, survey
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
 

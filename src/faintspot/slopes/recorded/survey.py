@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.io.frames import FrameSource
-from faintspot.slopes.camera.mean_frame import MeanFrame
+from faintspot.slopes.camera.mean_frame import MeanFrame, are_repeated
 from faintspot.slopes.camera.saturation import LargestValues
 
 _LOOKS, _FRAMES = 20, 50  # stretches of frames over the whole recording
@@ -70,13 +70,6 @@ def survey(shape: tuple[int, ...], blocks: Iterable[NDArray[np.generic]]) -> Sur
         unlike |= np.abs(level - np.median(level)) > typical
     usual = ~(unlike | np.concatenate(repeated))
     return Survey(frames.mean, values.saturation_adu, usual, int(np.count_nonzero(unlike)))
-
-
-def are_repeated(frames: NDArray[np.generic], before: NDArray[np.generic] | None) -> NDArray[np.bool_]:
-    """Return which frames (n, h, w) are the same as the one before, as a grabber writes them twice."""
-    same = (frames[1:] == frames[:-1]).all(axis=(1, 2))
-    first = before is not None and np.array_equal(frames[0], before)
-    return np.concatenate([[first], same])
 
 
 def _level_and_spread(frames: NDArray[np.generic]) -> NDArray[np.float64]:
