@@ -83,7 +83,7 @@ def doubts_of(found: FoundLayout) -> tuple[str, ...]:
     doubts = [found.lenslets.doubt] if found.lenslets.doubt else []
     for reason, doubtful in (
         ("at their window's edge, which cuts them", found.clipped),
-        ("displaced unlike those of all neighbours", found.unlike),
+        ("displaced unlike those of all neighbours, or far dimmer", found.unlike),
     ):
         if doubtful.any():
             numbers = np.flatnonzero(doubtful)

@@ -16,6 +16,8 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, lines_of, neighbours_of
 from faintspot.slopes.sensor.windows import Windows, find_windows
 
+_GHOST = 0.25  # of the flux of the dimmest neighbour
+
 
 @dataclass(frozen=True)
 class FoundLayout:
@@ -34,7 +36,7 @@ class FoundLayout:
     clipped : (n_subapertures,) array of bool
         True where the spot is within its standard deviation (at least 1 px) of the edge of its window.
     unlike : (n_subapertures,) array of bool
-        True where the displacement of the spot differs from those of all its neighbours.
+        True where the spot is displaced unlike all its neighbours, or amid others with four times its flux.
     """
 
     layout: Layout
@@ -88,7 +90,7 @@ def find_layout(frame: ArrayLike, **options: Any) -> FoundLayout:
         grid.centres[~within],
         _outside(found),
         depth < max(grid.spot_px, 1.0),
-        _unlike(grid)[within],
+        (_unlike(grid) | _dim(grid))[within],
     )
 
 
@@ -125,3 +127,10 @@ def _unlike(grid: LensletGrid) -> NDArray[np.bool_]:
     x, y = np.ascontiguousarray(x[None]), np.ascontiguousarray(y[None])
     flag_doubtful(x, y, np.zeros_like(x), flags, expected, np.empty(n, np.float32))
     return np.asarray(flags[0] != 0)
+
+
+def _dim(grid: LensletGrid) -> NDArray[np.bool_]:
+    """Return which spots amid others are so dim that they may be ghosts in a dark lenslet."""
+    neighbours = neighbours_of(grid.cells, grid.geometry)
+    dimmest = np.append(grid.flux, 0.0)[neighbours].min(axis=1)  # 0 at the edge of the pupil
+    return np.asarray(grid.flux < _GHOST * dimmest)
