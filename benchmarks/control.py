@@ -21,20 +21,17 @@ from numpy.typing import NDArray
 
 from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
 from benchmarks.prediction import TELEMETRY_GAIN, Case
-from faintspot.loop.control.base import Controller
-from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.compiled import CompiledIntegrator
-from faintspot.loop.control.identification.learning import learn_controller
+from faintspot.loop.control.base import CommandDelayLine, Controller
+from faintspot.loop.control.identification.learning import learn_controller, relearn
 from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.identification.predictive_control import LoopOfControl, PredictiveControl
-from faintspot.loop.control.identification.relearning import relearn
+from faintspot.loop.control.integrator import CompiledIntegrator
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_model import neighbours_within
 from faintspot.loop.control.kalman.local_predictor import local_shapes
 from faintspot.loop.control.kalman.predictive import Predictive
-from faintspot.loop.control.kalman.predictor import SlopePredictor
-from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 from faintspot.loop.control.reconstructor import Reconstructor
 from faintspot.loop.simulation import load_loop
 from faintspot.loop.simulation.control import slope_turbulence

@@ -38,9 +38,8 @@ from faintspot.engine.engine import Engine
 from faintspot.engine.path.timing import Latencies
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.requests.scheduling import real_time
-from faintspot.loop.control import slope_product
-from faintspot.loop.control.base import Controller
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control import integrator
+from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control, ControlOptions
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.reconstructor import Reconstructor
@@ -155,7 +154,7 @@ class _Turns(Latencies):
     def __init__(self, frames: int) -> None:
         super().__init__()
         self._frames, self._count = frames, 0
-        self._least = {DURING: slope_product._LEAST_BYTES, AFTER: sys.maxsize}
+        self._least = {DURING: integrator._LEAST_BYTES, AFTER: sys.maxsize}
         self.found: dict[str, list[int]] = {way: [] for way in self._least}
         self._choose(AFTER)
 
@@ -169,11 +168,11 @@ class _Turns(Latencies):
     def end(self) -> None:
         """Choose the usual way."""
         self._choose(DURING)
-        slope_product._LEAST_BYTES = self._least[DURING]
+        integrator._LEAST_BYTES = self._least[DURING]
 
     def _choose(self, way: str) -> None:
         self.way = way
-        slope_product._LEAST_BYTES = self._least[way]
+        integrator._LEAST_BYTES = self._least[way]
 
 
 def measured(across: int, kind: str) -> dict[str, NDArray[np.float64]]:

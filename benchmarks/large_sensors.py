@@ -21,9 +21,9 @@ import numpy as np
 from benchmarks.measuring import Row, Table
 from benchmarks.prediction import Case, Make, rivals
 from faintspot.base.statistics import paired_mean
+from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification import learning
 from faintspot.loop.control.identification.learning import GAINS
-from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.simulation import LoopConfiguration
 
 _DENSE = os.environ.get("FAINTSPOT_DENSE", "1") != "0"

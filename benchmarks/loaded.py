@@ -75,15 +75,15 @@ TASKS = {
     "slopes of a recording": Task(_SLOPES, 11_000, (_FRAMES, _LAYOUT)),
     "telemetry": Task("telemetry slopes.zarr --frame-rate-hz 250", 14_000, (_FRAMES, _LAYOUT, _SLOPES)),
     "loop magnitude": Task(
-        "loop magnitude diffraction_limit --quick --methods brightest --flux-e 20 --workers 0", 20_500
+        "loop magnitude diffraction_limit --quick --methods brightest --flux-e 20 --workers 0", 20_000
     ),
     "realtime run": Task(
         "realtime run --frames 20 --name {name}",
-        18_000,
+        17_500,
         (_FRAMES, _LAYOUT),
         "realtime replay frames.npy --name {name}",
     ),
-    "tune": Task("tune --read-noise-e 1 --pixels 8 --fwhm-px 1.8 --flux-e 100 -o tuned.toml", 20_500),
+    "tune": Task("tune --read-noise-e 1 --pixels 8 --fwhm-px 1.8 --flux-e 100 -o tuned.toml", 16_500),
 }
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from benchmarks.measuring import Row, Table, absolute_spread, best, interleaved, pinned
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.telescope.atmosphere import MovingLayers, make_atmosphere

@@ -21,13 +21,17 @@ from numpy.typing import NDArray
 
 from benchmarks.measuring import Row, Table
 from faintspot.base.statistics import paired_mean
-from faintspot.loop.control.base import LEARNT, Controller, ExpectedSlopes
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import (
+    LEARNT,
+    CommandDelayLine,
+    Controller,
+    ExpectedSlopes,
+    OpenLoopTelemetry,
+)
 from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.phase import residual_phase
-from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop
 from faintspot.loop.simulation.control import slope_turbulence
 from faintspot.loop.simulation.simulation import measure_gains

@@ -29,7 +29,7 @@ from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.loop.control.base import CONTROLS
 from faintspot.loop.control.configuration import Control, ControlOptions, load_control
 from faintspot.loop.control.identification.model import Kalman
-from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.control.kalman.predictor import SlopeModel
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.control import slope_turbulence
 from faintspot.loop.simulation.engine_files import write_engine_files

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.prediction import Shaken
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.integrator import Integrator

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.measuring import Row, Table
 from benchmarks.recorded_loops import Truth, drawn_cases, recorded, winds_of
-from faintspot.loop.control.identification.measured import Measured
+from faintspot.loop.control.identification.open_loop import Measured
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.simulation import LoopRecord, Method, load_loop, simulate_loop
 from faintspot.loop.telemetry.choices import AS_RUN, FILTER

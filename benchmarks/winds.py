@@ -15,11 +15,10 @@ from benchmarks.measuring import Row, Table
 from benchmarks.prediction import SETTLE, VIBRATION_NM, Case, Floats, Run
 from faintspot.base.statistics import paired_mean
 from faintspot.engine.loop.successor import ControllerSuccessor, PreparedController
-from faintspot.loop.control.base import ASSUMED, WINDS, Controller
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import ASSUMED, WINDS, CommandDelayLine, Controller
+from faintspot.loop.control.identification.learning import RelearntControl, relearn
 from faintspot.loop.control.identification.model import Kalman
-from faintspot.loop.control.identification.relearning import RelearntControl, relearn
-from faintspot.loop.control.kalman.choice import HANDOVER_FRAMES
+from faintspot.loop.control.kalman.guarded import HANDOVER_FRAMES
 
 CASES = {
     "diffraction_limit, 20 photons": Case(20.0, 0.0),

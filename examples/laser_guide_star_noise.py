@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 import faintspot as fs
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter
-from faintspot.loop.control.kalman.predictor import SlopePredictor
-from faintspot.loop.control.kalman.slope_model import SlopeModel
-from faintspot.loop.control.noise import add_noise, weighted_slopes
+from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 from faintspot.loop.control.phase import phase_of_commands
+from faintspot.loop.control.reconstructor import add_noise, weighted_slopes
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence, phase_covariance_rad2
 
 Floats = NDArray[np.float64]

@@ -55,15 +55,15 @@ def no_processes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 @pytest.fixture
 def coarse_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw without fine detail: pictures of reports take most of the time."""
-    from faintspot.base.report import drawing
+    from faintspot.base.report import plots
 
-    monkeypatch.setattr(drawing, "DOTS_PER_INCH", 20)
+    monkeypatch.setattr(plots, "DOTS_PER_INCH", 20)
 
 
 @pytest.fixture
 def undrawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compose the figures but do not draw them."""
-    from faintspot.base.report import drawing
+    from faintspot.base.report import plots
 
     for name in ("png", "svg"):
-        monkeypatch.setattr(drawing, name, lambda figure: b"")
+        monkeypatch.setattr(plots, name, lambda figure: b"")

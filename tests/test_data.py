@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from faintspot.data import mmt_frame
-from faintspot.slopes.camera.hot_pixels import find_hot_pixels
+from faintspot.slopes.camera.frame_checks import find_hot_pixels
 from faintspot.slopes.sensor.found_layout import find_layout
 
 

@@ -6,7 +6,7 @@ import json
 import sys
 from pathlib import Path
 
-from faintspot.base.report.drawing import new_figure
+from faintspot.base.report.plots import new_figure
 
 MARKERS = "os^D"
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 import faintspot as fs
 from faintspot.data import mmt_frame
-from faintspot.slopes.camera.hot_pixels import find_hot_pixels
+from faintspot.slopes.camera.frame_checks import find_hot_pixels
 from faintspot.slopes.sensor.found_layout import find_layout
 
 frame = mmt_frame()

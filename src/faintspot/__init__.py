@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from faintspot.slopes.estimators.algorithms.total_variation import tv_denoise as tv_denoise
     from faintspot.slopes.pipeline.following import SpotFollower as SpotFollower
     from faintspot.slopes.pipeline.images import measure_images as measure_images
-    from faintspot.slopes.pipeline.mean_flux import MeanFlux as MeanFlux
+    from faintspot.slopes.pipeline.light import MeanFlux as MeanFlux
     from faintspot.slopes.pipeline.settings import Settings as Settings
     from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline as SlopePipeline
     from faintspot.slopes.pipeline.slopes import Slopes as Slopes
@@ -55,7 +55,7 @@ _HOMES = {
     "InputError": "faintspot.base.errors",
     "LaserGuideStar": "faintspot.slopes.spots.laser",
     "Layout": "faintspot.slopes.sensor.layout",
-    "MeanFlux": "faintspot.slopes.pipeline.mean_flux",
+    "MeanFlux": "faintspot.slopes.pipeline.light",
     "MissingExtraError": "faintspot.base.errors",
     "PSF": "faintspot.slopes.spots.psf",
     "Settings": "faintspot.slopes.pipeline.settings",

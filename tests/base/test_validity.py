@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from faintspot.base.flags import NO_FLAG, SubapertureFlag
-from faintspot.base.validity import are_valid, leave_out
+from faintspot.base.flags import NO_FLAG, SubapertureFlag, are_valid, leave_out
 
 DARK, LIMITED = SubapertureFlag.NO_FLUX, SubapertureFlag.AT_SEARCH_LIMIT
 FLAGS = np.array([[DARK, LIMITED, 0, 8], [DARK, 0, 0, 64]], np.uint8)

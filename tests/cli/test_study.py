@@ -8,7 +8,7 @@ import pytest
 from tests.cli.cli_cases import Commands, command_line
 
 from faintspot.experiments import StudySpecification, Sweep, WorkerPool, open_study, run
-from faintspot.experiments.study import built_in as estimators
+from faintspot.experiments.study import specification as estimators
 
 pytest.importorskip("zarr")
 pytest.importorskip("xarray")

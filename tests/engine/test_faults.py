@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tests.engine.bench import SETTINGS, Bench, make, simulated
 
-from faintspot.engine.path.lateness import CAUSES, INCOMPLETE
+from faintspot.engine.path.timing import CAUSES, INCOMPLETE
 from faintspot.engine.pixels.segment import FOLDER
 
 pyshmem = pytest.importorskip("pyshmem")

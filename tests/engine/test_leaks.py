@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tests.engine.bench import Bench, simulated
 from tests.engine.estimator_files import write
 
-from faintspot.engine.settings.estimator_trial import EstimatorTrial
+from faintspot.engine.settings.estimators import EstimatorTrial
 
 pytestmark = pytest.mark.slow
 

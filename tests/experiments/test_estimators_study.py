@@ -10,7 +10,7 @@ import pytest
 from tests.experiments.study_cases import cells, dataset, power_law
 from tests.shared_data import shared_file
 
-from faintspot.base.report import drawing
+from faintspot.base.report import plots
 from faintspot.experiments.report.efficiency import (
     calibration_sections,
     compares_estimators,
@@ -19,7 +19,7 @@ from faintspot.experiments.report.efficiency import (
 )
 from faintspot.experiments.report.estimator_figures import estimator_figures
 from faintspot.experiments.report.page import study_report
-from faintspot.experiments.study.built_in import estimators_study
+from faintspot.experiments.study.specification import estimators_study
 from faintspot.experiments.study.sweep import Cell
 
 METHODS = ("brightest", "tv", "ml", "map", "weighted")
@@ -122,8 +122,8 @@ def test_other_studies_do_not_compare_estimators() -> None:
 
 
 def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drawing, "DOTS_PER_INCH", 20)
-    monkeypatch.setattr(drawing, "svg", lambda figure: b"")  # another drawing, as slow
+    monkeypatch.setattr(plots, "DOTS_PER_INCH", 20)
+    monkeypatch.setattr(plots, "svg", lambda figure: b"")  # another drawing, as slow
     specification = estimators_study(quick=True)
     quick = [asdict(cell) for cell in specification.cells()]
     few = [row for row in quick if row["d_over_r0"] > 0 or row["read_noise_e"] == 3]

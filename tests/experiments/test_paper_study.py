@@ -3,7 +3,7 @@
 import pytest
 
 from faintspot.base.errors import InputError
-from faintspot.experiments.study.built_in import FIGURES, paper_study
+from faintspot.experiments.study.specification import FIGURES, paper_study
 
 
 def test_full_study_has_every_figure_of_the_paper() -> None:

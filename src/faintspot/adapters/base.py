@@ -15,7 +15,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.configuration import Configuration
-from faintspot.slopes.pipeline.mean_flux import MeanFlux
+from faintspot.slopes.pipeline.light import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes

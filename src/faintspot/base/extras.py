@@ -9,7 +9,7 @@ from pathlib import Path
 from faintspot.base.errors import InputError, MissingExtraError
 
 EXTRAS = {
-    "io": ("astropy", "h5py", "PIL", "tifffile", "zarr"),
+    "io": ("astropy", "filelock", "h5py", "PIL", "tifffile", "zarr"),
     "report": ("matplotlib", "jinja2"),
     "loop": ("hcipy", "joblib", "xarray"),
     "cluster": ("distributed",),

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
-from faintspot.base.report.words import with_interval
+from faintspot.base.report.texts import with_interval
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import can_make
 from faintspot.cli.shared.output import results_table

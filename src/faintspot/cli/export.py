@@ -7,9 +7,8 @@ from pathlib import Path
 import click
 
 from faintspot.base.files import derived
-from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.commands import AO_MODE, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import AO_MODE
 from faintspot.cli.shared.output import write_aot_file
 
 

@@ -13,7 +13,7 @@ from faintspot.cli.shared.needs import needs
 from faintspot.experiments.store import kind_of_store
 from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.locations import split_location
-from faintspot.loop.simulation.files import holds_loop_results
+from faintspot.loop.simulation.record import holds_loop_results
 
 
 @needs("report", "matplotlib", "jinja2")

@@ -8,12 +8,10 @@ from typing import Any
 
 import click
 
-from faintspot.base.config.presets import PRESETS
-from faintspot.base.config.written_changes import parse_changes
+from faintspot.base.config.tables import PRESETS, parse_changes
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.flags import SubapertureFlag
-from faintspot.cli.shared.commands import NAMES, option
-from faintspot.cli.shared.options import KEY, REFERENCE, configuration_option
+from faintspot.cli.shared.commands import KEY, NAMES, REFERENCE, configuration_option, option
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.io.formats.registry import slope_format
 from faintspot.io.locations import split_location

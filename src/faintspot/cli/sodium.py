@@ -11,8 +11,7 @@ import numpy as np
 from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
-from faintspot.cli.shared.commands import option
-from faintspot.cli.shared.options import KEY, configuration_option
+from faintspot.cli.shared.commands import KEY, configuration_option, option
 from faintspot.cli.shared.output import picture_file, write_picture
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.io.frames import open_frames
@@ -93,7 +92,7 @@ def command(
                 f"  centres of [layout] moved by up to {moved:.2f} px, to the spots' centres of gravity"
             )
     if drawing is not None:
-        from faintspot.slopes.recorded.report.sodium_section import profile_figure
+        from faintspot.slopes.recorded.report.stored import profile_figure
 
         before = {"before": known.star.focused(laser.profile)}
         write_picture(profile_figure({**before, "now": profile}).figure, drawing)

@@ -86,7 +86,7 @@ def command(
     if specification == _PAPER:
         _repeat_the_paper(target, quick, figures, where)
     elif specification == _ESTIMATORS:
-        from faintspot.experiments.study.built_in import estimators_study
+        from faintspot.experiments.study.specification import estimators_study
 
         require("loop", "matplotlib", "jinja2", purpose="faintspot study estimators")
         _write_page(_measure(estimators_study(quick), target, **where), target)
@@ -103,7 +103,7 @@ def _repeat_the_paper(target: str, quick: bool, figures: tuple[str, ...], where:
     from faintspot.experiments.night.page import PAGE_FILE
     from faintspot.experiments.paper.whole import paper_markdown, paper_rows
     from faintspot.experiments.report.page import night_folder
-    from faintspot.experiments.study.built_in import FIGURES, NIGHT, paper_study
+    from faintspot.experiments.study.specification import FIGURES, NIGHT, paper_study
     from faintspot.loop.simulation.configuration.configuration import load_loop
 
     of_study = tuple(name for name in figures or FIGURES if name != NIGHT)

@@ -16,9 +16,8 @@ from rich.console import Console
 from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
 from faintspot.cli.layout.options import grid_shape
-from faintspot.cli.shared.commands import SectionedCommand, declared, flag_of, option
+from faintspot.cli.shared.commands import SectionedCommand, declared, flag_of, option, which_frames
 from faintspot.cli.shared.needs import suggested_slopes
-from faintspot.cli.shared.options import which_frames
 from faintspot.cli.shared.output import check_target, picture_file, results_table, wrapped, write_picture
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.experiments.planner import text as answer_text

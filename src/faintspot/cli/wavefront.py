@@ -18,8 +18,7 @@ from faintspot.cli.shared.output import picture_file, write_picture
 from faintspot.io.frames import read_array
 from faintspot.loop.control.flattening import Flattening, check_command_file, flattening, save_command
 from faintspot.slopes.pipeline.slopes import Slopes
-from faintspot.slopes.recorded.difference import difference
-from faintspot.slopes.recorded.stored_run import open_run
+from faintspot.slopes.recorded.stored_run import difference, open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.wavefront import Wavefront, ZonalMap, fit_wavefront, save_map, save_wavefront, zonal_map
 from faintspot.slopes.wavefront.files import check_map_file, check_wavefront_file

@@ -12,14 +12,12 @@ import numpy as np
 from faintspot.base.errors import InputError
 from faintspot.engine.loop.control_loop import CLOSED, OPEN, STATES, ControlLoop
 from faintspot.engine.path.frame_path import FramePath
-from faintspot.engine.path.lateness import CAUSES, IN_TIME, INCOMPLETE, WORKER, Lateness
 from faintspot.engine.path.slope_prior import SlopePrior
-from faintspot.engine.path.timing import Counters, Latencies
+from faintspot.engine.path.timing import CAUSES, IN_TIME, INCOMPLETE, WORKER, Counters, Latencies, Lateness
 from faintspot.engine.path.workers import Workers
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.settings.dark_following import DarkFollower
 from faintspot.engine.settings.estimators import EngineEstimators
-from faintspot.engine.settings.flux_following import FluxFollower
+from faintspot.engine.settings.following import DarkFollower, FluxFollower
 from faintspot.engine.settings.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
 from faintspot.engine.settings.plan import EnginePlan, SettingsPreparer
 from faintspot.engine.settings.running_settings import Change, RunningSettings
@@ -116,7 +114,7 @@ class Engine:
         self.counters, self.latencies = Counters(), Latencies()
         self._lateness = Lateness()
         self.late_because: dict[str, int] = {}
-        """Number of late frames by cause; see `faintspot.engine.path.lateness`."""
+        """Number of late frames by cause; see `faintspot.engine.path.timing`."""
         self.lost_because: dict[str, int] = {}
         """Number of lost frames by cause."""
         self._lost = 0, IN_TIME  # since the last measured frame: their number, and the last one's cause

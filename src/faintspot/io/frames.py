@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.sizes import check_bytes, check_size
-from faintspot.io.arrays.axes import arranged
-from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
+from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray, arranged
 from faintspot.io.formats.registry import frame_format
 from faintspot.io.locations import one_line, split_location
 

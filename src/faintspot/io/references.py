@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.validity import leave_out
+from faintspot.base.flags import leave_out
 from faintspot.io.formats.registry import slope_endings, slope_format
 from faintspot.io.frames import read_array
 from faintspot.io.locations import split_location

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from faintspot.base.errors import MissingExtraError
-from faintspot.base.report.drawing import limits_of, new_figure, plain_ticks, png, svg
+from faintspot.base.report.plots import limits_of, new_figure, plain_ticks, png, svg
 from faintspot.slopes.sensor.drawing import subaperture_shapes
 from faintspot.slopes.sensor.layout import Layout
 
@@ -45,7 +45,7 @@ def test_missing_matplotlib_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> 
         "slopes.recorded.report.frame_pictures",
         "slopes.recorded.report.maps",
     ):
-        for name in ("faintspot.base.report.drawing", f"faintspot.{module}"):
+        for name in ("faintspot.base.report.plots", f"faintspot.{module}"):
             monkeypatch.delitem(sys.modules, name, raising=False)
         with pytest.raises(MissingExtraError, match=r"faintspot\[report\]"):
             __import__(f"faintspot.{module}")

@@ -7,9 +7,9 @@ import pytest
 from tests.slopes.recorded.recorded_cases import Page as Reader
 
 from faintspot.base.errors import InputError
-from faintspot.base.report.drawing import new_figure
 from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import Report, Section, Table, TableCell, configuration_section
+from faintspot.base.report.plots import new_figure
 
 pytestmark = pytest.mark.usefixtures("coarse_pictures")
 

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from faintspot.base.report.page import TableCell
-from faintspot.base.report.texts import Texts
-from faintspot.base.report.words import Words
+from faintspot.base.report.texts import Texts, Words
 from faintspot.base.statistics import Estimate
 
 PACKAGES = (

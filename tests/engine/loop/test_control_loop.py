@@ -14,9 +14,8 @@ from tests.patience import examples
 from faintspot.base.errors import InputError
 from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.path.slope_prior import SlopePrior
-from faintspot.loop.control import slope_product
-from faintspot.loop.control.base import CONTROLS, INTEGRATOR, Controller
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control import integrator
+from faintspot.loop.control.base import CONTROLS, INTEGRATOR, CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control, ControlOptions
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.model import Kalman
@@ -131,7 +130,7 @@ def test_what_is_not_finite_never_reaches_the_mirror() -> None:
 
 def test_a_command_that_is_begun_while_rows_arrive_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """With lost frames, changed flags and slopes that are not finite; the tolerance is that of float32."""
-    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
     options = ControlOptions(centroid_gain=0.8, largest_residual_px=1e30, most_invalid=1.0)
     whole, begun = (ControlLoop(Control(INTERACTION, None, options), LAYOUT, threads=2) for _ in range(2))
     assert not begun.begin_product()  # the loop is open
@@ -158,7 +157,7 @@ def test_a_command_that_is_begun_while_rows_arrive_is_the_same(monkeypatch: pyte
 
 
 def test_no_command_is_begun_if_modes_are_removed_from_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
     options = ControlOptions(removed_modes="tip_tilt", largest_residual_px=1e30)
     loop = ControlLoop(Control(INTERACTION, None, options), LAYOUT)
     loop.close()

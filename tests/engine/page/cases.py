@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.engine.page.access import Access
-from faintspot.engine.page.batch import Batch, BatchSource, Picture
 from faintspot.engine.page.client_requests import ClientRequest
+from faintspot.engine.page.page_state import Batch, BatchSource, Picture
 from faintspot.engine.page.server import LiveServer
-from faintspot.engine.telemetry.segment import record_type
+from faintspot.engine.telemetry.ring import record_type
 from faintspot.slopes.sensor.layout import Layout
 
 LAYOUT = Layout.grid((3, 3), pixels=8, inner_radius=0.5)

@@ -1,6 +1,6 @@
 import asyncio
 
-from faintspot.engine.page.latest_messages import LatestMessages
+from faintspot.engine.page.page import LatestMessages
 
 
 def test_only_the_newest_message_of_each_kind_is_kept() -> None:

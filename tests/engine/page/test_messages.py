@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tests.engine.page.cases import unpacked
 
-from faintspot.engine.page.messages import packed
+from faintspot.engine.page.page import packed
 
 
 def test_message_holds_values_and_arrays_as_they_were() -> None:

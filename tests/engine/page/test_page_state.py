@@ -7,8 +7,7 @@ from tests.engine.page.cases import N, records
 
 from faintspot.base.flags import SubapertureFlag
 from faintspot.engine.page import page_state as page_state_module
-from faintspot.engine.page.batch import Batch, Picture
-from faintspot.engine.page.page_state import PageState, flag_names
+from faintspot.engine.page.page_state import Batch, PageState, Picture, flag_names
 
 
 def test_newest_frame_and_strip_charts() -> None:

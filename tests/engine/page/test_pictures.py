@@ -1,8 +1,8 @@
 import numpy as np
 from tests.engine.page.cases import LAYOUT, N, records, unpacked
 
-from faintspot.engine.page.batch import Picture
-from faintspot.engine.page.pictures import FrameDrawing
+from faintspot.engine.page.page import FrameDrawing
+from faintspot.engine.page.page_state import Picture
 
 
 def test_pictures_are_bytes_between_the_values_that_are_said() -> None:

@@ -14,8 +14,8 @@ from tests.simulated import frames_of
 import faintspot as fs
 from faintspot.engine.path.frame_path import FramePath, Progress, last_rows_of_groups
 from faintspot.engine.path.workers import Workers
-from faintspot.loop.control import slope_product
-from faintspot.loop.control.slope_product import SlopeProduct
+from faintspot.loop.control import integrator
+from faintspot.loop.control.integrator import SlopeProduct
 from faintspot.slopes.kernels.compilation.ordered import store
 from faintspot.slopes.kernels.driver.groups import SlopeArrays
 from faintspot.slopes.kernels.driver.streaming import (
@@ -119,7 +119,7 @@ def test_a_product_with_the_slopes_is_begun_while_rows_arrive(
     threads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The last rows come when some groups are done. Slopes are the same, and later frames begin anew."""
-    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
     data, source = frames(4), Source()
     expected = pipeline("plain")(data)
     product = SlopeProduct(np.random.default_rng(1).standard_normal((20, 2 * len(LAYOUT))))
@@ -152,7 +152,7 @@ def test_a_product_with_the_slopes_is_begun_while_rows_arrive(
 
 
 def test_frames_that_are_there_are_measured_before_any_product(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
     data, source = frames(1), Source()
     source.write(0, data[0])
     product = SlopeProduct(np.ones((20, 2 * len(LAYOUT))))
@@ -167,7 +167,7 @@ def test_frames_that_are_there_are_measured_before_any_product(monkeypatch: pyte
 
 def test_nothing_is_begun_of_a_frame_that_never_came(monkeypatch: pytest.MonkeyPatch) -> None:
     """The slopes of the frame before are still there."""
-    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
     data, source = frames(1), Source()
     source.write(0, data[0])
     product = SlopeProduct(np.ones((20, 2 * len(LAYOUT))))

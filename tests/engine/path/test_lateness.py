@@ -2,7 +2,7 @@
 
 import mmap
 
-from faintspot.engine.path.lateness import (
+from faintspot.engine.path.timing import (
     IN_TIME,
     OTHER,
     PAGE_FAULT,

@@ -6,7 +6,7 @@ import pytest
 from tests.patience import wait_for
 
 import faintspot as fs
-from faintspot.engine.path.time_limit import call_is_under_way, call_within, end_thread
+from faintspot.engine.path.python_path import call_is_under_way, call_within, end_thread
 
 pytestmark = pytest.mark.slow
 

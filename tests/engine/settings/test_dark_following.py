@@ -3,7 +3,7 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from faintspot.engine.path.frame_path import FramePath, Progress
-from faintspot.engine.settings.dark_following import EVERY, DarkFollower
+from faintspot.engine.settings.following import EVERY, DarkFollower
 
 LAYOUT = fs.Layout.grid((6, 6), pixels=10)
 N = len(LAYOUT)

@@ -10,8 +10,7 @@ from tests.engine.estimator_files import PEAK, write
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot.engine.settings.estimator_file import load_estimators
-from faintspot.engine.settings.estimator_trial import EstimatorTrial
+from faintspot.engine.settings.estimators import EstimatorTrial, load_estimators
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.estimators.registry import restore
 

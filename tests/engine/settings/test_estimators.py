@@ -15,8 +15,7 @@ from faintspot.cli.realtime.command import command
 from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import ControlServer
-from faintspot.engine.settings.estimator_file import load_estimators
-from faintspot.engine.settings.estimator_trial import EstimatorTrial
+from faintspot.engine.settings.estimators import EstimatorTrial, load_estimators
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.estimators.registry import restore
 

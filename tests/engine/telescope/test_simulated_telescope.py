@@ -33,8 +33,12 @@ from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
 from faintspot.engine.requests.requests import ControlServer, request
-from faintspot.engine.telescope.orders import ObservingConditions
-from faintspot.engine.telescope.simulated_telescope import TRUTH, SimulatedTelescope, commands_of
+from faintspot.engine.telescope.simulated_telescope import (
+    TRUTH,
+    ObservingConditions,
+    SimulatedTelescope,
+    commands_of,
+)
 from faintspot.loop.simulation import LoopRecord, simulate_loop
 from faintspot.loop.simulation.engine_files import write_engine_files
 from faintspot.loop.simulation.telescope.calibration import make_pipeline

@@ -10,7 +10,7 @@ from faintspot.experiments.closed_loop.budget import TERMS, run_budget
 from faintspot.experiments.closed_loop.experiment import scored_runs
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, method_kind
 from faintspot.experiments.closed_loop.results import BudgetResult
-from faintspot.loop.simulation.files import BUDGET_FILE
+from faintspot.loop.simulation.record import BUDGET_FILE
 from faintspot.loop.simulation.simulation import simulate_loop
 
 pytest.importorskip("hcipy")

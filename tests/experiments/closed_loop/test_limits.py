@@ -8,15 +8,13 @@ from hypothesis.extra.numpy import arrays
 from tests.experiments.result_cases import made_up_magnitude
 
 from faintspot.base.statistics import mean_by_blocks
-from faintspot.experiments.closed_loop.limits import (
+from faintspot.experiments.closed_loop.results import (
+    differences_by_flux,
     falling,
+    gains_in_magnitude,
     limiting_magnitudes,
     magnitude_gain,
     magnitude_limit,
-)
-from faintspot.experiments.closed_loop.results import (
-    differences_by_flux,
-    gains_in_magnitude,
 )
 
 MAGNITUDES = np.linspace(8.0, 13.0, 6)

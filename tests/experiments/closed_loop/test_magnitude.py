@@ -17,7 +17,7 @@ from faintspot.experiments.closed_loop.experiment import quick_run
 from faintspot.experiments.closed_loop.magnitude import run_magnitude
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.running import WorkerPool
-from faintspot.loop.simulation.files import MAGNITUDE_FILE
+from faintspot.loop.simulation.record import MAGNITUDE_FILE
 
 pytest.importorskip("hcipy")
 METHODS = ("centroid", "brightest")

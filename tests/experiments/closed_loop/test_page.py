@@ -7,7 +7,7 @@ from tests.experiments.result_cases import made_up_budget, made_up_magnitude
 
 from faintspot.experiments.closed_loop.page import loop_page, loop_warnings
 from faintspot.experiments.closed_loop.verdict import NOWHERE, LoopResults
-from faintspot.loop.simulation.files import MAGNITUDE_FILE
+from faintspot.loop.simulation.record import MAGNITUDE_FILE
 
 pytest.importorskip("hcipy")
 

@@ -22,7 +22,7 @@ from faintspot.experiments.closed_loop.verdict import (
     tv_method,
 )
 from faintspot.loop.simulation.configuration.configuration import load_loop
-from faintspot.loop.simulation.files import BUDGET_FILE, MAGNITUDE_FILE
+from faintspot.loop.simulation.record import BUDGET_FILE, MAGNITUDE_FILE
 from faintspot.slopes.pipeline.settings import Settings
 
 pytest.importorskip("hcipy")

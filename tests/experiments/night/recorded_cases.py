@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.engine.telemetry.segment import image_type, layout_values, record_type
+from faintspot.engine.telemetry.ring import image_type, layout_values, record_type
 from faintspot.io.telemetry.writing import TelemetryStore
 from faintspot.loop.control.configuration import Control, ControlOptions
 from faintspot.loop.control.recorded import packed_control

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 from tests.experiments.night_cases import night_with
 
-from faintspot.experiments.night.verdicts import FAILS, HOLDS, OPEN, verdicts
+from faintspot.experiments.night.analysis import FAILS, HOLDS, OPEN, verdicts
 
 
 def outcomes(*arguments: int, **options: float) -> list[tuple[str, str]]:

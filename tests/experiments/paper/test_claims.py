@@ -9,8 +9,8 @@ import pytest
 from tests.experiments.study_cases import METHODS, Cell, cells, dataset, power_law
 
 from faintspot.experiments.paper.claims import fixed_mode, guidance, verdicts
-from faintspot.experiments.study.built_in import paper_study
 from faintspot.experiments.study.curves import Judgement, Outcome, against_tv
+from faintspot.experiments.study.specification import paper_study
 
 pytest.importorskip("xarray")
 

@@ -5,7 +5,7 @@ from tests.experiments.night_cases import night_with
 from tests.experiments.study_cases import dataset, power_law
 
 from faintspot.base.report.page import TableCell
-from faintspot.experiments.night.verdicts import OPEN
+from faintspot.experiments.night.analysis import OPEN
 from faintspot.experiments.paper.whole import (
     FAILS,
     HOLDS,
@@ -15,7 +15,7 @@ from faintspot.experiments.paper.whole import (
     paper_rows,
     paper_section,
 )
-from faintspot.experiments.study.built_in import paper_study
+from faintspot.experiments.study.specification import paper_study
 
 pytest.importorskip("xarray")
 

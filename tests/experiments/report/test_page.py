@@ -11,8 +11,7 @@ from tests.experiments.study_cases import dataset, power_law
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.report.page import report_of_study, study_report
-from faintspot.experiments.study.built_in import paper_study
-from faintspot.experiments.study.specification import StudySpecification
+from faintspot.experiments.study.specification import StudySpecification, paper_study
 from faintspot.experiments.study.sweep import Sweep
 
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Controller, ExpectedSlopes
-from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.kalman.choice import SURPRISE
-from faintspot.loop.control.kalman.guarded import GuardedController
+from faintspot.loop.control.base import (
+    CommandDelayLine,
+    Controller,
+    ExpectedSlopes,
+    as_estimated,
+    without_prior,
+)
+from faintspot.loop.control.kalman.guarded import SURPRISE, GuardedController
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
-from faintspot.loop.control.telemetry import as_estimated, without_prior
 
 Floats = NDArray[np.float64]
 

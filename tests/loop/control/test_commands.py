@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine
 
 
 @pytest.mark.parametrize("delay", [1, 2, 5])

@@ -5,9 +5,14 @@ import pytest
 from tests.loop.control.control_cases import ERRORS, INTERACTION
 
 from faintspot.base.flags import SubapertureFlag
-from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.compiled import INVALID_PART, MEAN_SQUARE, CompiledIntegrator, true_slopes
-from faintspot.loop.control.integrator import Integrator
+from faintspot.loop.control.base import CommandDelayLine
+from faintspot.loop.control.integrator import (
+    INVALID_PART,
+    MEAN_SQUARE,
+    CompiledIntegrator,
+    Integrator,
+    true_slopes,
+)
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 N = 9

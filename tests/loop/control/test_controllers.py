@@ -16,8 +16,8 @@ from tests.loop.control.control_cases import (
 )
 from tests.loop.control.naive_guarded import Guarded
 
-from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.compiled import CompiledIntegrator
+from faintspot.loop.control.base import CommandDelayLine
+from faintspot.loop.control.integrator import CompiledIntegrator
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_predictor import local_filter

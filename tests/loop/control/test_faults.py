@@ -9,7 +9,7 @@ from tests.loop.control.control_cases import INTERACTION, MODEL, PHASE, PLANT, t
 from tests.loop.telemetry.loop_cases import recorded
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.faults import STUCK_FRAMES, followers, still_actuators
 from faintspot.loop.control.identification.recording import Recording, prepared
 from faintspot.loop.control.kalman.compiled import CompiledKalman

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.reconstructor import make_reconstructor
 

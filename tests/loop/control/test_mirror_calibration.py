@@ -10,9 +10,13 @@ from tests.loop.control.control_cases import INTERACTION
 
 from faintspot.base.errors import InputError
 from faintspot.base.flags import SubapertureFlag
-from faintspot.loop.control.calibration_files import save_calibration, save_picture
 from faintspot.loop.control.configuration import load_control, save_control
-from faintspot.loop.control.mirror_calibration import calibrate_mirror, centroid_gain
+from faintspot.loop.control.mirror_calibration import (
+    calibrate_mirror,
+    centroid_gain,
+    save_calibration,
+    save_picture,
+)
 from faintspot.slopes.sensor.layout import Layout
 
 REFERENCE = np.linspace(-0.3, 0.4, 18)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintspot.loop.control.noise import add_noise, weighted_slopes
-from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.control.reconstructor import add_noise, make_reconstructor, weighted_slopes
 
 RNG = np.random.default_rng(1)
 N = 10

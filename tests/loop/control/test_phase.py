@@ -3,12 +3,10 @@ from dataclasses import replace
 import numpy as np
 from tests.loop.control.control_cases import TURBULENCE, telemetry
 
-from faintspot.loop.control.base import Controller
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.identification.model import LoopPlant
 from faintspot.loop.control.kalman.compiled import CompiledKalman
-from faintspot.loop.control.kalman.predictor import SlopePredictor
-from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 from faintspot.loop.control.phase import residual_phase
 from faintspot.loop.control.reconstructor import make_reconstructor
 

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from faintspot.base.flags import SubapertureFlag
-from faintspot.loop.control import slope_product
-from faintspot.loop.control.slope_product import SlopeProduct
+from faintspot.loop.control import integrator
+from faintspot.loop.control.integrator import SlopeProduct
 from faintspot.slopes.kernels.driver.products import add_slopes
 
 N, COMMANDS, SCALE = 45, 31, 1.25
@@ -19,7 +19,7 @@ TOLERANCE = 1e-5
 
 @pytest.fixture(autouse=True)
 def _small_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
 
 
 class Measured:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from tests.loop.control.control_cases import FRAME_S, PHASE, PLANT, TURBULENCE, telemetry
 
+from faintspot.loop.control.base import OpenLoopTelemetry, usual_noise, without_prior
 from faintspot.loop.control.identification.learning import learn_controller
-from faintspot.loop.control.telemetry import OpenLoopTelemetry, usual_noise, without_prior
 
 
 def test_a_prior_is_taken_out_again() -> None:

@@ -5,7 +5,7 @@ import pytest
 from tests.loop.simulation.loop_cases import faint, plain, quiet
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.simulation import simulate_loop
 from faintspot.loop.simulation.telescope.model import TelescopeModel
 

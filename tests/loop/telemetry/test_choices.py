@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from faintspot.loop.control.identification.measured import Measured
+from faintspot.loop.control.identification.open_loop import Measured
 from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER, ControlChoice, _saved, _signed_root, advice
 
 

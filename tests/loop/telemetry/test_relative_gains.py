@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from tests.loop.telemetry.alternation_cases import alternating
 
-from faintspot.loop.telemetry.alternation import turns_of
-from faintspot.loop.telemetry.relative_gains import relative_gains
+from faintspot.loop.telemetry.alternation import relative_gains, turns_of
 
 SPECKLES = 0.1
 

@@ -13,8 +13,7 @@ from tests.loop.telemetry.loop_cases import AIR, LOOP_GAIN, NOISE_PX, RATE_HZ, r
 from faintspot.base.errors import InputError
 from faintspot.base.json_text import parse_json, to_json
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.measured import Measured
-from faintspot.loop.control.identification.open_loop import open_loop_of
+from faintspot.loop.control.identification.open_loop import Measured, open_loop_of
 from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER
 from faintspot.loop.telemetry.page import page_of_loop
 from faintspot.loop.telemetry.report import LoopReport, report_of_loop

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from faintspot.loop.turbulence.image_motion import differential_image_motion
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
+from faintspot.loop.turbulence.strength import differential_image_motion
 
 CELLS = np.argwhere(np.hypot(*(np.indices((7, 7)) - 3)) < 3.6)
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from tests.loop.control.frozen_flow import frozen_slopes
 
-from faintspot.loop.turbulence.image_motion import differential_image_motion
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
-from faintspot.loop.turbulence.strength import turbulence_strength
+from faintspot.loop.turbulence.strength import differential_image_motion, turbulence_strength
 
 CELLS = np.argwhere(np.hypot(*(np.indices((7, 7)) - 3)) < 3.6)
 RATE_HZ, SECONDS, PIECES, NOISE_PX = 60.0, 3.0, 16, 0.3

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintspot.slopes.camera.colour_mosaic import mosaic_contrast
+from faintspot.slopes.camera.frame_checks import mosaic_contrast
 
 SIDE = 160
 ROW, COLUMN = np.mgrid[:SIDE, :SIDE]

@@ -3,7 +3,7 @@ import pytest
 from tests.simulated import frames_of
 
 import faintspot as fs
-from faintspot.slopes.camera.hot_pixels import find_hot_pixels
+from faintspot.slopes.camera.frame_checks import find_hot_pixels
 from faintspot.slopes.simulate import Detector
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintspot.slopes.camera.saturation import LargestValues
+from faintspot.slopes.camera.frame_checks import LargestValues
 
 
 def spots(seed: int, peak: float = 9000.0) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from faintspot.slopes.camera.wrong_bytes import misread
+from faintspot.slopes.camera.frame_checks import misread
 
 ROW, COLUMN = np.mgrid[:120, :120]
 

@@ -50,12 +50,12 @@ class FigureWithData:
     @cached_property
     def files(self) -> dict[str, bytes]:
         """Contents of its files by ending, png alone or png, svg and csv."""
-        from faintspot.base.report import drawing
+        from faintspot.base.report import plots
 
-        contents = {"png": drawing.png(self.figure)}
+        contents = {"png": plots.png(self.figure)}
         if self.header:
             self.figure.set_layout_engine("none")  # keep the layout, which is slow to compute
-            contents |= {"svg": drawing.svg(self.figure), "csv": self.csv().encode()}
+            contents |= {"svg": plots.svg(self.figure), "csv": self.csv().encode()}
         return contents
 
 

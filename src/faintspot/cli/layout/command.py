@@ -18,11 +18,11 @@ from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.cli.layout import grid as layout_grid
 from faintspot.cli.layout import options as layout_options
-from faintspot.cli.layout.completing import completed
-from faintspot.cli.layout.darks import clearer_frame, measured_darks, with_measured_pixels
+from faintspot.cli.layout.completing import clearer_frame, completed, measured_darks, with_measured_pixels
 from faintspot.cli.layout.describing import describe, describe_settings, doubts_of
 from faintspot.cli.layout.options import plain
 from faintspot.cli.shared.commands import (
+    KEY,
     NAMES,
     RANGES,
     Listed,
@@ -32,15 +32,12 @@ from faintspot.cli.shared.commands import (
     option,
 )
 from faintspot.cli.shared.needs import suggested_slopes
-from faintspot.cli.shared.options import KEY
 from faintspot.cli.shared.output import picture_file
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.slopes.camera.binning import binned
 from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.camera.colour_mosaic import mosaic_contrast
-from faintspot.slopes.camera.hot_pixels import find_hot_pixels
+from faintspot.slopes.camera.frame_checks import find_hot_pixels, misread, mosaic_contrast
 from faintspot.slopes.camera.mean_frame import MeanFrame
-from faintspot.slopes.camera.wrong_bytes import misread
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, first_settings

@@ -8,9 +8,8 @@ import click
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import derived
-from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.commands import configuration_option, name_option, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import configuration_option, name_option
 
 
 @needs("realtime", "pyshmem")
@@ -64,9 +63,13 @@ def calibrate(
 
     from faintspot.cli.shared.progress import progress_bar
     from faintspot.engine.loop.poking import StreamedMirror
-    from faintspot.loop.control.calibration_files import save_calibration, save_picture
     from faintspot.loop.control.configuration import load_control
-    from faintspot.loop.control.mirror_calibration import calibrate_mirror, centroid_gain
+    from faintspot.loop.control.mirror_calibration import (
+        calibrate_mirror,
+        centroid_gain,
+        save_calibration,
+        save_picture,
+    )
     from faintspot.slopes.pipeline.configuration import Configuration
 
     described = Configuration(config)

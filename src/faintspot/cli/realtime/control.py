@@ -7,14 +7,13 @@ from typing import Any
 
 import click
 
-from faintspot.base.config.written_changes import parse_changes
+from faintspot.base.config.tables import parse_changes
 from faintspot.base.errors import InputError
 from faintspot.base.json_text import to_json
 from faintspot.base.toml_files import check_keys
 from faintspot.cli.realtime.stopping import stop_on_signal
-from faintspot.cli.shared.commands import RANGES, option
+from faintspot.cli.shared.commands import ENGINE_NAME, RANGES, option
 from faintspot.cli.shared.engine_requests import asked, asked_at_length, loop_in_words, notes, summary
-from faintspot.cli.shared.options import ENGINE_NAME
 from faintspot.engine.requests.private_socket import ENGINE, TELESCOPE
 from faintspot.engine.requests.requests import since
 

@@ -10,9 +10,8 @@ import click
 from rich.console import Console
 
 from faintspot.cli.realtime.stopping import stop_on_signal
-from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.commands import PORT, name_option, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import PORT, name_option
 from faintspot.cli.shared.output import results_table
 
 if TYPE_CHECKING:

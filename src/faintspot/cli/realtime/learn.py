@@ -10,9 +10,8 @@ import click
 from faintspot.base.errors import InputError
 from faintspot.base.extras import require_linux
 from faintspot.base.files import derived
-from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.commands import ENGINE_NAME, configuration_option, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import ENGINE_NAME, configuration_option
 from faintspot.cli.shared.progress import progress_bar
 
 
@@ -77,14 +76,14 @@ def learn(
 def _learn_repeatedly(name: str, config: str, every_s: float) -> None:
     """Learn from a running engine again and again."""
     require_linux("realtime learn --every")
-    from faintspot.engine.background.learning import BackgroundLearning
+    from faintspot.engine.background.background_process import BackgroundLearning
 
     BackgroundLearning(name, config, every_s).run(click.echo)
 
 
 def _learn_from(store: Path, config: str, winds: str, layers: tuple[tuple[float, float, float], ...]) -> None:
     """Learn from a recording."""
-    from faintspot.base.validity import leave_out
+    from faintspot.base.flags import leave_out
     from faintspot.io import read_telemetry
     from faintspot.loop.control.base import ASSUMED, KALMAN
     from faintspot.loop.control.configuration import load_control, prior_std_px, save_control

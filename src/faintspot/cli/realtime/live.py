@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 import click
 
 from faintspot.base.extras import require, require_linux
-from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.commands import ENGINE_NAME, PORT, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import ENGINE_NAME, PORT
 
 if TYPE_CHECKING:
     from faintspot.engine.page.server import LiveServer

@@ -9,9 +9,8 @@ import click
 
 from faintspot.base.errors import InputError
 from faintspot.base.extras import require
-from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.commands import AO_MODE, ENGINE_NAME, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import AO_MODE, ENGINE_NAME
 from faintspot.cli.shared.output import write_aot_file
 
 if TYPE_CHECKING:

@@ -12,10 +12,9 @@ import click
 
 from faintspot.cli.realtime.live import page_beside
 from faintspot.cli.realtime.stopping import stop_on_signal
-from faintspot.cli.shared.commands import RANGES, option
+from faintspot.cli.shared.commands import FRAMES, RANGES, configuration_option, name_option, option
 from faintspot.cli.shared.engine_requests import summary
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import FRAMES, configuration_option, name_option
 from faintspot.engine.requests.private_socket import socket_path
 
 if TYPE_CHECKING:
@@ -166,7 +165,7 @@ def _learning(engine: Engine, config: str) -> AbstractContextManager[None]:
     options = None if engine.loop is None else engine.loop.control.options
     if options is None or options.controller != KALMAN or not options.learn_every_s:
         return nullcontext()
-    from faintspot.engine.background.learning import background_learning
+    from faintspot.engine.background.background_process import background_learning
 
     return background_learning(engine, config, options.learn_every_s, partial(click.echo, err=True))
 

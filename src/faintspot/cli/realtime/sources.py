@@ -12,9 +12,8 @@ import click
 
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime.stopping import published, stop_on_signal
-from faintspot.cli.shared.commands import option
+from faintspot.cli.shared.commands import FRAMES, KEY, SLOTS, name_option, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.options import FRAMES, KEY, SLOTS, name_option
 from faintspot.cli.shared.progress import progress_bar
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ import click
 
 from faintspot.base.files import output_errors
 from faintspot.cli.realtime.stopping import published, stop_on_signal
-from faintspot.cli.shared.commands import option
-from faintspot.cli.shared.options import FRAMES, READOUT_FRACTION, SLOTS, name_option
+from faintspot.cli.shared.commands import FRAMES, READOUT_FRACTION, SLOTS, name_option, option
 from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
 
 

@@ -56,7 +56,7 @@ def picture_file(target: Path, picture: str | None, ending: str) -> Path | None:
 
 def write_picture(figure: Any, path: Path) -> None:
     """Write a figure as PNG."""
-    from faintspot.base.report.drawing import png
+    from faintspot.base.report.plots import png
 
     write_atomically(path, png(figure))
     click.echo(f"picture: {path}")

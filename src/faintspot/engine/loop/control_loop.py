@@ -15,11 +15,10 @@ from faintspot.engine.loop.guard import Guard
 from faintspot.engine.loop.successor import ControllerSuccessor, PreparedController
 from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.timing import Latencies
-from faintspot.loop.control.base import KALMAN, Controller
-from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.compiled import MEAN_SQUARE, true_slopes
+from faintspot.loop.control.base import KALMAN, CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.identification.model import Kalman
+from faintspot.loop.control.integrator import MEAN_SQUARE, true_slopes
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.kernels.driver.products import ProductPart
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.compiled import (
+from faintspot.loop.control.configuration import Control
+from faintspot.loop.control.integrator import (
     DISPLACEMENT,
     FLUX,
     FLUX_TIMES_DISPLACEMENT,
@@ -16,7 +17,6 @@ from faintspot.loop.control.compiled import (
     MEAN_SQUARE,
     displaced_flux,
 )
-from faintspot.loop.control.configuration import Control
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.sensor.layout import Layout
 

@@ -7,10 +7,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Controller
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine, Controller, without_prior
 from faintspot.loop.control.configuration import CONTROLLER, Control
-from faintspot.loop.control.telemetry import without_prior
 
 Floats = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from faintspot.base.config.written_changes import parse_changes, parse_ranges
+from faintspot.base.config.tables import parse_changes, parse_ranges
 from faintspot.base.errors import InputError
 from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request, since

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from faintspot.base.errors import InputError
-from faintspot.engine.page.batch import Batch, Picture
+from faintspot.engine.page.page_state import Batch, Picture
 from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope.simulated_telescope import TRUTH

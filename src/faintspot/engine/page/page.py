@@ -1,16 +1,124 @@
-"""The page's updates: read the source about ten times a second and send the changes."""
+"""The page's updates: read the source about ten times a second; send changes as binary messages."""
 
 from __future__ import annotations
 
+import asyncio
+import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
-from faintspot.engine.page.batch import BatchSource
-from faintspot.engine.page.messages import packed
-from faintspot.engine.page.page_state import PageState, flag_names
-from faintspot.engine.page.pictures import FrameDrawing
+from faintspot.base.json_text import to_json
+from faintspot.engine.page.page_state import BatchSource, PageState, Picture, flag_names
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.sensor.pupil import lenslet_outlines
+
+_ALIGN = 8
+
+
+def packed(kind: str, values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]] | None = None) -> bytes:
+    """Return a message; numbers that are not finite become null in values, and stay in arrays."""
+    described: dict[str, object] = {}
+    blocks: list[bytes] = []
+    offset = 0
+    for name, array in (arrays or {}).items():
+        data = array.tobytes()
+        described[name] = [array.dtype.name, list(array.shape), offset]
+        blocks += [data, bytes(-len(data) % _ALIGN)]
+        offset += len(data) + len(blocks[-1])
+    head = {"kind": kind, "values": values, "arrays": described}
+    text = to_json(head).encode()
+    text += b" " * (-(len(text) + 4) % _ALIGN)
+    return b"".join([struct.pack("<I", len(text)), text, *blocks])
+
+
+class LatestMessages:
+    """One message of each kind; a newer one replaces it whether or not it has been read.
+
+    A slow client misses messages, and nothing is queued for it. For use in one event loop.
+    """
+
+    def __init__(self) -> None:
+        self._messages: dict[str, tuple[int, bytes]] = {}
+        self._posted = 0
+        self._changed = asyncio.Event()
+
+    def post(self, kind: str, message: bytes) -> None:
+        """Set the message of a kind."""
+        self._posted += 1
+        self._messages[kind] = self._posted, message
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    def forget(self, kind: str) -> None:
+        """Remove the message of a kind: later clients do not get it."""
+        self._messages.pop(kind, None)
+
+    async def newer(self, last: int) -> list[tuple[int, bytes]]:
+        """Wait for messages posted after number `last`; return them with their numbers, in order."""
+        while not (messages := sorted(item for item in self._messages.values() if item[0] > last)):
+            await self._changed.wait()
+        return messages
+
+
+_PERCENTILES = (1.0, 99.9)  # shown as black and white, so that one hot pixel does not darken the rest
+_MOST_SAMPLES = 1 << 16  # for the percentiles
+
+
+class FrameDrawing:
+    """Pictures of a sensor, and its geometry for the page.
+
+    Parameters
+    ----------
+    layout : Layout
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        height, width = layout.window
+        rows = layout.corners[:, 0, None, None] + np.arange(height)[:, None]
+        columns = layout.corners[:, 1, None, None] + np.arange(width)
+        self._pixels = np.broadcast_arrays(rows, columns)
+
+    def sensor(self) -> bytes:
+        """Return the message with the sensor's geometry: positions in pixels of the frame."""
+        layout = self.layout
+        values = {"frame_shape": layout.frame_shape, "window": layout.window, "subapertures": len(layout)}
+        arrays = {
+            "corners": np.asarray(layout.corners, np.float32),
+            "centres": np.asarray(layout.centres, np.float32),
+            "outlines": lenslet_outlines(layout, 0.96).astype(np.float32),
+        }
+        return packed("sensor", values, arrays)
+
+    def message(self, picture: Picture, record: NDArray[np.void] | None) -> bytes:
+        """Return the message of a frame; without spots if its record is no longer available."""
+        raw, raw_range = _in_bytes(picture.raw)
+        stack, denoised_range = _in_bytes(picture.denoised)
+        denoised = np.zeros(self.layout.frame_shape, np.uint8)
+        denoised[tuple(self._pixels)] = np.maximum(stack, 1)  # 0: no sub-aperture
+        arrays = {"raw": raw, "denoised": denoised}
+        if record is not None:
+            arrays |= {name: record[name] for name in ("x", "y", "flags")}
+        values = {"frame": picture.frame, "raw_adu": raw_range, "denoised_e": denoised_range}
+        return packed("pictures", values, arrays)
+
+
+def _in_bytes(values: NDArray[np.float32]) -> tuple[NDArray[np.uint8], tuple[float, float]]:
+    """Return values as bytes, and the values of 0 and 255; values that are not finite become 0."""
+    finite = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+    samples = finite.ravel()[:: max(1, finite.size // _MOST_SAMPLES)]
+    low, high = (float(value) for value in np.percentile(samples, _PERCENTILES))
+    if not high > low:
+        high = low + 1.0
+    scaled = (finite - low) * (255.0 / (high - low))
+    return np.clip(scaled, 0, 255).astype(np.uint8), (low, high)
+
 
 UPDATE_S = 0.08
 """Interval between two updates of the page [s]."""

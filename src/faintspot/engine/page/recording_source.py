@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.engine.page.batch import Batch, Floats, Picture
 from faintspot.engine.page.client_requests import ClientRequest
-from faintspot.engine.telemetry.segment import image_type, record_type
+from faintspot.engine.page.page_state import Batch, Floats, Picture
+from faintspot.engine.telemetry.ring import image_type, record_type
 from faintspot.io.telemetry.recording import StoredTelemetry, stored_names
 from faintspot.slopes.sensor.layout import Layout
 

@@ -17,11 +17,9 @@ from importlib.resources import files
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.json_text import parse_json, to_json
 from faintspot.engine.page.access import Access
-from faintspot.engine.page.batch import BatchSource
 from faintspot.engine.page.client_requests import ClientRequests, answered
-from faintspot.engine.page.latest_messages import LatestMessages
-from faintspot.engine.page.messages import packed
-from faintspot.engine.page.page import UPDATE_S, Page
+from faintspot.engine.page.page import UPDATE_S, LatestMessages, Page, packed
+from faintspot.engine.page.page_state import BatchSource
 from faintspot.engine.pixels.readout import StopEvent
 
 try:

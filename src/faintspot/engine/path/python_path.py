@@ -1,8 +1,9 @@
-"""Frame path for an estimator in NumPy, which runs in its own thread and cannot stall the engine."""
+"""Frame path for an estimator in NumPy, which is tried first and cannot stall the engine."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import math
 import os
 import threading
@@ -10,21 +11,125 @@ import time
 import weakref
 from collections.abc import Callable, Sequence
 from queue import Empty, SimpleQueue
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.engine.path.frame_path import FramePath, check_real_time
-from faintspot.engine.path.time_limit import call_is_under_way, end_thread
-from faintspot.engine.path.trial_frames import trial_frames, typical_frame
 from faintspot.slopes.estimators.base import Positions
+from faintspot.slopes.estimators.faults import one_line
 from faintspot.slopes.estimators.python import PythonPlan
 from faintspot.slopes.kernels.driver.groups import CALIBRATED
 from faintspot.slopes.kernels.driver.products import ProductPart
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+
+Result = TypeVar("Result")
+_TRIAL = "faintspot-trial"
+
+
+def call_within(limit_s: float, name: str, function: Callable[..., Result], *arguments: object) -> Result:
+    """Call a function in a thread of its own and return what it returns.
+
+    Parameters
+    ----------
+    limit_s : float
+        Time limit; a call that exceeds it is abandoned and its thread asked to end, see `end_thread`.
+    name : str
+        Subject of the error message.
+
+    Raises
+    ------
+    InputError
+        When the time is over, or the function raises an exception that would end the process or the thread,
+        such as SystemExit. Other exceptions are passed on.
+    """
+    replies: SimpleQueue[tuple[Result | None, BaseException | None]] = SimpleQueue()
+
+    def work() -> None:
+        try:
+            replies.put((function(*arguments), None))
+        except BaseException as error:  # pass any exception to the caller
+            replies.put((None, error))
+
+    thread = threading.Thread(target=work, name=_TRIAL, daemon=True)
+    thread.start()
+    try:
+        result, error = replies.get(timeout=limit_s)
+    except Empty:
+        end_thread(thread)
+        raise InputError(f"{name}: did not return within {limit_s:g} s") from None
+    if isinstance(error, Exception):
+        raise error
+    if error is not None:
+        raise InputError(f"{name}: {one_line(error)}")
+    return result  # type: ignore[return-value]
+
+
+def call_is_under_way() -> bool:
+    """Return whether a `call_within` is running in this process: it may compile and delay other threads.
+
+    An abandoned call counts until its thread has ended.
+    """
+    return any(thread.name == _TRIAL for thread in threading.enumerate())
+
+
+def end_thread(thread: threading.Thread) -> None:
+    """Ask an abandoned thread to end; Python code ends at its next step.
+
+    Otherwise an endless loop would keep taking turns with all other threads. Compiled code is not
+    interrupted.
+    """
+    if thread.ident is not None:
+        identifier, exception = ctypes.c_ulong(thread.ident), ctypes.py_object(SystemExit)
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(identifier, exception)
+
+
+_FLUX_E = 300.0
+_NOISE_E = 3.0
+_SPOT_STD_PX = 1.0
+_SATURATED_ADU = 65535.0  # if the detector's saturation is not known
+
+
+def trial_frames(pipeline: SlopePipeline) -> list[NDArray[np.float32]]:
+    """Return frames (h, w) in ADU: without flux, with typical spots, of noise, of saturated pixels.
+
+    The frames are the same each time.
+    """
+    calibration = pipeline.calibration
+    dark, scale = _dark_and_scale(pipeline)
+    noise = _NOISE_E * np.random.default_rng(1503).standard_normal(dark.shape)
+    level = _SATURATED_ADU if calibration.saturation_adu is None else calibration.saturation_adu
+    frames_adu = dark, dark + noise / scale, np.full_like(dark, level)
+    return [typical_frame(pipeline), *(frame.astype(np.float32) for frame in frames_adu)]
+
+
+def typical_frame(pipeline: SlopePipeline) -> NDArray[np.float32]:
+    """Return a frame (h, w) in ADU with a spot in every sub-aperture and read noise; the same each time."""
+    layout = pipeline.layout
+    dark, scale = _dark_and_scale(pipeline)
+    rng = np.random.default_rng(2015)
+    ny, nx = layout.window
+    rows, columns = np.arange(ny) - 0.5 * (ny - 1), np.arange(nx) - 0.5 * (nx - 1)
+    spots = np.zeros(layout.frame_shape)
+    for row, column in layout.corners:
+        x, y = rng.uniform(-0.5, 0.5, 2)
+        squared = (rows[:, None] - y) ** 2 + (columns - x) ** 2
+        profile = np.exp(-0.5 * squared / _SPOT_STD_PX**2)
+        spots[row : row + ny, column : column + nx] = _FLUX_E * profile / profile.sum()
+    noise = _NOISE_E * rng.standard_normal(layout.frame_shape)
+    frame: NDArray[np.float32] = (dark + (spots + noise) / scale).astype(np.float32)
+    return frame
+
+
+def _dark_and_scale(pipeline: SlopePipeline) -> NDArray[np.float32]:
+    """Return dark (ADU) and electrons per ADU of every pixel, treating bad pixels like good ones."""
+    maps = pipeline.calibration.maps(pipeline.layout.frame_shape)
+    maps[0], maps[1] = np.nan_to_num(maps[0]), np.nan_to_num(maps[1], nan=1.0, posinf=1.0)
+    return maps
+
 
 BUDGET_S = 1e-3
 MOST_FAILURES = 3  # consecutive frames that fail or exceed the budget

@@ -25,7 +25,6 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.processes import process_lives, process_start
 from faintspot.engine.pixels.segment import (
     CELL,
     FOLLOWED,
@@ -33,6 +32,8 @@ from faintspot.engine.pixels.segment import (
     FOLLOWER_START,
     LOST,
     Segment,
+    process_lives,
+    process_start,
     up_to_pages,
 )
 from faintspot.slopes.kernels.compilation.ordered import fence, load, store

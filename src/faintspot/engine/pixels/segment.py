@@ -1,4 +1,4 @@
-"""Segments of shared memory: rings that one process writes and any number of processes of the same user read.
+"""Segments of shared memory: rings of one process that lives, which any process of the same user may read.
 
 Bytes from the start, of which everything but the first page begins at a page::
 
@@ -22,6 +22,7 @@ import re
 import secrets
 import stat
 import struct
+import time
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -34,8 +35,35 @@ from numpy.typing import NDArray
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
 from faintspot.base.json_text import parse_json, to_json
-from faintspot.engine.pixels.processes import process_lives, process_start
 from faintspot.slopes.kernels.compilation.ordered import load, store
+
+
+def process_start(pid: int) -> int:
+    """Return when a process started, in clock ticks since boot; -1 if it does not exist or is dead.
+
+    Process ids are reused; the pair of id and start time is not. A zombie, i.e. a killed process that its
+    parent has not waited for, counts as dead. See proc_pid_stat(5), fields 3 and 22.
+    """
+    try:
+        # The first thread's file holds the same: qemu-user makes up /proc/PID/stat for the process itself.
+        text = Path(f"/proc/{pid}/task/{pid}/stat").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        return -1
+    # The second field is the program's name in parentheses, which may contain blanks and parentheses.
+    fields = text.rpartition(")")[2].split()
+    return -1 if fields[0] in "ZXx" else int(fields[19])
+
+
+def process_lives(pid: int, start: int) -> bool:
+    """Return whether the process with that id and start time is alive."""
+    return start >= 0 and process_start(pid) == start
+
+
+def process_age_s(pid: int) -> float:
+    """Return how long ago a process started [s]; -1 if it does not exist or is dead."""
+    start = process_start(pid)
+    return -1.0 if start < 0 else time.clock_gettime(time.CLOCK_BOOTTIME) - start / os.sysconf("SC_CLK_TCK")
+
 
 FOLDER = Path("/dev/shm")
 """Folder of named shared memory on Linux."""

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.processes import process_start
-from faintspot.engine.pixels.segment import identity_of, new_memory
+from faintspot.engine.pixels.segment import identity_of, new_memory, process_start
 from faintspot.engine.streams.image_layout import (
     COUNTER,
     ISIO,

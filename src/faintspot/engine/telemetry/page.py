@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, new_figure, styled
+from faintspot.base.flags import leave_out
 from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import POSITIONS, Report, Section, configuration_section
-from faintspot.base.report.plots import Line, Panel
+from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, Line, Panel, new_figure, styled
 from faintspot.base.report.texts import Texts
-from faintspot.base.validity import leave_out
 from faintspot.engine.telemetry.numbers import (
     PERCENTILES,
     change_rows,

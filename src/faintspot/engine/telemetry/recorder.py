@@ -20,8 +20,7 @@ from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.engine.pixels.readout import StopEvent
 from faintspot.engine.settings.interleaving import methods_after
-from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.engine.telemetry.segment import Ring
+from faintspot.engine.telemetry.ring import Ring, TelemetryRing
 from faintspot.io.telemetry.writing import TelemetryStore
 
 _POLL_S = 0.01

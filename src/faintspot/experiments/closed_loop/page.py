@@ -6,8 +6,7 @@ import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.base.report.page import POSITIONS, Report, Section, configuration_section
-from faintspot.base.report.texts import Texts
-from faintspot.base.report.words import with_interval
+from faintspot.base.report.texts import Texts, with_interval
 from faintspot.base.statistics import paired_mean
 from faintspot.experiments.closed_loop.figures import magnitude_figure, strehl_axis
 from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult

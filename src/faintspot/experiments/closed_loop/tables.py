@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.json_text import parse_json
 from faintspot.base.report.page import Table
-from faintspot.base.report.texts import Texts
-from faintspot.base.report.words import with_error, with_interval
+from faintspot.base.report.texts import Texts, with_error, with_interval
 from faintspot.base.statistics import paired_mean
 from faintspot.experiments.closed_loop.budget import TERMS
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN

@@ -10,20 +10,20 @@ import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.base.json_text import parse_json
-from faintspot.base.report.words import plain_number, with_interval
+from faintspot.base.report.texts import plain_number, with_interval
 from faintspot.base.statistics import Estimate, paired_mean
-from faintspot.experiments.closed_loop.limits import magnitude_limit
 from faintspot.experiments.closed_loop.methods import VARIANTS, MethodKind, method_kind
 from faintspot.experiments.closed_loop.results import (
     BudgetResult,
     MagnitudeResult,
     differences_by_flux,
     gains_in_magnitude,
+    magnitude_limit,
 )
 from faintspot.experiments.closed_loop.tables import budget_table, in_columns, strehl_table
 from faintspot.experiments.methods import Knowledge
 from faintspot.loop.control.base import INTEGRATOR
-from faintspot.loop.simulation.files import BUDGET_FILE, MAGNITUDE_FILE
+from faintspot.loop.simulation.record import BUDGET_FILE, MAGNITUDE_FILE
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.estimators.built_in.window import Window

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.report.drawing import FLUX_GREY, METHOD_COLOURS, WIDTH
 from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.plots import Line, Panel, plot
+from faintspot.base.report.plots import FLUX_GREY, METHOD_COLOURS, WIDTH, Line, Panel, plot
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.closed_loop.figures import strehl_axis
 from faintspot.experiments.night.analysis import ALL_STRENGTHS, BEST, by_strength, groups, lines

@@ -24,11 +24,11 @@ from faintspot.experiments.night.analysis import (
     group_means,
     groups,
     lines,
+    verdicts,
 )
 from faintspot.experiments.night.blocks import NIGHT_STORE, Night
 from faintspot.experiments.night.figures import panels_figure
 from faintspot.experiments.night.protocol import PAPER_MEANS
-from faintspot.experiments.night.verdicts import verdicts
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 
 SUMMARY_FILE, PAGE_FILE = "night.json", "night.html"

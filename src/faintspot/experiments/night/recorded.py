@@ -15,21 +15,22 @@ from faintspot.base.errors import InputError
 from faintspot.experiments.night.blocks import Night
 from faintspot.experiments.night.measured_strehl import MeasuredStrehl
 from faintspot.experiments.night.recorded_methods import RecordedMethods, conditions_of
-from faintspot.experiments.night.seeing import r0_of_slopes
+from faintspot.experiments.night.simulated import r0_of_slopes
 from faintspot.io.telemetry.recording import Telemetry, read_telemetry
 from faintspot.loop.control.recorded import RecordedControl
 from faintspot.loop.telemetry.alternation import (
     AlternatingLoop,
+    RelativeGains,
     Turn,
     TurnPhase,
     open_loop_slopes,
     phase_of_turn,
+    relative_gains,
     turns_of,
 )
 from faintspot.loop.telemetry.choices import unseen_m2
 from faintspot.loop.telemetry.recorded_loop import control_of, system_numbers
 from faintspot.loop.telemetry.recording import CLOSED
-from faintspot.loop.telemetry.relative_gains import RelativeGains, relative_gains
 from faintspot.slopes.sensor.pupil import side_m
 
 Floats = NDArray[np.float64]

@@ -8,9 +8,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.report.drawing import METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
 from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.plots import Line, Panel, plot
+from faintspot.base.report.plots import (
+    METHOD_COLOURS,
+    WIDTH,
+    Line,
+    Panel,
+    colour_bar,
+    new_figure,
+    plot,
+    styled,
+)
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.methods import NO_TV, TV, knows_the_spot, label_of, style_of
 from faintspot.experiments.paper.claims import fixed_mode

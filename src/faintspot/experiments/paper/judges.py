@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from faintspot.base.report.texts import Texts
-from faintspot.base.report.words import with_error, with_interval
+from faintspot.base.report.texts import Texts, with_error, with_interval
 from faintspot.experiments.curves import Curve, Gain, gain_at_error, gain_at_flux
 from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.experiments.study.curves import (

@@ -9,8 +9,7 @@ import numpy as np
 
 from faintspot.base.report.figure_data import csv_text
 from faintspot.base.report.page import Section
-from faintspot.base.report.texts import Texts
-from faintspot.base.report.words import NOTHING
+from faintspot.base.report.texts import NOTHING, Texts
 from faintspot.experiments.curves import Gain, gain_at_error
 from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV, label_of
 from faintspot.experiments.paper.claims import fixed_mode

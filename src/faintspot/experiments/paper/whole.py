@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from faintspot.base.report.page import Section
 from faintspot.base.report.texts import Texts
-from faintspot.experiments.night.verdicts import verdicts as night_verdicts
+from faintspot.experiments.night.analysis import verdicts as night_verdicts
 from faintspot.experiments.paper.claims import fixed_mode, verdicts
 from faintspot.experiments.paper.tables import cases_csv
 from faintspot.experiments.study.curves import Judgement, Outcome, Verdict

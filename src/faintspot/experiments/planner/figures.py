@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.report.drawing import note, styled
-from faintspot.base.report.plots import Line, Panel, plot
+from faintspot.base.report.plots import Line, Panel, note, plot, styled
 from faintspot.experiments.planner import text as answer_text
 
 if TYPE_CHECKING:

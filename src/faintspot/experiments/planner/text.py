@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from faintspot.base.report.texts import Texts
-from faintspot.base.report.words import plain_number, with_error
+from faintspot.base.report.texts import Texts, plain_number, with_error
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.methods import Knowledge
 from faintspot.experiments.planner.answer import Answer, MethodResult, settings_in_words

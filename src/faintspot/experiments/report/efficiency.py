@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.report.page import Section
-from faintspot.base.report.texts import Texts
-from faintspot.base.report.words import number_or_dash
+from faintspot.base.report.texts import Texts, number_or_dash
 from faintspot.experiments.methods import knows_the_spot
 from faintspot.experiments.study.curves import StudyConditions
 from faintspot.experiments.study.specification import BEST, CORRECTED

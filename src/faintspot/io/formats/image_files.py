@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.io.arrays.channels import CHANNELS, EQUAL_COLOURS, grey, one_channel
-from faintspot.io.arrays.stored_array import StoredArray
+from faintspot.io.arrays.stored_array import CHANNELS, EQUAL_COLOURS, StoredArray, grey, one_channel
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.optional_packages import load_pillow
 

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.io.arrays.channels import EQUAL_COLOURS, grey
-from faintspot.io.arrays.stored_array import StoredArray
+from faintspot.io.arrays.stored_array import EQUAL_COLOURS, StoredArray, grey
 from faintspot.io.arrays.streams import StreamedArray, check_present
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.optional_packages import load_pillow, load_tifffile

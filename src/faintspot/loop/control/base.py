@@ -1,19 +1,110 @@
-"""Interface of controllers and of the filters with which they predict."""
+"""Interface of controllers and of the filters with which they predict; telemetry, delay of commands."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.reconstructor import LARGEST_CORRELATION
 
 if TYPE_CHECKING:
     from faintspot.slopes.kernels.driver.products import ProductPart
 
+
 Floats = NDArray[np.float64]
+
+
+class CommandDelayLine:
+    """Delay line between controllers and mirror; all controllers of a mirror share it.
+
+    Its memory is made once: what `acting` and `latest` return is good until the next command is sent.
+
+    Parameters
+    ----------
+    commands : int
+        Number of actuators.
+    delay_frames : int
+        The command computed from frame k acts first during frame k + delay_frames.
+    largest : float
+        Stroke: no command is sent that is larger. What is cut off is forgotten, so that nothing winds up.
+    """
+
+    def __init__(self, commands: int, delay_frames: int, largest: float = math.inf) -> None:
+        self.delay_frames, self.largest = delay_frames, largest
+        self.rows = np.zeros((delay_frames + 1, commands))
+        """(delay_frames + 1, commands): the latest commands."""
+        self.next_row = 0
+        """Row for the next command; the oldest other row acts."""
+        self._rows = list(self.rows)
+
+    @property
+    def acting(self) -> Floats:
+        """Commands that the mirror holds during this frame."""
+        return self._rows[(self.next_row + 1) % len(self._rows)]
+
+    @property
+    def around(self) -> tuple[Floats, Floats, Floats]:
+        """Commands of the last frame, of this one and of the next, for a delay of at least 2 frames."""
+        before, acting, after = (self._rows[(self.next_row + step) % len(self._rows)] for step in range(3))
+        return before, acting, after
+
+    @property
+    def latest(self) -> Floats:
+        """Last computed command, which may not act yet."""
+        return self._rows[self.next_row - 1]
+
+    @property
+    def spare(self) -> Floats:
+        """Row into which the next command may be written before `sent`.
+
+        Until then it holds what the mirror held during the last frame.
+        """
+        return self._rows[self.next_row]
+
+    def put(self, command: Floats) -> None:
+        """Send a command, clipped to the stroke, and advance by one frame.
+
+        Raises
+        ------
+        ArithmeticError
+            See `sent`.
+        """
+        total = float(command.sum())
+        np.clip(command, -self.largest, self.largest, out=self.spare)
+        self.sent(total)
+
+    def sent(self, total: float) -> None:
+        """Send the command in `spare`, which is within the stroke, and advance by one frame.
+
+        Parameters
+        ----------
+        total : float
+            Sum of the command before it was clipped, which turns an infinite command into a finite one.
+
+        Raises
+        ------
+        ArithmeticError
+            When the sum is not finite. The latest command stays the latest.
+        """
+        if not math.isfinite(total):
+            raise ArithmeticError("its commands were not finite")
+        self.next_row = (self.next_row + 1) % len(self._rows)
+
+    def copy_from(self, other: CommandDelayLine, *, without_latest: bool = False) -> None:
+        """Take the commands of a line of the same length, perhaps as they were before its latest."""
+        self.rows[:] = other.rows
+        self.next_row = (other.next_row - without_latest) % len(self._rows)
+
+    def hold(self, command: Floats) -> None:
+        """Restart with a mirror that holds a command, and no delayed commands."""
+        for row in self._rows:
+            np.clip(command, -self.largest, self.largest, out=row)
+
 
 INTEGRATOR, KALMAN = "integrator", "kalman"
 CONTROLS = {INTEGRATOR: "integrator with one gain", KALMAN: "predictive Kalman filter"}
@@ -129,3 +220,98 @@ class Predictor(Protocol):
 
     def advance(self) -> None:
         """Predict the next frame."""
+
+
+LEAST_SHARE = 0.02  # of the prior's information, that a slope is taken to add at least
+
+LEAST_VARIANCE_PX2 = 1e-8  # of slopes that are known without an error
+
+
+@dataclass(frozen=True, eq=False)
+class OpenLoopTelemetry:
+    """Open-loop slopes of consecutive frames, with their noise and the estimator's weight on them."""
+
+    open_loop_px: Floats
+    """(frames, m): open-loop slopes; any finite value where not measured."""
+    variance_px2: Floats
+    """(frames, m): variance of their noise; infinite: not measured."""
+    trust: Floats
+    """(frames, m): part of a deviation from what was expected that the estimator gives: 1, of estimators with
+    a prior less, where not measured 0."""
+    covariance_xy_px2: Floats | None = None
+    """(frames, m / 2): covariance of the noise of x and y, 0 where not measured; None: independent."""
+
+    def __len__(self) -> int:
+        return len(self.open_loop_px)
+
+    def part(self, start: int, stop: int | None) -> OpenLoopTelemetry:
+        """Return a selection of frames."""
+        arrays = {name: array for name, array in vars(self).items() if array is not None}
+        return OpenLoopTelemetry(**{name: array[start:stop] for name, array in arrays.items()})
+
+    @property
+    def covariances_px2(self) -> Floats:
+        """(frames, m / 2): covariance of the noise of x and y; 0 where they are independent."""
+        if self.covariance_xy_px2 is None:
+            return np.zeros((len(self), self.open_loop_px.shape[1] // 2))
+        return self.covariance_xy_px2
+
+    def scaled(self, noise_factor: float) -> OpenLoopTelemetry:
+        """Return the same telemetry with the noise scaled."""
+        covariance = self.covariance_xy_px2
+        return OpenLoopTelemetry(
+            self.open_loop_px,
+            self.variance_px2 * noise_factor,
+            self.trust,
+            None if covariance is None else covariance * noise_factor,
+        )
+
+
+def without_prior(
+    slopes_px: Floats, standard_error_px: Floats, expected_px: Floats, prior_std_px: Floats | None
+) -> tuple[Floats, Floats, Floats]:
+    """Return slopes without the estimator's prior, their variances, and `Telemetry.trust`.
+
+    A posterior's mean and variance s hold the prior of variance v, too; fed back to the filter that the
+    prior came from, it would count twice. The frame alone has the variance 1 / (1 / s - 1 / v), at most
+    v / 0.02 so that a posterior as wide as the prior stays harmless, and its slope is as much farther from
+    the prior's mean as the prior has drawn it there (all Gaussian).
+    """
+    variance = np.maximum(np.square(standard_error_px), LEAST_VARIANCE_PX2)
+    measured = np.isfinite(variance)
+    if prior_std_px is None:
+        return slopes_px, variance, measured.astype(np.float64)
+    prior = np.square(prior_std_px)
+    # Information of the frame in units of the prior's.
+    share = np.maximum(prior / variance - 1, LEAST_SHARE)
+    trust = np.where(measured, share / (1 + share), 0.0)
+    alone = expected_px + (slopes_px - expected_px) * (1 + share) / share
+    return alone, np.where(measured, prior / share, np.inf), trust
+
+
+def usual_noise(telemetry: OpenLoopTelemetry) -> tuple[Floats, Floats]:
+    """Return the noise that gives as much information as the frames do on average.
+
+    Returns
+    -------
+    variance_px2, covariance_xy_px2 : (m,), (m / 2,) array
+    """
+    variance, covariance = telemetry.variance_px2, telemetry.covariances_px2
+    x, y = np.split(variance, 2, axis=1)
+    measured = np.isfinite(x) & np.isfinite(y)
+    root = np.sqrt(np.where(measured, x, 1.0) * np.where(measured, y, 1.0))
+    rho = np.where(measured, np.clip(covariance / root, -LARGEST_CORRELATION, LARGEST_CORRELATION), 0.0)
+    rest = 1 - np.square(rho)
+    information = np.where(np.isfinite(variance), 1 / (variance * np.tile(rest, (1, 2))), 0.0).mean(axis=0)
+    of_x, of_y = np.split(np.maximum(information, 1e-6), 2)
+    shared = (rho / (root * rest)).mean(axis=0)
+    determinant = of_x * of_y - np.square(shared)
+    return np.concatenate([of_y / determinant, of_x / determinant]), shared / determinant
+
+
+def as_estimated(slopes_px: Floats, trust: Floats, controller: Controller) -> Floats:
+    """Return the slopes that an estimator with a prior would have given a controller."""
+    if controller.undoes_prior:
+        return slopes_px
+    expected = controller.expected().mean_px
+    return np.asarray(expected + trust * (slopes_px - expected))

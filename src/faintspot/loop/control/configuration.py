@@ -16,10 +16,9 @@ from faintspot.base.config.options import Options, setting
 from faintspot.base.config.tables import Tables, save_tables
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.toml_files import check_keys
-from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, Controller
-from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.compiled import CompiledIntegrator
+from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, CommandDelayLine, Controller
 from faintspot.loop.control.identification.model import Kalman, LoopPlant
+from faintspot.loop.control.integrator import CompiledIntegrator
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.loop.control.removed_modes import REMOVED_MODES, TIP_TILT_FOCUS, RemovedModes
 from faintspot.slopes.camera.calibration import Calibration

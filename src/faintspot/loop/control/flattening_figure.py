@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, new_figure, styled
+from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, new_figure, styled
 from faintspot.loop.control.flattening import Flattening
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.wavefront.figure import wavefront_map

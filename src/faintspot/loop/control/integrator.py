@@ -1,13 +1,24 @@
-"""Integrator with one gain."""
+"""Integrators, one of them compiled, and the product of a matrix with slopes while rows arrive."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Controller, ExpectedSlopes
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine, Controller, ExpectedSlopes
 from faintspot.loop.control.reconstructor import Reconstructor
+from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
+from faintspot.slopes.kernels.driver.products import (
+    ProductMemory,
+    ProductPart,
+    add_products,
+    finish_product,
+    is_measured,
+)
 
 Floats = NDArray[np.float64]
 
@@ -67,3 +78,231 @@ class Integrator(Controller):
         """Update with this frame's wavefront, given as the commands that cause it."""
         forgotten = self._leak if self._sees_mirror else self._gain
         self.line.put((1 - forgotten) * self.line.latest - self._gain * wavefront)
+
+
+_LEAST_BYTES = 500_000
+"""Size of a matrix below which the product takes no longer than what it takes to begin it."""
+
+
+class SlopeProduct:
+    """Product of a matrix with the slopes of each frame, or with other vectors, in float32.
+
+    A product that has been begun is that of the slopes as they were measured. When the whole product is asked
+    for, only slopes that differ from these are left to do: those that have not been taken yet, and those that
+    have changed since. Without a beginning these are all.
+
+    Parameters
+    ----------
+    matrix : (c, 2 n) array
+    """
+
+    def __init__(self, matrix: NDArray[np.floating]) -> None:
+        self.columns = np.ascontiguousarray(matrix.T, np.float32)
+        """(2 n, c): the matrix, transposed."""
+        m, c = self.columns.shape
+        slopes, subtracted, result = (np.zeros(size, np.float32) for size in (m, m, c))
+        self.memory = ProductMemory(slopes, subtracted, np.zeros((1, c), np.float32), result)
+        self._expected = np.zeros(m)
+
+    def __call__(self, vector: Floats) -> Floats:
+        """Return the product, (c,)."""
+        _FINISH(self.columns, vector, self.memory)
+        return np.asarray(self.memory.result, np.float64)
+
+    def several(self, *vectors: Floats) -> Floats:
+        """Return the products with a few vectors, (vectors, c); the matrix is read once."""
+        out = np.zeros((len(vectors), self.columns.shape[1]), np.float32)
+        _ADD_PRODUCTS(self.columns, np.array(vectors, np.float32), out)
+        return out.astype(np.float64)
+
+    def parts(self, threads: int, scale: float, expected: Floats | None = None) -> Sequence[ProductPart]:
+        """Return the parts of the next frame's product for each of the threads that measure its slopes.
+
+        There are none of a small matrix, which is read faster than so many parts of it.
+
+        Parameters
+        ----------
+        threads : int
+        scale : float
+            Factor on measured slopes.
+        expected : (2 n,) array, optional
+            Subtracted from scaled slopes. Default: 0.
+        """
+        if self.columns.nbytes < _LEAST_BYTES:
+            return ()
+        if len(self.memory.outs) != threads:
+            outs = np.zeros((threads, self.columns.shape[1]), np.float32)
+            self.memory = self.memory._replace(outs=outs)
+        self._expected[:] = 0.0 if expected is None else expected
+        slopes, subtracted, outs, _ = self.memory
+        return [ProductPart(self.columns, scale, self._expected, slopes, subtracted, out) for out in outs]
+
+
+_ADD_PRODUCTS, _FINISH = Direct(add_products), Direct(finish_product)
+
+
+Singles = NDArray[np.float32]
+
+_compiled = partial(compiled_with, source=__file__)
+
+INVALID_PART, MEAN_SQUARE = range(2)
+"""Summary of a frame from `true_slopes`: fraction of invalid sub-apertures; of the valid ones, the mean
+square of a slope along one axis, px^2."""
+
+
+@_compiled
+def true_slopes(
+    x: Singles,
+    y: Singles,
+    flags: NDArray[np.uint8],
+    error_x: Singles,
+    error_y: Singles,
+    covariance_xy: Singles,
+    gain: float,
+    slopes: Floats,
+    errors: Floats,
+    covariance: Floats,
+    statistics: Floats,
+) -> None:
+    """Write slopes [true px], all x, then all y, their errors and covariances; invalid: 0, infinite and 0.
+
+    Parameters
+    ----------
+    x, y, flags, error_x, error_y, covariance_xy : (n,) arrays
+        As in `faintspot.Slopes`.
+    gain : float
+        Centroid gain.
+    slopes, errors : (2 n,) float64 arrays
+    covariance : (n,) float64 array
+        Covariances of x and y.
+    statistics : (2,) float64 array
+        `INVALID_PART`, `MEAN_SQUARE`.
+    """
+    n, scale = x.shape[0], 1.0 / gain
+    invalid, square = 0, 0.0
+    for s in range(n):
+        along, across = x[s] * scale, y[s] * scale
+        if is_measured(along, across, flags[s]):
+            slopes[s], slopes[n + s] = along, across
+            errors[s], errors[n + s] = error_x[s] * scale, error_y[s] * scale
+            covariance[s] = covariance_xy[s] * scale * scale
+            square += along * along + across * across
+        else:
+            slopes[s] = slopes[n + s] = 0.0
+            errors[s] = errors[n + s] = np.inf
+            covariance[s] = 0.0
+            invalid += 1
+    statistics[INVALID_PART] = invalid / n
+    statistics[MEAN_SQUARE] = square / (2 * max(n - invalid, 1))
+
+
+FLUX, DISPLACEMENT, FLUX_TIMES_DISPLACEMENT = range(3)
+"""Summary of a frame from `displaced_flux`: means over the sub-apertures."""
+
+
+@_compiled
+def displaced_flux(
+    commands: Floats, flux: Singles, columns: Singles, work: tuple[Singles, Singles], statistics: Floats
+) -> None:
+    """Write means of the flux, of the squared displacement by the mirror, and of their product.
+
+    Parameters
+    ----------
+    commands : (commands,) float64 array
+        Commands that acted in the frame.
+    flux : (n,) float32 array
+        What is not finite counts as 0.
+    columns : (commands, 2 n) float32 array
+        The interaction matrix, transposed, see `add_products`.
+    work : tuple of (1, commands) and (1, 2 n) float32 arrays
+        Commands, and displacements: all x, then all y.
+    statistics : (3,) float64 array
+        `FLUX`, `DISPLACEMENT` (px^2), `FLUX_TIMES_DISPLACEMENT`.
+    """
+    n = flux.shape[0]
+    acting, displaced = work
+    for c in range(commands.shape[0]):
+        acting[0, c] = commands[c]
+    displaced[:] = 0.0
+    add_products(columns, acting, displaced)
+    statistics[:] = 0.0
+    for s in range(n):
+        square = displaced[0, s] * displaced[0, s] + displaced[0, n + s] * displaced[0, n + s]
+        flux_e = flux[s] if np.isfinite(flux[s]) else 0.0
+        statistics[FLUX] += flux_e / n
+        statistics[DISPLACEMENT] += square / n
+        statistics[FLUX_TIMES_DISPLACEMENT] += flux_e * square / n
+
+
+@_compiled
+def integrate(
+    slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, next_row: Any, memory: Any
+) -> float:
+    """Write the next command: `keep` times the latest minus `gain` times the wavefront, clipped.
+
+    Return the command's sum before it was clipped.
+
+    Parameters
+    ----------
+    slopes : (m,) float64 array
+        Finite.
+    columns : (m, commands) float32 array, contiguous
+        The reconstructor, transposed, see `add_products`. Reading it takes most of the time of large sensors.
+    gain, keep, largest : float
+    rows : (delay + 1, commands) float64 array
+        Of a `CommandDelayLine`.
+    next_row : int
+        Which row to write; the latest command is in the one before.
+    memory : ProductMemory
+        Of the wavefront.
+    """
+    latest, out = rows[(next_row or rows.shape[0]) - 1], rows[next_row]
+    finish_product(columns, slopes, memory)
+    total = 0.0
+    for c in range(out.shape[0]):
+        command = keep * latest[c] - gain * memory.result[c]
+        total += command
+        out[c] = min(max(command, -largest), largest)
+    return total
+
+
+_INTEGRATE = Direct(integrate)
+
+
+class CompiledIntegrator(Controller):
+    """Compiled `control.integrator.Integrator` with equal weights of all slopes.
+
+    Parameters
+    ----------
+    line : CommandDelayLine
+    interaction : (m, commands) array
+        Slopes in px that a unit of each command adds.
+    reconstruct : (commands, m) array
+        The wavefront from slopes, as commands that cause it.
+    gain : float
+        May be changed between two frames.
+    leak : float
+        Part of the command that is forgotten in every frame.
+    """
+
+    gain: float
+
+    def __init__(
+        self, line: CommandDelayLine, interaction: Floats, reconstruct: Floats, gain: float, leak: float
+    ) -> None:
+        super().__init__(line, interaction)
+        self._wavefront = SlopeProduct(reconstruct)
+        self.gain, self._keep = float(gain), 1.0 - leak
+
+    def update(
+        self, slopes_px: Floats, standard_error_px: Floats, covariance_xy_px2: Floats | None = None
+    ) -> None:
+        """See `Controller`; invalid slopes are 0, and all count the same."""
+        line, product = self.line, self._wavefront
+        numbers = self.gain, self._keep, line.largest
+        total = _INTEGRATE(slopes_px, product.columns, *numbers, line.rows, line.next_row, product.memory)
+        line.sent(total)
+
+    def begin_product(self, threads: int, scale: float) -> Sequence[ProductPart]:
+        """See `Controller`."""
+        return self._wavefront.parts(threads, scale)

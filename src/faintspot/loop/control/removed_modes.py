@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import finite_array, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED
-from faintspot.loop.control.compiled import MEAN_SQUARE
+from faintspot.loop.control.integrator import MEAN_SQUARE
 from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
 
 Floats = NDArray[np.float64]

@@ -11,15 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.base import INTEGRATOR, Controller
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import (
+    INTEGRATOR,
+    CommandDelayLine,
+    Controller,
+    OpenLoopTelemetry,
+    without_prior,
+)
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.identification.open_loop import measured_delay, open_loop_of
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import Integrator
-from faintspot.loop.control.telemetry import OpenLoopTelemetry, without_prior
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED, ControlParameters, RunLength
 from faintspot.loop.simulation.methods import PRIOR, Method

@@ -1,8 +1,9 @@
-"""Record of a closed-loop run: telemetry and true values."""
+"""Record of a closed-loop run: telemetry and true values; folders of results."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -89,3 +90,31 @@ class LoopRecord(NpzFile):
         if not chosen.any():
             raise InputError(f"method = {method}: no frame after the {self.settle_frames} settling ones")
         return float(self.strehl[chosen].mean())
+
+
+MAGNITUDE_FILE = "magnitude.npz"
+BUDGET_FILE = "budget.npz"
+"""Names of the files in a folder of results."""
+
+
+def holds_loop_results(path: Path) -> bool:
+    """Return whether a folder holds results of `faintspot loop`."""
+    return any((path / name).is_file() for name in (MAGNITUDE_FILE, BUDGET_FILE))
+
+
+def make_folder(folder: str | Path) -> Path:
+    """Make a folder if it does not exist, and return its path.
+
+    Raises
+    ------
+    InputError
+        When it cannot be made.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(exist_ok=True)
+    except FileNotFoundError:
+        raise InputError(f"{folder}: the folder {folder.parent} does not exist: create it first") from None
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror or error})") from None
+    return folder

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.loop.control.base import INTEGRATOR
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import INTEGRATOR, CommandDelayLine
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED, RunLength
@@ -27,6 +26,7 @@ from faintspot.loop.simulation.telescope.calibration import (
     typical_spots,
 )
 from faintspot.loop.simulation.telescope.camera import Exposing, make_detector
+from faintspot.loop.simulation.telescope.laser import FollowedSodium, LowOrders, learn_sodium, with_spots
 from faintspot.loop.simulation.telescope.model import (
     TelescopeModel,
     atmosphere_of,
@@ -34,10 +34,8 @@ from faintspot.loop.simulation.telescope.model import (
     prepare,
     without_flux,
 )
-from faintspot.loop.simulation.telescope.natural_star import LowOrders
-from faintspot.loop.simulation.telescope.sodium import FollowedSodium, learn_sodium, with_spots
 from faintspot.slopes.pipeline.configuration import to_text
-from faintspot.slopes.pipeline.mean_flux import MeanFlux
+from faintspot.slopes.pipeline.light import MeanFlux
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.training.known_sodium import KnownSodium

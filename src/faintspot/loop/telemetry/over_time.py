@@ -12,8 +12,7 @@ import numpy as np
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.report.figure_data import csv_text
-from faintspot.loop.control.identification.measured import Measured
-from faintspot.loop.control.identification.open_loop import FEWEST_FRAMES
+from faintspot.loop.control.identification.open_loop import FEWEST_FRAMES, Measured
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.telemetry.report import report_of_loop
 

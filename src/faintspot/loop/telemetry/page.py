@@ -8,12 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from faintspot.base.report.drawing import GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
 from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import Report, Table
-from faintspot.base.report.plots import Line, Panel, plot
+from faintspot.base.report.plots import (
+    GREY,
+    METHOD_COLOURS,
+    WIDTH,
+    Line,
+    Panel,
+    colour_bar,
+    new_figure,
+    plot,
+    styled,
+)
 from faintspot.base.report.texts import Texts
-from faintspot.loop.control.identification.measured import R0, Measured
+from faintspot.loop.control.identification.open_loop import R0, Measured
 from faintspot.loop.telemetry.over_time import Piece
 from faintspot.loop.telemetry.report import LoopReport, Part
 

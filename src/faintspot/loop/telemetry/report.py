@@ -14,18 +14,16 @@ from faintspot.base.errors import InputError
 from faintspot.base.report.texts import Texts
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
-from faintspot.loop.control.identification.measured import (
+from faintspot.loop.control.identification.open_loop import (
     R0,
     Measured,
-    outer_scale_and_r0,
-    wind_errors,
-    winds_of,
-)
-from faintspot.loop.control.identification.open_loop import (
     OpenLoop,
     known_delay,
     open_loop_of,
+    outer_scale_and_r0,
     site_of_loop,
+    wind_errors,
+    winds_of,
     with_axes_of,
 )
 from faintspot.loop.control.identification.predictive_control import ObservedLoop
@@ -33,9 +31,8 @@ from faintspot.loop.control.identification.recording import Recording, prepared
 from faintspot.loop.telemetry.choices import ControlChoice, advice, compared_choices
 from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
 from faintspot.loop.telemetry.spectra import ModalSpectra, modal_spectra
-from faintspot.loop.turbulence.image_motion import differential_image_motion
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
-from faintspot.loop.turbulence.strength import turbulence_strength
+from faintspot.loop.turbulence.strength import differential_image_motion, turbulence_strength
 from faintspot.slopes.sensor.pupil import subapertures_across
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 

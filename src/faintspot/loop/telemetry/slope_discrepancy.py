@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.measured import Measured
-from faintspot.loop.control.identification.open_loop import OpenLoop
+from faintspot.loop.control.identification.open_loop import Measured, OpenLoop
 from faintspot.loop.control.identification.recording import Recording
-from faintspot.loop.control.identification.slope_records import interpolated
+from faintspot.loop.control.identification.slope_spectra import interpolated
 from faintspot.slopes.wavefront.discrepancy import not_gradients
 
 Floats = NDArray[np.float64]

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.slope_records import SlopeRecords
-from faintspot.loop.control.identification.slope_spectra import SlopeSpectra
+from faintspot.loop.control.identification.slope_spectra import SlopeRecords, SlopeSpectra
 from faintspot.loop.control.identification.vibrations import MODES, mode_shapes
-from faintspot.loop.control.telemetry import OpenLoopTelemetry
 
 Floats = NDArray[np.float64]
 

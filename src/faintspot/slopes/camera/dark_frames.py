@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.statistics import MAD_TO_STD
-from faintspot.slopes.camera.hot_pixels import find_hot_pixels
+from faintspot.slopes.camera.frame_checks import find_hot_pixels
 
 Floats = NDArray[np.float64]
 

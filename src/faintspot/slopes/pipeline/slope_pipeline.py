@@ -28,8 +28,7 @@ from faintspot.slopes.kernels.driver.doubtful import check_slopes
 from faintspot.slopes.kernels.driver.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
 from faintspot.slopes.kernels.parallel import most_threads, run_groups, thread_scratch
 from faintspot.slopes.pipeline import configuration
-from faintspot.slopes.pipeline.light import MeanLight, light_test
-from faintspot.slopes.pipeline.mean_flux import MeanFlux
+from faintspot.slopes.pipeline.light import MeanFlux, MeanLight, light_test
 from faintspot.slopes.pipeline.plan import Plan, packed_calibration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes, Stages

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.files import write_atomically
-from faintspot.base.report.drawing import colour_bar, limits_of, new_figure, png, styled
+from faintspot.base.report.plots import colour_bar, limits_of, new_figure, png, styled
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.sensor.layout import Layout
 

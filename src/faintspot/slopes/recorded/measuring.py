@@ -30,11 +30,10 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.mean_frame import are_repeated
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration
-from faintspot.slopes.pipeline.labelled import layout_coordinates
-from faintspot.slopes.pipeline.mean_flux import MeanFlux
+from faintspot.slopes.pipeline.light import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px, with_preset, without_denoising
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
-from faintspot.slopes.pipeline.slopes import Slopes
+from faintspot.slopes.pipeline.slopes import Slopes, layout_coordinates
 from faintspot.slopes.recorded.response import response
 from faintspot.slopes.recorded.survey import Survey, stretches, survey
 from faintspot.slopes.sensor.layout import Layout

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
-from faintspot.base.flags import NO_FLAG, SubapertureFlag
+from faintspot.base.flags import NO_FLAG, SubapertureFlag, are_valid
 from faintspot.base.statistics import MAD_TO_STD, Estimate, absolute_errors, slope_statistics
-from faintspot.base.validity import are_valid
 
 Floats = NDArray[np.float64]
 

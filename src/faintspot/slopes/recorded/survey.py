@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.io.frames import FrameSource
+from faintspot.slopes.camera.frame_checks import LargestValues
 from faintspot.slopes.camera.mean_frame import MeanFrame, are_repeated
-from faintspot.slopes.camera.saturation import LargestValues
 
 _LOOKS, _FRAMES = 20, 50  # stretches of frames over the whole recording
 _FRAMES_FOR_SATURATION = 200

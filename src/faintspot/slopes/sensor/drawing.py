@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.report.drawing import COLOUR_MAP, GREY, colour_bar
+from faintspot.base.report.plots import COLOUR_MAP, GREY, colour_bar
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_outlines, lenslet_pitch
 

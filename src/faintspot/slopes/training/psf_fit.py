@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import solve
 
-from faintspot.slopes.training.registration import FINE, Floats
-from faintspot.slopes.training.stacking import Sums, offsets
+from faintspot.slopes.training.registration import FINE, Floats, Sums, offsets
 
 NODES_PER_PX = 2
 _MOST_NODES = 41  # along one axis, for what is not a product

@@ -15,8 +15,16 @@ from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.training.psf_fit import FIRST_FORM, Form, choose_form, fit_psf, samples_of
-from faintspot.slopes.training.registration import Floats, PSFTables, Registered, Stack, register, start
-from faintspot.slopes.training.stacking import Sums, stack_spots
+from faintspot.slopes.training.registration import (
+    Floats,
+    PSFTables,
+    Registered,
+    Stack,
+    Sums,
+    register,
+    stack_spots,
+    start,
+)
 
 _START_WIDTHS_PX = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 _START_SPOTS = 500

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.flags import KEEPABLE, SubapertureFlag
-from faintspot.base.validity import leave_out
+from faintspot.base.flags import KEEPABLE, SubapertureFlag, leave_out
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.mean_frame import MeanFrame
 from faintspot.slopes.pipeline.light import MeanLight

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from faintspot.base.report.drawing import FLUX_GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
 from faintspot.base.report.figure_data import FigureWithData
+from faintspot.base.report.plots import FLUX_GREY, METHOD_COLOURS, WIDTH, colour_bar, new_figure, styled
 from faintspot.base.statistics import rms
 from faintspot.slopes.sensor.drawing import Map, subaperture_map
 from faintspot.slopes.sensor.layout import Layout

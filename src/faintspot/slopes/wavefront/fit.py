@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.base.validity import leave_out
+from faintspot.base.flags import leave_out
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, lit_outlines, pupil_of

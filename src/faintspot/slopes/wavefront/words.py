@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.base.report.words import number_or_dash, signed
+from faintspot.base.report.texts import number_or_dash, signed
 from faintspot.base.statistics import rms
 from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
 from faintspot.slopes.wavefront.units import UNITS

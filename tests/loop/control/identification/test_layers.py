@@ -6,9 +6,9 @@ from tests.loop.control.control_cases import TURBULENCE
 from tests.loop.control.frozen_flow import frozen_slopes
 
 from faintspot.base.errors import InputError
+from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.vibrations import mode_shapes
-from faintspot.loop.control.telemetry import OpenLoopTelemetry
 
 RATE_HZ = 250.0
 CELLS = np.array([[row, column] for row in range(5) for column in range(5)], np.float64)

@@ -9,7 +9,7 @@ import pytest
 from tests.loop.control.control_cases import COVARIANCES, FRAME_S, INTERACTION, PLANT, TURBULENCE, telemetry
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.configuration import Control, ControlOptions
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.model import Kalman

@@ -8,8 +8,7 @@ from tests.loop.telemetry.loop_cases import AIR, recorded
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.measured import winds_of
-from faintspot.loop.control.identification.open_loop import measured_delay, site_of_loop
+from faintspot.loop.control.identification.open_loop import measured_delay, site_of_loop, winds_of
 from faintspot.loop.control.identification.recording import Recording
 
 

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from tests.loop.control.driven import driven, oscillator
 
 from faintspot.base.errors import InputError
+from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.loop_delay import DelayFits
 from faintspot.loop.control.identification.model import LoopPlant
 from faintspot.loop.control.identification.open_loop import site_of_loop
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.reconstructor import make_reconstructor
-from faintspot.loop.control.telemetry import OpenLoopTelemetry
 
 _RATE_HZ, _FRAMES, _NOISE = 500.0, 8000, 0.5
 _TURBULENCE, _VIBRATION, _BROAD = (

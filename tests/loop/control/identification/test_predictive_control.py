@@ -10,7 +10,7 @@ from tests.loop.control.control_cases import CELLS, INTERACTION, LAYERS, PHASE_O
 from tests.loop.telemetry.loop_cases import recorded
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.identification import predictive_control
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.predictive_control import LoopOfControl, PredictiveControl, learn

@@ -5,9 +5,8 @@ from functools import partial
 import numpy as np
 from tests.loop.control.control_cases import FRAME_S, LAYERS, PHASE, PLANT, TURBULENCE, telemetry
 
-from faintspot.loop.control.base import ASSUMED
+from faintspot.loop.control.base import ASSUMED, OpenLoopTelemetry
 from faintspot.loop.control.identification.learning import learn_controller
-from faintspot.loop.control.telemetry import OpenLoopTelemetry
 
 FRAMES = telemetry(400, 0.5, model=LAYERS)
 

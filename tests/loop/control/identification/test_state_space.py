@@ -24,7 +24,7 @@ from tests.loop.control.control_cases import (
 from tests.shared_data import ROOT
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.state_space import state_space, write_matrices
 from faintspot.loop.control.kalman.local_predictor import local_filter

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from faintspot.loop.control.kalman.choice import (
+from faintspot.loop.control.kalman.guarded import (
     AT_LIMIT,
     CHOOSE,
     CHOSEN,

@@ -9,12 +9,11 @@ import pytest
 from tests.loop.control.control_cases import INTERACTION, LAYERS, MODEL, PHASE, PLANT, telemetry
 from tests.loop.control.naive_guarded import Guarded
 
-from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.kalman.choice import HANDOVER_FRAMES
+from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.kalman.compiled import STEPS, CompiledKalman
+from faintspot.loop.control.kalman.guarded import HANDOVER_FRAMES
 from faintspot.loop.control.kalman.predictive import Predictive
-from faintspot.loop.control.kalman.predictor import SlopePredictor
-from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 
 M, COMMANDS = INTERACTION.shape
 USUAL_PX2, GAIN, FRAMES = 0.25, 0.4, telemetry(500)

@@ -5,10 +5,9 @@ import pytest
 from tests.loop.control.control_cases import INTERACTION, PHASE, PLANT, telemetry
 from tests.loop.control.naive_guarded import Guarded
 
-from faintspot.loop.control.base import Controller
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.identification.model import Make
-from faintspot.loop.control.kalman.choice import EXCESS, MOST_EXCESS
+from faintspot.loop.control.kalman.guarded import EXCESS, MOST_EXCESS
 
 FRAMES = telemetry(900, 0.2)
 

@@ -16,10 +16,9 @@ from tests.loop.control.control_cases import (
 )
 from tests.loop.control.naive_guarded import Guarded
 
-from faintspot.loop.control import slope_product
-from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.kalman.choice import EXCESS, MOST_EXCESS
-from faintspot.loop.control.kalman.guarded import GuardedController
+from faintspot.loop.control import integrator
+from faintspot.loop.control.base import CommandDelayLine
+from faintspot.loop.control.kalman.guarded import EXCESS, MOST_EXCESS, GuardedController
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter
 from faintspot.loop.control.kalman.predictive import Predictive
@@ -99,7 +98,7 @@ def test_a_command_that_is_begun_while_slopes_are_measured_is_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Both of the filter and of the integrator that takes over; the tolerance is that of float32."""
-    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
     arrays, rng, chosen = wrong_filter(), np.random.default_rng(3), []
     lines = [CommandDelayLine(COMMANDS, 2, 0.8) for _ in range(2)]
     others = INTERACTION, PLANT.reconstructor, PHASE_OF_COMMANDS, arrays, GAIN, PLANT.leak
@@ -132,7 +131,7 @@ def test_a_command_that_is_begun_while_slopes_are_measured_is_the_same(
 def test_nothing_is_begun_with_a_prior_or_before_the_frame_is_complete(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(slope_product, "_LEAST_BYTES", 0)
+    monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
     line = CommandDelayLine(COMMANDS, 2, 0.8)
     others = INTERACTION, PLANT.reconstructor, PHASE_OF_COMMANDS, wrong_filter(), GAIN, PLANT.leak
     controller = LargeGuarded(line, *others)

@@ -10,18 +10,17 @@ from tests.loop.control.control_cases import CELLS, FRAME_S, LAYERS, PLANT, TURB
 from tests.loop.control.frozen_flow import frozen_slopes
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.identification import model as models
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.model import Kalman
-from faintspot.loop.control.kalman import local_covariance, local_model
+from faintspot.loop.control.kalman import local_model
 from faintspot.loop.control.kalman import local_predictor as local_kalman
 from faintspot.loop.control.kalman.local_model import LocalModel, at_most, neighbours_within, solve_locally
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter
-from faintspot.loop.control.kalman.predictor import SlopePredictor
+from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 from faintspot.loop.control.kalman.predictor import steady_covariance as dense_covariance
-from faintspot.loop.control.kalman.slope_model import SlopeModel
-from faintspot.loop.control.noise import add_noise
+from faintspot.loop.control.reconstructor import add_noise
 
 SIDE_M = TURBULENCE.subaperture_m
 PAIR = replace(TURBULENCE, positions_m=CELLS[[0, 1, 3, 4]][:, ::-1] * SIDE_M)  # all adjacent to each other
@@ -68,7 +67,7 @@ def test_weak_layers_join_those_of_similar_wind(monkeypatch: pytest.MonkeyPatch)
 
 
 def _transition(model: LocalModel) -> np.ndarray:
-    return np.asarray(local_covariance._transition(model.neighbours, model.weights).toarray(), np.float64)
+    return np.asarray(local_model._transition(model.neighbours, model.weights).toarray(), np.float64)
 
 
 def test_where_all_are_neighbours_the_model_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,7 +100,7 @@ def test_a_step_of_the_covariance_is_the_textbooks(reach: float, monkeypatch: py
     monkeypatch.setattr(local_model, "_AT_ONCE", 4)
     """With gains among all, and with those that know only some neighbours (Joseph's form)."""
     model = LocalModel.of_layers(TURBULENCE.layers(), FRAME_S)
-    before = local_covariance._prior(TURBULENCE.layers(), FRAME_S).astype(np.float64)
+    before = local_model._prior(TURBULENCE.layers(), FRAME_S).astype(np.float64)
     around, half = neighbours_within(CELLS, reach), len(before) // 2
     step = np.vstack([_transition(model), np.eye(half, 2 * half)])
     noise = np.diag(NOISE_PX2)
@@ -118,9 +117,9 @@ def test_a_step_of_the_covariance_is_the_textbooks(reach: float, monkeypatch: py
     for layer in range(2):
         part = slice(18 * layer, 18 * (layer + 1))
         expected[part, part] += model.driving[layer]
-    found = local_covariance._next(
+    found = local_model._next(
         before.astype(np.float32),
-        local_covariance._transition(model.neighbours, model.weights),
+        local_model._transition(model.neighbours, model.weights),
         model.driving.astype(np.float32),
         (NOISE_PX2, SHARED_PX2),
         around,

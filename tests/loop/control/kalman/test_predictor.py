@@ -3,8 +3,7 @@ import pytest
 from scipy.linalg import block_diag, solve_discrete_are
 from tests.loop.control.control_cases import COVARIANCES, ERRORS, LAYERS, MODEL, telemetry
 
-from faintspot.loop.control.kalman.predictor import SlopePredictor, steady_covariance
-from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor, steady_covariance
 
 MODELS = pytest.mark.parametrize("model", [MODEL, LAYERS], ids=["one layer", "two layers"])
 

@@ -11,10 +11,14 @@ from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.methods import default_methods, method_kind
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.engine_files import write_engine_files
-from faintspot.loop.simulation.telescope.laser import LaserSource, laser_guide_star
+from faintspot.loop.simulation.telescope.laser import (
+    FollowedSodium,
+    LaserSource,
+    LowOrders,
+    laser_guide_star,
+    learn_sodium,
+)
 from faintspot.loop.simulation.telescope.model import prepare
-from faintspot.loop.simulation.telescope.natural_star import LowOrders
-from faintspot.loop.simulation.telescope.sodium import FollowedSodium, learn_sodium
 from faintspot.slopes.spots.sodium import SodiumProfile
 
 pytest.importorskip("hcipy")

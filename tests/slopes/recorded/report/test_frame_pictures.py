@@ -4,7 +4,7 @@ import matplotlib
 import numpy as np
 from tests.slopes.recorded.recorded_cases import SETTINGS, sensor, simulated
 
-from faintspot.base.report.drawing import png
+from faintspot.base.report.plots import png
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.recorded.report.frame_pictures import (

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.slope_records import SlopeRecords
-from faintspot.loop.control.identification.slope_spectra import SlopeSpectra
+from faintspot.loop.control.identification.slope_spectra import SlopeRecords, SlopeSpectra
 from faintspot.loop.control.identification.vibrations import MODES, Vibration, mode_shapes
 from faintspot.loop.turbulence.strength import OUTER_SCALE_SPREAD
 

@@ -1,18 +1,20 @@
-"""Controllers that learn what they need to know from telemetry, with an integrator to fall back to."""
+"""Controllers that learn from telemetry, with an integrator to fall back to, and learn again."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from faintspot.loop.control.base import ASSUMED, LEARNT
+from faintspot.base.errors import InputError
+from faintspot.loop.control.base import ASSUMED, LEARNT, SETTLE_FRAMES, OpenLoopTelemetry
 from faintspot.loop.control.identification.layers import AVERAGED, Identification, Identified
+from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.phase import phase_of_commands
-from faintspot.loop.control.telemetry import OpenLoopTelemetry
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 
 GAINS = (0.03, 0.05, 0.07, 0.1, 0.13, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5, 0.6, 0.7, 0.8)
@@ -75,3 +77,119 @@ def _fits(
         return [anywhere]
     # A line that the winds explain is no vibration in either model.
     return [windy, replace(anywhere, vibrations=windy.vibrations)]
+
+
+Floats = NDArray[np.float64]
+
+JUDGED_PART = 0.35
+"""Part of a stretch, its end, on which models are judged; they are learnt from the rest."""
+STANDARD_ERRORS = 2.0
+_BLOCK_FRAMES = 25
+_FEWEST_BLOCKS = 10
+FEWEST_FRAMES = math.ceil(_FEWEST_BLOCKS * _BLOCK_FRAMES / JUDGED_PART) + 1
+"""Frames of a stretch that can be learnt from and judged on."""
+
+
+@dataclass(frozen=True, eq=False)
+class RelearntControl:
+    """New filter, and the residual phase variance that it and others would have left on the same frames.
+
+    All are computed for the centroid gain that was found.
+    """
+
+    learnt: Kalman
+    residual: float
+    by_running: float
+    by_integrator: float
+    error: float
+    """Standard error of `by_running` minus `residual`."""
+    delay: LoopDelay | None = None
+    """Centroid gain that was found, relative to that of the slopes; None: it was not measured."""
+    gain_changed: bool = False
+    """Whether it differs from the running filter's beyond its error."""
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the new filter leaves less than the integrator, and than the running one beyond the error.
+
+        A running filter with another centroid gain would leave more than computed: it is always replaced.
+        """
+        saved = self.by_running - self.residual
+        return (self.gain_changed or saved > STANDARD_ERRORS * self.error) and (
+            self.residual < self.by_integrator
+        )
+
+    def summary(self) -> str:
+        """Return a summary of one line."""
+        part, error = self.residual / self.by_running, self.error / self.by_running
+        of_integrator = self.residual / self.by_integrator
+        gain = "" if self.delay is None else f"{self.delay.gain_summary}, "
+        return (
+            f"{gain}{self.learnt.description}; phase variance {part:.3f} +- {error:.3f} of the running "
+            f"filter's, {of_integrator:.2f} of the integrator's"
+        )
+
+
+def relearn(
+    plant: LoopPlant,
+    running: Kalman,
+    telemetry: OpenLoopTelemetry,
+    site: SlopeTurbulence,
+    rate_hz: float,
+    start: Identified | None = None,
+    delay: LoopDelay | None = None,
+) -> RelearntControl:
+    """Learn from the first part of telemetry, and judge on the rest by replay; nothing else is changed.
+
+    All filters are replayed on the same open-loop slopes, each with its own commands, so that nothing is
+    risked on the mirror. The running filter must not have learnt from this telemetry.
+
+    Parameters
+    ----------
+    plant : Plant
+    running : Model
+        Model of the Kalman filter in use.
+    telemetry : OpenLoopTelemetry
+        Consecutive frames.
+    site : SlopeTurbulence
+    rate_hz : float
+        Frames per second.
+    start : Identified, optional
+        Turbulence that was found before, from which the search starts: faster, but finds no new layer.
+    delay : LoopDelay, optional
+        With the centroid gain of the telemetry. Default: that of the running filter, not measured again.
+
+    Raises
+    ------
+    InputError
+        When there are too few frames.
+    """
+    frames = len(telemetry)
+    if frames < FEWEST_FRAMES:
+        raise InputError(f"telemetry: expected {FEWEST_FRAMES} frames to judge a filter, got {frames}")
+    first = frames - round(JUDGED_PART * frames)
+    new = learn_controller(plant, telemetry.part(0, first), site, rate_hz, start=start)
+    identified, begin = new.identified, max(0, first - SETTLE_FRAMES)
+    replayed = telemetry.part(begin, None)  # all have settled when the part begins that they are judged on
+    phase = new.phase(plant)
+    by_integrator = plant.replayed_integrators([new.plain_gain], replayed, phase)[0]
+    residuals = *(model.replayed(plant, replayed, phase) for model in (new, running)), by_integrator
+    by_new, by_running, by_integrator = (squares[first - begin :] for squares in residuals)
+    gain = running.centroid_gain if delay is None else delay.gain
+    changed = delay is not None and abs(gain - running.centroid_gain) > STANDARD_ERRORS * delay.gain_error
+    if changed and by_running.mean() < by_new.mean():  # the turbulence known before fits better
+        new, by_new = replace(running, plain_gain=new.plain_gain), by_running
+    means = float(by_new.mean()), float(by_running.mean()), float(by_integrator.mean())
+    # By the residuals the engine chooses what begins.
+    learnt = replace(new, left=(means[0], means[2]), centroid_gain=gain, identified=identified)
+    error = _error_of_mean(by_running - by_new)
+    return RelearntControl(learnt, *means, error, delay, changed)
+
+
+def _error_of_mean(values: Floats) -> float:
+    """Return the standard error of the mean of correlated values, from the scatter of blocks."""
+    blocks = len(values) // _BLOCK_FRAMES
+    means = values[: blocks * _BLOCK_FRAMES].reshape(blocks, _BLOCK_FRAMES).mean(axis=1)
+    with np.errstate(invalid="ignore"):
+        error = float(means.std(ddof=1)) / math.sqrt(blocks)
+    return error if math.isfinite(error) else math.inf

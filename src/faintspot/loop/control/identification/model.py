@@ -16,21 +16,26 @@ from numpy.typing import NDArray
 from faintspot.base.checks import numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays, save_arrays
-from faintspot.loop.control.base import KALMAN, SETTLE_FRAMES, Controller, Predictor
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import (
+    KALMAN,
+    SETTLE_FRAMES,
+    CommandDelayLine,
+    Controller,
+    OpenLoopTelemetry,
+    Predictor,
+    usual_noise,
+)
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.replay import mean_residual, replayed_frames, replayed_integrators
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
-from faintspot.loop.control.kalman.local_covariance import STEPS
+from faintspot.loop.control.kalman.local_model import STEPS
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter, local_shapes
 from faintspot.loop.control.kalman.predictive import Predictive
-from faintspot.loop.control.kalman.predictor import SlopePredictor, steady_covariance
-from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor, steady_covariance
 from faintspot.loop.control.reconstructor import Reconstructor
-from faintspot.loop.control.telemetry import OpenLoopTelemetry, usual_noise
 
 Floats = NDArray[np.float64]
 Make = Callable[[CommandDelayLine], Controller]

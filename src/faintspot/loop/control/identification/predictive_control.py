@@ -14,17 +14,19 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import real_array
 from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.measured import Measured, Wind, winds_of
 from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.identification.open_loop import (
+    Measured,
     OpenLoop,
+    Wind,
     measured_delay,
     open_loop_of,
     site_of_loop,
+    winds_of,
     with_axes_of,
 )
 from faintspot.loop.control.identification.recording import Prepared, Recording, prepared

@@ -13,10 +13,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.loop.control.base import Controller
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine, Controller, OpenLoopTelemetry, as_estimated
 from faintspot.loop.control.reconstructor import Reconstructor
-from faintspot.loop.control.telemetry import OpenLoopTelemetry, as_estimated
 
 Floats = NDArray[np.float64]
 

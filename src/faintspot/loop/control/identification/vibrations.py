@@ -13,7 +13,7 @@ from scipy.ndimage import median_filter
 from scipy.optimize import minimize
 from scipy.stats import chi2, gamma
 
-from faintspot.loop.control.kalman.slope_model import SlopeModel
+from faintspot.loop.control.kalman.predictor import SlopeModel
 
 Floats = NDArray[np.float64]
 

@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import ExpectedSlopes
-from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.kalman.choice import CHOSEN
-from faintspot.loop.control.kalman.guarded import GuardedController
+from faintspot.loop.control.base import (
+    LEAST_VARIANCE_PX2,
+    CommandDelayLine,
+    ExpectedSlopes,
+    OpenLoopTelemetry,
+)
+from faintspot.loop.control.kalman.guarded import CHOSEN, GuardedController
 from faintspot.loop.control.kalman.kernels import (
     COMMAND_ROWS,
     FOLLOW,
@@ -26,7 +29,6 @@ from faintspot.loop.control.kalman.kernels import (
     replay,
 )
 from faintspot.loop.control.kalman.predictor import SlopePredictor, shares
-from faintspot.loop.control.telemetry import LEAST_VARIANCE_PX2, OpenLoopTelemetry
 
 Floats = NDArray[np.float64]
 

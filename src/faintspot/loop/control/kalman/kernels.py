@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.loop.control.kalman import choice
-from faintspot.loop.control.kalman.choice import (
+from faintspot.loop.control.base import LEAST_SHARE, LEAST_VARIANCE_PX2
+from faintspot.loop.control.kalman import guarded
+from faintspot.loop.control.kalman.guarded import (
     AT_LIMIT,
     BLENDED,
     CHOSEN,
@@ -26,12 +27,11 @@ from faintspot.loop.control.kalman.choice import (
     choose,
 )
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
-from faintspot.loop.control.telemetry import LEAST_SHARE, LEAST_VARIANCE_PX2
 from faintspot.slopes.kernels.compilation.compiling import Direct, _kernel
 from faintspot.slopes.kernels.driver.products import add_products
 
 # Compiled anew when the guard changes, too.
-_compiled = partial(_kernel, sources=(Path(__file__), Path(choice.__file__)))
+_compiled = partial(_kernel, sources=(Path(__file__), Path(guarded.__file__)))
 
 # Rows of memory: of slopes, and of commands; the first four are commands and what they add to slopes.
 HELD, HELD_LEARNT, HELD_PLAIN, LATEST_PLAIN, _LEFT_LEARNT, _LEFT_PLAIN, _FOR_PLAIN = range(7)

@@ -8,15 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import ExpectedSlopes
-from faintspot.loop.control.commands import CommandDelayLine
-from faintspot.loop.control.kalman.choice import SURPRISE
-from faintspot.loop.control.kalman.guarded import GuardedController
-from faintspot.loop.control.kalman.local_covariance import replies
+from faintspot.loop.control.base import CommandDelayLine, ExpectedSlopes, without_prior
+from faintspot.loop.control.integrator import SlopeProduct
+from faintspot.loop.control.kalman.guarded import SURPRISE, GuardedController
+from faintspot.loop.control.kalman.local_model import replies
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor
 from faintspot.loop.control.reconstructor import Reconstructor
-from faintspot.loop.control.slope_product import SlopeProduct
-from faintspot.loop.control.telemetry import without_prior
 from faintspot.slopes.kernels.driver.products import ProductPart
 
 Floats = NDArray[np.float64]

@@ -13,10 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.kalman.local_covariance import local_gains, of_slopes, steady_covariance
-from faintspot.loop.control.kalman.local_model import Indices, at_most, neighbours_within
+from faintspot.loop.control.kalman.local_model import (
+    Indices,
+    at_most,
+    local_gains,
+    neighbours_within,
+    of_slopes,
+    steady_covariance,
+)
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
-from faintspot.loop.control.noise import add_noise
+from faintspot.loop.control.reconstructor import add_noise
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
 

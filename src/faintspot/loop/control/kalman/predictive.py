@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.base import Controller, ExpectedSlopes, Predictor
-from faintspot.loop.control.commands import CommandDelayLine
+from faintspot.loop.control.base import CommandDelayLine, Controller, ExpectedSlopes, Predictor
 
 Floats = NDArray[np.float64]
 

@@ -15,14 +15,15 @@ from faintspot.base.config.tables import ConfigurationTable, tables_as_text
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.sizes import check_size
 from faintspot.base.toml_files import check_keys, check_known, checked_table, parse_file, parse_text
-from faintspot.loop.simulation.configuration.laser_section import Laser, NaturalStar
 from faintspot.loop.simulation.configuration.sections import (
     CLOSED,
     OPEN,
     Atmosphere,
     Camera,
     ControlParameters,
+    Laser,
     Mirror,
+    NaturalStar,
     RunLength,
     Science,
     SensorParameters,

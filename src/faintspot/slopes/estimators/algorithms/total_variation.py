@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import image_stack, number_between, numbers_between, one_of
-from faintspot.base.config.presets import PRESETS, of_denoising
+from faintspot.base.config.tables import PRESETS, of_denoising
 from faintspot.base.errors import InputError
 from faintspot.slopes.kernels.compilation.host import lanes_for
 from faintspot.slopes.kernels.gravity.stacks import denoise_stack

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.config.options import Value, option
-from faintspot.base.config.presets import PRESETS
+from faintspot.base.config.tables import PRESETS
 from faintspot.base.sizes import MOST_NUMBERS, check_size
 from faintspot.slopes.estimators import spot_tables
 from faintspot.slopes.estimators.base import Style

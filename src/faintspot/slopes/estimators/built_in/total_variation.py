@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.config.options import PerSubaperture, Value, is_auto, option
-from faintspot.base.config.presets import FEW_KEPT, PRESETS, of_denoising
+from faintspot.base.config.tables import FEW_KEPT, PRESETS, of_denoising
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.algorithms.automatic import automatic_strength
 from faintspot.slopes.estimators.algorithms.noise import suggested_strength

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.report.drawing import (
+from faintspot.base.report.plots import (
     FLUX_GREY,
     TRUTH_COLOUR,
     WIDTH,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from faintspot.base.report.drawing import (
+from faintspot.base.report.plots import (
     FLUX_GREY,
     GREY,
     METHOD_COLOURS,

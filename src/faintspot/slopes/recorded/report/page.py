@@ -10,8 +10,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.flags import SubapertureFlag
 from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import POSITIONS, Report, Section, Table, configuration_section
-from faintspot.base.report.texts import Texts
-from faintspot.base.report.words import percentage
+from faintspot.base.report.texts import Texts, percentage
 from faintspot.base.statistics import Estimate, rms
 from faintspot.slopes.recorded.report import frame_pictures, maps
 from faintspot.slopes.recorded.report.run import SlopesRun

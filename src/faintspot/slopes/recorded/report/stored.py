@@ -1,8 +1,8 @@
-"""The report page of slopes that lie in files."""
+"""The report page of slopes that lie in files, with its section on sodium profiles."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,21 +10,62 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.base.flags import are_valid, leave_out
+from faintspot.base.report.figure_data import FigureWithData
 from faintspot.base.report.page import Report, Section
+from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, Line, Panel, plot
 from faintspot.base.report.texts import Texts
-from faintspot.base.validity import are_valid, leave_out
 from faintspot.io import open_frames
 from faintspot.io.frames import FrameSource
+from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slopes import Slopes, Stages
 from faintspot.slopes.recorded.report.frame_pictures import Followed, farthest_frame
 from faintspot.slopes.recorded.report.page import slopes_report
 from faintspot.slopes.recorded.report.run import SlopesRun
-from faintspot.slopes.recorded.report.sodium_section import sodium_section_of_frames
+from faintspot.slopes.recorded.sodium import sodium_of_frames
 from faintspot.slopes.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.slopes.recorded.stored_run import StoredRun, open_run
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.laser_spots import LaserSpots
+from faintspot.slopes.spots.sodium import SodiumProfile
 
 _TEXT = Texts("faintspot.slopes.recorded")
+
+
+def profile_figure(profiles: Mapping[str, SodiumProfile]) -> FigureWithData:
+    """Draw the density of profiles against altitude; the last one is emphasised."""
+    *before, newest = profiles
+    lines, rows = [], []
+    for index, (name, profile) in enumerate(profiles.items()):
+        altitude, density = profile.altitudes_m / 1e3, 1e3 * profile.density
+        style: dict[str, object] = {"color": METHOD_COLOURS[1], "lw": 2.2}
+        if name != newest:
+            dashes = ("--", ":", "-.")[index % 3] if len(before) > 1 else "--"
+            style = {"color": GREY, "lw": 1.6, "ls": dashes}
+        mean = f"mean {profile.mean_m / 1e3:.1f} km, std {profile.std_m / 1e3:.1f} km"
+        lines.append(Line(f"{name}\n({mean})", density, altitude, style=style))
+        rows += [(name, f"{a:.6g}", f"{b:.6g}") for a, b in zip(altitude, density, strict=True)]
+    flux, height = "return flux per km of altitude", "altitude above sea level (km)"
+    panel = Panel(lines, flux, height, x_range=(0, None), legend=True)
+    return _TEXT.figure("sodium", plot([[panel]], 4.6, width=0.6 * WIDTH, legend=""), rows)
+
+
+def sodium_section_of_frames(
+    source: FrameSource, layout: Layout, calibration: Calibration, laser: LaserSpots, most_frames: int
+) -> Section:
+    """Return the section with the configured profile, and that of frames; or why there is none."""
+    try:
+        found = sodium_of_frames(source, layout, calibration, laser, most_frames=most_frames)
+    except InputError as error:
+        return _TEXT.section("sodium", missing=f"Not fitted: {error}.")
+    sodium = found.sodium
+    profiles = {"configured": sodium.star.focused(laser.profile), "these frames": sodium.fit.profile}
+    figure = profile_figure(profiles)
+    doubt = found.left_out.capitalize() or None
+    return _TEXT.section("sodium", figure, width=sodium.spot_fwhm_arcsec, left_out=doubt)
+
+
 _SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
 _SAME_POSITION_PX = 0.02
 """Recomputed positions differ by less, whatever processor computed the stored ones."""
