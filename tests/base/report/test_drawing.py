@@ -40,7 +40,7 @@ def test_svg_is_the_same_bytes_for_the_same_figure() -> None:
 def test_missing_matplotlib_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     for module in (
-        "base.report.drawing",
+        "base.report.plots",
         "slopes.recorded.layout_picture",
         "slopes.recorded.report.frame_pictures",
         "slopes.recorded.report.maps",

@@ -1,4 +1,4 @@
-// Messages from the server: values and named arrays; see messages.py.
+// Messages from the server: values and named arrays; see page.py.
 
 const TYPES = {
   float32: Float32Array, float64: Float64Array, uint8: Uint8Array, int32: Int32Array,
