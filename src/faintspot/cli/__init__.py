@@ -17,7 +17,7 @@ _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
     "doctor": "Show versions, extras and processor, and how to add what is missing.",
     "estimators": "List the estimators, or the options of one.",
-    "export": "Write weights and matrices, or telemetry, as FITS for other software.",
+    "export": "Write telemetry as FITS (AOT) for other software.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
     "live": "Show a running engine, or a recording, as a web page.",
     "loop": "Compare methods in a simulated closed loop, and recommend one.",
