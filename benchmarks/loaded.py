@@ -72,14 +72,14 @@ class Task:
 
 TASKS = {
     "SlopePipeline, one TV frame": Task(_FRAME, 8_000),
-    "slopes of a recording": Task(_SLOPES, 11_000, (_FRAMES, _LAYOUT)),
-    "telemetry": Task("telemetry slopes.zarr --frame-rate-hz 250", 14_000, (_FRAMES, _LAYOUT, _SLOPES)),
+    "slopes of a recording": Task(_SLOPES, 10_800, (_FRAMES, _LAYOUT)),
+    "telemetry": Task("telemetry slopes.zarr --frame-rate-hz 250", 12_000, (_FRAMES, _LAYOUT, _SLOPES)),
     "loop magnitude": Task(
-        "loop magnitude diffraction_limit --quick --methods brightest --flux-e 20 --workers 0", 20_000
+        "loop magnitude diffraction_limit --quick --methods brightest --flux-e 20 --workers 0", 15_300
     ),
     "realtime run": Task(
         "realtime run --frames 20 --name {name}",
-        17_500,
+        14_500,
         (_FRAMES, _LAYOUT),
         "realtime replay frames.npy --name {name}",
     ),

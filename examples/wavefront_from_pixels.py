@@ -28,7 +28,7 @@ from scipy.sparse.linalg import eigsh
 from faintspot.experiments.closed_loop.methods import method_kind
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 from faintspot.loop.simulation import LoopConfiguration, load_loop
-from faintspot.loop.simulation.control import learnt_control
+from faintspot.loop.simulation.learning import learnt_control
 from faintspot.loop.simulation.simulation import DisabledErrors, _Loop
 from faintspot.loop.simulation.telescope.model import LoopOptics, TelescopeModel, prepare
 from faintspot.loop.turbulence.slope_covariance import phase_covariance_rad2

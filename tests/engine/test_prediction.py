@@ -14,7 +14,7 @@ from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.streams.prediction_stream import PredictionStream
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.simulation import Method, simulate_loop
-from faintspot.loop.simulation.control import learnt_control
+from faintspot.loop.simulation.learning import learnt_control
 from faintspot.slopes.pipeline import configuration as configuration_file
 
 pytest.importorskip("hcipy")

@@ -98,8 +98,6 @@ def command(
       faintspot telemetry loop.toml -o loop.html
       faintspot telemetry loop.npz --controller controller.npz
     """
-    from faintspot.loop.control.configuration import load_control
-    from faintspot.loop.control.identification.predictive_control import learn, learn_observed
     from faintspot.loop.telemetry.over_time import table_of_pieces
     from faintspot.loop.telemetry.page import page_of_loop
     from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
@@ -117,6 +115,8 @@ def command(
         if engine is not None:
             if recording is None:
                 recording = Path(temporary.enter_context(tempfile.TemporaryDirectory()), f"{engine}.zarr")
+            from faintspot.loop.control.configuration import load_control
+
             config = config or "faintspot.toml"
             load_control(config)  # faults of the file are found before the recording
             _record(engine, recording, _SECONDS if seconds is None else seconds)
@@ -149,6 +149,8 @@ def command(
         click.echo(report.advice)
     click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
     if controller is not None:
+        from faintspot.loop.control.identification.predictive_control import learn, learn_observed
+
         click.echo("controller ...", err=True)
         with errors_within(f"{controller}: not written, keep the integrator"):
             control = learn(loop) if report.observed is None else learn_observed(report.observed)

@@ -13,7 +13,6 @@ from faintspot.base.errors import InputError
 from faintspot.engine.engine import Engine
 from faintspot.engine.path.pipeline_maker import PipelineMaker
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
-from faintspot.loop.control.identification.model import Kalman
 from faintspot.slopes.pipeline.configuration import Configuration
 
 LENGTHY = ("set", "interleave", "load", "unload", "learnt", "spots")
@@ -73,6 +72,8 @@ def _take_learnt(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, o
         return {}
     if engine.loop is None:
         raise InputError("learnt: this engine makes no commands; add [control] to its configuration")
+    from faintspot.loop.control.identification.model import Kalman
+
     try:
         engine.loop.renew(Kalman.load(_text(fields, "model"), engine.loop.control.plant))
     except InputError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,14 @@ from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.timing import Latencies
 from faintspot.loop.control.base import KALMAN, CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control
-from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.integrator import MEAN_SQUARE, true_slopes
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.kernels.driver.products import ProductPart
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout
+
+if TYPE_CHECKING:
+    from faintspot.loop.control.identification.model import Kalman
 
 NONE, OPEN, CLOSED = "none", "open", "closed"
 STATES = (NONE, OPEN, CLOSED)

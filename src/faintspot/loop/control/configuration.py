@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from faintspot.base.config.tables import Tables, save_tables
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.toml_files import check_keys
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, CommandDelayLine, Controller
-from faintspot.loop.control.identification.model import Kalman, LoopPlant
 from faintspot.loop.control.integrator import CompiledIntegrator
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.loop.control.removed_modes import REMOVED_MODES, TIP_TILT_FOCUS, RemovedModes
@@ -25,6 +24,9 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
+
+if TYPE_CHECKING:
+    from faintspot.loop.control.identification.model import Kalman, LoopPlant
 
 Floats = NDArray[np.float64]
 
@@ -205,6 +207,8 @@ class Control:
             return self.model  # kept for `with_controller`
         if self.model is None:
             raise InputError(f"expected a file with the model of {CONTROLS[kind]}, got none", name=MODEL)
+        from faintspot.loop.control.identification.model import Kalman  # an integrator needs no filters
+
         model = self.model
         if not isinstance(model, Kalman):
             model = Kalman.load(model, self.plant)
@@ -228,7 +232,9 @@ class Control:
 
     @property
     def plant(self) -> LoopPlant:
-        """Loop properties that controllers use."""
+        """Loop properties that learnt controllers use."""
+        from faintspot.loop.control.identification.model import LoopPlant
+
         options = self.options
         return LoopPlant(self.controlled, self.reconstructor, options.delay_frames, options.leak)
 

@@ -13,7 +13,7 @@ from faintspot.base.files import output_errors, write_atomically
 from faintspot.loop.control.base import INTEGRATOR, KALMAN
 from faintspot.loop.control.configuration import TABLE, save_control
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.control import learnt_control
+from faintspot.loop.simulation.learning import learnt_control
 from faintspot.loop.simulation.methods import PRIOR, Method
 from faintspot.loop.simulation.simulation import measure_gains, simulate_loop
 from faintspot.loop.simulation.telescope.calibration import make_pipeline, reference_slopes

@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from faintspot.base.config.options import REQUIRED, TEXT, Options, number, setting
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR
@@ -102,6 +105,19 @@ class Method(Options, table="method"):
     def parts(self) -> dict[str, Any]:
         """Arguments of a pipeline beside settings and calibration."""
         return {"psf": self.psf, "score": self.score}
+
+    @property
+    def has_prior(self) -> bool:
+        """Whether the estimator uses the controller's prediction as its prior."""
+        has = self.predict_prior and PRIOR in self.settings.declared() and not self.true_slopes
+        return has and getattr(self.settings, PRIOR) is not None
+
+    def prior_std_px(self, slopes: int) -> NDArray[np.float64] | None:
+        """Return the standard deviations of the estimator's prior around the prediction, (2 n,), or None."""
+        if not self.has_prior:
+            return None
+        std_px = np.broadcast_to(getattr(self.settings, PRIOR), (slopes // 2,))
+        return np.tile(std_px, 2).astype(np.float64)
 
     def with_options(self, changes: Mapping[str, Any]) -> Method:
         """Return the same with some settings changed."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import INTEGRATOR, CommandDelayLine
-from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED, RunLength
-from faintspot.loop.simulation.control import learnt_control, make_controller
+from faintspot.loop.simulation.control import make_controller
 from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import LoopRecord
 from faintspot.loop.simulation.telescope.calibration import (
@@ -26,7 +25,6 @@ from faintspot.loop.simulation.telescope.calibration import (
     typical_spots,
 )
 from faintspot.loop.simulation.telescope.camera import Exposing, make_detector
-from faintspot.loop.simulation.telescope.laser import FollowedSodium, LowOrders, learn_sodium, with_spots
 from faintspot.loop.simulation.telescope.model import (
     TelescopeModel,
     atmosphere_of,
@@ -38,7 +36,11 @@ from faintspot.slopes.pipeline.configuration import to_text
 from faintspot.slopes.pipeline.light import MeanFlux
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
-from faintspot.slopes.training.known_sodium import KnownSodium
+
+if TYPE_CHECKING:
+    from faintspot.loop.control.identification.model import Kalman
+    from faintspot.loop.simulation.telescope.laser import LaserRun
+    from faintspot.slopes.training.known_sodium import KnownSodium
 
 _MOST_METHODS = 127
 _FLUX_FRAMES = 20
@@ -146,10 +148,8 @@ def simulate_loop(
     number = int(number_between("realisation", realisation, 0, integer=True))
     first = int(number_between("first_frame", first_frame, 0, integer=True))
     switches = DisabledErrors() if disabled_errors is None else disabled_errors
-    ready = [
-        learnt_control(switches.configuration(configuration), method, start, simulate_loop)
-        for method in map(switches.method, methods)
-    ]
+    changed = switches.configuration(configuration)
+    ready = [_with_control(changed, method, start) for method in map(switches.method, methods)]
     loop = partial(_Loop, configuration, ready, numbers, start, number, first, switches)
     gains = None
     if switches.exact_gain:
@@ -191,8 +191,9 @@ class _Loop:
         gains: NDArray[np.float64] | None = None,
     ) -> None:
         self.configuration = configuration = disabled_errors.configuration(configuration)
-        self.sodium = _known_sodium(configuration, seed, realisation)
-        self.methods = methods = tuple(self._with_spots(method) for method, _ in ready)
+        methods = [method for method, _ in ready]
+        self.laser = _laser_run(configuration, methods, seed, realisation)
+        self.methods = methods = methods if self.laser is None else self.laser.methods
         self.learnt = [learnt for _, learnt in ready]
         self.schedule, self.disabled_errors = schedule, disabled_errors
         self.seed, self.realisation, self.first_frame = seed, realisation, first_frame
@@ -211,16 +212,6 @@ class _Loop:
         self.gains, self.divisors = self._gains_and_divisors(gains)
         self.line = CommandDelayLine(optics.mirror.commands, configuration.control.delay_frames)
         self.controllers = [make_controller(configuration, optics, *pair, self.line) for pair in ready]
-        self.low_orders = None
-        self.followed: list[FollowedSodium | None] = [None] * len(methods)
-        if self.sodium is not None:
-            self.low_orders = LowOrders(configuration, optics.sensor, seed, realisation)
-            self.followed = [
-                FollowedSodium(configuration, optics.sensor.layout, self.sodium)
-                if method.follows_profile
-                else None
-                for method in methods
-            ]
         frames, n = len(schedule), len(optics.sensor.layout)
         self.slopes = np.zeros((frames, 2 * n), np.float32)
         self.valid = np.zeros((frames, n), np.bool_)
@@ -285,8 +276,8 @@ class _Loop:
         per_px = 1 / self.divisors[number]
         vector, covariance = (values.astype(np.float64) for values in (slopes.vector, slopes.covariance_xy))
         vector *= per_px
-        if self.low_orders is not None:
-            vector = self.low_orders.merged(self.first_frame + frame, wavefront, vector, slopes.flags)
+        if self.laser is not None:
+            vector = self.laser.low_orders.merged(self.first_frame + frame, wavefront, vector, slopes.flags)
         self.controllers[number].update(vector, error.astype(np.float64) * per_px, covariance * per_px**2)
         self.slopes[frame], self.errors[frame] = slopes.vector, error
         self.covariances[frame] = slopes.covariance_xy
@@ -308,7 +299,10 @@ class _Loop:
             prior = self.controllers[number].expected().mean_px
         pixels = self.telescope_model.frame(self.first_frame + frame, wavefront)
         slopes = self.pipelines[number](pixels, prior)
-        self._follow_profile(number, pixels, slopes)
+        if self.laser is not None and self.laser.follow(number, pixels, slopes.vector.astype(np.float64)):
+            method = self.laser.methods[number]
+            self.pipelines[number] = make_pipeline(self.configuration, sensor, method)
+            self._follow_flux(number)
         flux = self.fluxes[number]
         if flux is not None:
             self.fluxes[number] = flux.updated(slopes.flux)
@@ -318,21 +312,6 @@ class _Loop:
             true = sensor.mean_slopes_px(wavefront)
             self.regression[:, number] += slopes.vector.astype(np.float64) @ true, true @ true
         return slopes
-
-    def _with_spots(self, method: Method) -> Method:
-        """Return a method that knows the spots of a laser guide star as they were before the run."""
-        if self.sodium is None or method.psf is not None:
-            return method
-        return with_spots(self.sodium, self.configuration, method)
-
-    def _follow_profile(self, number: int, pixels: NDArray[np.generic], slopes: Slopes) -> None:
-        """Take a frame for the sodium profile; make the method's pipeline anew when it changes."""
-        followed = self.followed[number]
-        if followed is None or not followed.take(pixels, slopes.vector.astype(np.float64)):
-            return
-        method = with_spots(followed.sodium, self.configuration, self.methods[number])
-        self.pipelines[number] = make_pipeline(self.configuration, self.optics.sensor, method)
-        self._follow_flux(number)
 
     def gains_in_run(self) -> NDArray[np.float64]:
         """Return the regression of each method's measured slopes on the true ones."""
@@ -405,14 +384,34 @@ def _typical_spots(
     return typical_spots(configuration, sensor, optics.mirror, atmosphere, optics.reconstructor.matrix)
 
 
-def _known_sodium(configuration: LoopConfiguration, seed: int, realisation: int) -> KnownSodium | None:
-    """Return what is known of the sodium layer before a run; None without a laser."""
+def _with_control(
+    configuration: LoopConfiguration, method: Method, seed: int
+) -> tuple[Method, Kalman | None]:
+    """Return a method and its learnt controller, None for the integrator."""
+    if method.control == INTEGRATOR:
+        return method, None
+    from faintspot.loop.simulation.learning import learnt_control
+
+    return learnt_control(configuration, method, seed, simulate_loop)
+
+
+def _laser_run(
+    configuration: LoopConfiguration, methods: Sequence[Method], seed: int, realisation: int
+) -> LaserRun | None:
+    """Return what a run with a laser guide star adds; None without one."""
     if configuration.laser is None:
         return None
-    return _learnt_sodium(replace(configuration, name="-", run=RunLength()), seed, realisation)
+    from faintspot.loop.simulation.telescope.laser import LaserRun, LowOrders
+
+    known = _learnt_sodium(replace(configuration, name="-", run=RunLength()), seed, realisation)
+    sensor = prepare(configuration).sensor
+    low_orders = LowOrders(configuration, sensor, seed, realisation)
+    return LaserRun(configuration, sensor.layout, methods, known, low_orders)
 
 
 @lru_cache(maxsize=4)
 def _learnt_sodium(configuration: LoopConfiguration, seed: int, realisation: int) -> KnownSodium:
+    from faintspot.loop.simulation.telescope.laser import learn_sodium
+
     spots = np.concatenate(_typical_spots(without_flux(configuration), seed, realisation))
     return learn_sodium(configuration, prepare(configuration).sensor.layout, spots, seed)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +26,17 @@ from faintspot.loop.control.identification.open_loop import (
     winds_of,
     with_axes_of,
 )
-from faintspot.loop.control.identification.predictive_control import ObservedLoop
 from faintspot.loop.control.identification.recording import Recording, prepared
-from faintspot.loop.telemetry.choices import ControlChoice, advice, compared_choices
 from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
 from faintspot.loop.telemetry.spectra import ModalSpectra, modal_spectra
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.turbulence.strength import differential_image_motion, turbulence_strength
 from faintspot.slopes.sensor.pupil import subapertures_across
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
+
+if TYPE_CHECKING:
+    from faintspot.loop.control.identification.predictive_control import ObservedLoop
+    from faintspot.loop.telemetry.choices import ControlChoice
 
 Floats = NDArray[np.float64]
 
@@ -71,15 +73,12 @@ class LoopReport:
     turbulence: Identified | None = None
     spectra: ModalSpectra | None = None
     choices: list[ControlChoice] = field(default_factory=list)
+    advice: str = ""
+    """Recommendation in one sentence; empty if no control was compared."""
     delay: LoopDelay | None = None
     """Delay and centroid gain that were measured and are used."""
     observed: ObservedLoop | None = None
     """From which a controller can be learnt; None if delay or turbulence are unknown."""
-
-    @property
-    def advice(self) -> str:
-        """Recommendation in one sentence; empty if no control was compared."""
-        return advice(self.choices)
 
     def as_values(self) -> dict[str, Any]:
         """Return the report as plain values, for JSON; null is not known."""
@@ -135,6 +134,8 @@ def report_of_loop(
         progress("turbulence")
         identification = _turbulence(report, open_loop, delay)
         if report.delay is not None and identification is not None:
+            from faintspot.loop.control.identification.predictive_control import ObservedLoop
+
             report.observed = ObservedLoop(ready, report.delay, open_loop, identification)
         if compare:
             progress("other choices")
@@ -365,12 +366,16 @@ def _choices(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> None:
     if loop.interaction_matrix is None:
         part.missing = "The recording has no interaction or control matrix: no mirror can be replayed."
         return
+    from faintspot.loop.telemetry.choices import advice, compared_choices  # with all filters
+
     turbulence = report.parts["turbulence"].values
     r0 = next((value for value in turbulence if value.name == R0), Measured(R0, "m"))
     try:
         report.choices = compared_choices(loop, open_loop, delay, site_of_loop(loop), r0, report.turbulence)
     except InputError as error:
         part.missing = str(error)
+        return
+    report.advice = advice(report.choices)
 
 
 def _rounded(values: Floats) -> list[float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,6 @@ from faintspot.loop.control.base import (
     Predictor,
     usual_noise,
 )
-from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.replay import mean_residual, replayed_frames, replayed_integrators
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.compiled import CompiledKalman
@@ -36,6 +35,9 @@ from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_
 from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor, steady_covariance
 from faintspot.loop.control.reconstructor import Reconstructor
+
+if TYPE_CHECKING:
+    from faintspot.loop.control.identification.layers import Identified
 
 Floats = NDArray[np.float64]
 Make = Callable[[CommandDelayLine], Controller]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -341,4 +342,50 @@ class FollowedSodium:
         if self._frames % self._laser.follow_every_frames:
             return False
         self.sodium = self.sodium.updated(self._mean)
+        return True
+
+
+class LaserRun:
+    """Part of a run that only a laser guide star needs: known and followed spots, and low orders.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+        With a laser.
+    layout : Layout
+    methods : sequence of Method
+    known : KnownSodium
+        Known before the run.
+    low_orders : LowOrders
+
+    Attributes
+    ----------
+    methods : list of Method
+        They know the spots, as they were before the run or as followed since.
+    """
+
+    def __init__(
+        self,
+        configuration: LoopConfiguration,
+        layout: Layout,
+        methods: Sequence[Method],
+        known: KnownSodium,
+        low_orders: LowOrders,
+    ) -> None:
+        self._configuration, self.low_orders = configuration, low_orders
+        self.methods = [
+            with_spots(known, configuration, method) if method.psf is None else method for method in methods
+        ]
+        self._followed = {
+            number: FollowedSodium(configuration, layout, known)
+            for number, method in enumerate(methods)
+            if method.follows_profile
+        }
+
+    def follow(self, number: int, frame_adu: NDArray[np.generic], slopes_px: Floats) -> bool:
+        """Take a frame of a method for its sodium profile; return whether the method has new spots."""
+        followed = self._followed.get(number)
+        if followed is None or not followed.take(frame_adu, slopes_px):
+            return False
+        self.methods[number] = with_spots(followed.sodium, self._configuration, self.methods[number])
         return True

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +22,12 @@ from faintspot.loop.simulation.configuration.sections import (
 from faintspot.loop.simulation.telescope.atmosphere import MovingLayers, make_atmosphere
 from faintspot.loop.simulation.telescope.calibration import interaction_matrix, true_interaction_matrix
 from faintspot.loop.simulation.telescope.camera import Exposing, NoiselessDetector, make_detector
-from faintspot.loop.simulation.telescope.laser import LaserSource
 from faintspot.loop.simulation.telescope.mirror import BestFit, DeformableMirror, make_mirror
 from faintspot.loop.simulation.telescope.pupil import PupilAmplitude, make_pupil
 from faintspot.loop.simulation.telescope.wavefront_sensor import ShackHartmann, make_sensor
+
+if TYPE_CHECKING:
+    from faintspot.loop.simulation.telescope.laser import LaserSource
 
 _OF_AIR = (
     "frame_rate_hz",
@@ -207,6 +210,8 @@ def laser_source(configuration: LoopConfiguration) -> LaserSource | None:
 
 @lru_cache(maxsize=2)
 def _laser_source(configuration: LoopConfiguration) -> LaserSource:
+    from faintspot.loop.simulation.telescope.laser import LaserSource
+
     return LaserSource(configuration, _prepared(configuration).sensor)
 
 

@@ -1,0 +1,168 @@
+"""Controllers learnt from telemetry of the simulated loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.base import INTEGRATOR, OpenLoopTelemetry, without_prior
+from faintspot.loop.control.identification.learning import learn_controller
+from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.model import Kalman
+from faintspot.loop.control.identification.open_loop import measured_delay, open_loop_of
+from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.configuration.sections import CLOSED, ControlParameters, RunLength
+from faintspot.loop.simulation.control import plant_of, slope_turbulence
+from faintspot.loop.simulation.methods import PRIOR, Method
+from faintspot.loop.simulation.record import LoopRecord
+from faintspot.loop.simulation.telescope.model import prepare
+from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.slopes.pipeline.configuration import to_text
+
+Floats = NDArray[np.float64]
+Simulate = Callable[..., LoopRecord]
+
+FIRST_TELEMETRY_REALISATION = 2000
+"""Realisation of the turbulence from which controllers learn; never scored or tuned on."""
+
+_TELEMETRY_PRIOR_PX = 0.6  # while telemetry is taken, as nothing is known yet
+_SETTLE_FRAMES = 50
+
+
+def learnt_control(
+    configuration: LoopConfiguration, method: Method, seed: int, simulate: Simulate
+) -> tuple[Method, Kalman | None]:
+    """Return the learnt controller of a method (None for the integrator), and the adapted method.
+
+    The prior of an estimator that has one becomes as wide as the control is sure.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+    method : Method
+    seed : int
+    simulate : function
+        `simulate_loop`, which makes the telemetry.
+
+    Raises
+    ------
+    InputError
+        For control that learns, in open loop.
+    """
+    if method.control == INTEGRATOR:
+        return method, None
+    if configuration.control.mode != CLOSED:
+        raise InputError(f"method.control = {method.control!r}: expected {INTEGRATOR!r} in open loop")
+    learnt = _learnt(
+        replace(configuration, name="-", run=RunLength()),
+        _TelemetryMethod.of(method),
+        method.noise_scale,
+        seed,
+        simulate,
+    )
+    if method.has_prior:
+        std = np.sqrt(np.square(learnt.expected_std_px).reshape(2, -1).mean(axis=0))
+        method = method.with_options({PRIOR: std})
+    return method, learnt
+
+
+@dataclass(frozen=True)
+class _TelemetryMethod:
+    """Method, equal to others that would leave the same telemetry."""
+
+    method: Method = field(compare=False)
+    same: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, method: Method) -> _TelemetryMethod:
+        plain = replace(method, label="telemetry", control=INTEGRATOR, noise_scale=1.0)
+        if method.has_prior:
+            plain = plain.with_options({PRIOR: _TELEMETRY_PRIOR_PX})
+        values = {
+            **vars(plain),
+            "settings": to_text(plain.settings),
+            "psf": id(method.psf),
+            "score": id(method.score),
+        }
+        return cls(plain, tuple(values.items()))
+
+
+@lru_cache(maxsize=4)  # a search scales the noise of one model by three factors
+def _learnt(
+    configuration: LoopConfiguration,
+    method: _TelemetryMethod,
+    noise_scale: float,
+    seed: int,
+    simulate: Simulate,
+) -> Kalman:
+    if noise_scale != 1.0:  # learning takes long
+        return _learnt(configuration, method, 1.0, seed, simulate).with_noise(noise_scale)
+    optics, control = prepare(configuration), configuration.control
+    telemetry, gain = _telemetry(_without_assumed(configuration), method, seed, simulate)
+    site = slope_turbulence(configuration, optics.sensor.layout.cells)
+    known = site, control.frame_rate_hz, control.winds
+    learnt = learn_controller(plant_of(configuration, optics), telemetry, *known)
+    return replace(learnt, centroid_gain=gain)
+
+
+@lru_cache(maxsize=1)  # for several controls; 170 MB with 40 x 40 sub-apertures
+def _telemetry(
+    configuration: LoopConfiguration, method: _TelemetryMethod, seed: int, simulate: Simulate
+) -> tuple[OpenLoopTelemetry, float]:
+    """Run the loop with an integrator in turbulence that is never scored; return also the centroid gain."""
+    frames = configuration.control.telemetry_frames
+    run = configuration.replace("run", frames=frames, settle_frames=0)
+    record = simulate(run, [method.method], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)
+    loop = recorded_loop(record, method.method)
+    delay = LoopDelay(record.delay_frames, 0.0, 1.0, 0.0)
+    if method.method.correct_gain and not method.method.true_slopes:
+        try:
+            _, delay = measured_delay(loop)
+        except InputError as error:
+            raise InputError(
+                f"control.telemetry_frames = {frames}: too few for the centroid gain ({error})"
+            ) from None
+    return open_loop_of(loop, delay).telemetry, delay.gain
+
+
+def recorded_loop(record: LoopRecord, method: Method) -> Recording:
+    """Return what a telescope records of a run of one method with the integrator, freed of its prior."""
+    delay = record.delay_frames
+    sent = record.commands[delay:].astype(np.float64)  # computed from each frame
+    slopes, errors = (
+        values[: len(sent)].astype(np.float64) for values in (record.slopes_px, record.standard_error_px)
+    )
+    expected, prior = np.zeros_like(slopes), method.prior_std_px(slopes.shape[1])
+    if method.predict_prior:  # what acts less the latest command, which acts so many frames later
+        acting = record.commands.astype(np.float64) @ record.interaction_matrix.T
+        expected = acting[: len(sent)] - acting[delay - 1 :][: len(sent)]
+    slopes, variance, _ = without_prior(slopes, errors, expected, prior)
+    recording = Recording(
+        np.where(np.isfinite(variance), slopes, np.nan),
+        sent,
+        record.interaction_matrix,
+        record.cells,
+        record.frame_rate_hz,
+        subaperture_m=record.subaperture_m,
+        pixel_scale_arcsec=record.pixel_scale_rad / ARCSEC,
+        delay_frames=delay,
+        standard_errors=np.sqrt(variance),
+        covariance_xy=record.covariance_xy_px2[: len(sent)].astype(np.float64),
+        prior_std=prior,
+        slope_unit="px",
+    )
+    return recording.part(slice(_SETTLE_FRAMES, None))
+
+
+def _without_assumed(configuration: LoopConfiguration) -> LoopConfiguration:
+    """Return the configuration without values that do not affect the telemetry."""
+    usual = ControlParameters()
+    names = ("winds", "assumed_wind_factor", "assumed_wind_turn_deg")
+    return configuration.replace("control", **{name: getattr(usual, name) for name in names})
