@@ -71,6 +71,19 @@ def test_astropy_reads_the_fits_file(tmp_path: Path, name: str) -> None:
         assert b"pixels = 16" in units["ATTRIBUTES"].data.tobytes()
 
 
+def test_attributes_of_a_finished_output_are_not_measured_again(tmp_path: Path) -> None:
+    calls = []
+
+    def measured() -> dict[str, list[float]]:
+        calls.append(1)
+        return {"response": [1.0, 0.5]}
+
+    for _ in range(2):
+        write(tmp_path / "slopes.npz", result(), measured_attributes=measured)
+        assert read_slopes(tmp_path / "slopes.npz").attributes["response"] == [1.0, 0.5]
+    assert len(calls) == 1
+
+
 def test_csv_is_a_plain_table(tmp_path: Path) -> None:
     whole = result()
     whole["x"][1, 2] = np.float32(0.1)

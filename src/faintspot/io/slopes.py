@@ -44,6 +44,7 @@ def create_writer(
     coordinates: Mapping[str, NDArray[np.generic]],
     resume: bool = True,
     overwrite: bool = False,
+    measured_attributes: Callable[[], Mapping[str, object]] | None = None,
 ) -> SlopeWriter:
     """Return a writer of slopes to `path`: .zarr, .fits, .fits.gz, .npz or .csv.
 
@@ -68,6 +69,8 @@ def create_writer(
     overwrite : bool
         Replace a finished output, or another run's: a file when the new one is complete, a .zarr store at
         once. An unfinished output of the same run is still resumed if `resume` is set.
+    measured_attributes : callable, optional
+        Returns further attributes; not called if the output is finished already.
 
     Raises
     ------
@@ -100,6 +103,9 @@ def create_writer(
         is_finished = not overwrite and _is_finished(path, file_format, run, resume=resume)
         if is_finished and (export is None or not store_path.exists()):
             return SlopeWriter(path, run)
+        if measured_attributes is not None:
+            more = json_values("attributes", measured_attributes())
+            run = replace(run, attributes={**run.attributes, **more})
         if not has_zarr() and not store_path.exists():
             check_memory(path, *run.sizes)
             return SlopeWriter(path, run, export=export)

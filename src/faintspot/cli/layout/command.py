@@ -41,7 +41,7 @@ from faintspot.slopes.camera.mean_frame import MeanFrame
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, first_settings
-from faintspot.slopes.recorded.survey import survey
+from faintspot.slopes.recorded.survey import UsualFrames, survey
 from faintspot.slopes.sensor.found_layout import FoundLayout, find_layout
 from faintspot.slopes.sensor.known_grid import KnownGrid
 from faintspot.slopes.sensor.layout import GEOMETRIES, LARGEST_BIN, OPTICS, Layout
@@ -333,28 +333,31 @@ def _seen_frames(
     def blocks() -> Iterator[NDArray[np.generic]]:
         return (block for _, block in source.blocks(0, count, _FIRST_FRAMES))
 
-    seen, notes = survey(source.shape, blocks()), []
-    if not seen.usual.any():
-        seen = replace(seen, usual=np.ones(count, bool), unlike=0)
-    if reason := misread(source.block(int(seen.usual.argmax()), int(seen.usual.argmax()) + 1)[0]):
+    frames, notes = UsualFrames(), []
+    seen = survey(source.shape, map(frames.seen, blocks()))
+    unlike, repeated = frames.unlike, frames.repeated
+    if (unlike | repeated).all():
+        unlike, repeated = np.zeros((2, count), bool)
+    usual = ~(unlike | repeated)
+    if reason := misread(source.block(int(usual.argmax()), int(usual.argmax()) + 1)[0]):
         raise InputError(f"{source.description}: {reason}")
     mean = seen.mean
-    if not seen.usual.all():
-        usual, flags = MeanFrame(source.shape), iter(seen.usual)
+    if not usual.all():
+        mean_frame, flags = MeanFrame(source.shape), iter(usual)
         for block in blocks():
-            usual.add(block[[next(flags) for _ in block]])
-        mean = usual.mean
-        if seen.unlike:
-            notes.append(
-                f"  {seen.unlike} of {count} frames left out: at least twice as bright or half as bright as "
-                "most, or with another background"
-            )
-    if repeated := int(np.count_nonzero(~seen.usual)) - seen.unlike:
-        notes.append(f"  {repeated} of {count} frames left out: repeated, the same as the one before")
+            mean_frame.add(block[[next(flags) for _ in block]])
+        mean = mean_frame.mean
+    if unlike.any():
+        notes.append(
+            f"  {np.count_nonzero(unlike)} of {count} frames left out: at least twice as bright or half as "
+            "bright as most, or with another background"
+        )
+    if again := int(np.count_nonzero(repeated & ~unlike)):
+        notes.append(f"  {again} of {count} frames left out: repeated, the same as the one before")
     if np.isnan(mean).all():
         raise InputError(f"{source.description}: expected a frame with spots, every pixel is NaN or infinite")
     dark, electrons_per_adu = calibration.maps(source.shape)
     electrons: NDArray[np.float64] = (mean - dark) * electrons_per_adu
-    chosen = np.flatnonzero(seen.usual)[:_FIRST_FRAMES]
+    chosen = np.flatnonzero(usual)[:_FIRST_FRAMES]
     first = source.block(int(chosen[0]), int(chosen[-1]) + 1)[chosen - chosen[0]]
     return electrons, first, seen.saturation_adu, notes

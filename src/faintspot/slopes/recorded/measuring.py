@@ -14,10 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import one_of
-from faintspot.base.config.tables import is_map
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.flags import SubapertureFlag, kept_flags
-from faintspot.base.statistics import MAD_TO_STD
 from faintspot.base.variables import scaled_positions
 from faintspot.base.version import __version__
 from faintspot.io.frames import FrameSource, open_frames
@@ -27,6 +25,7 @@ from faintspot.io.slopes import create_writer
 from faintspot.io.stored.slopes_format import UNITS, pixels_in
 from faintspot.io.telemetry.aot_reading import is_aot, read_aot
 from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.camera.fitting_dark import with_fitting_dark
 from faintspot.slopes.camera.mean_frame import are_repeated
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration
@@ -35,7 +34,7 @@ from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px, with_pres
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes, layout_coordinates
 from faintspot.slopes.recorded.response import response
-from faintspot.slopes.recorded.survey import Survey, stretches, survey
+from faintspot.slopes.recorded.survey import Survey, frames_apart, stretches, survey
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
 
@@ -47,10 +46,7 @@ _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small
 _FOLLOWED_FRAMES = 32  # of a block, one after the other: for the progress bar
 
 _LOOKS_FOR_FLUX, _FRAMES_FOR_FLUX = 20, 50  # stretches of frames over the whole recording
-# Differences from the dark that count, over their scatter and the largest value; width of wide spots over the
-# side of the window.
-_OTHER_DARK, _ROUNDED, _WIDE = 3.0, 1e-6, 0.35
-_FEWEST_PX = 4  # of a window's side; below, as in quad cells, no pixel shows the background only
+_WIDE = 0.35  # width of wide spots, over the side of the window
 _FRAMES_FOR_RESPONSE = 200  # fewest, as of the statistics that need it
 
 Progress = Callable[[int, int], None]
@@ -204,8 +200,12 @@ def measure_recorded(
             attributes["reference"] = np.asarray(positions).tolist()
         with errors_within(configuration_file):
             measure = _follower(pipeline) if follow else pipeline.with_dark(seen.mean)
-        if isinstance(measure, SlopePipeline) and source.n_frames >= _FRAMES_FOR_RESPONSE:
-            attributes["response"] = response(measure, seen.mean, stretches(source)).tolist()
+
+        def shown() -> dict[str, Any]:
+            if not isinstance(measure, SlopePipeline) or source.n_frames < _FRAMES_FOR_RESPONSE:
+                return {}
+            return {"response": response(measure, seen.mean, frames_apart(source)).tolist()}
+
         prepared, last = measure.plan.prepared, None
         faults = prepared.faults
         with create_writer(
@@ -213,6 +213,7 @@ def measure_recorded(
             n_frames=source.n_frames,
             n_subapertures=len(layout),
             attributes=attributes,
+            measured_attributes=shown,
             coordinates=layout_coordinates(layout),
             overwrite=overwrite,
         ) as writer:
@@ -257,7 +258,7 @@ def _calibration(
         summary.saturation_adu = seen.saturation_adu
         calibration = replace(calibration, saturation_adu=seen.saturation_adu)
     is_wide = _are_wide(settings, layout)
-    calibration, summary.background = _with_fitting_dark(calibration, layout, seen.mean, is_wide=is_wide)
+    calibration, summary.background = with_fitting_dark(calibration, layout, seen.mean, is_wide=is_wide)
     return calibration
 
 
@@ -312,30 +313,6 @@ def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str
     roi = [] if is_whole else ["--roi", f"{left},{top},{right},{bottom}"]
     words = ["faintspot", "layout", str(frames), "--grid", f"{rows}x{columns}", *roi, "-o", str(path)]
     return shlex.join(words)
-
-
-def _with_fitting_dark(
-    calibration: Calibration, layout: Layout, mean: NDArray[np.float64], *, is_wide: bool
-) -> tuple[Calibration, str]:
-    """Move an estimated dark level to the background of these frames, if that is elsewhere; say so.
-
-    The background is that of the first and last rows of windows, as in the frames of the layout. A dark that
-    is stated stays, but is named where it lies above the frames. Wings of wide spots are no background.
-    """
-    if calibration.dark is None or not np.isfinite(mean).any() or min(layout.window) < _FEWEST_PX:
-        return calibration, ""
-    edges = layout.images(mean - calibration.dark)[:, [0, -1]]
-    away = float(np.nanmedian(edges))
-    scatter = MAD_TO_STD * float(np.nanmedian(np.abs(edges - away)))
-    wings = away > 0 and (is_wide or calibration.dark_is_known)  # or sky, where the dark is known
-    if wings or abs(away) <= max(_OTHER_DARK * scatter, _ROUNDED * float(np.nanmax(np.abs(mean)))):
-        return calibration, ""
-    level = float(np.nanmedian(calibration.dark))
-    found = f"the background of these frames is {level + away:.4g} ADU, the dark {level:.4g} ADU"
-    if calibration.dark_is_known:
-        return calibration, f"{found}: pixels below it have no flux; give the dark of these frames"
-    moved = calibration.dark + away if is_map(calibration.dark) else float(f"{level + away:.7g}")
-    return replace(calibration, dark=moved), f"{found} as estimated with the layout: the former is taken off"
 
 
 def _are_wide(settings: Settings, layout: Layout) -> bool:

@@ -14,7 +14,6 @@ from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 Floats = NDArray[np.float64]
 
 _STEP_PX = 0.25
-_FRAMES_APART = 8  # of those displaced: the turbulence has moved on
 
 
 def response(pipeline: SlopePipeline, mean_frame: Floats, frames: Iterable[NDArray[Any]]) -> Floats:
@@ -31,14 +30,14 @@ def response(pipeline: SlopePipeline, mean_frame: Floats, frames: Iterable[NDArr
     mean_frame : (h, w) array
         Mean of the frames, ADU.
     frames : iterable of (n, h, w) array, ADU
-        Blocks of frames from all over the recording.
+        Blocks of frames from all over the recording, as from `frames_apart`.
     """
     dark = np.nan_to_num(pipeline.calibration.maps(mean_frame.shape)[0])
     if pipeline.settings.estimator.name == "window":
         mean = np.where(np.isnan(mean_frame), np.nanmedian(mean_frame), mean_frame)
         changes = [_change(pipeline, mean[None], dark, _STEP_PX)]
     else:
-        changes = [_change(pipeline, block[::_FRAMES_APART], dark, 1.0) for block in frames]
+        changes = [_change(pipeline, block, dark, 1.0) for block in frames]
     return np.asarray(np.concatenate(changes, axis=1).mean(axis=1))
 
 
