@@ -16,7 +16,7 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, lines_of, neighbours_of
 from faintspot.slopes.sensor.windows import Windows, find_windows
 
-_GHOST = 0.25  # of the flux of the dimmest neighbour
+_GHOST = 0.25  # of the median flux of the neighbours
 
 
 @dataclass(frozen=True)
@@ -131,6 +131,6 @@ def _unlike(grid: LensletGrid) -> NDArray[np.bool_]:
 
 def _dim(grid: LensletGrid) -> NDArray[np.bool_]:
     """Return which spots amid others are so dim that they may be ghosts in a dark lenslet."""
-    neighbours = neighbours_of(grid.cells, grid.geometry)
-    dimmest = np.append(grid.flux, 0.0)[neighbours].min(axis=1)  # 0 at the edge of the pupil
-    return np.asarray(grid.flux < _GHOST * dimmest)
+    around = np.append(grid.flux, np.nan)[neighbours_of(grid.cells, grid.geometry)]
+    around[np.isnan(around).all(axis=1)] = 0.0
+    return np.asarray(grid.flux < _GHOST * np.nanmedian(around, axis=1))

@@ -78,9 +78,9 @@ class TestAgainstOracle:
 
 
 class TestSecondSpots:
-    """A reflection within the window, which pulls the slope by less than displacements differ."""
+    """A reflection beside the spot or in place of it, which pulls less than displacements differ."""
 
-    @pytest.mark.parametrize(("flux", "flagged"), [(1.0, False), (1.6, True)])
+    @pytest.mark.parametrize(("flux", "flagged"), [(1.0, False), (1.6, True), (0.5, False), (0.16, True)])
     def test_flux_decides(self, flux: float, flagged: bool) -> None:
         arrays = SlopeArrays(*(np.zeros((1, N), kind) for kind in RESULT_TYPES))
         arrays.x[0], arrays.y[0] = np.random.default_rng(1).uniform(-0.25, 0.25, (2, N))

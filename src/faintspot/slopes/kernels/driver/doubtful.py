@@ -21,11 +21,12 @@ TYPICAL = 4.5
 distributed displacements, 1 in 1000 of 7 x 7 sub-apertures, 1 in 2000 of 40 x 40."""
 
 SUSPECT, LIKE = 1.5, 2.0
-"""Likewise where the flux shows a second spot in the window; and for one that lines of valid ones confirm."""
-_SECOND_SPOT = 1.25
-"""Flux over that of the brightest neighbour, from which a window holds a second spot."""
+"""Likewise where the flux shows a second spot or a ghost; and for one that lines of valid ones confirm."""
+_SECOND_SPOT, _GHOST = 1.25, 0.25
+"""Flux over that of the brightest neighbour, from which a window holds a second spot; and over that of the
+dimmest one, up to which it holds the ghost of another spot."""
 _SURELY = 4.0
-"""Photon noise by which that excess exceeds zero."""
+"""Photon noise by which the difference from these limits (for a second spot, from no excess) is not zero."""
 
 
 class Expected(NamedTuple):
@@ -94,7 +95,7 @@ def _is_suspect(f: Any, s: Any, x: Any, y: Any, flags: Any, expected: Any) -> An
 @compiled
 def _compare(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, differences: Any) -> None:
     """Compare the slopes of a frame with their lines, and flag those unlike all their neighbours."""
-    n, largest, second_spots = x.shape[1], np.float32(0.0), 0
+    n, largest, other_flux = x.shape[1], np.float32(0.0), 0
     for s in range(n):
         differences[s] = -1.0
         if flags[f, s] & _UNMEASURED:
@@ -102,8 +103,8 @@ def _compare(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, diffe
         differences[s], least = _difference(f, s, x, y, flags, expected)
         if least > expected.least:
             largest = max(largest, differences[s])
-            second_spots += _has_second_spot(f, s, flux, flags, expected)
-    if second_spots > 0 or _exceeds(differences, n, np.float32(1.0 / TYPICAL) * largest):
+            other_flux += _has_other_flux(f, s, flux, flags, expected)
+    if other_flux > 0 or _exceeds(differences, n, np.float32(1.0 / TYPICAL) * largest):
         _flag_unlike(f, x, y, flux, flags, expected, differences)
 
 
@@ -115,11 +116,11 @@ def _flag_unlike(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, d
     for s in range(n):
         if not differences[s] > SUSPECT * median:
             continue
-        is_far = differences[s] > TYPICAL * median or _has_second_spot(f, s, flux, flags, expected)
+        is_far = differences[s] > TYPICAL * median or _has_other_flux(f, s, flux, flags, expected)
         if is_far and _difference(f, s, x, y, flags, expected)[1] > expected.least:
             flags[f, s] |= UNLIKE_NEIGHBOURS
     for s in range(n):
-        if not flags[f, s] & UNLIKE_NEIGHBOURS or _has_second_spot(f, s, flux, flags, expected):
+        if not flags[f, s] & UNLIKE_NEIGHBOURS or _has_other_flux(f, s, flux, flags, expected):
             continue
         if _is_continued(f, s, x, y, flags, expected, LIKE * median):
             differences[s] = -2.0
@@ -129,20 +130,29 @@ def _flag_unlike(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, d
 
 
 @compiled
-def _has_second_spot(f: Any, s: Any, flux: Any, flags: Any, expected: Any) -> Any:
-    """Return whether a window has clearly more flux than all its neighbours, and none of it saturated."""
+def _has_other_flux(f: Any, s: Any, flux: Any, flags: Any, expected: Any) -> Any:
+    """Return whether a window has clearly more flux than all its neighbours, or a fraction of it.
+
+    A second spot or a ghost causes that. Windows with saturated pixels never count.
+    """
     if flags[f, s] & SATURATED:
         return False
-    lines, n, brightest = expected.lines, flux.shape[1], np.float32(0.0)
+    lines, n, own = expected.lines, flux.shape[1], flux[f, s]
+    brightest, dimmest = np.float32(0.0), np.float32(math.inf)
     for k in range(lines.shape[1]):
         for i in range(2):
             other = lines[s, k, i]
             if other < n and not flags[f, other] & _UNMEASURED:
-                brightest = max(brightest, flux[f, other])
-                if not flux[f, s] > _SECOND_SPOT * brightest:
+                brightest, dimmest = max(brightest, flux[f, other]), min(dimmest, flux[f, other])
+                if _GHOST * dimmest <= own <= _SECOND_SPOT * brightest:
                     return False
-    excess, both = flux[f, s] - brightest, flux[f, s] + brightest
-    return brightest > 0.0 and excess * excess > _SURELY * _SURELY * both
+    if not brightest > 0.0:
+        return False
+    if own < _GHOST * dimmest:
+        lack, variance = _GHOST * dimmest - own, _GHOST * _GHOST * dimmest + max(own, 0.0)
+        return lack * lack > _SURELY * _SURELY * variance
+    excess, both = own - brightest, own + brightest
+    return excess * excess > _SURELY * _SURELY * both
 
 
 @compiled
