@@ -263,6 +263,8 @@ def command(
         estimated = (*calibration.estimated, "read_noise_e")
         calibration = replace(calibration, read_noise_e=noise, estimated=estimated)
     settings = Settings.load(target) if keeps_settings else seen.settings
+    if seen.doubt and not keeps_settings:
+        layout = replace(layout, doubts=(*layout.doubts, seen.doubt))
     if keeps_settings:
         notes.append(f"  the settings that {output} has are kept")
     marks: dict[str, Any] = {}

@@ -15,6 +15,7 @@ from faintspot.slopes.camera.binning import binned, binned_calibration
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.algorithms.noise import pixel_noise
 from faintspot.slopes.estimators.algorithms.spot_width import SeenSpots, like_most, seen_spots
+from faintspot.slopes.estimators.base import Need
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.binning import binned_layout
@@ -33,6 +34,8 @@ _WEIGHTS = (1.25, 1.6)  # width of the weight over the spot's: best where read n
 # slopes depend on where in its pixel a spot lies: by so much at most, if any weight reaches it.
 _OVERLAPPING, _NARROW_WEIGHTS = 0.35, (0.5, 0.7, 0.9)
 _SHARP_PX, _WIDE_WEIGHTS, _MOST_BY_PHASE_PX = 2.2, (2.5, 4.0, 6.0), 0.015
+_DOUBTFUL_BY_PHASE_PX = 0.03
+_MORE_STEPS = 8  # of fits of sharp spots: three do not always reach the maximum
 _WINDOWS = (1.0, 1.5, 2.2, 3.2)  # width of a fixed window over the spot's: wide where spots move far
 _LEAST_RESPONSE = 0.05  # below, the displacements are not known well enough to choose the width
 _LEAST_DISPLACEMENT = 0.15  # rms over the spot's width: frames to come may move more than static ones
@@ -41,8 +44,10 @@ _LEAST_RANGE_PX = 1.0
 # Predicted error with a tight search range over that in the whole window, to take the tight one: frames to
 # come may be aberrated where these are flat.
 _BETTER = 0.8
-_FAINT, _AS_GOOD = 0.8, 1.1  # response below which a fixed window is tried, and its error over the best one
-_SPOTS = 512
+# Response below which a fixed window is tried, and its error over the best one; also of sharp spots, whose
+# slopes in a fixed window depend on their place in the pixel.
+_FAINT, _AS_GOOD, _MUCH_BETTER = 0.8, 1.1, 0.5
+_SPOTS, _PHASES = 512, 64
 _SHARPEST_PX = 0.1  # standard deviation of a spot before its pixels blur it
 
 
@@ -61,6 +66,8 @@ class FirstSettings:
         Slope shown for a displacement of 1 px; below 1 where slopes would else be worse than none.
     psf : mapping, optional
         Table [psf] of the configuration, where the settings need it.
+    by_phase_px : float
+        Error of slopes that depends on where in its pixel a spot lies, where spots are sharp [px].
     """
 
     settings: Settings
@@ -68,6 +75,17 @@ class FirstSettings:
     flux: float
     response: float = 1.0
     psf: dict[str, Any] | None = None
+    by_phase_px: float = 0.0
+
+    @property
+    def doubt(self) -> str:
+        """Why the slopes may be wrong, in one line; empty if they are not."""
+        if self.by_phase_px <= _DOUBTFUL_BY_PHASE_PX:
+            return ""
+        return (
+            "spots are so sharp that their slopes depend on where in its pixel a spot lies, by up to "
+            f"{self.by_phase_px:.2g} px"
+        )
 
 
 def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[np.generic]) -> FirstSettings:
@@ -112,8 +130,8 @@ def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[np.
     noise = max(noise, _LEAST_NOISE * spots.flux)
     trial = _Trial(images, layout, noise, spots)
     settings, response = trial.best()
-    psf = trial.psf if settings.estimator.name == "ml" else None
-    return FirstSettings(settings, noise, spots.flux, response, psf)
+    psf = trial.psf if Need.PSF in settings.estimator.needs else None
+    return FirstSettings(settings, noise, spots.flux, response, psf, trial.by_phase_px(settings))
 
 
 def _seen(images: Floats) -> SeenSpots | None:
@@ -170,7 +188,8 @@ class _Trial:
         variance = noise**2 + _photon_noise(images, noise, spots.flux) * mean
         self._images = mean + np.sqrt(variance) * rng.standard_normal(mean.shape)
         self._weights = (*(_NARROW_WEIGHTS if overlap else ()), *_WEIGHTS)
-        if self._fwhm < _SHARP_PX:
+        self._is_sharp = self._fwhm < _SHARP_PX
+        if self._is_sharp:
             self._weights += _WIDE_WEIGHTS
 
     @property
@@ -214,11 +233,15 @@ class _Trial:
             for reach in (None, tight)
             for factor in self._weights
         ]
-        if self._fwhm < _SHARP_PX:
-            by_phase = [self._by_phase(each) for each in following]
-            fit = Settings("ml", search_range_px=tight)
-            if min(by_phase) > max(_MOST_BY_PHASE_PX, self._by_phase(fit)):
-                return fit, 1.0
+        if self._is_sharp:
+            by_phase = [self.by_phase_px(each) for each in following]
+            fits: list[tuple[float, Settings]] = []
+            for name, steps in (("ml", 3), ("ml", _MORE_STEPS), ("map", _MORE_STEPS)):
+                if min(by_phase + [error for error, _ in fits]) > _MOST_BY_PHASE_PX:
+                    fit = Settings(name, steps=steps, search_range_px=tight)
+                    fits.append((self.by_phase_px(fit), fit))
+            if fits and (best_fit := min(fits, key=lambda each: each[0]))[0] < min(by_phase):
+                return best_fit[1], 1.0
             most = max(_MOST_BY_PHASE_PX, min(by_phase))
             following = [each for each, error in zip(following, by_phase, strict=True) if error <= most]
         windows = [
@@ -239,7 +262,8 @@ class _Trial:
         for settings in following:
             if (error := self._error(self._measured(settings))) < _BETTER * least:
                 best, least = settings, error
-        if response < _FAINT and self._error(self._measured(window)) < _AS_GOOD * least:
+        as_good = _MUCH_BETTER if self._is_sharp else _AS_GOOD
+        if response < _FAINT and self._error(self._measured(window)) < as_good * least:
             return window, response
         return best, 1.0
 
@@ -251,11 +275,13 @@ class _Trial:
         gain = min(float((shown**2).sum()) / product, _LARGEST_GAIN)
         return window.replace(centroid_gain=_rounded(gain)), response
 
-    def _by_phase(self, settings: Settings) -> float:
-        """Return the largest error that depends on where in its pixel a spot lies."""
-        truth = np.stack([np.linspace(-0.5, 0.5, 32), np.zeros(32)], axis=1)
-        errors = (self._measured(settings, self._spots_at(truth)) - truth)[:, 0]
-        return float(0.5 * np.ptp(errors))
+    def by_phase_px(self, settings: Settings) -> float:
+        """Return the largest error that depends on where in its pixel a spot lies; 0 unless it is sharp."""
+        if not self._is_sharp:
+            return 0.0
+        truth = np.stack([np.linspace(-0.5, 0.5, _PHASES), np.arange(_PHASES) * 0.382 % 1 - 0.5], axis=1)
+        errors = self._measured(settings, self._spots_at(truth)) - truth
+        return float(0.5 * np.ptp(errors, axis=0).max())
 
     def _error(self, positions: Floats) -> float:
         return float(np.abs(positions - self._truth).mean())
@@ -265,7 +291,7 @@ class _Trial:
         images, (ny, nx) = self._images if images is None else images, self._window
         layout = Layout.stacked(len(images), (ny, nx))
         frame = images.reshape(len(images) * ny, nx).astype(np.float32)
-        psf = PSF.analytic(**self.psf) if settings.estimator.name == "ml" else None
+        psf = PSF.analytic(**self.psf) if Need.PSF in settings.estimator.needs else None
         camera = Calibration(dark=0.0, read_noise_e=self._noise)
         slopes = SlopePipeline(layout, settings, camera, psf=psf)(frame)
         return np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64)
