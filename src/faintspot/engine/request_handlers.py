@@ -13,6 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.engine.engine import Engine
 from faintspot.engine.path.pipeline_maker import PipelineMaker
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
+from faintspot.loop.control.base import KALMAN
 from faintspot.slopes.pipeline.configuration import Configuration
 
 LENGTHY = ("set", "interleave", "load", "unload", "learnt", "spots")
@@ -61,17 +62,18 @@ def _stop(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, object]:
 
 
 def _take_learnt(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, object]:
-    """Note what was learnt beside the engine, and take the new model, if one is handed over."""
+    """Note what is learnt beside the engine, and take the new model, if one is handed over."""
     learning: dict[str, object] = {
         "found": _text(fields, "found"),
         "unix_time_s": time.time(),
-        "taken": False,
+        "taken": bool(fields.get("taken", False)),
+        "running": bool(fields.get("running", False)),
     }
     engine.learning = learning
     if fields.get("model") is None:
         return {}
-    if engine.loop is None:
-        raise InputError("learnt: this engine makes no commands; add [control] to its configuration")
+    if engine.loop is None or engine.loop.control.options.controller != KALMAN:
+        raise InputError('learnt: expected an engine with controller = "kalman" in [control]')
     from faintspot.loop.control.identification.model import Kalman
 
     try:

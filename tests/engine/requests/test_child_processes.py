@@ -65,6 +65,16 @@ def test_one_that_ends_says_why_and_all_others_end(tmp_path: Path) -> None:
     assert (tmp_path / "bridge.log").stat().st_mode & 0o077 == 0
 
 
+def test_one_that_has_done_its_work_may_be_absent(tmp_path: Path) -> None:
+    with ChildProcesses(tmp_path) as processes:
+        processes.start("list", ["estimators"])
+        wait_for(lambda: processes.finished("list"))
+        processes.check()
+        processes.start("wrong", ["estimators", "nothing"])
+        with pytest.raises(InputError, match="wrong: the process has ended"):
+            wait_for(lambda: processes.finished("wrong"))
+
+
 def test_one_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("faintspot.engine.requests.child_processes._PATIENCE_S", 0.1)
     with ChildProcesses(tmp_path) as processes:

@@ -9,7 +9,7 @@ from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.engine.request_handlers import commands_of
-from faintspot.engine.settings.interleaving import Interleaving, methods_after
+from faintspot.engine.settings.interleaving import Interleaving, methods_after, short_names
 from faintspot.slopes.pipeline.settings import without_denoising
 
 pytestmark = pytest.mark.slow
@@ -43,6 +43,14 @@ def test_texts(text: str, changes: dict[str, Any], denoises: bool, control: str 
     method = found.methods[1]
     assert found.labels == ["none", text, "set"]
     assert (method.changes, method.denoises, method.control) == (changes, denoises, control)
+
+
+def test_short_names_leave_out_values_unless_two_methods_would_share_one() -> None:
+    window = "window+window_fwhm_px=5.3+centroid_gain=0.3"
+    assert short_names(["none", "tv:0.6", window, "map+prior_std_px=1+kalman", "noise_std=2", window]) == [
+        *("none", "tv:0.6", "window", "map+kalman", "noise_std=2", "window")
+    ]
+    assert short_names(["tv+noise_std=2", "tv+noise_std=3"]) == ["tv+noise_std=2", "tv+noise_std=3"]
 
 
 def test_estimators_without_a_strength() -> None:

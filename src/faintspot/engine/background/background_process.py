@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.engine.engine import Engine
-from faintspot.engine.requests.child_processes import ChildProcesses
+from faintspot.engine.requests.child_processes import ONE_THREAD, ChildProcesses
 from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
 from faintspot.engine.requests.scheduling import lowest_priority
@@ -32,7 +32,6 @@ from faintspot.loop.telemetry.recording import CLOSED, recorded_loop, site_of
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.settings import Settings
 
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _WATCH_S = 1.0
 
 

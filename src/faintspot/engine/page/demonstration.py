@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,41 +14,41 @@ from numpy.typing import NDArray
 
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
-from faintspot.base.files import output_errors, write_atomically
+from faintspot.base.files import derived, output_errors, write_atomically
 from faintspot.engine.loop.control_loop import CLOSED, STATES
 from faintspot.engine.pixels.readout import StopEvent
-from faintspot.engine.requests.child_processes import ChildProcesses
+from faintspot.engine.requests.child_processes import ONE_THREAD, ChildProcesses
 from faintspot.engine.requests.private_socket import socket_path
-from faintspot.engine.requests.requests import request
+from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
+from faintspot.engine.settings.interleaving import short_names
 from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope.simulated_telescope import TRUTH
-from faintspot.loop.control.base import INTEGRATOR, KALMAN
-from faintspot.loop.control.configuration import CONTROLLER, save_control
+from faintspot.loop.control.base import KALMAN
+from faintspot.loop.control.configuration import TABLE, save_control
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
-from faintspot.loop.simulation.engine_files import fixed_window, write_engine_files
-from faintspot.loop.simulation.methods import Method
-from faintspot.loop.simulation.simulation import measure_gains
-from faintspot.loop.simulation.telescope.calibration import make_pipeline
-from faintspot.loop.simulation.telescope.model import prepare
-from faintspot.slopes.pipeline.configuration import save
+from faintspot.loop.simulation.engine_files import CONFIGURATION, fixed_window, write_engine_files
+from faintspot.slopes.pipeline.configuration import Configuration, save
 from faintspot.slopes.pipeline.settings import Settings
 
+Say = Callable[[str], None]
 Floats = NDArray[np.float64]
 
-_CONFIGURATION = "camera_3e"
+_STAR = "camera_3e"
 # Chosen in the simulated loop with other realisations of the turbulence than the one shown.
-_PRIOR_PX, _GAIN = 1.0, 0.4
+_FILTER, _GAIN = f"map+prior_std_px=1+{KALMAN}", 0.4
+_STRENGTH_E = 0.8  # which the paper found best at the telescope
 _TURN_S = 1.0
 _IMAGES_EVERY = 10
 _SETTLE_FRAMES = 20  # start of a turn, affected by the previous method
 _OPEN_FRAMES = 100  # before the loop is closed, to set the guard's limit
-_COMPILING_S = 600.0  # time limit of the engine, which compiles on first use
+_LEARN_FRAMES = 1000
+_COMPILING_S = 600.0  # time limit of the engine, which compiles on first use, and of the learning
 _PATIENCE_S = 60.0
 _LOOKS_PER_FRAME = 4
 _LEAST_LOOK_S = 1e-3
-_TELESCOPE, _ENGINE, _PAGE = "telescope", "engine", "page"
+_TELESCOPE, _ENGINE, _PAGE, _RECORDER, _LEARNER = "telescope", "engine", "page", "recorder", "learner"
 _STREHL, _COMMAND_FRAME = TRUTH.index("strehl"), TRUTH.index("command_frame")
 
 
@@ -59,7 +59,7 @@ class LiveDemonstration:
     Parameters
     ----------
     folder : path
-        Folder of configurations, matrices and log files.
+        Folder of configurations, matrices, telemetry and log files.
     photons : float
         Photo-electrons per fully illuminated sub-aperture and frame.
     rate_hz : float
@@ -82,7 +82,7 @@ class LiveDemonstration:
     @property
     def observed(self) -> LoopConfiguration:
         """Configuration of the simulated loop."""
-        star = load_loop(_CONFIGURATION).replace("camera", photons_per_subaperture=self.photons)
+        star = load_loop(_STAR).replace("camera", photons_per_subaperture=self.photons)
         return star.replace("control", gain=_GAIN).slowed_to(self.rate_hz)
 
     @property
@@ -90,57 +90,56 @@ class LiveDemonstration:
         """Number of frames per turn of a method."""
         return max(2 * _SETTLE_FRAMES, round(_TURN_S * self.rate_hz))
 
-    @cached_property
-    def methods(self) -> dict[str, str]:
-        """Methods that take turns, by name, in the format of `faintspot realtime run --interleave`.
-
-        The window uses its centroid gain for speckled spots, as a system would have measured it. "map" uses
-        the Kalman filter's prediction. Brightest pixels do better without a correction of their very low
-        gain.
-        """
-        observed = self.observed
-        window = fixed_window(observed, centroid_gain=1.0)
-        pipeline = make_pipeline(observed, prepare(observed).sensor, Method("-", window))
-        gain = float(measure_gains(observed, [pipeline], seed=self.seed)[0])
-        options = f"window_fwhm_px={window.window_fwhm_px:g}+centroid_gain={gain:.3g}"
-        return {
-            "brightest": f"brightest+{INTEGRATOR}",
-            "window": f"estimator=window+{options}+{INTEGRATOR}",
-            f"map+{KALMAN}": f"map+{KALMAN}",
-        }
-
-    def write_files(self) -> tuple[Path, Path]:
-        """Write the configurations of the loop and of the engine; return both paths.
-
-        The interaction matrix is taken from the simulation: measuring it takes the telescope some ten
-        seconds.
+    def write_loop(self) -> Path:
+        """Write the configuration of the simulated loop; return its path.
 
         Raises
         ------
         InputError
-            When a value is out of range, or a file cannot be written.
+            When a value is out of range, or the file cannot be written.
         """
-        observed = self.observed
+        observed, path = self.observed, self.folder / "loop.toml"
         with output_errors(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
-        loop = self.folder / "loop.toml"
-        write_atomically(loop, observed.to_text())
-        # Settings of one method, which the other methods ignore.
-        settings = Settings("map", prior_std_px=_PRIOR_PX, flux_e=self.photons)
-        engine = self.folder / "faintspot.toml"
-        save(engine, settings)
-        write_engine_files(observed, self.folder, KALMAN)
-        save_control(engine, gain=_GAIN, centroid_gain=1.0, prediction=CONTROLLER)
-        return loop, engine
+        write_atomically(path, observed.to_text())
+        return path
 
-    def run(self, stop: StopEvent, seconds: float, say: Callable[[str], None]) -> Shown:
-        """Start all processes, watch the closed loop for `seconds` or until `stop` is set, and end them.
+    def write_engine(self) -> tuple[Path, str]:
+        """Write the configuration of the engine and its matrices; return the path of the former and a window.
+
+        The interaction matrix is taken from the simulation: measuring it takes the telescope some ten
+        seconds. The window, a method of `faintspot realtime run --interleave`, has its centroid gain for
+        speckled spots, as a system would have measured it. Brightest pixels do better without a correction
+        of their very low gain.
+
+        Raises
+        ------
+        InputError
+            When a file cannot be written.
+        """
+        observed, path = self.observed, self.folder / CONFIGURATION
+        with output_errors(path):
+            path.unlink(missing_ok=True)
+        save(path, fixed_window(observed, centroid_gain=1.0))
+        write_engine_files(observed, self.folder)
+        written = Configuration(path)
+        width, gain = written.settings.window_fwhm_px, written[TABLE]["centroid_gain"]
+        save(path, Settings("tv", noise_std=_STRENGTH_E, flux_e=self.photons))
+        model = derived(path, ".model.npz").name  # where `faintspot realtime learn` puts it
+        save_control(path, gain=_GAIN, centroid_gain=1.0, model=model)
+        return path, f"window+window_fwhm_px={width:g}+centroid_gain={gain:.3g}"
+
+    def run(self, stop: StopEvent, seconds: float, say: Say) -> Shown:
+        """Start all processes, compare methods for `seconds` or until `stop` is set, and end the processes.
+
+        The loop is closed with the integrator at once. A Kalman filter is learnt from its telemetry and
+        then takes turns, too.
 
         Parameters
         ----------
         stop : event
         seconds : float
-            Time with a closed loop.
+            Time for which all methods take turns.
         say : function
             Called with one-line messages about progress and the page's address.
 
@@ -151,39 +150,71 @@ class LiveDemonstration:
             ready.
         """
         self._check_name()
-        say(f"simulating a telescope and training a Kalman filter (one minute); files: {self.folder}")
-        loop, engine = self.write_files()
-        shown = Shown(list(self.methods), self.observed.control.delay_frames)
-        if stop.is_set():
-            return shown
+        shown = Shown(self.observed.control.delay_frames)
+        loop, name = self.write_loop(), ["--name", self.name]
         with ChildProcesses(self.folder) as processes:
-            name = ["--name", self.name]
-            seed = ["--seed", str(self.seed)]
-            turns = ["--interleave", ",".join(self.methods.values()), "--every", str(self.turn_frames)]
-            images = ["--images-every", str(_IMAGES_EVERY)]
-            processes.start(_TELESCOPE, ["realtime", "telescope", str(loop), *name, *seed])
-            processes.start(_ENGINE, ["realtime", "run", "--config", str(engine), *name, *turns, *images])
-            say("starting telescope and engine; on first use the engine compiles for about a minute")
 
             def wait(condition: Callable[[], bool], awaited: str, timeout_s: float) -> None:
                 processes.wait_until(lambda: stop.is_set() or condition(), awaited, timeout_s)
 
-            wait(lambda: self._frames_measured() > 0, "slopes of the engine", _COMPILING_S)
             processes.start(_PAGE, ["live", *name, "--port", str(self.port)])
+            processes.start(_TELESCOPE, ["realtime", "telescope", str(loop), *name, "--seed", str(self.seed)])
             wait(lambda: len(processes.output(_PAGE)) > 0, "the page", _PATIENCE_S)
             if stop.is_set():
                 return shown
-            processes.check()
             say(f"{processes.output(_PAGE)[0]}\nOpen it in a browser; Ctrl-C ends it and prints a table")
-            begun = self._frames_measured()
-            wait(lambda: self._frames_measured() >= begun + _OPEN_FRAMES, "frames", _PATIENCE_S)
-            with _Watcher(self.name, shown, _LOOKS_PER_FRAME * self.rate_hz) as watcher:
-                watcher.watch(processes, stop, _OPEN_FRAMES / self.rate_hz)
+            say(f"starting telescope and engine, which compiles on first use; files: {self.folder}")
+            engine, window = self.write_engine()
+            first = ["--interleave", window, "--images-every", str(_IMAGES_EVERY)]
+            processes.start(_ENGINE, ["realtime", "run", "--config", str(engine), *name, *first])
+            wait(lambda: self._frames_measured() >= _OPEN_FRAMES, "slopes of the engine", _COMPILING_S)
+            if stop.is_set():
+                return shown
+            looks_hz = _LOOKS_PER_FRAME * self.rate_hz
+            with _Watcher(self.name, shown, looks_hz, processes, stop) as watcher:
+                watcher.watch(_OPEN_FRAMES / self.rate_hz)
                 self._asked("loop", action="close")
-                say(f"the loop is closed; methods compared for {seconds:g} s: {', '.join(self.methods)}")
-                watcher.watch(processes, stop, seconds)
+                say("the loop is closed with an integrator")
+                self._learn(engine, window, processes, watcher, say)
+                say(f"methods compared for {seconds:g} s: {', '.join(shown.methods)}")
+                watcher.watch(seconds)
             shown.status = self._asked("status")
         return shown
+
+    def _learn(
+        self, engine: Path, window: str, processes: ChildProcesses, watcher: _Watcher, say: Say
+    ) -> None:
+        """Learn a Kalman filter from the telemetry while other methods take turns; then let it, too."""
+        store, found = self.folder / "telemetry.zarr", f"from {_LEARN_FRAMES} frames of the closed loop"
+        shutil.rmtree(store, ignore_errors=True)
+        self._asked("learnt", found=found, running=True)
+        say(f"a Kalman filter is learnt {found}")
+        recording = [str(store), "--name", self.name, "--frames", str(_LEARN_FRAMES)]
+        processes.start(_RECORDER, ["realtime", "record", *recording])
+        watcher.watch(_COMPILING_S, until=lambda: processes.finished(_RECORDER))
+        if watcher.stopped():
+            return
+        self._interleave(methods := ["none", "tv", window], watcher.shown)
+        processes.start(_LEARNER, ["realtime", "learn", str(store), "--config", str(engine)], ONE_THREAD)
+        try:
+            watcher.watch(_COMPILING_S, until=lambda: processes.finished(_LEARNER))
+            if watcher.stopped():
+                return
+            self._interleave([*methods, _FILTER], watcher.shown)
+            self._asked("learnt", found=found, taken=True)
+        except InputError as error:
+            say(f"no filter takes turns: {error}")
+
+    def _interleave(self, methods: list[str], shown: Shown) -> None:
+        """Let methods take turns from now on."""
+        request(
+            socket_path(self.name),
+            "interleave",
+            timeout_s=LENGTHY_TIMEOUT_S,
+            methods=",".join(methods),
+            every=self.turn_frames,
+        )
+        shown.begin(short_names(methods))
 
     def _check_name(self) -> None:
         """Refuse the name of a running engine, whose loop belongs to someone else."""
@@ -208,14 +239,22 @@ class LiveDemonstration:
 class Shown:
     """Data gathered from the loop."""
 
-    methods: list[str]
     delay_frames: int
+    methods: list[str] = field(default_factory=list)
+    """Names of the methods that take turns."""
+    first_method: int = 0
+    """Number of the first of them in `rows`."""
     rows: list[tuple[float, ...]] = field(default_factory=list)
     """Rows of all frames: number, method, state of the loop, latency [us]."""
     truth: dict[int, tuple[float, float]] = field(default_factory=dict)
     """Strehl ratio, and frame whose commands acted, by frame number; for the frames that were read."""
     status: dict[str, Any] | None = None
     """Status of the engine at the end."""
+
+    def begin(self, methods: list[str]) -> None:
+        """Let other methods take turns; the first ever follow the single method of the start."""
+        self.first_method += len(self.methods) or 1
+        self.methods = methods
 
     @property
     def table(self) -> Floats:
@@ -245,9 +284,9 @@ class Shown:
         ratio.
         """
         frames = self.table
-        frames = frames[frames[:, 2] == STATES.index(CLOSED)]
-        method = frames[:, 1].astype(np.int64)
-        if len(np.unique(method)) < len(self.methods):
+        frames = frames[(frames[:, 2] == STATES.index(CLOSED)) & (frames[:, 1] >= self.first_method)]
+        method = frames[:, 1].astype(np.int64) - self.first_method
+        if not self.methods or len(np.unique(method)) < len(self.methods):
             return []
         begins = np.flatnonzero(np.concatenate([[True], np.diff(method) != 0]))
         since = np.arange(len(method)) - begins[np.searchsorted(begins, np.arange(len(method)), "right") - 1]
@@ -273,22 +312,35 @@ class MethodShown:
 class _Watcher(Closing):
     """Reader of telemetry and truth as they arrive."""
 
-    def __init__(self, name: str, shown: Shown, looks_hz: float) -> None:
-        self._shown, self._look_s = shown, max(1 / looks_hz, _LEAST_LOOK_S)
+    def __init__(
+        self, name: str, shown: Shown, looks_hz: float, processes: ChildProcesses, stop: StopEvent
+    ) -> None:
+        self.shown, self._look_s = shown, max(1 / looks_hz, _LEAST_LOOK_S)
+        self._processes, self._stop = processes, stop
         self._reader = TelemetryRing.attach(name)
         self._truth = Follower(f"{name}_truth")
         self._cursor = self._reader.records.written
+
+    def stopped(self) -> bool:
+        """Return whether the demonstration is to end."""
+        return self._stop.is_set()
 
     def close(self) -> None:
         """Close stream and telemetry."""
         self._truth.close()
         self._reader.close()
 
-    def watch(self, processes: ChildProcesses, stop: StopEvent, seconds: float) -> None:
-        """Gather data for `seconds`."""
+    def watch(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+        """Gather data for `seconds` or until a condition holds.
+
+        Raises
+        ------
+        InputError
+            When a process has ended.
+        """
         end = time.monotonic() + seconds
-        while not stop.is_set() and time.monotonic() < end:
-            processes.check()
+        while not self.stopped() and not until() and time.monotonic() < end:
+            self._processes.check()
             self._look()
             time.sleep(self._look_s)
         self._look()
@@ -296,8 +348,8 @@ class _Watcher(Closing):
     def _look(self) -> None:
         truth = self._truth.newest()
         if truth is not None and len(truth.values) == len(TRUTH):
-            self._shown.truth[truth.number] = truth.values[_STREHL], truth.values[_COMMAND_FRAME]
+            self.shown.truth[truth.number] = truth.values[_STREHL], truth.values[_COMMAND_FRAME]
         records, self._cursor, _ = self._reader.records.since(self._cursor)
         latency_us = (records["published_time_ns"] - records["last_row_time_ns"]) / 1e3
         columns = (records["frame"], records["method"], records["loop"], latency_us)
-        self._shown.rows += zip(*(column.tolist() for column in columns), strict=True)
+        self.shown.rows += zip(*(column.tolist() for column in columns), strict=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.flags import INVALID, SubapertureFlag, are_valid
-from faintspot.engine.settings.interleaving import methods_after
+from faintspot.engine.settings.interleaving import methods_after, short_names
 from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
 from faintspot.io.frame_numbers import all_left_out
 from faintspot.slopes.sensor.layout import Layout
@@ -321,7 +321,7 @@ class PageState:
         return np.concatenate([np.empty((0, len(_FRAME))), *self._frames])
 
     def _method_name(self, method: int) -> str:
-        return self.methods[method] if method < len(self.methods) else f"method {method}"
+        return short_names(self.methods)[method] if method < len(self.methods) else f"method {method}"
 
 
 def flag_names() -> list[dict[str, Any]]:

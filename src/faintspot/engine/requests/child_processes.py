@@ -20,6 +20,9 @@ _LOOK_S = 0.02
 _DIES_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 _ERROR = "faintspot: error: "
 
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""Variables of a process that leaves the other cores alone."""
+
 
 class ChildProcesses(Closing):
     """Commands that run beside this process; a context manager that ends them, the last one first.
@@ -88,6 +91,19 @@ class ChildProcesses(Closing):
             if code is not None:
                 words = (self.output(name) or [f"exit code {code}"])[-1] if code >= 0 else f"signal {-code}"
                 raise InputError(f"{name}: the process has ended: {words.removeprefix(_ERROR)}")
+
+    def finished(self, name: str) -> bool:
+        """Return whether a command has done its work; from then on it may be absent.
+
+        Raises
+        ------
+        InputError
+            When a process has failed; the message holds its last line.
+        """
+        if name in self._started and self._started[name].poll() == 0:
+            del self._started[name]
+        self.check()
+        return name not in self._started
 
     def wait_until(self, condition: Callable[[], bool], awaited: str, timeout_s: float) -> None:
         """Wait for a condition that needs all processes.

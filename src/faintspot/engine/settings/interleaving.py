@@ -114,6 +114,17 @@ def methods_after(
     return names, first
 
 
+def short_names(methods: Sequence[str]) -> list[str]:
+    """Return the methods without the values of their settings, where that leaves them different names."""
+    short = []
+    for method in methods:
+        parts = [part for part in method.split("+") if "=" not in part]
+        short.append("+".join(parts) if parts and "=" not in method.split("+")[0] else method)
+    texts = dict(zip(methods, short, strict=True))
+    names = list(texts.values())
+    return [method if names.count(texts[method]) > 1 else texts[method] for method in methods]
+
+
 def _parsed_method(text: str) -> InterleavedMethod:
     """Return a method: settings, a controller, or both joined with "+"."""
     measured, control = split_control(text)

@@ -237,8 +237,8 @@ function showStrips({ strip: names, strip_s: seconds, strip_methods: methods, fl
   ], { logarithmic: true, marks: column("lost") });
   say("latency-caption", "µs: typical (line), longest (dashed), lost frames (ticks)");
   const method = column("method");
-  const byMethod = (values) => Object.entries(methods).map(([number, name], i) => (
-    { name, values: values.map((value, k) => method[k] === Number(number) ? value : NaN),
+  const byMethod = (values) => [...new Set(Object.values(methods))].map((name, i) => (
+    { name, values: values.map((value, k) => methods[method[k]] === name ? value : NaN),
       colour: METHOD_COLOURS[i % METHOD_COLOURS.length], dash: i >= METHOD_COLOURS.length }));
   const show = (id, lines, text, unit, limits = { from: 0 }) => {
     drawStrip(byId(id), times, seconds, lines, limits);
