@@ -36,8 +36,8 @@ _LOOP = "loop"  # a figure that the paper has not, and takes longer than all oth
     "figures",
     multiple=True,
     metavar="NAME",
-    help="Only what this figure of the paper needs: fig2 to fig7, or night (Table 1 and its figure). loop: where "
-    "denoising pays in a closed loop.",
+    help="Only what this figure of the paper needs: fig2 to fig7, or night (Table 1 and its figure). loop: "
+    "where denoising pays in a closed loop.",
 )
 @option(
     "--output",

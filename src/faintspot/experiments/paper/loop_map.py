@@ -21,6 +21,7 @@ from faintspot.experiments.closed_loop.verdict import equal_methods
 from faintspot.experiments.methods import NO_TV, SMOOTHING, TV, label_of
 from faintspot.experiments.running import WorkerPool, in_stages
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
+from faintspot.loop.simulation.record import make_folder
 from faintspot.slopes.estimators.built_in.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.slopes.estimators.built_in.window import Window
 
@@ -91,6 +92,7 @@ def run_loop_map(
     MissingExtraError
         When HCIPy is not installed.
     """
+    folder = make_folder(folder)
     columns = [(r0, camera) for r0 in R0_M for camera in cameras]
     pools = in_stages(pool or WorkerPool(), [1000] * len(columns))
     fluxes = _QUICK_FLUXES_E if quick else FLUXES_E
@@ -98,7 +100,7 @@ def run_loop_map(
     cells = []
     for (r0, camera), part in zip(columns, pools, strict=True):
         loop = _loop(r0, cameras[camera], quick)
-        place = Path(folder) / f"r0 {100 * r0:g} cm, {camera}"
+        place = folder / f"r0-{100 * r0:g}cm-{camera.replace(' ', '')}"
         result = run_magnitude(loop, place, METHODS, fluxes, search=search, pool=part, overwrite=overwrite)
         cells += cells_of(result, r0, camera)
     return cells
