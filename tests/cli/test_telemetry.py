@@ -14,8 +14,15 @@ pytest.importorskip("zarr")
 
 from tests.engine import telemetry_cases
 from tests.engine.telemetry_cases import FIELDS, LAYOUT, SETTINGS, Engine, N
-from tests.experiments.night.recorded_cases import write_recording
-from tests.loop.telemetry.alternation_cases import MATRIX, PIXEL_ARCSEC, SIDE, SUBAPERTURE_M, alternating
+from tests.experiments.night.recorded_cases import BEGIN_S, write_recording
+from tests.loop.telemetry.alternation_cases import (
+    MATRIX,
+    PIXEL_ARCSEC,
+    RATE_HZ,
+    SIDE,
+    SUBAPERTURE_M,
+    alternating,
+)
 from tests.loop.telemetry.loop_cases import recorded
 
 from faintspot.engine.pixels.segment import FOLDER
@@ -98,5 +105,14 @@ def test_methods_that_alternated_are_compared(folder: Path, run: Commands) -> No
     assert numbers["reference"] == "none"
     assert numbers["turns"] == 40
     assert "How the blocks were made" in Path("night.html").read_text()
+    shown = BEGIN_S + np.arange(2000) / RATE_HZ
+    np.savetxt("s.csv", np.stack([shown, 0.3 + 0.1 * loop.method], axis=1), delimiter=",", fmt="%.4f")
+    Path("s.toml").write_text("science_wavelength_m = 2.2e-6\n")
+    given = ("--settle", "9", "--strehl", "s.csv", "--system", "s.toml", "-o", "other.html")
+    run.ok("telemetry", "night.zarr", *given)
+    numbers = json.loads(Path("other.json").read_text())
+    assert numbers["settle_frames"] == {"none": 9, "tv:0.6": 9}
+    assert numbers["strehl"] == "measured"
+    assert numbers["differences"][0]["without_r0"]["value"] == pytest.approx(0.1, abs=0.01)
     run.refused("telemetry", "night.zarr", "--strehl", "absent.csv", naming=("absent.csv",))
     run.refused("telemetry", "night.zarr", "--one-loop", "--settle", "5", naming=("--settle", "alternated"))

@@ -3,12 +3,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.experiments.night_cases import night_with, without_r0
+from tests.experiments.night_cases import BLOCK_S, night_with, without_r0
 
 from faintspot.experiments.night.analysis import (
     ALL_STRENGTHS,
     BEST,
     by_strength,
+    contrast,
     differences,
     drift_of_r0,
     group_means,
@@ -106,6 +107,28 @@ def test_hours_are_those_of_three_standard_errors() -> None:
     assert not unseen.is_long_enough
 
 
+def test_hours_of_a_group_are_those_of_its_blocks_and_of_the_reference() -> None:
+    every, best = differences(night_with())
+    # 8 cycles of 4 strengths and 4 of 6, of which one is 0 and one within the paper's range.
+    assert [each.hours for each in (every, best)] == pytest.approx(
+        [BLOCK_S / 3600 * (12 + blocks) for blocks in (8 * 3 + 4 * 5, 8 * 1 + 4 * 1)]
+    )
+    assert [each.blocks for each in (every, best)] == [44, 12]
+
+
+def test_means_of_sets_and_a_parabola_of_the_seeing_are_removed_exactly() -> None:
+    night = night_with(11)
+    drift = np.log(night.true_r0_m)
+    of_set = np.array([0.1, 0.25, 0.3, 0.2])[night.set_number]
+    strehl = of_set + 0.2 * drift - 0.1 * drift**2 + 0.07 * (night.strength_e > 0)
+    known = replace(night, strehl=strehl)
+    reference = known.method == known.reference
+    found = contrast(known, known.strength_e > 0, reference, drift)
+    assert found.value == pytest.approx(0.07, abs=1e-9)
+    assert found.standard_error < 1e-9
+    assert abs(contrast(known, known.strength_e > 0, reference, None).value - 0.07) > 1e-4
+
+
 def test_without_paired_runs_hours_are_those_of_the_measured_effect() -> None:
     found = differences(night_with(7, effect=0.1, paired=False))[0]
     assert found.paired is None
@@ -137,6 +160,15 @@ def test_the_line_against_r0_is_least_squares() -> None:
     assert (line.slope_per_m.value, line.intercept) == pytest.approx((slope, intercept))
     assert line.correlation == pytest.approx(np.corrcoef(night.r0_m[rows], night.strehl[rows])[0, 1])
     assert line.slope_per_m.decided == 1
+    per_cm = (line.slope_per_cm.value, line.slope_per_cm.standard_error, line.slope_per_cm.high)
+    per_m = (line.slope_per_m.value, line.slope_per_m.standard_error, line.slope_per_m.high)
+    assert per_cm == pytest.approx([0.01 * number for number in per_m])
+    without = [
+        np.polyfit(night.r0_m[rows & (night.cycle != each)], night.strehl[rows & (night.cycle != each)], 1)[0]
+        for each in range(12)
+    ]
+    error = np.sqrt(11 / 12 * np.square(without - np.mean(without)).sum())
+    assert line.slope_per_m.standard_error == pytest.approx(error)
 
 
 def test_means_of_sets_and_of_all() -> None:
@@ -145,4 +177,5 @@ def test_means_of_sets_and_of_all() -> None:
     *of_sets, of_all = group_means(night, rows)
     assert [count for _, _, count in of_sets] == [4, 2, 4, 2]
     assert of_all[0] == pytest.approx(night.strehl[rows].mean())
+    assert of_all[1] == pytest.approx(night.strehl[rows].std(ddof=1))
     assert of_sets[1][0] == pytest.approx(night.strehl[rows & (night.set_number == 1)].mean())

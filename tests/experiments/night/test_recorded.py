@@ -87,6 +87,22 @@ def test_the_difference_of_residual_phase_is_found(tmp_path: Path) -> None:
     true = [wave * known.phase_m2[scored & (known.loop.method == method)].mean() for method in (0, 1)]
     (found,) = phase_differences(recorded)
     assert found.measured.low < true[1] - true[0] < found.measured.high < 0
+    # Not only in difference; fitting and aliasing, which slopes do not show, are added.
+    unseen = 0.36 * (SUBAPERTURE_M / night.r0_m) ** (5 / 3) * (500e-9 / night.wavelength_m) ** 2
+    seen = night.phase_rad2 - unseen
+    for method in (0, 1):
+        of_method = seen[night.method == method]
+        error = night.phase_error_rad2[night.method == method]
+        assert abs(of_method.mean() - true[method]) < 4 * np.sqrt(np.square(error).sum()) / len(error)
+    np.testing.assert_allclose(night.strehl, np.exp(-night.phase_rad2))
+    np.testing.assert_allclose(night.strehl_error, night.strehl * night.phase_error_rad2)
+    together = recorded.turns_in_block
+    np.testing.assert_allclose(night.duration_s, together * (50 - SETTLE) / RATE_HZ, rtol=1e-6)
+    assert night.overhead_s == pytest.approx(together * SETTLE / RATE_HZ)
+    assert night.hours == pytest.approx(4000 / RATE_HZ / 3600)
+    # A block's middle is the mean of its frames: of turns 0, 2, ... and of turns 1, 3, ...
+    middle_s = np.arange(2) * 50 / RATE_HZ + ((together - 1) * 50 + 0.5 * (SETTLE + 49)) / RATE_HZ
+    np.testing.assert_allclose(night.middle_s[:2], middle_s - SETTLE / RATE_HZ, atol=1e-6)
     np.testing.assert_array_equal(night.r0_m[::2], night.r0_m[1::2])  # of all methods together
     summary = summary_of_recording(recorded)
     json.dumps(summary, allow_nan=False)
@@ -122,6 +138,29 @@ def test_intervals_hold_in_drifting_seeing(tmp_path: Path) -> None:
         found = difference(night, groups(night)[0], None).measured
         held += found.low < 0.03 < found.high
     assert held >= 21
+
+
+def test_slopes_of_other_centroid_gains_tell_the_same_phase(tmp_path: Path) -> None:
+    """Method 1 sees 0.8 of a displacement: unnoticed, its phase would come out 36 % smaller."""
+    known = alternating(4000, 25, gains=(1.0, 0.8), noise_px=(0.03, 0.03))
+    recorded = recorded_night(stored(tmp_path, known), settle_frames=10)
+    night, ratio = recorded.night, recorded.gains.gain[1]
+    assert ratio == pytest.approx(0.8, rel=0.1)
+    wave = (2 * np.pi / night.wavelength_m) ** 2
+    unseen = 0.36 * (SUBAPERTURE_M / night.r0_m) ** (5 / 3) * (500e-9 / night.wavelength_m) ** 2
+    scored = np.arange(4000) % 25 >= 10
+    # The mean gain, of the logarithms, is the one that [control] states: 1.
+    for method, gain in ((0, 1 / np.sqrt(ratio)), (1, np.sqrt(ratio))):
+        true = wave * known.phase_m2[scored & (known.loop.method == method)].mean()
+        found = (night.phase_rad2 - unseen)[night.method == method].mean()
+        assert found == pytest.approx(true * ((1.0, 0.8)[method] / gain) ** 2, rel=0.05)
+    shared = recorded.shared_phase_error_rad2[night.method == 1]
+    seen = (night.phase_rad2 - unseen)[night.method == 1]
+    np.testing.assert_allclose(shared, 2 * seen * recorded.gains.error[1] / ratio, rtol=1e-6)
+    assert night.shared_error is not None
+    other = night.method == 1
+    np.testing.assert_allclose(night.shared_error[other], shared * night.strehl[other])
+    assert not night.shared_error[~other].any()
 
 
 def test_conditions_make_sets(tmp_path: Path) -> None:

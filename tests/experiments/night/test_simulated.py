@@ -8,9 +8,10 @@ from tests.experiments.experiment_cases import HERE, StopsAfter, assert_same_uni
 from faintspot.base.errors import InputError
 from faintspot.experiments.night.blocks import load_night
 from faintspot.experiments.night.protocol import NightPlan
-from faintspot.experiments.night.simulated import run_night
+from faintspot.experiments.night.simulated import r0_of_slopes, run_night
 from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation import simulate_loop
+from faintspot.loop.simulation.control import slope_turbulence
 
 pytest.importorskip("hcipy")
 pytest.importorskip("zarr")
@@ -35,6 +36,11 @@ def test_a_night_is_what_the_loop_does(tmp_path: Path) -> None:
     np.testing.assert_array_equal(night.set_number, [0] * 6 + [1] * 4)
     rate = LOOP.control.frame_rate_hz
     np.testing.assert_allclose(night.start_s, (60 * np.arange(10) + 20) / rate)
+    np.testing.assert_array_equal(night.strength_e, [np.nan, 0, 1, np.nan, 0, 1, np.nan, 0, 0.5, 1])
+    np.testing.assert_allclose(night.duration_s, 40 / rate)
+    assert night.hours == pytest.approx(600 / rate / 3600)
+    assert night.paired_strehl[6] == night.strehl[6]  # the first of the second set
+    assert night.paired_strehl[5] != night.strehl[5]
     # The first block of the reference has seen nothing else, so that it is the reference's own run.
     assert night.paired_strehl[0] == night.strehl[0]
     first = PLAN.configuration(LOOP, 0).replace("run", frames=60)
@@ -43,6 +49,16 @@ def test_a_night_is_what_the_loop_does(tmp_path: Path) -> None:
     assert night.true_r0_m[0] == pytest.approx(np.mean(alone.r0_m[20:] ** (-5 / 3)) ** (-3 / 5))
     phase = (2e-9 * np.pi / night.wavelength_m) ** 2 * np.square(alone.residual_nm[20:])
     assert night.phase_rad2[0] == pytest.approx(phase.mean())
+    pieces = alone.strehl[20:].reshape(10, 4).mean(axis=1)
+    assert night.strehl_error[0] == pytest.approx(pieces.std(ddof=1) / np.sqrt(10))
+    pieces = (2e-9 * np.pi / night.wavelength_m) ** 2 * np.square(alone.residual_nm[20:].reshape(10, 4))
+    assert night.phase_error_rad2[0] == pytest.approx(pieces.mean(axis=1).std(ddof=1) / np.sqrt(10))
+    # The same turbulence without the mirror: 40 frames and other noise, 0.5 % apart; 25 % if added to it.
+    seen = simulate_loop(first.replace("control", mode="open"), PLAN.made(first, 0, {})[:1])
+    site = slope_turbulence(first, seen.cells)
+    slopes = seen.slopes_px[20:] / seen.centroid_gain[0]
+    r0_m, _ = r0_of_slopes(slopes, slopes, site, first.atmosphere.outer_scale_m)
+    assert night.r0_m[0] == pytest.approx(r0_m, rel=0.05)
     # The second set goes on where the first ended.
     second = PLAN.configuration(LOOP, 1).replace("run", frames=60)
     later = simulate_loop(second, PLAN.made(second, 1, {})[:1], first_frame=360)

@@ -1,9 +1,10 @@
 from dataclasses import replace
 
 import numpy as np
-from tests.experiments.night_cases import night_with
+import pytest
+from tests.experiments.night_cases import BLOCK_S, night_with
 
-from faintspot.experiments.night.analysis import FAILS, HOLDS, OPEN, verdicts
+from faintspot.experiments.night.analysis import FAILS, HOLDS, OPEN, lines, verdicts
 
 
 def outcomes(*arguments: int, **options: float) -> list[tuple[str, str]]:
@@ -24,6 +25,23 @@ def test_a_small_effect_is_not_decided_by_alternation_but_by_the_same_turbulence
     assert (every.outcome, every.paired_outcome) == (OPEN, FAILS)
     assert abs(every.significance) < 3
     assert every.hours_needed > 2 * night_with(0).hours
+
+
+def test_best_strengths_are_compared_with_all_others() -> None:
+    """The others are the 32 blocks of TV outside the range, not the reference."""
+    night = night_with(2, effect=0.1, best=0.2)
+    _, _, found, line = verdicts(night)
+    for estimate in (found.measured, found.paired):
+        assert abs(estimate.value - 0.2) < 3 * estimate.standard_error
+    assert found.paired.standard_error < 0.02  # noise of 0.028 in each of 12 and of 32 blocks
+    assert found.significance == pytest.approx(found.measured.value / found.measured.standard_error)
+    hours = 44 * BLOCK_S / 3600
+    error = found.measured.standard_error
+    assert found.hours_needed == pytest.approx(hours * (3 * error / found.paired.value) ** 2)
+    slope = lines(night)[0].slope_per_m
+    needed = 68 * BLOCK_S / 3600 * (3 * slope.standard_error / slope.value) ** 2
+    assert line.hours_needed == pytest.approx(needed)
+    assert line.unit == " per cm"
 
 
 def test_without_paired_runs_there_is_no_paired_verdict() -> None:

@@ -203,9 +203,9 @@ def lines(night: Night) -> list[Regression]:
 
 def _line(night: Night, group: BlockGroup) -> Regression | None:
     rows = group.rows & np.isfinite(night.r0_m + night.strehl)
-    if rows.sum() < _FEWEST_ROWS or np.ptp(night.r0_m[rows]) == 0:
-        return None
     r0, strehl = night.r0_m[rows], night.strehl[rows]
+    if len(r0) < _FEWEST_ROWS or np.ptp(r0) == 0 or np.ptp(strehl) == 0:
+        return None
     slope, intercept = np.polyfit(r0, strehl, 1)
     cycle = night.cycle[rows]
     without = [

@@ -256,12 +256,13 @@ def _groups(scored: Sequence[_Scored], reference: int, together: int) -> list[li
 
     A cycle begins with each turn of the reference, and with other conditions.
     """
-    cycle, conditions = 0, scored[0].turn.conditions
+    cycles: dict[int, int] = {}
     groups: dict[tuple[int, int], dict[int, list[_Scored]]] = {}
     for each in scored:
-        cycle += each.turn.method == reference or each.turn.conditions != conditions
         conditions = each.turn.conditions
-        group = groups.setdefault((conditions, cycle // together), {})
+        begins = each.turn.method == reference or conditions not in cycles
+        cycles[conditions] = cycles.get(conditions, -1) + begins
+        group = groups.setdefault((conditions, cycles[conditions] // together), {})
         group.setdefault(each.turn.method, []).append(each)
     return [
         [group[method] for method in sorted(group, key=lambda number: (number != reference, number))]
