@@ -61,6 +61,18 @@ def test_a_recording_has_no_slopes_that_were_not_measured() -> None:
         measured.recorded(np.zeros(4))
 
 
+def test_slopes_and_their_errors_are_in_the_tools_unit() -> None:
+    """With an axis that is opposite to the frame's."""
+    of_tool, in_px = tool(EVERYTHING, unit_per_px=(2.0, -0.5)), tool(EVERYTHING)
+    frame = tall(noisy(np.random.default_rng(1)))
+    slopes, expected = of_tool.measure(frame), in_px.measure(frame)
+    np.testing.assert_allclose(slopes, [2.0 * expected[0], -0.5 * expected[1]])
+    x, y = in_px.standard_errors
+    assert np.isfinite(x).all()
+    np.testing.assert_allclose(of_tool.standard_errors, [2.0 * x, 0.5 * y])
+    np.testing.assert_array_equal(x, in_px.last.standard_error_x)
+
+
 def test_calibrating_is_a_block_that_ends() -> None:
     measured = tool(Settings("window", flux_e=FAINT_E))
     bright = tall(images(1e5))

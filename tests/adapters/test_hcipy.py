@@ -152,6 +152,8 @@ def test_last_estimate_says_how_good_it_is(optics: Any) -> None:
     assert errors.shape == slopes.shape
     assert np.isinf(errors[:, 3]).all()
     assert ((errors[:, 4] > 0) & (errors[:, 4] < PIXEL_M)).all()
+    last = estimator.measured.last
+    np.testing.assert_allclose(errors, PIXEL_M * np.stack([last.standard_error_x, last.standard_error_y]))
 
 
 def test_axes_that_run_backwards(optics: Any) -> None:

@@ -99,6 +99,19 @@ def test_noise_switches_calibration_off_and_prediction_on() -> None:
     assert len(asked) == 1
 
 
+def test_predictions_are_in_the_tools_unit_and_from_its_references() -> None:
+    """Places are predictions times the unit, plus the reference; 5 e- say little against 0.02 px."""
+    wfs: Any = StandIn()
+    predicted = np.random.default_rng(2).uniform(-0.2, 0.2, 2 * N)
+    settings = Settings("map", flux_e=5.0, prior_std_px=0.02)
+    oopao.attach(wfs, settings, READ_NOISE, psf=PSF, predict=lambda last: predicted)
+    wfs.cam.photonNoise, wfs.slopes_units = True, 3.0
+    wfs.sh_data["src_0"].reference_signal_2D += np.array([[0.3], [-0.2]])
+    rng = np.random.default_rng(1)
+    signal(wfs, noisy(rng, 5.0))
+    np.testing.assert_allclose(signal(wfs, noisy(rng, 5.0)).ravel(), predicted, atol=0.02)
+
+
 def test_a_spot_without_flux_has_slope_zero() -> None:
     wfs: Any = StandIn()
     attached = oopao.attach(wfs, EVERYTHING)

@@ -6,7 +6,9 @@ import pytest
 from tests.cli.cli_cases import LAYOUT, Commands, simulated
 
 from faintspot import Calibration, Layout, SlopePipeline
+from faintspot.cli.tune import _binned
 from faintspot.experiments.planner import tuning
+from faintspot.slopes.sensor.binning import binned_layout
 
 KNOWN = ("--read-noise-e", 3, "--pixels", 8, "--fwhm-px", "1.8", "--flux-e", 200)
 
@@ -78,6 +80,23 @@ def test_binned_layout(run: Commands, tmp_path: Path, monkeypatch: pytest.Monkey
     assert pipeline.layout == layout
     assert (pipeline.calibration.dark, pipeline.calibration.read_noise_e) == (100.0, 1.5)
     assert pipeline.settings.search_range_px == 2.0
+
+
+def test_values_of_binned_frames() -> None:
+    """Of 3 x 3 pixels: noises add in squares, and lengths are counted in larger pixels."""
+    layout = Layout.grid((4, 4), pixels=18, bin=3)
+    given = {
+        "read_noise_e": 2.0, "background_e": 0.5, "pixel_scale_arcsec": 0.1, "fwhm_px": 6.0,
+        "search_range_px": 4.5, "pixels": 18, "budget": "0.3px", "flux_e": 70.0, "gain_e_per_adu": 2.0,
+    }  # fmt: skip
+    assert _binned(given, layout) == pytest.approx(
+        {
+            "read_noise_e": 6.0, "background_e": 4.5, "pixel_scale_arcsec": 0.3, "fwhm_px": 2.0,
+            "search_range_px": 1.5, "pixels": 6, "budget": 0.1, "flux_e": 70.0, "gain_e_per_adu": 2.0,
+            "layout": binned_layout(layout),
+        }
+    )  # fmt: skip
+    assert _binned({"budget": "50mas"}, layout)["budget"] == "50mas"
 
 
 @pytest.mark.slow

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from tests.cli.cli_cases import CONFIGURATION, Commands, simulated
+from tests.slopes.wavefront.test_fit import slopes_of
 
 from faintspot import Layout
 from faintspot.base.json_text import parse_json
+from faintspot.cli.wavefront import _with_error_of
 from faintspot.io import read_slopes
 from faintspot.slopes.pipeline.configuration import to_text
 from faintspot.slopes.pipeline.slopes import Slopes
@@ -50,6 +52,15 @@ def test_table_picture_and_files(run: Commands, slopes: Path) -> None:
     np.testing.assert_allclose(
         [float(row["rms_without_tilt_nm"]) for row in rows[1:]], expected.rms(tilt=False), rtol=1e-6
     )
+    named = rows[0]["noll4_osa4_defocus_nm"], rows[0]["noll4_osa4_defocus_standard_error_nm"]
+    mean, error = expected.mean[2], expected.mean_standard_error[2]
+    assert [float(text) for text in named] == pytest.approx([mean, error], rel=1e-6)
+    assert [written["mean"]["modes"][2][name] for name in ("mean", "standard_error")] == [mean, error]
+    errors = [float(row["noll4_osa4_defocus_standard_error_nm"]) for row in rows[1:]]
+    np.testing.assert_allclose(errors, expected.standard_errors[:, 2], rtol=1e-6)
+    np.testing.assert_allclose(written["frames"]["standard_errors"], expected.standard_errors)
+    np.testing.assert_allclose(written["frames"]["residual_px"], expected.residual_px)
+    assert written["mean"]["rms"] == pytest.approx(np.sqrt(np.sum(expected.mean**2)))
     with fits.open("w.fits", checksum=True) as units:
         assert units[0].header["BUNIT"] == "nm"
         np.testing.assert_allclose(units["MODES"].data["MEAN"], expected.mean)
@@ -143,11 +154,18 @@ def test_zonal_map_and_its_files(run: Commands, slopes: Path, coarse_pictures: N
         last = units["ZONAL"].header["CRVAL1"] + 200 * units["ZONAL"].header["CDELT1"]
         assert last == pytest.approx(31.5)  # the edge of the last of 32 pixels
         known = np.isfinite(units["ZONAL"].data)
+        np.testing.assert_allclose(units["SUBAPERTURES"].data["X"], layout.centres[:, 0])
+        np.testing.assert_allclose(units["SUBAPERTURES"].data["Y"], layout.centres[:, 1])
     with Path("m.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == np.count_nonzero(known)
     assert list(rows[0]) == ["x_px", "y_px", "modes_um", "zonal_um", "standard_error_um", "part"]
     np.testing.assert_allclose([float(row["zonal_um"]) for row in rows], expected.sheet[known], rtol=1e-6)
+    row, column = np.nonzero(known)
+    np.testing.assert_allclose([float(each["x_px"]) for each in rows], -0.5 + 0.16 * column, atol=1e-5)
+    np.testing.assert_allclose([float(each["y_px"]) for each in rows], -0.5 + 0.16 * row, atol=1e-5)
+    errors = [float(each["standard_error_um"]) for each in rows]
+    np.testing.assert_allclose(errors, expected.standard_errors[expected.nearest[known]], rtol=1e-6)
 
 
 def test_map_of_the_modes(run: Commands, slopes: Path, no_picture: None) -> None:
@@ -182,6 +200,16 @@ def test_difference_of_two_recordings(run: Commands, slopes: Path, no_picture: N
         again = parse_json(Path("w.json").read_text())["mean"]
         means = [mode["mean"] for mode in again["modes"]]
         assert means == pytest.approx([mode["mean"] for mode in moved["modes"]], abs=0.02)
+
+
+def test_errors_of_what_is_subtracted_count() -> None:
+    layout, noise = Layout.grid((7, 7), pixels=8), np.random.default_rng(1).normal(0.0, 0.1, (30, 2, 49))
+    slopes = slopes_of(noise)
+    wavefront, surface = fit_wavefront(slopes, layout), zonal_map(slopes, layout)
+    both, surfaces = _with_error_of(slopes, layout, wavefront, surface)
+    assert surfaces is not None
+    np.testing.assert_allclose(both.mean_standard_error, np.sqrt(2) * wavefront.mean_standard_error)
+    np.testing.assert_allclose(surfaces.standard_errors, np.sqrt(2) * surface.standard_errors)
 
 
 def test_displaced_source_is_a_tilt(run: Commands, slopes: Path, no_picture: None) -> None:

@@ -1,6 +1,7 @@
 """A mirror never gets a command that is not a finite number, whatever the files of [control] hold."""
 
 from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -154,6 +155,65 @@ def test_a_command_that_is_begun_while_rows_arrive_is_the_same(monkeypatch: pyte
     assert np.abs(sent[0]).max() > 0.1
     begun.open()
     assert not begun.begin_product()
+
+
+def frame_of(rng: np.random.Generator) -> Slopes:
+    slopes = Slopes(*(np.zeros(N, kind) for kind in RESULT_TYPES))
+    slopes.x[:], slopes.y[:] = 0.1 * rng.standard_normal((2, N))
+    return slopes
+
+
+def test_commands_are_minus_the_gain_times_the_wavefront_of_true_slopes() -> None:
+    options = ControlOptions(gain=0.3, leak=0.02, centroid_gain=0.5, largest_residual_px=1e30)
+    control = Control(INTERACTION, None, options)
+    loop, rng, expected = ControlLoop(control, LAYOUT), np.random.default_rng(5), np.zeros(COMMANDS)
+    loop.close()
+    for number in range(3):
+        slopes = frame_of(rng)
+        measured = np.concatenate([slopes.x, slopes.y]) / 0.5
+        expected = 0.98 * expected - 0.3 * control.reconstructor.matrix @ measured
+        np.testing.assert_allclose(loop.follow(slopes, number), expected, atol=1e-5)
+        loop.look_after(slopes.flux)
+        rms = np.sqrt(np.mean(measured**2))
+        assert number > 0 or loop.guard.residual_px == pytest.approx(rms, rel=1e-5)
+
+
+@pytest.mark.parametrize("lost", [0, 1, 2, 7])
+def test_commands_act_after_their_delay_also_if_frames_are_lost(lost: int) -> None:
+    """The mirror moves on in lost frames, for which there was no other command."""
+    options = ControlOptions(delay_frames=3, largest_residual_px=1e30)
+    loop, rng = ControlLoop(Control(INTERACTION, None, options), LAYOUT), np.random.default_rng(6)
+    loop.close()
+    sent: list[np.ndarray] = []
+    for number in (0, 1, 2, 3 + lost, 4 + lost):
+        sent += [sent[-1]] * (number - len(sent)) if sent else []
+        slopes = frame_of(rng)
+        sent.append(loop.follow(slopes, number).copy())
+        loop.look_after(slopes.flux)
+        acts = number + 1 - 3  # in the next frame
+        expected = sent[acts] if acts >= 0 else np.zeros(COMMANDS)
+        np.testing.assert_array_equal(loop._line.acting, expected)
+
+
+def test_a_new_controller_follows_slopes_divided_by_its_own_centroid_gain() -> None:
+    options = ControlOptions(centroid_gain=0.5, largest_residual_px=1e30)
+    loop, rng = ControlLoop(Control(INTERACTION, None, options), LAYOUT), np.random.default_rng(7)
+    loop.close()
+    taken: list[Any] = []
+    new: Any = SimpleNamespace(is_settling=True, ready=SimpleNamespace(centroid_gain=0.4))
+    new.follow = lambda _, *frame: taken.append([None if part is None else part.copy() for part in frame])
+    slopes = frame_of(rng)
+    slopes.standard_error_x[:], slopes.standard_error_y[:] = rng.uniform(0.1, 0.3, (2, N))
+    slopes.covariance_xy[:] = rng.uniform(0.0, 0.01, N)
+    loop.follow(slopes, 0)
+    loop._successor = new
+    loop.look_after(slopes.flux)
+    [(vector, errors, covariance, _, prior)] = taken
+    np.testing.assert_allclose(vector, slopes.vector / 0.4, rtol=1e-6)
+    standard = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
+    np.testing.assert_allclose(errors, standard / 0.4, rtol=1e-6)
+    np.testing.assert_allclose(covariance, slopes.covariance_xy / 0.4**2, rtol=1e-6)
+    assert prior is None
 
 
 def test_no_command_is_begun_if_modes_are_removed_from_slopes(monkeypatch: pytest.MonkeyPatch) -> None:

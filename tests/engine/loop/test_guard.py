@@ -9,7 +9,7 @@ from tests.loop.control.control_cases import INTERACTION
 from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.loop.guard import Guard, LostSpots
 from faintspot.loop.control.configuration import Control, ControlOptions
-from faintspot.loop.control.integrator import INVALID_PART
+from faintspot.loop.control.integrator import INVALID_PART, MEAN_SQUARE
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout
 
@@ -132,6 +132,75 @@ def test_a_loop_is_closed_again_at_half_the_invalid_slopes(part: float, again: b
     for _ in range(300):
         guard.watch(summary, commands, flux)
     assert guard.may_close_again == again
+
+
+FLUX, FLAT = np.full(N, 100.0, "f4"), np.zeros(COMMANDS)
+
+
+def guarded(**options: float) -> Guard:
+    """Return the guard of a loop that has just been closed."""
+    guard = Guard(Control(INTERACTION, None, OPTIONS.replaced(options)), LAYOUT)
+    guard.begin()
+    return guard
+
+
+def reason(guard: Guard, *, square_px2: float = 0.0, invalid: float = 0.0, at_limit: int = 0) -> str:
+    """Return why a loop opens within 300 frames, 15 times the guard's memory, that are all the same."""
+    summary, latest = np.zeros(8), np.zeros(COMMANDS)
+    summary[MEAN_SQUARE], summary[INVALID_PART] = square_px2, invalid
+    latest[:at_limit] = -10.0
+    return next(filter(None, (guard.objection(summary, FLAT, FLUX, latest) for _ in range(300))), "")
+
+
+@pytest.mark.parametrize("limit_px", [None, 0.6])
+def test_a_loop_opens_at_its_largest_residual(limit_px: float | None) -> None:
+    """Without a stated one at a quarter of a window, here 4 px."""
+    options = {} if limit_px is None else {"largest_residual_px": limit_px}
+    largest = limit_px or 4.0
+    assert not reason(guarded(**options), square_px2=(0.98 * largest) ** 2)
+    opened = guarded(**options)
+    assert f"more than {largest:.2f}" in reason(opened, square_px2=(1.02 * largest) ** 2)
+    assert opened.flattens
+
+
+def test_slopes_of_the_open_loop_are_the_limit_where_they_are_known() -> None:
+    for size, opens in ((1.22, False), (1.28, True)):
+        guard = guarded()
+        guard.end()
+        summary = np.zeros(8)
+        summary[MEAN_SQUARE] = 0.7**2
+        for _ in range(OPTIONS.guard_frames):
+            guard.watch(summary, FLAT, FLUX)
+        guard.begin()
+        assert bool(reason(guard, square_px2=(0.7 * size) ** 2)) == opens
+
+
+def test_commands_at_their_limit_open_the_loop() -> None:
+    options = {"largest_command": 10.0, "most_at_limit": 0.3}  # 3.6 of 12
+    assert not reason(guarded(**options), at_limit=3)
+    assert "of the commands at their limit, more than 30 %" in reason(guarded(**options), at_limit=4)
+
+
+def test_figures_of_the_guard_are_means_of_late() -> None:
+    """Also of few frames, which are not diluted with earlier ones that there were not."""
+    guard = guarded(largest_command=10.0, most_at_limit=0.9, most_invalid=0.9)
+    summary, latest = np.zeros(8), np.zeros(COMMANDS)
+    summary[MEAN_SQUARE], summary[INVALID_PART], latest[:6] = 0.8**2, 0.2, 10.0
+    for _ in range(3):
+        assert not guard.objection(summary, FLAT, FLUX, latest)
+        assert guard.status() == pytest.approx(
+            {"residual_px": 0.8, "invalid_part": 0.2, "at_limit_part": 0.5}
+        )
+
+
+@pytest.mark.parametrize(("flux", "lost"), [(0.30, True), (0.37, False)])
+def test_spots_are_lost_where_their_flux_is_low_when_they_are_displaced(flux: float, lost: bool) -> None:
+    """Displaced in half of the frames: mean(F d^2) < 0.5 mean(F) mean(d^2) at a third of the flux."""
+    spots = LostSpots(INTERACTION, 20)
+    for frame in range(200):
+        moved = frame >= 100
+        spots.take(np.full(COMMANDS, float(moved)), FLUX * np.float32(flux if moved else 1.0))
+    assert spots.lost == lost
 
 
 def test_flux_that_is_not_finite_counts_as_none() -> None:

@@ -183,13 +183,17 @@ def test_what_was_overwritten_is_counted(name: str, tmp_path: Path) -> None:
         for frame in range(20):
             write(ring, frame)
             write_images(ring, frame)
+        for number in range(300):
+            ring.write_change(0, number, {"noise_std": 1.0}, None)
         report = recording.run(n_frames=7)
     assert (report.frames, report.dropped) == (7, 13)
     assert (report.images, report.dropped_images) == (2, 18)
+    assert (report.changes, report.dropped_changes) == (255, 45)  # of 256 places
     telemetry = read_telemetry(tmp_path / "night.zarr")
     assert list(telemetry.image_frame) == [18, 19]
     assert telemetry.attributes["dropped_records"] == 13
     assert telemetry.attributes["dropped_images"] == 18
+    assert telemetry.attributes["dropped_changes"] == 45
 
 
 def test_methods_that_came_later_are_named(name: str, tmp_path: Path) -> None:

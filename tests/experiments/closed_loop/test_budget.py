@@ -29,6 +29,8 @@ def strehl(term: str) -> float:
 def test_without_nothing_it_is_the_loop_itself() -> None:
     record = simulate_loop(FAINT, [KIND.method(FAINT, CHOICE)])
     assert strehl("nothing") == pytest.approx(record.mean_strehl(), abs=1e-12)
+    found = scored_runs(KIND, FAINT, CHOICE, TERMS["nothing"], lambda frames: None)["residual_nm"][0]
+    assert found == pytest.approx(np.sqrt(np.mean(record.residual_nm[40:] ** 2)))
 
 
 @pytest.mark.parametrize(

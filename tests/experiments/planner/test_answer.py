@@ -51,6 +51,9 @@ def test_maps_of_the_calibration_are_kept() -> None:
     calibration = dataclasses.replace(answer, question=question).calibration
     np.testing.assert_array_equal(calibration.dark, dark)
     assert (calibration.gain_e_per_adu, calibration.read_noise_e) == (2.0, 3.0)
+    emccd = dataclasses.replace(question, em_gain=30.0, background_e=0.7)
+    calibration = dataclasses.replace(answer, question=emccd).calibration
+    assert (calibration.em_gain, calibration.background_e) == (30.0, 0.7)
 
 
 def test_magnitudes_are_relative_without_photometry() -> None:
@@ -80,6 +83,7 @@ def test_the_recommendation_in_words() -> None:
 def test_a_star_that_is_too_faint_is_called_so() -> None:
     answer = answered(read_noise_e=30.0, flux_e=20.0)
     assert answer.is_hopeless
+    assert answer.prior_rms_px == pytest.approx(1 / np.sqrt(3))  # of places within 1 px
     assert "too faint" in " ".join(answer_text.recommendation(answer))
 
 

@@ -12,7 +12,14 @@ from tests.simulated import frames_of
 
 from faintspot.base.statistics import Estimate
 from faintspot.experiments import Answer, Promise, Question, question_from_frames, tune
-from faintspot.experiments.planner.promise import _spot_positions, _with_unshared
+from faintspot.experiments.planner.promise import (
+    _dealt,
+    _error_of,
+    _frame_to_frame,
+    _split,
+    _spot_positions,
+    _with_unshared,
+)
 from faintspot.experiments.planner.text import CONTRADICTED, promise_lines
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
@@ -123,6 +130,33 @@ def test_spots_in_the_middle_of_the_search_range_have_larger_errors_than_spread_
     slopes = SlopePipeline(LAYOUT, method.settings, question.calibration, **method.parts)(frames[40:])
     reached = np.abs(np.stack([slopes.x, slopes.y], axis=-1) - truth[40:]).mean()
     assert promise.expected_px == pytest.approx(reached, rel=0.08)
+
+
+def assert_independent(pair: tuple[np.ndarray, np.ndarray], mean: float, variance: float) -> None:
+    """Of 200,000 pixels: mean and variance to 0.5 %, their correlation to 0.0025; four times that."""
+    assert [image.mean() for image in pair] == pytest.approx([mean, mean], abs=0.01 * np.sqrt(variance))
+    assert [image.var() for image in pair] == pytest.approx([variance, variance], rel=0.015)
+    assert abs(np.corrcoef([image.ravel() for image in pair])[0, 1]) < 0.01
+
+
+def test_two_images_of_a_frame_have_the_noise_of_their_flux_and_none_in_common() -> None:
+    rng, shape, share = np.random.default_rng(1), (50, 4, 20, 50), 0.4
+    expected = np.full(shape, 40.0)
+    images = 40.0 + 7.0 * rng.standard_normal(shape)  # photons, and read noise of 3 electrons
+    assert_independent(_split(images, expected, 9.0, 1.0, share, rng), 16.0, 16.0 + 9.0)
+    question = Question(read_noise_e=0.2, background_e=5.0, flux_e=100.0, fwhm_px=1.77, layout=LAYOUT)
+    counted = rng.poisson(45.0, shape).astype(np.float64) - 5.0
+    assert_independent(_dealt(counted, share, question, rng), 16.0, 16.0 + 5.0 + 0.2**2)
+
+
+def test_error_from_frame_to_frame_is_r_whatever_moves_slowly() -> None:
+    """R of normal errors is sqrt(2 / pi) standard deviations; 2 x 12,000 slopes tell it to 0.6 %."""
+    slopes = 0.2 * np.random.default_rng(2).standard_normal((400, 30, 2))
+    found = _error_of(slopes[::2] - slopes[1::2], 2)
+    assert found.value == pytest.approx(0.2 * np.sqrt(2 / np.pi), rel=0.03)
+    assert found.standard_error == pytest.approx(0.2 * np.sqrt((1 - 2 / np.pi) / 12000), rel=0.05)
+    moving = slopes + 0.3 * np.arange(400)[:, None, None]
+    assert _frame_to_frame(moving).value == pytest.approx(0.2 * np.sqrt(2 / np.pi), rel=0.03)
 
 
 def test_spots_are_predicted_without_the_noise_of_their_positions() -> None:

@@ -35,6 +35,17 @@ def test_magnitude_gives_electrons() -> None:
     question = Question(**without("flux_e"), **STAR)
     assert question.photometry is not None
     assert question.star_flux_e == pytest.approx(float(question.photometry.electrons(10.0)))
+    by_hand = Question(**without("flux_e"), **STAR, zero_point=1e10, throughput=0.5, quantum_efficiency=0.8)
+    assert by_hand.star_flux_e == pytest.approx(1e10 * 1e-4 * 0.5**2 / 500.0 * 0.5 * 0.8)
+
+
+def test_what_estimators_know_of_an_emccd() -> None:
+    camera = {"read_noise_e": 50.0, "em_gain": 100.0, "background_e": 0.2}
+    scene = Question(**{**KNOWN, **camera, "search_range_px": 3.0}).scene(80.0)
+    assert (scene.flux_e, scene.read_noise_e, scene.background_e) == (80.0, 0.5, 0.2)
+    assert scene.excess_noise == pytest.approx(2.0, abs=0.02)
+    assert (scene.window, scene.spot_fwhm_px, scene.position_range_px) == ((16, 16), 2.0, 3.0)
+    assert scene.diffraction_px == pytest.approx(2.0 / 0.886, rel=2e-3)  # lambda / d
 
 
 @pytest.mark.parametrize(("fwhm_px", "expected"), [(1.5, 1.0), (4.0, 2.0)])

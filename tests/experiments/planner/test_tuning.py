@@ -2,7 +2,8 @@ import dataclasses
 import itertools
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from types import SimpleNamespace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ from tests.experiments.planner_cases import CAMERA, QUICK, answered
 
 from faintspot.base.errors import InputError
 from faintspot.experiments import Question, tune
-from faintspot.experiments.planner.tuning import _ranked
+from faintspot.experiments.methods import method_for_scene
+from faintspot.experiments.planner.simulated import SPOTS_PER_FRAME, SimulatedSpots
+from faintspot.experiments.planner.tuning import _bound, _error_scale, _ranked
 from faintspot.slopes.estimators import Estimator, Scene, estimators, registry
 
 
@@ -19,6 +22,7 @@ def test_every_method_is_scored_on_the_same_spots() -> None:
     assert [result.method.name for result in answer.results] == list(estimators())
     assert answer.curve.methods == tuple(estimators())
     assert (len(answer.flux_e), answer.realisations) == (3, 512)
+    np.testing.assert_allclose(np.diff(np.log10(answer.flux_e)), 0.4 * 0.75)  # magnitudes
     assert all(result.settings.search_range_px == 1.0 for result in answer.results)
 
 
@@ -28,6 +32,50 @@ def test_errors_are_near_the_bound_where_the_spot_is_known() -> None:
     assert answer["ml"].statistics.error.value == pytest.approx(answer.bound_px[1], rel=0.15)
     assert answer.best.method.name in ("ml", "weighted", "matched", "smoothed", "map")
     assert answer.best.over_brightest.value > 0.1
+
+
+def test_the_bound_is_the_mean_over_sub_apertures_that_differ_in_flux() -> None:
+    question = Question(**CAMERA)
+    shared = dataclasses.replace(question, relative_flux=np.repeat([0.5, 1.5], 50))
+    of_half, whole, of_more = (_bound(question, np.array([flux]))[0] for flux in (100.0, 200.0, 300.0))
+    # Nine quantiles: four or five of each half, or one between them.
+    assert _bound(shared, np.array([200.0]))[0] == pytest.approx((of_half + of_more) / 2, rel=0.06)
+    assert of_half > 1.4 * whole
+
+
+def test_stated_errors_are_scaled_to_the_actual_ones() -> None:
+    rng = np.random.default_rng(3)
+    truth, errors = rng.uniform(-1, 1, (4000, 2)), 0.2 * rng.standard_normal((4000, 2))
+    errors[::50] = 5.0  # outliers, which no standard error tells
+    stated = np.full(4000, 0.1)
+    x, y = (truth + errors).T
+    slopes: Any = SimpleNamespace(x=x, y=y, standard_error_x=stated, standard_error_y=stated)
+    assert _error_scale(slopes, truth) == pytest.approx(2.0, rel=0.03)
+    slopes.standard_error_x = slopes.standard_error_y = 2.04 * stated
+    assert _error_scale(slopes, truth) == 1.0  # nearly right
+
+
+def test_spots_are_exposed_and_measured_in_photo_electrons() -> None:
+    """EM gain and background are the camera's; values tried together are each measured as one alone."""
+    camera = {**CAMERA, "read_noise_e": 60.0, "em_gain": 20.0, "background_e": 2.0}
+    question = Question(**camera, relative_flux=np.array([0.5, 1.5]))
+    spots = SimulatedSpots.of(question, 256, np.random.default_rng(1))
+    _, scored = spots.exposed(300.0, np.random.default_rng(2))
+    assert scored.truth.shape == (4, SPOTS_PER_FRAME, 2)
+    assert np.abs(scored.truth).max() == pytest.approx(1.0, rel=0.02)
+    electrons = (scored.frames.reshape(256, -1) / 20.0 - 2.0).sum(axis=1)
+    # Windows of 144 px: an error of 40 e- in 256, and wings beyond the window.
+    assert electrons.mean() == pytest.approx(300.0, abs=15.0)
+    assert electrons.std() == pytest.approx(np.hypot(150.0, 50.0), rel=0.1)
+    method = method_for_scene(estimators()["brightest"], question.scene(300.0))
+    slopes = spots.measure(scored, method)
+    assert np.abs(np.stack([slopes.x, slopes.y], axis=-1) - scored.truth).mean() < 0.3
+    values = [10, 30]
+    found: Any = spots.measure_each(scored, method, "keep_brightest", values)
+    for value, (x, y) in zip(values, found, strict=True):
+        alone = spots.measure(scored, method.with_options({"keep_brightest": value}))
+        np.testing.assert_allclose(x, alone.x, atol=1e-6)
+        np.testing.assert_allclose(y, alone.y, atol=1e-6)
 
 
 def test_more_flux_means_smaller_errors() -> None:

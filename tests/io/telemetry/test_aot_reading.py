@@ -64,6 +64,7 @@ def test_ours_bit_for_bit(tmp_path: Path, reference: Any) -> None:
     assert np.array_equal(sensor.flux, telemetry.flux)
     assert sensor.unit == "pix"
     assert sensor.noise is not None
+    assert np.array_equal(sensor.noise[:, 0], np.square(telemetry.standard_error_x))
     assert np.array_equal(sensor.noise[:, 1], np.square(telemetry.standard_error_y))
     assert np.array_equal(sensor.noise[:, 2], telemetry.covariance_xy)
     assert sensor.flags is not None
@@ -77,6 +78,43 @@ def test_ours_bit_for_bit(tmp_path: Path, reference: Any) -> None:
         "AotSensor('SENSOR', 8 sub-apertures, layout, pixels, slopes"
         f"{'' if reference is None else ', reference'})"
     )
+
+
+@pytest.mark.filterwarnings("ignore:.*'SLOPES_NOISE' is not an AOT binary table")
+def test_what_others_read_of_ours(tmp_path: Path) -> None:
+    """Where the windows begin, x before y; references from their middles, with what was subtracted."""
+    layout = ATTRIBUTES["layout"]
+    moved = {
+        **layout,
+        "frame_shape": (30, 30),
+        "corners": [[row + 1, column + 5] for row, column in layout["corners"]],
+        "centres": [[x + 5, y + 1] for x, y in layout["centres"]],
+    }
+    path = own(tmp_path, layout=moved, reference=REFERENCE.tolist())
+    (sensor,) = aotpy.AOSystem.read_from_file(path).wavefront_sensors
+    (first,) = sensor.mask_offsets
+    assert (first.x, first.y, sensor.subaperture_size) == (5.0, 1.0, 8.0)
+    expected = REFERENCE.reshape(2, N) + np.array([[0.25], [0.0]])
+    np.testing.assert_allclose(sensor.ref_measurements.data, expected, atol=1e-6)
+
+
+def test_values_of_a_loop(tmp_path: Path) -> None:
+    def in_units_of_the_standard(system: Any) -> None:
+        system.main_telescope.enclosing_diameter = 4.2
+        system.wavefront_sensors[0].detector.pixel_scale = 1e-6  # radian
+        loop = system.loops[0]
+        loop.framerate, loop.delay, loop.closed = 500.0, 2.5, False
+        loop.control_matrix.data = np.arange(256.0).reshape(32, 2, 4)
+        loop.commands.data = np.arange(1600.0).reshape(50, 32)
+
+    sensor = read_aot(example(tmp_path / "e.fits", in_units_of_the_standard))
+    assert sensor.pixel_scale_arcsec == pytest.approx(0.206265, rel=1e-5)
+    assert (sensor.diameter_m, sensor.frame_rate_hz, sensor.delay_frames) == (4.2, 500.0, 2.5)
+    assert not sensor.is_closed
+    assert sensor.control_matrix is not None
+    assert sensor.commands is not None
+    np.testing.assert_array_equal(sensor.control_matrix[1], np.arange(8.0, 16.0))
+    np.testing.assert_array_equal(sensor.commands[2], np.arange(64.0, 96.0))
 
 
 def test_ours_is_measured_as_it_was(tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:

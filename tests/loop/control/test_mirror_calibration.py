@@ -62,7 +62,10 @@ def test_what_is_found_is_true_within_its_errors() -> None:
     score = (found.interaction - INTERACTION) / found.interaction_error
     assert 0.7 < np.sqrt(np.square(score).mean()) < 1.5
     np.testing.assert_allclose(found.reference, REFERENCE, atol=0.01)
-    assert np.abs(found.reference - REFERENCE).max() < 6 * found.reference_error.max()
+    assert 0.5 < np.sqrt(np.square((found.reference - REFERENCE) / found.reference_error).mean()) < 2
+    size = np.linalg.norm(INTERACTION, axis=0)
+    deviation = np.linalg.norm(found.interaction - INTERACTION, axis=0) / size
+    assert 0.6 < np.sqrt(np.square(deviation / found.relative_error).mean()) < 1.6
     assert found.linearity == pytest.approx(1.0, abs=0.02)
 
 

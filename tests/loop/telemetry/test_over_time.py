@@ -8,9 +8,10 @@ import pytest
 from tests.loop.telemetry.loop_cases import AIR, RATE_HZ, recorded
 
 from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.open_loop import Measured
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.telemetry import over_time
-from faintspot.loop.telemetry.over_time import table_of_pieces, turbulence_over_time
+from faintspot.loop.telemetry.over_time import Piece, table_of_pieces, turbulence_over_time
 from faintspot.loop.telemetry.page import page_of_loop
 from faintspot.loop.telemetry.report import report_of_loop
 
@@ -72,6 +73,19 @@ def test_pieces_are_all_whole_ones(
     pieces = turbulence_over_time(loop, every_s)
     assert [piece.start_s for piece in pieces] == pytest.approx([0.0, every_s, 2 * every_s])
     assert seen == [[7 + start, 6 + start + frames] for start in (0, frames, 2 * frames)]
+
+
+def test_table_of_pieces() -> None:
+    pieces = [
+        Piece(0.0, 2.5, {"r0": Measured("r0", "m", 0.1, 0.02)}),
+        Piece(2.5, 2.5, {"noise": Measured("noise", "", 0.3)}, "no r0"),
+    ]
+    rows = list(csv.reader(table_of_pieces(pieces).splitlines()))
+    assert rows == [
+        ["start_s", "duration_s", "r0 (m)", "error of r0 (m)", "noise", "error of noise"],
+        ["0", "2.5", "0.1", "0.02", "", ""],
+        ["2.5", "2.5", "", "", "0.3", ""],
+    ]
 
 
 def test_pieces_that_do_not_fit() -> None:

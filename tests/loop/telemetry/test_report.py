@@ -14,9 +14,10 @@ from faintspot.base.errors import InputError
 from faintspot.base.json_text import parse_json, to_json
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import Measured, open_loop_of
+from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER
 from faintspot.loop.telemetry.page import page_of_loop
-from faintspot.loop.telemetry.report import LoopReport, report_of_loop
+from faintspot.loop.telemetry.report import LoopReport, Part, _vibrations, report_of_loop
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +70,68 @@ def test_turbulence(report: LoopReport) -> None:
         direction = math.radians(value(report, "turbulence", f"layer {number}: direction").value)
         assert speed * math.cos(direction) == pytest.approx(x, abs=1.0)
         assert speed * math.sin(direction) == pytest.approx(y, abs=1.0)
+
+
+def test_numbers_that_follow_from_others(report: LoopReport) -> None:
+    noise = value(report, "noise", "noise of a slope")
+    tilt = value(report, "noise", "tilt over a sub-aperture")
+    to_nm = np.deg2rad(0.2 / 3600) * 0.6 * 1e9  # px of 0.2 arcsec, over 0.6 m
+    assert (tilt.value, tilt.error) == pytest.approx((to_nm * noise.value, to_nm * noise.error))
+    r0 = value(report, "turbulence", "r0 at 500 nm")
+    seeing = value(report, "turbulence", "seeing at 500 nm")
+    assert seeing.value == pytest.approx(0.98 * np.rad2deg(500e-9 / r0.value) * 3600)
+    assert seeing.error / seeing.value == pytest.approx(r0.error / r0.value)
+    layers = [
+        (value(report, "turbulence", f"layer {k}: speed"), value(report, "turbulence", f"layer {k}: share"))
+        for k in (1, 2)
+    ]
+    mean = sum(share.value * speed.value ** (5 / 3) for speed, share in layers) ** 0.6
+    wind = value(report, "turbulence", "wind speed, mean for the coherence time")
+    assert wind.value == pytest.approx(mean)
+    parts = [
+        (
+            share.value * (speed.value / mean) ** (2 / 3) * speed.error,
+            0.6 * mean * ((speed.value / mean) ** (5 / 3) - 1) * share.error,
+        )
+        for speed, share in layers
+    ]
+    assert wind.error == pytest.approx(np.linalg.norm(parts), rel=0.2)  # of 1000 draws
+    time = value(report, "turbulence", "coherence time at 500 nm")
+    assert time.value == pytest.approx(1e3 * 0.314 * r0.value / mean)
+    assert time.error / time.value == pytest.approx(np.hypot(r0.error / r0.value, wind.error / mean))
+    assert value(report, "frames", "longest gap").value == 20
+    assert value(report, "frames", "duration").value == pytest.approx(2550 / RATE_HZ)
+
+
+def test_strehl_ratios_are_those_of_the_whole_residual(report: LoopReport) -> None:
+    """Fitting 0.28 and aliasing 0.08 rad^2 at r0 = the sub-aperture's side, at 500 nm."""
+    r0 = value(report, "turbulence", "r0 at 500 nm")
+    unseen_nm2 = (500 / (2 * np.pi)) ** 2 * 0.36 * (0.6 / r0.value) ** (5 / 3)
+    for choice in report.choices:
+        residual, total = choice.residual, choice.total
+        if not math.isfinite(residual.value):
+            continue
+        assert total.value**2 == pytest.approx(residual.value**2 + unseen_nm2)
+        assert choice.strehl.value == pytest.approx(np.exp(-((2 * np.pi * total.value / 1650) ** 2)))
+        # In variance: of the replay, and of the fitting error by its coefficient (0.04) and by r0.
+        of_fitting = unseen_nm2 * np.hypot(0.04 / 0.36, 5 / 3 * r0.error / r0.value)
+        variance_error = np.hypot(2 * residual.value * residual.error, of_fitting)
+        assert 2 * total.value * total.error == pytest.approx(variance_error, rel=1e-6)
+
+
+def test_vibrations_in_nm_are_those_of_the_wavefront() -> None:
+    """A tip of slope s over a round pupil of diameter D has an rms of s D / 4; y slopes do not move."""
+    found = report_of_loop(recorded().part(slice(0, 300)), compare=False)
+    assert found.turbulence is not None
+    lines = [Vibration(mode, 40.0, 0.01, 0.1, 0.2, 0.02) for mode in ("tip", "focus")]
+    found.parts["vibrations"] = Part("")
+    _vibrations(found, replace(found.turbulence, vibrations=tuple(lines)))
+    tip, focus = (value(found, "vibrations", f"rms of {mode}") for mode in ("tip", "focus"))
+    unit = found.loop.unit  # in which slopes have an rms of 1
+    rms_nm = np.sqrt(2) * 0.1 * unit * np.deg2rad(0.2 / 3600) * 3.0 / 4 * 1e9
+    assert (tip.value, tip.error) == pytest.approx((rms_nm, 0.2 * rms_nm))
+    assert (focus.value, focus.error) == pytest.approx((0.1 * unit, 0.02 * unit))
+    assert (tip.unit, focus.unit) == ("nm", "px")
 
 
 def test_other_choices(report: LoopReport) -> None:

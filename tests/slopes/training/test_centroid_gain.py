@@ -9,6 +9,7 @@ import faintspot as fs
 from faintspot.slopes.estimators.built_in.window import Window
 from faintspot.slopes.spots.shapes import spots
 from faintspot.slopes.training import measure_centroid_gain
+from faintspot.slopes.training.centroid_gain import CentroidGain
 
 FRAMES = 2000
 DITHER = 0.3 * np.sin(2 * np.pi * 0.137 * np.arange(FRAMES))
@@ -24,6 +25,12 @@ def test_gain_and_its_error() -> None:
     away = (found.gain.T.ravel() - true) / found.standard_error.T.ravel()
     assert abs(away.mean()) < 0.25  # 3.5 standard errors of a mean of 200
     assert 0.85 < away.std() < 1.25  # 20 stretches each know their scatter to 16 %, 200 of them the mean
+
+
+def test_the_mean_counts_each_by_its_error() -> None:
+    found = CentroidGain(np.array([[1.0, 2.0], [5.0, 7.0]]), np.array([[0.1, 0.2], [np.nan, 0.0]]))
+    assert found.mean == pytest.approx(((100 * 1.0 + 25 * 2.0) / 125, np.sqrt(1 / 125)))
+    assert CentroidGain(found.gain, np.zeros((2, 2))).mean == (3.75, 0.0)
 
 
 def test_quad_cells() -> None:

@@ -82,6 +82,10 @@ def test_a_tilt_in_nanometres() -> None:
     sheet = found.sheet(points=101)
     assert sheet[50, 100] - sheet[50, 0] == pytest.approx(edge_to_edge_nm, rel=1e-6)  # late where spots go
     assert np.isnan(sheet[0, 0])
+    assert np.nanmax(np.abs(found.sheet(points=101, tilt=False))) == pytest.approx(0, abs=1e-3)
+    both = replace(found, other_standard_error=np.full(len(found.modes), 30.0)).in_unit("waves", 600.0)
+    np.testing.assert_allclose(both.coefficients, found.coefficients / 600)
+    np.testing.assert_allclose(both.mean_standard_error, np.hypot(found.mean_standard_error, 30.0) / 600)
     by_size = fit_wavefront(slopes_of(position), replace(SCALED, diameter_m=None, subaperture_m=0.6))
     np.testing.assert_allclose(by_size.coefficients, found.coefficients)
 
@@ -100,6 +104,9 @@ def test_standard_errors_are_those_of_the_scatter() -> None:
     np.testing.assert_allclose(of_residuals, scatter, rtol=0.045)
     np.testing.assert_allclose(known.mean_standard_error, scatter / np.sqrt(4000), rtol=1e-3)
     assert np.all(np.abs(known.mean) < 4.5 * known.mean_standard_error)
+    np.testing.assert_allclose(known.rms_of_frames, np.hypot(scatter, known.mean))
+    # Of 72 slopes, 27 modes leave 45 degrees of freedom.
+    assert np.sqrt(np.mean(known.residual_px**2)) == pytest.approx(0.1 * np.sqrt(45 / 72), rel=0.01)
 
 
 def test_frames_with_too_few_valid_are_left_out() -> None:

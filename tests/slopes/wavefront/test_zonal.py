@@ -92,6 +92,13 @@ def test_errors_from_residuals() -> None:
     np.testing.assert_allclose(unknown.values, known.values)
 
 
+def test_slopes_that_no_surface_has_are_left() -> None:
+    """Slopes around the middle, of 1 px at a radius of 5 sub-apertures."""
+    y, x = (LARGE.cells - 9.5).T / 5
+    found = zonal_map(slopes_of(np.stack([-y, x])[None]), LARGE)
+    assert found.residual_px == pytest.approx(np.sqrt(np.mean((x**2 + y**2) / 2)), rel=0.03)
+
+
 def test_units_and_map() -> None:
     slopes = slopes_of(slopes_of_modes(SCALED, np.array([[0.4, 0.0, 0.2, 0.0, 0.0]])))
     found, modes = zonal_map(slopes, SCALED), fit_wavefront(slopes, SCALED, modes=5)

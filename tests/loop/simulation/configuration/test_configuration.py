@@ -1,6 +1,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tests.refusals import refused
 
@@ -47,6 +48,28 @@ def test_flux_by_magnitude() -> None:
     loop = LoopConfiguration().replace("camera", photons_per_subaperture=None, magnitude=11.0)
     assert loop.photons == pytest.approx(float(loop.photometry.electrons(11.0)))
     assert 100 < loop.photons < 500
+
+    known = loop.replace("camera", zero_point=1e10, throughput=0.5, quantum_efficiency=0.8)
+    side_m, rate_hz = 0.6, known.control.frame_rate_hz
+    assert known.photons == pytest.approx(1e10 * 10**-4.4 * side_m**2 / rate_hz * 0.5 * 0.8)
+
+
+def test_what_estimators_know() -> None:
+    """Of an EMCCD: noise before the multiplication, which doubles the variance of photons."""
+    camera = {"read_noise_e": 30.0, "em_gain": 20.0, "background_e": 0.3, "dark_e": 0.2}
+    loop = LoopConfiguration().replace("camera", **camera).replace("sensor", spot_elongation=2.0, samples=24)
+    scene = loop.scene
+    assert (scene.flux_e, scene.read_noise_e, scene.background_e) == (100.0, 1.5, 0.5)
+    assert (scene.excess_noise, scene.elongation) == (2.0, 2.0)
+    assert scene.diffraction_px == pytest.approx(2.0)
+    assert scene.spot_fwhm_px == pytest.approx(0.886 * 2.0 * np.sqrt(2.0))  # geometric mean
+    r0_m = 0.15 * (loop.sensor.wavelength_m / 500e-9) ** 1.2
+    assert scene.d_over_r0 == pytest.approx(0.6 / r0_m)
+    assert LoopConfiguration().scene.excess_noise == 1.0
+    laser = LoopConfiguration().replace("laser", spot_fwhm_arcsec=1.2)
+    width = np.hypot(0.886 * 2.0, 1.2 / np.degrees(laser.pixel_scale_rad) / 3600)
+    assert laser.scene.spot_fwhm_px == pytest.approx(width)
+    assert laser.scene.elongation == 1.0
 
 
 def test_sizes_of_the_default() -> None:
