@@ -155,8 +155,8 @@ def describe(summary: Summary, output: str) -> list[str]:
     lines = [
         f"{output}: {_count(summary.n_frames, 'frame')}, {_count(summary.n_subapertures, 'sub-aperture')}"
     ]
-    if summary.origin:
-        lines.append(f"  {summary.origin}")
+    if summary.found.origin:
+        lines.append(f"  {summary.found.origin}")
     if summary.resumed_at:
         lines.append(
             f"  went on at frame {summary.resumed_at} (counted from 0); the counts are from there on"
@@ -175,20 +175,20 @@ def describe(summary: Summary, output: str) -> list[str]:
         count = summary.flag_counts.get(flag, 0)
         if count:
             lines.append(f"  {_count(count, 'slope')} {text} ({100 * count / summary.measured:.3g} %)")
-    if summary.saturation_adu is not None:
+    if summary.found.saturation_adu is not None:
         lines.append(
-            f"  values pile up at {summary.saturation_adu:g} ADU, taken as saturation; saturation_adu in "
-            "[calibration] states it"
+            f"  values pile up at {summary.found.saturation_adu:g} ADU, taken as saturation; "
+            "saturation_adu in [calibration] states it"
         )
-    if summary.background:
-        lines.append(f"  {summary.background}")
+    if summary.found.background:
+        lines.append(f"  {summary.found.background}")
     if summary.repeated_frames:
         lines.append(
             f"  {_count(summary.repeated_frames, 'frame')} repeated: every pixel as in the one before"
         )
-    if summary.reference:
-        lines.append(f"  {summary.reference}")
-    if not any(summary.flag_counts.values()) and not summary.doubtful:
+    if summary.found.reference:
+        lines.append(f"  {summary.found.reference}")
+    if not any(summary.flag_counts.values()) and not summary.found.doubtful:
         lines.append("  every slope is valid, without any flag")
     if summary.failed_frames:
         lines.append(f"  {_count(summary.failed_frames, 'frame')} without slopes: {summary.failure}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,7 +22,6 @@ from faintspot.io.locations import split_location
 from faintspot.io.references import read_reference
 from faintspot.io.slopes import create_writer
 from faintspot.io.stored.slopes_format import UNITS, pixels_in
-from faintspot.io.telemetry.aot_reading import is_aot, read_aot
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.fitting_dark import with_fitting_dark
 from faintspot.slopes.camera.mean_frame import are_repeated
@@ -33,6 +31,7 @@ from faintspot.slopes.pipeline.light import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px, with_preset, without_denoising
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes, layout_coordinates
+from faintspot.slopes.recorded.configured import configured
 from faintspot.slopes.recorded.response import response
 from faintspot.slopes.recorded.survey import Survey, frames_apart, stretches, survey
 from faintspot.slopes.sensor.layout import Layout
@@ -54,22 +53,9 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass
-class Summary:
-    """Summary of a run over recorded frames."""
+class Findings:
+    """Properties of frames and layout that no configuration states."""
 
-    n_frames: int
-    n_subapertures: int
-    resumed_at: int = 0
-    flag_counts: dict[SubapertureFlag, int] = field(default_factory=dict)
-    """Number of slopes of this call with each flag."""
-    bad_frames: int = 0
-    """Frames of this call without a single valid slope."""
-    measured: int = 0
-    """Slopes made by this call."""
-    failed_frames: int = 0
-    """Frames of this call in which an estimator in NumPy failed."""
-    failure: str = ""
-    """Error of the last of them."""
     origin: str = ""
     """Description of the values taken from a file of telemetry."""
     reference: str = ""
@@ -78,14 +64,36 @@ class Summary:
     """Saturation level found in the frames, where the configuration states none."""
     background: str = ""
     """What was taken off instead of an estimated dark that does not fit the frames."""
-    repeated_frames: int = 0
-    """Frames of this call that are the same as the one before."""
     doubtful: bool = False
     """Whether the layout has doubts that nobody has settled."""
 
+
+@dataclass
+class Summary:
+    """Summary of a run over recorded frames."""
+
+    n_frames: int
+    n_subapertures: int
+    found: Findings
+    resumed_at: int = 0
+    flag_counts: dict[SubapertureFlag, int] = field(default_factory=dict)
+    """Number of slopes of this call with each flag."""
+    bad_frames: int = 0
+    """Frames of this call without a single valid slope."""
+    failed_frames: int = 0
+    """Frames of this call in which an estimator in NumPy failed."""
+    failure: str = ""
+    """Error of the last of them."""
+    repeated_frames: int = 0
+    """Frames of this call that are the same as the one before."""
+
+    @property
+    def measured(self) -> int:
+        """Slopes made by this call."""
+        return self.n_subapertures * (self.n_frames - self.resumed_at)
+
     def add(self, slopes: Slopes) -> None:
         """Count the flags of a block."""
-        self.measured += slopes.flags.size
         self.bad_frames += int(np.count_nonzero(~slopes.valid.any(axis=-1)))
         for flag in SubapertureFlag:
             count = int(np.count_nonzero(slopes.flags & flag))
@@ -174,18 +182,19 @@ def measure_recorded(
     if follow and choices.get("mean_flux", False):
         raise InputError("follow (--follow) and mean_flux (--mean-flux): expected one of them, got both")
     key, reference = choices.get("key"), choices.get("reference")
-    described, origin, positions = _configured(configuration_file, frames, key)
+    described, origin, positions = configured(configuration_file, frames, key)
     if reference is not None:
         positions = read_reference(reference) if isinstance(reference, str | Path) else reference
     layout, settings = described.layout, _settings(described.settings, choices)
     with open_frames(frames, key=key, time_axis=choices.get("time_axis")) as source:
         _check_files(source, frames, output, layout, configuration_file)
-        summary = Summary(source.n_frames, len(layout), origin=origin, doubtful=bool(layout.doubts))
+        found = Findings(origin, doubtful=bool(layout.doubts))
+        summary = Summary(source.n_frames, len(layout), found)
         if positions is None:
-            summary.reference = reference_in_words(layout.fitted)
+            found.reference = reference_in_words(layout.fitted)
         seen = survey(source.shape, stretches(source))
         try:
-            calibration = _calibration(described.calibration, settings, layout, seen, summary)
+            calibration = _calibration(described.calibration, settings, layout, seen, found)
             spot: dict[str, Any] = described.spot
             pipeline = SlopePipeline(layout, settings, calibration, positions, **spot, threads=threads)
         except InputError as error:
@@ -250,69 +259,16 @@ def _settings(settings: Settings, choices: Choices) -> Settings:
 
 
 def _calibration(
-    calibration: Calibration, settings: Settings, layout: Layout, seen: Survey, summary: Summary
+    calibration: Calibration, settings: Settings, layout: Layout, seen: Survey, found: Findings
 ) -> Calibration:
     """Return the calibration with what the frames show: saturation, where none is stated, and the dark."""
     calibration.maps(layout.frame_shape)  # refuses maps of another shape
     if calibration.saturation_adu is None and seen.saturation_adu is not None:
-        summary.saturation_adu = seen.saturation_adu
+        found.saturation_adu = seen.saturation_adu
         calibration = replace(calibration, saturation_adu=seen.saturation_adu)
     is_wide = _are_wide(settings, layout)
-    calibration, summary.background = with_fitting_dark(calibration, layout, seen.mean, is_wide=is_wide)
+    calibration, found.background = with_fitting_dark(calibration, layout, seen.mean, is_wide=is_wide)
     return calibration
-
-
-def _configured(
-    path: str | Path, frames: Sequence[str | Path], key: str | None
-) -> tuple[Configuration, str, NDArray[Any] | None]:
-    """Return the configuration, what of it is that of an AOT file, in words, and that file's references."""
-    described = Configuration(path) if Path(path).exists() else None
-    first = None if described is not None and "layout" in described else _aot_file(frames)
-    if first is None:
-        return described or Configuration(path), "", None
-    sensor = read_aot(first[0], first[1] or key)
-    where = f"{first[0]}: sensor {sensor.name!r}"
-    if sensor.layout is None:
-        raise InputError(
-            f"{where}: expected its sub-apertures (subaperture_mask, mask_offsets, subaperture_size), found "
-            f"none; give [layout] in {path}"
-        )
-    with errors_within(where):
-        layout = Layout(**sensor.layout)
-    words = ["sub-apertures", *(["reference slopes"] if sensor.reference is not None else [])]
-    parts: dict[str, Any] = {"layout": layout}
-    if described is None:
-        if not sensor.tables:
-            command = _layout_command(frames[0], layout, path)
-            raise InputError(f"{path}: no such file, and {first[0]} has no settings; `{command}` makes one")
-        words.append("settings")
-        if sensor.parts is not None:
-            stored = configuration.unpacked(sensor.parts)
-            parts |= dict(zip(("calibration", "psf", "score"), stored, strict=True))
-    tables = sensor.tables if described is None else described.tables
-    listed = " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
-    return Configuration(path, tables, **parts), f"{listed} of {first[0]}", sensor.reference
-
-
-def _aot_file(frames: Sequence[str | Path]) -> tuple[Path, str | None] | None:
-    """Return the first file of frames and the key in its name, if it is one of telemetry (AOT)."""
-    if isinstance(frames, str | Path) or not frames:
-        return None
-    try:
-        first = split_location(frames[0])
-    except InputError:  # whoever opens it says so, after what is wrong with the configuration
-        return None
-    return first if is_aot(first[0]) else None
-
-
-def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str:
-    """Return the command that writes a configuration for a layout whose cells are on a grid."""
-    rows, columns = np.ptp(layout.cells, axis=0) + 1
-    (top, left), (bottom, right) = layout.corners.min(axis=0), layout.corners.max(axis=0) + layout.window
-    is_whole = (top, left, bottom, right) == (0, 0, *layout.frame_shape)
-    roi = [] if is_whole else ["--roi", f"{left},{top},{right},{bottom}"]
-    words = ["faintspot", "layout", str(frames), "--grid", f"{rows}x{columns}", *roi, "-o", str(path)]
-    return shlex.join(words)
 
 
 def _are_wide(settings: Settings, layout: Layout) -> bool:

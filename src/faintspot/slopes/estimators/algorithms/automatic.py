@@ -26,7 +26,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import numbers_between, one_of
 from faintspot.base.errors import InputError
-from faintspot.slopes.estimators.algorithms.automatic_constants import FEW, KEPT, SMOOTHING, STRENGTH, Kept
+from faintspot.slopes.estimators.algorithms.automatic_constants import (
+    FEW,
+    KEPT,
+    SMOOTHING,
+    STRENGTH,
+    Constants,
+)
 
 _Values = np.float64 | NDArray[np.float64]  # one number, or an array
 _Truths = np.bool_ | NDArray[np.bool_]
@@ -98,19 +104,21 @@ def automatic_strength(
     """
     sensor = _sensor(flux_e, read_noise_e, **conditions)
     lost, off = _lost_and_off(sensor, KEPT["tv"])
-    gain = STRENGTH.gaussian if sensor.gaussian else STRENGTH.diffraction
-    wings = 0.0 if sensor.gaussian else STRENGTH.wings
+    gain = STRENGTH["gaussian"] if sensor.gaussian else STRENGTH["diffraction"]
+    wings = 0.0 if sensor.gaussian else STRENGTH["wings"]
     matched = sensor.matched_squared
-    freedom = 1 + (matched / STRENGTH.noise_freedom_at**2) ** (STRENGTH.noise_freedom_exponent / 2)
-    freedom = STRENGTH.core_freedom * sensor.area + STRENGTH.noise_freedom / freedom
+    freedom = 1 + (matched / STRENGTH["noise_freedom_at"] ** 2) ** (STRENGTH["noise_freedom_exponent"] / 2)
+    freedom = STRENGTH["core_freedom"] * sensor.area + STRENGTH["noise_freedom"] / freedom
     noise = np.sqrt(sensor.variance)
     contrast = np.maximum(sensor.flux / (sensor.area * noise), 1e-3)
-    dark = gain * (noise + STRENGTH.tail * sensor.excess * sensor.counted) * contrast**-STRENGTH.decline
+    dark = (
+        gain * (noise + STRENGTH["tail"] * sensor.excess * sensor.counted) * contrast ** -STRENGTH["decline"]
+    )
     dark = dark**2 * np.maximum(1 - freedom / sensor.pixels, 0.1)
     flux = sensor.excess * sensor.flux / sensor.pixels
-    outside_core = wings * np.exp(-STRENGTH.wings_window * sensor.area / sensor.pixels)
+    outside_core = wings * np.exp(-STRENGTH["wings_window"] * sensor.area / sensor.pixels)
     found = np.minimum(np.sqrt(dark + outside_core * flux), np.sqrt(sensor.variance + flux))
-    strength = np.where(lost, STRENGTH.lost * noise, found)
+    strength = np.where(lost, STRENGTH["lost"] * noise, found)
     result: NDArray[np.float64] = np.where(off, 0.0, strength)[()]
     return result
 
@@ -185,8 +193,8 @@ def automatic_kept_pixels(
         return _whole(_kept_without_denoising(sensor), sensor)
     kept = _found(sensor, constants)
     if np.any(lost):
-        scaled = sensor.prior_signal * (9.0 / sensor.area) ** constants.shrink_area
-        held = sensor.pixels * np.exp(-constants.shrink * scaled**constants.shrink_exponent)
+        scaled = sensor.prior_signal * (9.0 / sensor.area) ** constants["shrink_area"]
+        held = sensor.pixels * np.exp(-constants["shrink"] * scaled ** constants["shrink_exponent"])
         kept = np.where(lost, np.maximum(held, kept), kept)
     if np.any(off):
         kept = np.where(off, _kept_without_denoising(sensor), kept)
@@ -226,9 +234,9 @@ class _Sensor(NamedTuple):
         """D^2 r^2 / N: range of the spots over the noise of the centre of gravity of the whole window."""
         return self.matched_squared * self.range_px**2 / self.pixels
 
-    def contrast(self, constants: Kept) -> _Values:
+    def contrast(self, constants: Constants) -> _Values:
         """Return C."""
-        tail = constants.tail * self.excess * self.counted
+        tail = constants["tail"] * self.excess * self.counted
         return self.flux / (self.area * (np.sqrt(self.variance) + tail))
 
 
@@ -265,19 +273,19 @@ def _sensor(flux_e: ArrayLike, read_noise_e: ArrayLike, **conditions: Unpack[Con
     )
 
 
-def _lost(sensor: _Sensor, constants: Kept) -> _Truths:
+def _lost(sensor: _Sensor, constants: Constants) -> _Truths:
     """Return where the core of the spot does not stand out of the noise of the dark pixels."""
-    contrast = sensor.contrast(constants) * (sensor.area / 9.0) ** constants.lost_area
-    limit = constants.lost * (sensor.pixels / 256.0) ** constants.lost_window
-    return contrast * sensor.range_px**constants.lost_range < limit
+    contrast = sensor.contrast(constants) * (sensor.area / 9.0) ** constants["lost_area"]
+    limit = constants["lost"] * (sensor.pixels / 256.0) ** constants["lost_window"]
+    return contrast * sensor.range_px ** constants["lost_range"] < limit
 
 
-def _lost_and_off(sensor: _Sensor, constants: Kept) -> tuple[_Truths, _Truths]:
+def _lost_and_off(sensor: _Sensor, constants: Constants) -> tuple[_Truths, _Truths]:
     """Return where the spot is lost, and where denoising is better omitted."""
     lost = _lost(sensor, constants)
-    off = lost & (sensor.prior_signal < constants.off_lost)
+    off = lost & (sensor.prior_signal < constants["off_lost"])
     signal = _signal_with_photons(sensor) * sensor.range_px**2 / sensor.area
-    return lost, off | (signal < constants.off) | (sensor.core_photons < constants.off_photons)
+    return lost, off | (signal < constants["off"]) | (sensor.core_photons < constants["off_photons"])
 
 
 def _signal_with_photons(sensor: _Sensor) -> _Values:
@@ -285,23 +293,23 @@ def _signal_with_photons(sensor: _Sensor) -> _Values:
     return sensor.matched_squared / (1 + FEW.photons * sensor.core_photon_variance)
 
 
-def _found(sensor: _Sensor, constants: Kept) -> _Values:
+def _found(sensor: _Sensor, constants: Constants) -> _Values:
     """Return the number of pixels to keep for a spot that stands out of the noise."""
-    threshold = constants.threshold * (1 + sensor.core_photon_variance) ** -constants.threshold_photons
+    threshold = constants["threshold"] * (1 + sensor.core_photon_variance) ** -constants["threshold_photons"]
     window = np.log1p(sensor.pixels / sensor.area) / 3.4  # 3.4: size 1 in 16 x 16 px
-    signal = sensor.contrast(constants) / (threshold * window**constants.threshold_window)
+    signal = sensor.contrast(constants) / (threshold * window ** constants["threshold_window"])
     level, area = np.log1p(signal), sensor.area
     if sensor.gaussian:
-        kept = constants.gaussian * (area + constants.gaussian_px) * level
+        kept = constants["gaussian"] * (area + constants["gaussian_px"]) * level
     else:
-        core = constants.core * (area + constants.core_px) * level
-        wings = constants.wings * (area + constants.wings_px)
-        wings = wings * np.log(np.maximum(signal / constants.wings_from, 1.0))
-        kept = np.minimum(core, constants.lobe * area + constants.lobe_px) + wings
+        core = constants["core"] * (area + constants["core_px"]) * level
+        wings = constants["wings"] * (area + constants["wings_px"])
+        wings = wings * np.log(np.maximum(signal / constants["wings_from"], 1.0))
+        kept = np.minimum(core, constants["lobe"] * area + constants["lobe_px"]) + wings
     if constants is KEPT["none"]:
         kept = kept + _few_photons(sensor)
     margin = np.maximum(np.sqrt(sensor.pixels) / 2 - sensor.range_px, 1.0)
-    limit = constants.edge * area * (margin**2 / (area * sensor.elongation)) ** constants.edge_exponent
+    limit = constants["edge"] * area * (margin**2 / (area * sensor.elongation)) ** constants["edge_exponent"]
     return kept / np.sqrt(1 + (kept / limit) ** 2)
 
 
@@ -317,7 +325,7 @@ def _kept_without_denoising(sensor: _Sensor) -> _Values:
     constants = KEPT["none"]
     found = _found(sensor, constants)
     signal = _signal_with_photons(sensor) * sensor.range_px**2 / sensor.pixels
-    held = sensor.pixels * np.exp(-constants.shrink * signal**constants.shrink_exponent)
+    held = sensor.pixels * np.exp(-constants["shrink"] * signal ** constants["shrink_exponent"])
     return np.where(_lost(sensor, constants), np.maximum(held, found), found)
 
 
