@@ -91,9 +91,7 @@ def _row(name: str, n: int, times: Times) -> Row:
 def _table(shape: tuple[int, int]) -> Table:
     layout = fs.Layout.grid(shape, pixels=16)
     frames, _ = fs.slopes.simulate.sensor_frames(
-        layout.corners,
-        layout.window,
-        layout.frame_shape,
+        layout,
         1,
         flux_e=FLUX_E,
         rng=np.random.default_rng(2),

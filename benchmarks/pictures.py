@@ -31,9 +31,7 @@ def frames(layout: fs.Layout) -> dict[str, NDArray[np.uint16]]:
     camera = fs.slopes.simulate.Detector(read_noise_e=READ_NOISE_E)
 
     def spots(flux_e: float) -> NDArray[np.uint16]:
-        frame, _ = fs.slopes.simulate.sensor_frames(
-            layout.corners, layout.window, layout.frame_shape, 1, flux_e=flux_e, detector=camera, rng=rng
-        )
+        frame, _ = fs.slopes.simulate.sensor_frames(layout, 1, flux_e=flux_e, detector=camera, rng=rng)
         pixels: NDArray[np.uint16] = np.clip(np.rint(frame[0] + 100.0), 0, 65535).astype(np.uint16)
         return pixels
 

@@ -95,9 +95,7 @@ def frames(count: int = 8) -> tuple[fs.Layout, NDArray[np.uint16]]:
     layout = fs.Layout.grid((SIDE, SIDE), pixels=PIXELS)
     detector = fs.slopes.simulate.Detector(2.0, offset_adu=LEVEL_ADU, bits=16)
     raw, _ = fs.slopes.simulate.sensor_frames(
-        layout.corners,
-        layout.window,
-        layout.frame_shape,
+        layout,
         count,
         flux_e=300.0,
         detector=detector,

@@ -12,9 +12,7 @@ import faintspot as fs
 # A sensor of 36 sub-apertures and a few noisy frames with known spot positions.
 layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
 frames, truth = fs.slopes.simulate.sensor_frames(
-    layout.corners,
-    layout.window,
-    layout.frame_shape,
+    layout,
     500,
     flux_e=200,
     detector=fs.slopes.simulate.Detector(read_noise_e=3.0),

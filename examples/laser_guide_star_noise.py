@@ -110,7 +110,7 @@ def measured(launch: Launch, psf: fs.PSF, flux: float, positions: Floats, seed: 
     """Return slopes of spots at positions (frames, n, 2) px."""
     layout = laser.layout_of(launch.side)
     frames, _ = fs.slopes.simulate.sensor_frames(
-        layout.corners, layout.window, layout.frame_shape, len(positions), flux_e=flux, psf=psf,
+        layout, len(positions), flux_e=flux, psf=psf,
         detector=laser.DETECTOR, rng=np.random.default_rng(seed), positions=positions,
     )  # fmt: skip
     settings = fs.Settings("ml", search_range_px=3.0)

@@ -101,7 +101,7 @@ def frames_of(psf: fs.PSF, side: int, flux: float, n: int, seed: int) -> tuple[A
     """Return frames and the positions of their spots (n, N, 2)."""
     layout, rng = layout_of(side), np.random.default_rng(seed)
     return fs.slopes.simulate.sensor_frames(
-        layout.corners, layout.window, layout.frame_shape, n, flux_e=flux, psf=psf, detector=DETECTOR,
+        layout, n, flux_e=flux, psf=psf, detector=DETECTOR,
         rng=rng, positions=rng.normal(0.0, MOTION_PX, (n, N, 2)),
     )  # fmt: skip
 
@@ -246,7 +246,7 @@ def efficiency_table(case: Case, advance: Advance) -> None:
     for flux in EFFICIENCY_FLUXES:
         rng = np.random.default_rng(int(flux))
         frames, truth = fs.slopes.simulate.sensor_frames(
-            layout.corners, layout.window, layout.frame_shape, SPOTS, flux_e=flux, psf=psf, detector=DETECTOR,
+            layout, SPOTS, flux_e=flux, psf=psf, detector=DETECTOR,
             rng=rng, positions=rng.normal(0.0, MOTION_PX, (SPOTS, len(kept), 2)),
         )  # fmt: skip
         steps = np.geomspace(0.3, 1.1, 6)

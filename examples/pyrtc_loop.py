@@ -62,9 +62,7 @@ class Sensor(WavefrontSensor):
         """Publish a frame, stamped with its number."""
         tilt = TILT_PX + self.commands.read()
         frames, _ = fs.slopes.simulate.sensor_frames(
-            self.layout.corners,
-            self.layout.window,
-            self.layout.frame_shape,
+            self.layout,
             1,
             flux_e=300.0,
             positions=np.broadcast_to(tilt, (1, len(self.layout), 2)),

@@ -8,4 +8,4 @@ from faintspot.slopes.simulate import sensor_frames
 
 def frames_of(layout: Layout, n: int, **options: Any) -> tuple[Any, Any]:
     """Return so many frames of a sensor and the positions of its spots, see `sensor_frames`."""
-    return sensor_frames(layout.corners, layout.window, layout.frame_shape, n, **options)
+    return sensor_frames(layout, n, **options)

@@ -20,9 +20,7 @@ layout = fs.Layout.grid((7, 7), pixels=12, outer_radius=3.5, inner_radius=0.5)
 shape = {"size": 1.3, "elongation": 1.5, "angle_deg": 30.0}
 detector = fs.slopes.simulate.Detector(read_noise_e=3.0)
 frames, truth = fs.slopes.simulate.sensor_frames(
-    layout.corners,
-    layout.window,
-    layout.frame_shape,
+    layout,
     600,
     flux_e=150.0,
     detector=detector,

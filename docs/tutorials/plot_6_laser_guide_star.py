@@ -41,9 +41,7 @@ layout = fs.Layout.grid((10, 10), pixels=10)
 camera = fs.slopes.simulate.Detector(1.0)
 psf = star.psf(profile)
 frames, truth = fs.slopes.simulate.sensor_frames(
-    layout.corners,
-    layout.window,
-    layout.frame_shape,
+    layout,
     300,
     flux_e=200.0,
     psf=psf,

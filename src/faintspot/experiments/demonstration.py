@@ -82,9 +82,7 @@ def simulate(
 ) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """Return frames in ADU and the true positions (n_frames, n, 2), px."""
     return sensor_frames(
-        layout.corners,
-        layout.window,
-        layout.frame_shape,
+        layout,
         n_frames,
         flux_e=flux_e,
         position_range_px=POSITION_RANGE_PX,

@@ -35,9 +35,7 @@ def frames(geometry: str = "square", n_frames: int = 3) -> NDArray[Any]:
     corners = np.floor(points[:, ::-1]).astype(int) - 7
     wanted = points - (corners[:, ::-1] + 7.5)
     simulated, _ = sensor_frames(
-        corners,
-        (16, 16),
-        SHAPE,
+        Layout(SHAPE, (16, 16), corners),
         n_frames,
         flux_e=2000.0,
         positions=np.tile(wanted, (n_frames, 1, 1)),

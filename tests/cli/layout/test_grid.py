@@ -22,9 +22,7 @@ def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def save_frames(layout: Layout = QUAD) -> None:
     frames, _ = sensor_frames(
-        layout.corners,
-        layout.window,
-        layout.frame_shape,
+        layout,
         20,
         flux_e=500.0,
         position_range_px=0.3,

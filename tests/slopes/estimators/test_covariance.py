@@ -43,7 +43,7 @@ def distances(slopes: fs.Slopes, truth: Any) -> Any:
 def test_ellipses_hold_95_percent(name: str, flux: float) -> None:
     """Within 2 %: the scatter of 3600 spots is 0.4 %; the rest is what a normal distribution neglects."""
     frames, truth = fs.slopes.simulate.sensor_frames(
-        LAYOUT.corners, LAYOUT.window, LAYOUT.frame_shape, FRAMES, flux_e=flux, psf=PSF,
+        LAYOUT, FRAMES, flux_e=flux, psf=PSF,
         positions=np.random.default_rng(2).normal(0.0, MOTION_PX, (FRAMES, len(STAR), 2)),
         detector=fs.slopes.simulate.Detector(1.0), rng=np.random.default_rng(3),
     )  # fmt: skip

@@ -25,7 +25,7 @@ def sensor(shape: tuple[int, int] = (3, 3)) -> Layout:
 
 def simulated(layout: Layout, n_frames: int) -> tuple[NDArray[Any], NDArray[np.float64]]:
     rng = np.random.default_rng(4)
-    return sensor_frames(layout.corners, layout.window, layout.frame_shape, n_frames, rng=rng)
+    return sensor_frames(layout, n_frames, rng=rng)
 
 
 def two_methods(layout: Layout, frames: NDArray[Any]) -> tuple[list[MeasuredSlopes], dict[str, Stages]]:

@@ -1,11 +1,24 @@
 """Frames of simulated sensors: what is known about each is chosen, not found."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.slopes.simulate import Detector, sensor_frames
+
+
+@dataclass
+class Windows:
+    """Windows that may overlap, unlike those of a `Layout`."""
+
+    corners: np.ndarray
+    window: tuple[int, int]
+    frame_shape: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.corners)
 
 
 def spot_frame(
@@ -31,10 +44,9 @@ def spot_frame(
     corners = np.stack([np.rint(nodes.imag), np.rint(nodes.real)], axis=1).astype(int) - side // 2 + margin
     wanted = np.stack([nodes.real - np.rint(nodes.real), nodes.imag - np.rint(nodes.imag)], axis=1)
     options = {"read_noise_e": 3.0, "bits": 16, "offset_adu": 100.0, **detector}
+    windows: Any = Windows(corners, (side, side), (shape[0] + 2 * margin, shape[1] + 2 * margin))
     frames, _ = sensor_frames(
-        corners,
-        (side, side),
-        (shape[0] + 2 * margin, shape[1] + 2 * margin),
+        windows,
         n_frames,
         flux_e=flux_e,
         profile="gaussian",

@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 from tests.refusals import assert_each_refused
 
+from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.simulate import Detector, sensor_frames, spots, subapertures
 from faintspot.slopes.spots.psf import PSF
 
 QUIET = Detector(0.0)
 CORNERS = np.array([[0, 0], [2, 10], [12, 1]])
+SQUARE, FLAT = (Layout((20, 24), window, CORNERS) for window in ((8, 8), (8, 6)))
 
 
 def spots_as_seen(positions: Any, *, flux_e: Any, shape: tuple[int, int] = (16, 16), **spot: Any) -> Any:
@@ -88,7 +90,7 @@ def test_many_subapertures_are_made_in_blocks() -> None:
 def test_sensor_frames_hold_each_spot_in_its_window() -> None:
     positions = np.array([[0.5, -0.5], [-1.0, 0.0], [2.0, 1.5]])
     frames, truth = sensor_frames(
-        CORNERS, (8, 6), (20, 24), 400, positions=positions, flux_e=[100.0, 0.0, 50.0], detector=QUIET,
+        FLAT, 400, positions=positions, flux_e=[100.0, 0.0, 50.0], detector=QUIET,
         rng=np.random.default_rng(5),
     )  # fmt: skip
     assert frames.shape == (400, 20, 24)
@@ -104,39 +106,21 @@ def test_sensor_frames_hold_each_spot_in_its_window() -> None:
     assert np.all(np.abs(frames.mean(axis=0) - expected) <= 7 * np.sqrt(expected / 400) + 1e-6)
 
 
-def test_windows_may_overlap() -> None:
-    corners = [[0, 0], [0, 0]]
-    frames, _ = sensor_frames(
-        corners,
-        (6, 6),
-        (6, 6),
-        1,
-        positions=[[0, 0], [0, 0]],
-        flux_e=1e6,
-        detector=QUIET,
-        rng=np.random.default_rng(14),
-    )
-    expected = spots_as_seen([[0, 0]], shape=(6, 6), flux_e=2e6)[0]
-    assert np.all(np.abs(frames[0] - expected) <= 6 * np.sqrt(expected))
-
-
 def test_sensor_frames_draw_new_positions_in_each_frame() -> None:
-    frames, truth = sensor_frames(
-        CORNERS, (8, 8), (20, 24), 30, position_range_px=2.0, rng=np.random.default_rng(6)
-    )
+    frames, truth = sensor_frames(SQUARE, 30, position_range_px=2.0, rng=np.random.default_rng(6))
     assert np.unique(truth).size == truth.size
     assert np.abs(truth).max() <= 2
     assert frames.dtype == np.float32
-    again = sensor_frames(CORNERS, (8, 8), (20, 24), 30, position_range_px=2.0, rng=np.random.default_rng(6))
+    again = sensor_frames(SQUARE, 30, position_range_px=2.0, rng=np.random.default_rng(6))
     np.testing.assert_array_equal(frames, again[0])
     moving = np.random.default_rng(0).uniform(-1, 1, (30, 3, 2))
-    _, truth = sensor_frames(CORNERS, (8, 8), (20, 24), 30, positions=moving)
+    _, truth = sensor_frames(SQUARE, 30, positions=moving)
     np.testing.assert_array_equal(truth, moving)
 
 
 def test_sensor_frames_are_the_detectors_adu() -> None:
     camera = Detector(1.0, offset_adu=500.0, bits=12, hot_pixels=[(19, 23, 1e6)])
-    frames, _ = sensor_frames(CORNERS, (8, 8), (20, 24), 3, detector=camera, rng=np.random.default_rng(7))
+    frames, _ = sensor_frames(SQUARE, 3, detector=camera, rng=np.random.default_rng(7))
     assert frames.dtype == np.uint16
     assert np.all(frames[:, 19, 23] == 4095)
     assert np.median(frames) == 500
@@ -145,7 +129,11 @@ def test_sensor_frames_are_the_detectors_adu() -> None:
 def test_many_frames_are_made_in_blocks() -> None:
     # 600 x 64 x 64 pixels are more than one block.
     frames, truth = sensor_frames(
-        [[10, 20]], (16, 16), (64, 64), 600, flux_e=1e4, detector=QUIET, rng=np.random.default_rng(13)
+        Layout((64, 64), (16, 16), np.array([[10, 20]])),
+        600,
+        flux_e=1e4,
+        detector=QUIET,
+        rng=np.random.default_rng(13),
     )
     total = frames[:, 10:26, 20:36].sum(axis=(1, 2), dtype=np.float64)
     expected = spots_as_seen(truth[:, 0], flux_e=1e4).sum(axis=(1, 2))
@@ -169,10 +157,7 @@ def test_bad_subapertures_are_named_in_one_line() -> None:
 
 def test_bad_sensors_are_named_in_one_line() -> None:
     assert_each_refused(
-        partial(sensor_frames, corners=CORNERS, window=(8, 8), frame_shape=(20, 24), n_frames=4),
-        corners=[[[13, 0]], [[0, -1]], [[0.5, 0]], [0, 0]],
-        window=["8 x 8"],
-        frame_shape=[(20,)],
+        partial(sensor_frames, layout=SQUARE, n_frames=4),
         n_frames=[0],
         positions=[np.zeros((2, 2)), np.zeros((2, 3, 2))],
         size=[np.nan],
@@ -183,7 +168,7 @@ def test_bad_sensors_are_named_in_one_line() -> None:
 def test_frames_of_psfs_hold_their_images() -> None:
     psf = PSF.analytic("gaussian", elongation=[1.0, 2.0, 3.0], angle_deg=[0.0, 20.0, 70.0], index=[2, 0, 1])
     frames, truth = sensor_frames(
-        CORNERS, (8, 6), (20, 24), 300, flux_e=100.0, psf=psf, detector=QUIET, rng=np.random.default_rng(6)
+        FLAT, 300, flux_e=100.0, psf=psf, detector=QUIET, rng=np.random.default_rng(6)
     )
     for corner, plane, positions in zip(CORNERS, (2, 0, 1), truth.swapaxes(0, 1), strict=True):
         seen = frames[:, corner[0] : corner[0] + 8, corner[1] : corner[1] + 6].mean(axis=0)
@@ -195,13 +180,11 @@ def test_frames_of_psfs_hold_their_images() -> None:
 
 def test_jitter_moves_all_spots_together() -> None:
     options: dict[str, Any] = {"position_range_px": 0.0, "detector": QUIET}
-    _, truth = sensor_frames(
-        CORNERS, (8, 6), (20, 24), 4000, jitter_px=0.3, rng=np.random.default_rng(7), **options
-    )
+    _, truth = sensor_frames(FLAT, 4000, jitter_px=0.3, rng=np.random.default_rng(7), **options)
     np.testing.assert_array_equal(truth, np.broadcast_to(truth[:, :1], truth.shape))
     # 4.9 standard errors of a standard deviation.
     assert np.all(np.abs(truth[:, 0].std(axis=0) - 0.3) <= 4.9 * 0.3 / np.sqrt(8000))
-    still = sensor_frames(CORNERS, (8, 6), (20, 24), 3, rng=np.random.default_rng(8))
-    moved = sensor_frames(CORNERS, (8, 6), (20, 24), 3, jitter_px=0.3, rng=np.random.default_rng(8))
+    still = sensor_frames(FLAT, 3, rng=np.random.default_rng(8))
+    moved = sensor_frames(FLAT, 3, jitter_px=0.3, rng=np.random.default_rng(8))
     assert not np.array_equal(still[1], moved[1])
     np.testing.assert_allclose(np.ptp(moved[1] - still[1], axis=1), 0.0, atol=1e-12)

@@ -20,9 +20,7 @@ USED = ~np.isin(np.arange(len(LAYOUT)), DARK)
 def frames(flux_e: float = 300.0, n: int = 40) -> NDArray[np.float32]:
     """Frames whose sub-apertures `DARK` have no spot."""
     images, _ = sensor_frames(
-        LAYOUT.corners,
-        LAYOUT.window,
-        LAYOUT.frame_shape,
+        LAYOUT,
         n,
         flux_e=flux_e * USED,
         detector=Detector(read_noise_e=2.0),

@@ -78,7 +78,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **st
     >>> camera = fs.slopes.simulate.Detector(read_noise_e=3.0, gain_e_per_adu=0.5, offset_adu=100.0)
     >>> layout = fs.Layout.grid((6, 6), pixels=12)
     >>> frames, _ = fs.slopes.simulate.sensor_frames(
-    ...     layout.corners, layout.window, layout.frame_shape, 40, flux_e=300.0, position_range_px=0.5,
+    ...     layout, 40, flux_e=300.0, position_range_px=0.5,
     ...     detector=camera, rng=np.random.default_rng(1),
     ... )
     >>> question = question_from_frames(frames, layout=layout)

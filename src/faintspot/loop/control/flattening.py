@@ -100,7 +100,7 @@ def flattening(slopes: Slopes, interaction: ArrayLike, stroke: float | None = No
     >>> from faintspot.loop.control.flattening import flattening
     >>> layout = fs.Layout.grid((4, 4), pixels=8)
     >>> frames, _ = fs.slopes.simulate.sensor_frames(
-    ...     layout.corners, layout.window, layout.frame_shape, 5, flux_e=1000.0,
+    ...     layout, 5, flux_e=1000.0,
     ...     positions=np.tile([0.5, 0.0], (len(layout), 1)), rng=np.random.default_rng(1),
     ... )
     >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frames)

@@ -75,7 +75,7 @@ class SlopePipeline:
     >>> import numpy as np, faintspot as fs
     >>> layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
     >>> frames, truth = fs.slopes.simulate.sensor_frames(
-    ...     layout.corners, layout.window, layout.frame_shape, 20, flux_e=200.0, rng=np.random.default_rng(1)
+    ...     layout, 20, flux_e=200.0, rng=np.random.default_rng(1)
     ... )
     >>> pipeline = fs.SlopePipeline(layout, fs.Settings(noise_std=0.5, keep_brightest=12))
     >>> slopes = pipeline(frames)

@@ -148,7 +148,7 @@ class Stages:
     --------
     >>> import numpy as np, faintspot as fs
     >>> layout = fs.Layout.grid((7, 7), pixels=16)
-    >>> frames, _ = fs.slopes.simulate.sensor_frames(layout.corners, layout.window, layout.frame_shape, 1)
+    >>> frames, _ = fs.slopes.simulate.sensor_frames(layout, 1)
     >>> stages = fs.SlopePipeline(layout, fs.Settings(noise_std=0.5, keep_brightest=12)).explain(frames[0])
     >>> stages.denoised.shape
     (49, 16, 16)

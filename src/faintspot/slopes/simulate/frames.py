@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
 from faintspot.slopes.camera.detector import Detector
+from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import SpotShape, image_shape, per_spot, spots
 from faintspot.slopes.spots.speckled import LARGEST_D_OVER_R0, speckled_images
@@ -118,9 +120,7 @@ def subapertures(
 
 
 def sensor_frames(
-    corners: ArrayLike,
-    window: tuple[int, int],
-    frame_shape: tuple[int, int],
+    layout: Layout,
     n_frames: int,
     *,
     flux_e: ArrayLike = 100.0,
@@ -139,12 +139,8 @@ def sensor_frames(
 
     Parameters
     ----------
-    corners : array_like of int, shape (n, 2)
-        Row and column of the first pixel of each sub-aperture's window.
-    window : (int, int)
-        Rows and columns (ny, nx) of each window, px.
-    frame_shape : (int, int)
-        Rows and columns of the frame, px.
+    layout : Layout
+        Windows and the frame; spots are relative to the centres of windows.
     n_frames : int
         Number of frames.
     flux_e : float or array_like, shape (n,)
@@ -176,21 +172,18 @@ def sensor_frames(
     Raises
     ------
     InputError
-        If a value is not finite, out of range or of the wrong shape, or a window leaves the frame.
+        If a value is not finite, out of range or of the wrong shape.
 
     Examples
     --------
     >>> import numpy as np, faintspot as fs
     >>> grid = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5)
-    >>> frames, truth = fs.slopes.simulate.sensor_frames(grid.corners, grid.window, grid.frame_shape, 10)
+    >>> frames, truth = fs.slopes.simulate.sensor_frames(grid, 10)
     >>> frames.shape, truth.shape
     ((10, 112, 112), (10, 37, 2))
     """
     n_frames = int(number_between("n_frames", n_frames, 1, integer=True))
-    rows, columns = image_shape("frame_shape", frame_shape)
-    window_shape = image_shape("window", window)
-    pixels = _window_pixels(corners, window_shape, (rows, columns))
-    n = len(pixels)
+    n, pixels = len(layout), _window_pixels(layout)
     position_rng, noise_rng = spawn(rng, 2)
     truth = _true_positions(positions, position_range_px, (n_frames, n, 2), position_rng)
     jitter = number_between("jitter_px", jitter_px, 0.0)
@@ -199,14 +192,14 @@ def sensor_frames(
     camera = _camera(detector)
     if psf and spot_shape:
         raise InputError(f"psf: expected no {', '.join(spot_shape)} beside it")
-    sensor = n, window_shape, flux_e
+    sensor = n, layout.window, flux_e
     images_of = _spots_of_psf(psf, *sensor) if psf else _spots(*sensor, spot_shape)
     blocks = []
-    block = max(1, _BLOCK_PIXELS // max(rows * columns, pixels.size))
+    block = max(1, _BLOCK_PIXELS // max(math.prod(layout.frame_shape), pixels.size))
     for start in range(0, n_frames, block):
         part = truth[start : start + block]
         images = images_of(part)
-        mean_e = _place_windows(images.reshape(len(part), -1), pixels, (rows, columns))
+        mean_e = _place_windows(images.reshape(len(part), -1), pixels, layout.frame_shape)
         blocks.append(camera.expose(mean_e, spawn(noise_rng, 1)[0]))
     return np.concatenate(blocks), truth
 
@@ -273,20 +266,12 @@ def _true_positions(
     return np.broadcast_to(given, shape).copy()
 
 
-def _window_pixels(corners: object, window: tuple[int, int], frame: tuple[int, int]) -> NDArray[np.int64]:
+def _window_pixels(layout: Layout) -> NDArray[np.int64]:
     """Return the flat frame index of each window's pixels, shape (n, ny * nx)."""
-    first: NDArray[np.int64] = numbers_between("corners", corners, 0, 2**31, integer=True)
-    if first.ndim != 2 or first.shape[1] != 2:
-        raise InputError(f"corners: expected shape (n, 2) holding row and column, got {first.shape}")
-    outside = np.flatnonzero(np.any(first + np.array(window) > np.array(frame), axis=1))
-    if outside.size:
-        row, column = first[outside[0]]
-        raise InputError(
-            f"corners[{outside[0]}] = ({row}, {column}): window {window} leaves the frame {frame}"
-        )
-    window_rows = first[:, 0, None, None] + np.arange(window[0])[:, None]
-    window_columns = first[:, 1, None, None] + np.arange(window[1])
-    flat: NDArray[np.int64] = (window_rows * frame[1] + window_columns).reshape(len(first), -1)
+    height, width = layout.window
+    rows = layout.corners[:, 0, None, None] + np.arange(height)[:, None]
+    columns = layout.corners[:, 1, None, None] + np.arange(width)
+    flat: NDArray[np.int64] = (rows * layout.frame_shape[1] + columns).reshape(len(layout), -1)
     return flat
 
 

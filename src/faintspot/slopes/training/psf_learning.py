@@ -121,7 +121,7 @@ def learn_psf(
     >>> import numpy as np, faintspot as fs
     >>> layout = fs.Layout.grid((4, 4), pixels=12)
     >>> frames, _ = fs.slopes.simulate.sensor_frames(
-    ...     layout.corners, layout.window, layout.frame_shape, 40, flux_e=150.0, rng=np.random.default_rng(1)
+    ...     layout, 40, flux_e=150.0, rng=np.random.default_rng(1)
     ... )
     >>> psf = fs.learn_psf(frames, layout, rng=np.random.default_rng(2))
     >>> print(f"{psf.fwhm_px.mean():.1f} px; in truth {fs.PSF.analytic().fwhm_px.mean():.1f}")

@@ -60,7 +60,7 @@ def slope_discrepancy(slopes: Slopes, layout: Layout) -> Discrepancy:
     >>> rng = np.random.default_rng(1)
     >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5)
     >>> frames, _ = fs.slopes.simulate.sensor_frames(
-    ...     layout.corners, layout.window, layout.frame_shape, 200, position_range_px=0.0, rng=rng
+    ...     layout, 200, position_range_px=0.0, rng=rng
     ... )
     >>> settings = fs.Settings("window", flux_e=100.0, spot_fwhm_px=1.8)
     >>> slopes = fs.SlopePipeline(layout, settings, fs.Calibration(read_noise_e=0.1))(frames)

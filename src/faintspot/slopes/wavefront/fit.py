@@ -156,7 +156,7 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     >>> import numpy as np, faintspot as fs
     >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5, pixel_scale_arcsec=0.5, subaperture_m=0.6)
     >>> frames, _ = fs.slopes.simulate.sensor_frames(
-    ...     layout.corners, layout.window, layout.frame_shape, 5, flux_e=1000.0,
+    ...     layout, 5, flux_e=1000.0,
     ...     positions=np.tile([0.3, 0.0], (len(layout), 1)), rng=np.random.default_rng(1),
     ... )
     >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frames)
