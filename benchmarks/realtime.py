@@ -26,6 +26,7 @@ from benchmarks.measuring import Row, Table, Times, median_ratio, spread
 from benchmarks.realtime_processes import SMALL, USUAL, engine_and_camera
 from faintspot import Calibration, Layout, Settings, SlopePipeline
 from faintspot.engine.engine import Engine
+from faintspot.engine.options import EngineOptions
 from faintspot.engine.pixels.pixel_ring import PixelRing
 
 FRAMES, RATE_HZ, ROWS = 1500, 300, 112
@@ -64,7 +65,7 @@ def _own_us(iterations: int) -> dict[str, float]:
             name,
             lambda each: SlopePipeline(layout, each, Calibration(dark=0.0, read_noise_e=1.0)),
             settings,
-            images_every=0,
+            EngineOptions(images_every=0),
         )
         path = engine.live.running.paths(ring)[0]
         with engine._streams.held():

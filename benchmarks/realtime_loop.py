@@ -25,11 +25,13 @@ from benchmarks.measuring import Row, Table
 from benchmarks.realtime_processes import engine_and_telescope
 from faintspot import Calibration, Layout, Settings, SlopePipeline
 from faintspot.engine.engine import Engine
+from faintspot.engine.options import EngineOptions
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.loop.control.base import CONTROLS
-from faintspot.loop.control.configuration import Control, ControlOptions, load_control
+from faintspot.loop.control.configuration import Control, load_control
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.kalman.predictor import SlopeModel
+from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.control import slope_turbulence
 from faintspot.loop.simulation.engine_files import write_engine_files
@@ -79,7 +81,7 @@ def _row(label: str, layout: Layout, control: Control, target_us: float) -> Row:
             name,
             lambda each: SlopePipeline(layout, each, Calibration(dark=0.0, read_noise_e=1.0)),
             Settings("brightest", keep_brightest=12),
-            images_every=0,
+            EngineOptions(images_every=0),
             control=control,
         )
         loop, streams = engine.loop, engine._streams

@@ -13,6 +13,7 @@ from tests.simulated import frames_of
 import faintspot as fs
 from faintspot.base.closing import Closing
 from faintspot.engine.engine import Engine
+from faintspot.engine.options import EngineOptions
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.telemetry.ring import TelemetryRing
 
@@ -31,13 +32,19 @@ def simulated(n: int) -> NDArray[np.uint16]:
     return np.asarray(frames, np.uint16)
 
 
+def split(options: dict[str, Any], **others: Any) -> tuple[EngineOptions]:
+    """Take the options of `EngineOptions` out of those of an engine."""
+    names = options.keys() & EngineOptions.__dataclass_fields__.keys()
+    return (EngineOptions(**others, **{name: options.pop(name) for name in names}),)
+
+
 class Bench(Closing):
     """Every frame that the engine measures is in `records`, in the order in which it was measured."""
 
     def __init__(self, name: str | None = None, **options: Any) -> None:
         self.name = name or f"fs_test_{uuid4().hex[:12]}"
         self._ring: PixelRing | None = None
-        self.engine = Engine(self.name, make, SETTINGS, **options)
+        self.engine = Engine(self.name, make, SETTINGS, *split(options), **options)
         self._thread = threading.Thread(target=self.engine.run)
         self.telemetry = TelemetryRing.attach(self.name)
         self._thread.start()

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pyshmem
+from tests.engine.bench import split
 from tests.loop.simulation.loop_cases import faint
 from tests.patience import wait_for
 
@@ -57,8 +58,8 @@ def make_engine(
         name,
         make,
         described.settings if settings is None else settings,
+        *split(options, images_every=0),
         control=control,
-        images_every=0,
         **options,
     )
 

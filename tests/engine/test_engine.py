@@ -38,7 +38,7 @@ def test_every_frame_is_published_once_and_bit_for_bit(bench: Bench) -> None:
     counters = bench.engine.counters
     assert (counters.processed, counters.dropped, counters.skipped) == (6, 0, 0)
     assert counters.iterations == make(SETTINGS)(data).iterations.sum()
-    assert bench.engine.latencies.as_dict()["count"] == 6
+    assert bench.engine.account.latencies.as_dict()["count"] == 6
 
 
 def test_what_is_published(bench: Bench) -> None:

@@ -32,7 +32,7 @@ def test_a_short_frame(bench: Bench) -> None:
         bench.until(lambda: bench.engine.counters.processed == 2)
     counters = bench.engine.counters
     assert (counters.short, counters.dropped, counters.skipped) == (1, 1, 0)
-    assert bench.engine.lost_because == {CAUSES[INCOMPLETE]: 1}
+    assert bench.engine.account.lost_because == {CAUSES[INCOMPLETE]: 1}
     assert bench.records["lost"].sum() == 1
     assert bench.records["frame"].tolist() == [0, 2]
     assert np.array_equal(bench.slopes[2], make(SETTINGS)(data[2]).vector)
@@ -75,7 +75,11 @@ def test_overtaken_frames_are_dropped_never_mixed(bench: Bench) -> None:
         bench.until(lambda: counters.processed + counters.dropped >= n_frames - 1)
     assert counters.dropped > 0
     assert counters.frames_in == counters.processed + counters.dropped
-    assert counters.dropped == counters.torn + counters.passed_over == sum(bench.engine.lost_because.values())
+    assert (
+        counters.dropped
+        == counters.torn + counters.passed_over
+        == sum(bench.engine.account.lost_because.values())
+    )
     records = bench.records
     assert len(records) == counters.processed
     assert (np.diff(records["frame"]) > 0).all()

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from typing import Any
 
 import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.engine.loop.control_loop import CLOSED, OPEN, STATES, ControlLoop
+from faintspot.engine.options import EngineOptions, FrameInput
 from faintspot.engine.path.frame_path import FramePath
 from faintspot.engine.path.slope_prior import SlopePrior
-from faintspot.engine.path.timing import CAUSES, IN_TIME, INCOMPLETE, WORKER, Counters, Latencies, Lateness
+from faintspot.engine.path.timing import INCOMPLETE, WORKER, FrameAccount
 from faintspot.engine.path.workers import Workers
-from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.pixels.pixel_ring import PixelRing, living_ring
 from faintspot.engine.settings.estimators import EngineEstimators
 from faintspot.engine.settings.following import DarkFollower, FluxFollower
 from faintspot.engine.settings.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
@@ -24,8 +26,8 @@ from faintspot.engine.settings.running_settings import Change, RunningSettings
 from faintspot.engine.streams.prediction_stream import PredictionStream
 from faintspot.engine.streams.slope_streams import SlopeStreams
 from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.io.frame_numbers import left_out
-from faintspot.loop.control.configuration import NONE, STREAM, Control
+from faintspot.loop.control.configuration import Control
+from faintspot.loop.control.options import NONE, STREAM
 from faintspot.loop.control.recorded import packed_control
 from faintspot.slopes.pipeline.configuration import packed, to_text
 from faintspot.slopes.pipeline.settings import Settings
@@ -34,20 +36,6 @@ from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 _WATCH_S = 0.02  # between two checks of the watcher
 _LOOKS_FOR_DARK = 10  # ditto, between two searches for dark sub-apertures
 _LOOKS_BETWEEN_STALE = 10  # asking the operating system whether the source is alive takes longer
-DEADLINE_S = 1e-3
-IMAGES_EVERY = 100
-
-
-class FrameInput(Protocol):
-    """Source that brings frames into the ring in the engine's own thread."""
-
-    def step(self) -> bool:
-        """Wait a moment for a frame; return whether one has come."""
-        ...
-
-    def close(self) -> None:
-        """Release all resources."""
-        ...
 
 
 class Engine:
@@ -61,27 +49,15 @@ class Engine:
         Function that makes a pipeline from settings.
     settings : Settings
         Initial settings.
-    threads : int
-        Number of threads that measure.
-    cpus : sequence of int, optional
-        Processors to pin threads to; the first one is for the thread that calls `run`.
+    options : EngineOptions, optional
     interleaving : Interleaving, optional
         Configurations that take turns: changes of the settings, and controllers.
-    deadline_s : float
-        Latency from a frame's last row beyond which slopes count as late.
     source : FrameInput, optional
         Brings frames into the ring in the thread that measures them, e.g. a `StreamBridge`. Default: another
         process writes into the ring.
-    images_every : int
-        Interval, in frames of one configuration, at which telemetry keeps images; 0: no images.
     control : Control, optional
         Computes commands from slopes; the loop starts open. Default: no commands. The reference slopes are
         for the pipelines.
-    mean_flux : float, optional
-        Number of frames over which the flux of each sub-aperture is averaged, for estimators that use it.
-        Default: they keep `flux_e`.
-    polls : bool
-        Whether threads poll for rows all the time. Default: they sleep until shortly before rows are due.
 
     Attributes
     ----------
@@ -98,26 +74,18 @@ class Engine:
         name: str,
         make_pipeline: Callable[[Settings], SlopePipeline],
         settings: Settings,
+        options: EngineOptions | None = None,
         *,
-        threads: int = 1,
-        cpus: Sequence[int] | None = None,
         interleaving: Interleaving | None = None,
         source: FrameInput | None = None,
-        deadline_s: float = DEADLINE_S,
-        images_every: int = IMAGES_EVERY,
         control: Control | None = None,
-        mean_flux: float | None = None,
-        polls: bool = False,
     ) -> None:
-        self.name, self._deadline_ns, self._images_every = name, round(deadline_s * 1e9), images_every
+        options = EngineOptions() if options is None else options
+        threads = options.threads
+        self.name, self._images_every = name, options.images_every
         interleaving = Interleaving() if interleaving is None else interleaving
-        self.counters, self.latencies = Counters(), Latencies()
-        self._lateness = Lateness()
-        self.late_because: dict[str, int] = {}
-        """Number of late frames by cause; see `faintspot.engine.path.timing`."""
-        self.lost_because: dict[str, int] = {}
-        """Number of lost frames by cause."""
-        self._lost = 0, IN_TIME  # since the last measured frame: their number, and the last one's cause
+        self.account = FrameAccount(options.deadline_s)
+        self.counters = self.account.counters
         self.refused: list[str] = []
         """Parts of the real-time scheduling that were not permitted."""
         self.learning: dict[str, Any] | None = None
@@ -127,14 +95,19 @@ class Engine:
         self._waiting = False
         self._arrival, self._number = 0, -1  # of the last measured frame
         # Frames of an own source are complete when they are measured: there is nothing to sleep for.
-        self._sleeps, self._last_row_ns = source is None and not polls, 0
+        self._sleeps, self._last_row_ns = source is None and not options.polls, 0
         self._measured: dict[int, int] = {}  # frames, by configuration
         self._stopping = threading.Event()
-        self._workers = Workers(threads - 1, cpus) if threads > 1 else None
+        self._resources = ExitStack()
+        """Closed in reverse order when the engine has run."""
+        self._workers = Workers(threads - 1, options.cpus) if threads > 1 else None
         prior = None if control is None else SlopePrior(len(control.interaction) // 2)
-        self.preparer = SettingsPreparer(make_pipeline, interleaving, self._workers, deadline_s, prior)
+        self.preparer = SettingsPreparer(
+            make_pipeline, interleaving, self._workers, options.deadline_s, prior
+        )
         self.live: RunningSettings[EnginePlan] = RunningSettings(self.preparer.prepare, settings)
         self.estimators = EngineEstimators(self.live, self.preparer)
+        mean_flux = options.mean_flux
         self._flux = None if mean_flux is None else FluxFollower(self.live, mean_flux)
         self._dark = DarkFollower(self.live.running.pipelines[0])
         layout = self.live.running.layout
@@ -165,6 +138,11 @@ class Engine:
                 parts=packed(first.calibration, *first.spot),
                 control=packed_control(control),
             )
+            self._resources.callback(self._telemetry.close)
+            self._resources.callback(self._streams.close)
+            for part in (source, self._workers, self._prediction, self._flux):
+                if part is not None:
+                    self._resources.callback(part.close)
         except InputError:
             self._streams.close()
             raise
@@ -183,10 +161,7 @@ class Engine:
             "source": None if ring is None else {"pid": ring.creator_pid, "frame": ring.progress()[0]},
             "source_refused": self._incompatible or None,
             "preparing": self.live.preparing,
-            "counters": self.counters.as_dict(),
-            "late_because": dict(self.late_because),
-            "lost_because": dict(self.lost_because),
-            "latency": self.latencies.as_dict(),
+            **self.account.as_dict(),
             "estimator": self.live.settings.estimator.name,
             "subapertures": len(self.live.running.layout),
             "dark": np.flatnonzero(self._dark.dark).tolist(),
@@ -217,12 +192,9 @@ class Engine:
         before = self.preparer.interleaving
         new = Interleaving.parse(text, every, before.first + len(before.methods))
         self._make_ready(new)
-        self.preparer.interleaving = new
-        try:
+        with self.preparer.kept_if_right():
+            self.preparer.interleaving = new
             return self.live.renew({METHODS: new.labels, FIRST_METHOD: new.first, EVERY: new.every})
-        except BaseException:
-            self.preparer.interleaving = before
-            raise
 
     def renew_spots(
         self, make_pipeline: Callable[[Settings], SlopePipeline], changes: Mapping[str, object]
@@ -234,13 +206,9 @@ class Engine:
         InputError
             When the settings do not fit; nothing changes then.
         """
-        before = self.preparer.make_pipeline
-        self.preparer.make_pipeline = make_pipeline
-        try:
+        with self.preparer.kept_if_right():
+            self.preparer.make_pipeline = make_pipeline
             return self.live.renew(changes)
-        except BaseException:
-            self.preparer.make_pipeline = before
-            raise
 
     def _make_ready(self, interleaving: Interleaving) -> None:
         """Prepare the controllers of all configurations, or refuse them."""
@@ -267,7 +235,7 @@ class Engine:
         try:
             with self._streams.held(), np.errstate(all="ignore"):  # a warning takes time and is not shown
                 while not self._done(n_frames):
-                    ring = self._attached()
+                    ring, self._incompatible = living_ring(self.name, self.live.running.layout.frame_shape)
                     if ring is None:
                         self._await_ring()
                     else:
@@ -285,16 +253,7 @@ class Engine:
         finally:
             self._stopping.set()
             watcher.join()
-            if self._flux is not None:
-                self._flux.close()
-            if self._prediction is not None:
-                self._prediction.close()
-            if self._workers is not None:
-                self._workers.close()
-            if self._source is not None:
-                self._source.close()
-            self._streams.close()
-            self._telemetry.close()
+            self._resources.close()
 
     def _done(self, n_frames: int | None) -> bool:
         return self._stopping.is_set() or (n_frames is not None and self.counters.processed >= n_frames)
@@ -305,25 +264,6 @@ class Engine:
             self._stopping.wait(_WATCH_S)
         else:
             self._source.step()
-
-    def _attached(self) -> PixelRing | None:
-        """Return the source's ring; None if there is none that is alive and fits."""
-        try:
-            ring = PixelRing.attach(self.name, follows=True)
-        except InputError:
-            self._incompatible = ""
-            return None
-        if ring.stale or ring.closed:
-            return None
-        shape, expected = ring.shape, self.live.running.layout.frame_shape
-        fits = shape == expected and ring.dtype in (np.uint16, np.float32)
-        self._incompatible = ""
-        if not fits:
-            self._incompatible = (
-                f"frames of {shape[0]} x {shape[1]} pixels, {ring.dtype}; "
-                f"expected {expected[0]} x {expected[1]}, uint16 or float32"
-            )
-        return ring if fits else None
 
     def _follow(self, ring: PixelRing, n_frames: int | None) -> None:
         """Measure the frames of a ring until it ends."""
@@ -398,14 +338,13 @@ class Engine:
         self, ring: PixelRing, path: FramePath, method: int, arrival: int, number: int, explained: bool
     ) -> None:
         """Publish the slopes first, then the details, unless the frame was overwritten meanwhile."""
-        counters, slopes = self.counters, path.slopes
+        slopes = path.slopes
         moment = ring.last_row_time_ns(number, arrival) if number >= 0 else 0
         if not moment:
             self._lose(ring, path, arrival, number)
             return
         self._streams.publish_slopes(slopes, number)
         published = time.monotonic_ns()
-        latency = published - moment
         loop, state, commands = self.loop, 0, None
         if loop is not None:
             was_closed = loop.closed
@@ -414,69 +353,45 @@ class Engine:
             loop.latencies.add(time.monotonic_ns() - moment)
             state = STATES.index(CLOSED if was_closed else OPEN)
             loop.look_after(slopes.flux)
-        self.latencies.add(latency)
         path.flag_doubtful()
         change = self.live.change_number
         self._streams.publish_marks((number, method, change, moment, published))
-        invalid, limited, iterations = self._streams.publish_details(slopes, number)
-        late = latency > self._deadline_ns
-        cause = self._cause(late, path)
-        causes = cause, *self._lost
+        details = self._streams.publish_details(slopes, number)
+        causes = self.account.published(published - moment, path, preparing=self.live.preparing is not None)
         self._telemetry.write(
             number, method, change, (moment, published), slopes, causes=causes, loop=state, commands=commands
         )
-        self._lost = 0, IN_TIME
         self._dark.take(path.frame)
         if self._flux is not None:
             self._flux.take(slopes.flux)
         if self._streams.commands_lost:
-            counters.commands_renewed += self._streams.renew_commands()
+            self.counters.commands_renewed += self._streams.renew_commands()
         if explained:
             np.copyto(self._raw, ring.slot(number))
             if ring.intact(number, arrival):
                 self._telemetry.write_images(number, self._raw, path.denoised)
-        counters.frames_in += 1
-        counters.processed += 1
-        counters.invalid_subapertures += invalid
-        counters.at_iteration_limit += limited
-        counters.iterations += iterations
-        counters.late += late
-        if late:
-            _count(self.late_because, cause)
-        counters.estimator_failures += path.failed
-        if self._arrival and number != self._number + 1:
-            skipped = left_out(self._number, number)
-            counters.skipped += max(skipped, 0)
-            counters.repeated += number <= self._number
-            counters.source_restarts += skipped < 0 and number > self._number
+        self.account.finished(details, number, self._number if self._arrival else None)
         self._measured[method] = self._measured.get(method, 0) + 1
         self._arrival, self._number = arrival, number
         self._last_row_ns = moment if self._sleeps else 0
 
     def _lose(self, ring: PixelRing, path: FramePath, arrival: int, number: int) -> None:
         """Count a frame that cannot be published, and find the next one."""
-        counters, cause, passed_over = self.counters, self._cause(True, path), 0
+        cause, passed_over = None, 0
         self._last_row_ns = 0
         if number >= 0 and ring.intact(number, arrival):  # the next one began before its last row arrived
-            counters.short += 1
+            self.counters.short += 1
             self._number, cause = number, INCOMPLETE
         elif ring.number_of(arrival) >= 0:  # complete, but a worker died and its share is missing
             self._number, cause = ring.number_of(arrival), WORKER
         else:  # overwritten: continue with the newest frame
             newest = ring.arrivals
             passed_over = max(newest - 1 - arrival, 0)
-            counters.torn += 1
-            counters.passed_over += passed_over
+            self.counters.torn += 1
+            self.counters.passed_over += passed_over
             self._number = ring.number_of(newest) - 1
         self._arrival = arrival + passed_over
-        counters.frames_in += 1 + passed_over
-        counters.dropped += 1 + passed_over
-        _count(self.lost_because, cause, 1 + passed_over)
-        self._lost = self._lost[0] + 1 + passed_over, cause
-
-    def _cause(self, late: bool, path: FramePath) -> int:
-        """Return why a frame was late or lost, if it was."""
-        return self._lateness.cause(late, self.live.preparing is not None, path.woken_late, path.sleeps)
+        self.account.lost(1 + passed_over, path, preparing=self.live.preparing is not None, cause=cause)
 
     # The watcher's thread ---------------------------------------------------------------------------
 
@@ -512,22 +427,11 @@ class Engine:
             if stopping and (ring is None or not self._waiting):
                 return
 
-    def _tell_of_loop(self, last: dict[str, object]) -> dict[str, Any]:
+    def _tell_of_loop(self, last: dict[str, object]) -> dict[str, object]:
         """Write to telemetry when the loop was opened, and why, or closed, or its gain changed."""
         if self.loop is None:
             return last
-        loop = self.loop
-        state = {
-            "loop": loop.state,
-            "gain": loop.gain,
-            "opened_because": loop.opened_because,
-            "closed_again_because": loop.closed_again_because,
-        }
+        state = self.loop.noted_state()
         if state != last:
             self._telemetry.write_change(self._number, self.live.change_number, state, None)
         return state
-
-
-def _count(causes: dict[str, int], cause: int, frames: int = 1) -> None:
-    """Count frames of a cause."""
-    causes[CAUSES[cause]] = causes.get(CAUSES[cause], 0) + frames

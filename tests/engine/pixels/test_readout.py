@@ -110,7 +110,7 @@ def test_overruns_are_counted_and_left_behind(ring: PixelRing, monkeypatch: pyte
         starts.append(now[0])
         now[0] += 25_000_000 if len(starts) <= 3 else 1_000_000
 
-    def wait_until(moment: int) -> None:
+    def wait_until(moment: int, spins: bool) -> None:
         now[0] = max(now[0], moment)
 
     starts: list[int] = []

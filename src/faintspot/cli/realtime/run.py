@@ -103,6 +103,7 @@ def run(
     """
     from faintspot.base.errors import InputError
     from faintspot.engine.engine import Engine
+    from faintspot.engine.options import EngineOptions
     from faintspot.engine.path.pipeline_maker import PipelineMaker
     from faintspot.engine.request_handlers import LENGTHY, commands_of
     from faintspot.engine.requests.requests import ControlServer
@@ -126,12 +127,10 @@ def run(
             None if control is None else control.reference,
         ),
         settings,
-        cpus=cpus,
+        EngineOptions(cpus=cpus, deadline_s=deadline_us * 1e-6, **options),
         source=None if stream is None else _followed(stream, name),
         interleaving=None if interleave is None else Interleaving.parse(interleave, every),
-        deadline_s=deadline_us * 1e-6,
         control=control,
-        **options,
     )
     if engine.loop is not None and close_loop:
         engine.loop.close()

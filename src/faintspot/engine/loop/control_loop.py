@@ -354,6 +354,15 @@ class ControlLoop:
             "latency": self.latencies.as_dict(),
         }
 
+    def noted_state(self) -> dict[str, object]:
+        """Return the state whose changes are written to telemetry."""
+        return {
+            "loop": self.state,
+            "gain": self.gain,
+            "opened_because": self.opened_because,
+            "closed_again_because": self.closed_again_because,
+        }
+
     def _warm_up(self, n: int) -> None:
         """Compile all controllers; the mirror's commands stay."""
         commands = self._line.latest.copy()

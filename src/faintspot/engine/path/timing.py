@@ -10,6 +10,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.engine.path.frame_path import FramePath
+from faintspot.io.frame_numbers import left_out
+
 _BITS = 7  # 2^7 bins in every factor of 2: each is at most 1/128 of its value wide
 _LONGEST_NS = 2**37 - 1  # 137 s; longer durations count in the last bin
 _BINS = ((_LONGEST_NS.bit_length() - _BITS - 1) << _BITS) + 2 ** (_BITS + 1)
@@ -169,3 +172,82 @@ class Lateness:
         grown = [after > before for after, before in zip(now, self._before, strict=True)]
         self._before = now
         return PREPARING + (preparing, *grown, True).index(True) if late else IN_TIME
+
+
+class FrameAccount:
+    """Counters and latencies of an engine's frames, and why frames were late or lost.
+
+    Parameters
+    ----------
+    deadline_s : float
+        Latency beyond which slopes count as late.
+    """
+
+    def __init__(self, deadline_s: float) -> None:
+        self.counters, self.latencies = Counters(), Latencies()
+        self.late_because: dict[str, int] = {}
+        """Number of late frames by cause; see `CAUSES`."""
+        self.lost_because: dict[str, int] = {}
+        """Number of lost frames by cause."""
+        self._deadline_ns, self._lateness = round(deadline_s * 1e9), Lateness()
+        self._lost = 0, IN_TIME  # since the last published frame: their number, and the last one's cause
+
+    def published(self, latency_ns: int, path: FramePath, *, preparing: bool) -> tuple[int, int, int]:
+        """Take the latency of a frame; return its cause, and number and last cause of frames lost before."""
+        late, counters = latency_ns > self._deadline_ns, self.counters
+        self.latencies.add(latency_ns)
+        cause = self._lateness.cause(late, preparing, path.woken_late, path.sleeps)
+        counters.estimator_failures += path.failed
+        counters.late += late
+        if late:
+            _count(self.late_because, cause)
+        causes = cause, *self._lost
+        self._lost = 0, IN_TIME
+        return causes
+
+    def finished(self, details: tuple[int, int, int], number: int, before: int | None) -> None:
+        """Count a frame of which everything has been published.
+
+        Parameters
+        ----------
+        details : (int, int, int)
+            Invalid slopes, slopes at the iteration limit, iterations.
+        number : int
+        before : int, optional
+            Number of the frame before; None for the first one.
+        """
+        counters = self.counters
+        counters.frames_in += 1
+        counters.processed += 1
+        invalid, limited, iterations = details
+        counters.invalid_subapertures += invalid
+        counters.at_iteration_limit += limited
+        counters.iterations += iterations
+        if before is not None and number != before + 1:
+            skipped = left_out(before, number)
+            counters.skipped += max(skipped, 0)
+            counters.repeated += number <= before
+            counters.source_restarts += skipped < 0 and number > before
+
+    def lost(self, frames: int, path: FramePath, *, preparing: bool, cause: int | None = None) -> None:
+        """Count lost frames; the cause is found out if it is not given."""
+        found = self._lateness.cause(True, preparing, path.woken_late, path.sleeps)
+        cause = found if cause is None else cause
+        self.counters.frames_in += frames
+        self.counters.dropped += frames
+        _count(self.lost_because, cause, frames)
+        self._lost = self._lost[0] + frames, cause
+
+    def as_dict(self) -> dict[str, object]:
+        """Return everything as plain values."""
+        return {
+            "counters": self.counters.as_dict(),
+            "late_because": dict(self.late_because),
+            "lost_because": dict(self.lost_because),
+            "latency": self.latencies.as_dict(),
+        }
+
+
+def _count(causes: dict[str, int], cause: int, frames: int = 1) -> None:
+    """Count frames of a cause."""
+    causes[CAUSES[cause]] = causes.get(CAUSES[cause], 0) + frames

@@ -268,3 +268,22 @@ def _slot_bytes(description: Mapping[str, Any]) -> int:
     """Return the bytes from one slot to the next, whole pages."""
     rows, columns = description["shape"]
     return up_to_pages(rows * columns * np.dtype(description["dtype"]).itemsize)
+
+
+def living_ring(name: str, shape: tuple[int, int]) -> tuple[PixelRing | None, str]:
+    """Return the ring of a source that is alive, and a description of its frames if they do not fit.
+
+    Without a ring, or if frames are not of this shape and uint16 or float32, there is None.
+    """
+    try:
+        ring = PixelRing.attach(name, follows=True)
+    except InputError:
+        return None, ""
+    if ring.stale or ring.closed:
+        return None, ""
+    if ring.shape == shape and ring.dtype in (np.uint16, np.float32):
+        return ring, ""
+    return None, (
+        f"frames of {ring.shape[0]} x {ring.shape[1]} pixels, {ring.dtype}; "
+        f"expected {shape[0]} x {shape[1]}, uint16 or float32"
+    )

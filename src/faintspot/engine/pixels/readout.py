@@ -154,7 +154,7 @@ class Readout(ABC):
             if frame is None:
                 break
             moment = start + round(tick * self._period_ns)
-            self._wait_until(moment)
+            _wait_until(moment, self._spins)
             now = time.monotonic_ns()
             self.late += now - moment > LATE * self._period_ns
             self._publish(moment, frame)
@@ -166,7 +166,7 @@ class Readout(ABC):
                 reported_ns = now
         if published:
             # The last frame takes its full frame time too, so that rates are right.
-            self._wait_until(start + round(tick * self._period_ns))
+            _wait_until(start + round(tick * self._period_ns), self._spins)
         if progress is not None:
             progress(published)
         return CameraReport(published, self.overruns, (time.monotonic_ns() - start) / 1e9, self.late)
@@ -176,16 +176,10 @@ class Readout(ABC):
         ring = self._ring
         slot = ring.begin(self._next)
         for first, last, delay in self._blocks:
-            self._wait_until(moment + delay)
+            _wait_until(moment + delay, self._spins)
             slot[first:last] = frame[first:last]
             ring.rows_ready(last)
         self._next += 1
-
-    def _wait_until(self, moment: int) -> None:
-        if self._spins:
-            _wait_until(moment)
-        else:
-            time.sleep(max(0, moment - time.monotonic_ns()) / 1e9)
 
 
 def readout_type(detector: Detector) -> np.dtype[np.generic]:
@@ -195,10 +189,10 @@ def readout_type(detector: Detector) -> np.dtype[np.generic]:
     return np.dtype(np.uint16 if detector.bits <= 16 else np.uint32)
 
 
-def _wait_until(moment: int) -> None:
+def _wait_until(moment: int, spins: bool) -> None:
     """Wait until a time of CLOCK_MONOTONIC, ns; return at once if it is past."""
-    remaining = moment - time.monotonic_ns()
-    if remaining > _SPIN_NS:
-        time.sleep((remaining - _SPIN_NS) / 1e9)
-    while time.monotonic_ns() < moment:
+    remaining, busy = moment - time.monotonic_ns(), _SPIN_NS if spins else 0
+    if remaining > busy:
+        time.sleep((remaining - busy) / 1e9)
+    while spins and time.monotonic_ns() < moment:
         pass

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -132,6 +133,16 @@ class SettingsPreparer:
         if is_built_in(settings.estimator):
             self._built_in = settings.estimator
         return prepared
+
+    @contextmanager
+    def kept_if_right(self) -> Iterator[None]:
+        """Undo changes of `make_pipeline` and `interleaving` that are made inside if an error leaves it."""
+        before = self.make_pipeline, self.interleaving
+        try:
+            yield
+        except BaseException:
+            self.make_pipeline, self.interleaving = before
+            raise
 
     def built_in(self, settings: Settings) -> Settings:
         """Return settings in which the last built-in estimator replaces a user-defined one."""
