@@ -23,7 +23,7 @@ from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinne
 from benchmarks.prediction import TELEMETRY_GAIN, Case
 from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.identification.learning import learn_controller, relearn
-from faintspot.loop.control.identification.model import Kalman, LoopPlant
+from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.predictive_control import LoopOfControl, PredictiveControl
 from faintspot.loop.control.integrator import CompiledIntegrator
 from faintspot.loop.control.kalman.compiled import CompiledKalman
@@ -32,6 +32,7 @@ from faintspot.loop.control.kalman.local_model import neighbours_within
 from faintspot.loop.control.kalman.local_predictor import local_shapes
 from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
+from faintspot.loop.control.plant import LoopPlant
 from faintspot.loop.control.reconstructor import Reconstructor
 from faintspot.loop.simulation import load_loop
 from faintspot.loop.simulation.control import slope_turbulence
@@ -69,8 +70,8 @@ def small_table() -> Table:
         return Predictive(line, plant.interaction, predictor, clean)
 
     def compiled(model: SlopeModel) -> Controller:
-        matrix, predictor = plant.reconstructor.matrix, SlopePredictor(model, errors**2)
-        return CompiledKalman(line(), plant.interaction, matrix, matrix, predictor, clean, 0.3, control.leak)
+        predictor = SlopePredictor(model, errors**2)
+        return CompiledKalman(line(), plant, plant.reconstructor.matrix, predictor, 0.3)
 
     controllers: dict[str, Controller] = {
         "integrator": plant.integrator(0.4, line()),
@@ -101,8 +102,7 @@ def sizes_table() -> Table:
         interaction = rng.standard_normal((slopes, commands)) / np.sqrt(slopes)
         line = CommandDelayLine(commands, 2, 1.0)
         name = f"{slopes} slopes, {commands} commands"
-        of_mirror = interaction, interaction.T, interaction.T
-        filtered = CompiledKalman(line, *of_mirror, predictor, interaction.T, 0.3, 0.01)
+        filtered = CompiledKalman(line, _plant(interaction), interaction.T, predictor, 0.3)
         controllers[name] = partial(
             filtered.update, 0.1 * rng.standard_normal(slopes), rng.uniform(0.5, 1.5, slopes)
         )
@@ -136,13 +136,17 @@ def _of_size(across: int) -> list[Row]:
     integrator = CompiledIntegrator(line, interaction, interaction.T, 0.3, 0.01)
     rows = [_timed(f"{across} x {across}, integrator", integrator, 4 * interaction.size, 2 * n)]
     del integrator
-    none = np.zeros((0, 0))
-    reconstructor = Reconstructor(interaction.T, none, none, interaction.T)
     arrays = random_filter(cells, rng)
     line = CommandDelayLine(commands, 2, 1.0)
     same = np.zeros((commands, commands))  # the residuals compare as equal: the guard keeps the filter
-    guarded = LargeGuarded(line, interaction, reconstructor, same, arrays, 0.3, 0.01)
+    guarded = LargeGuarded(line, _plant(interaction), same, arrays, 0.3)
     return [*rows, _timed(f"{across} x {across}, prediction", guarded, 4 * interaction.size, 2 * n)]
+
+
+def _plant(interaction: NDArray[np.float64]) -> LoopPlant:
+    """Return a loop in which the transposed interaction matrix is the reconstructor."""
+    none = np.zeros((0, 0))
+    return LoopPlant(interaction, Reconstructor(interaction.T, none, none, interaction.T), 2, 0.01)
 
 
 def _random_sensor(across: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

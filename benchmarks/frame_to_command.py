@@ -35,13 +35,15 @@ from benchmarks import pyrtc
 from benchmarks.control import random_filter
 from benchmarks.measuring import Row, Table
 from faintspot.engine.engine import Engine
+from faintspot.engine.options import EngineOptions
 from faintspot.engine.path.timing import Latencies
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.requests.scheduling import real_time
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CommandDelayLine, Controller
-from faintspot.loop.control.configuration import Control, ControlOptions
+from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
+from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.control.reconstructor import Reconstructor
 
 PIXELS, LEVEL_ADU, READOUT, COMMANDS_PER_SUBAPERTURE = 8, 100, 0.8, 1.04
@@ -98,8 +100,7 @@ class RandomControl(Control):
             return super().controller(line)
         arrays = random_filter(self.centres, np.random.default_rng(2))
         same = np.zeros((self.commands, self.commands))  # residuals compare as equal: the filter stays
-        of_loop = self.interaction, self.reconstructor, same
-        return LargeGuarded(line, *of_loop, arrays, 0.3, self.options.leak)
+        return LargeGuarded(line, self.plant, same, arrays, 0.3)
 
     def rehearse(self) -> None:
         """See `Control`; these matrices need no test."""
@@ -109,9 +110,7 @@ def stack_of(layout: fs.Layout) -> NDArray[np.uint16]:
     """Simulate raw frames."""
     detector = fs.slopes.simulate.Detector(2.0, offset_adu=LEVEL_ADU, bits=16)
     raw, _ = fs.slopes.simulate.sensor_frames(
-        layout.corners,
-        layout.window,
-        layout.frame_shape,
+        layout,
         _STACK,
         flux_e=300.0,
         detector=detector,
@@ -186,7 +185,7 @@ def measured(across: int, kind: str) -> dict[str, NDArray[np.float64]]:
         name,
         lambda each: fs.SlopePipeline(layout, each, calibration),
         fs.Settings("thresholded", threshold_e=0.0),
-        images_every=0,
+        EngineOptions(images_every=0),
         control=control,
     )
     assert engine.loop is not None

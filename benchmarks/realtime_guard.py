@@ -13,7 +13,8 @@ import numpy as np
 
 from benchmarks.measuring import Row, Table
 from faintspot.engine.loop.control_loop import ControlLoop
-from faintspot.loop.control.configuration import Control, ControlOptions
+from faintspot.loop.control.configuration import Control
+from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.simulation import Method, load_loop
 from faintspot.loop.simulation.simulation import measure_gains
 from faintspot.loop.simulation.telescope.calibration import make_pipeline

@@ -20,11 +20,11 @@ from benchmarks.prediction import Make, rivals
 from faintspot.base.statistics import mean_by_blocks
 from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.model import LoopPlant
 from faintspot.loop.control.identification.open_loop import open_loop_of, site_of_loop
 from faintspot.loop.control.identification.recording import Recording
-from faintspot.loop.control.identification.replay import replayed_frames
+from faintspot.loop.control.plant import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.control.replay import replayed_frames
 
 RATE_HZ, DIAMETER_M, LEAK = 1000.0, 10.0, 0.01
 DELAYS = 2, 1, 3

@@ -17,10 +17,11 @@ from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, CommandDelayLine, Controller
-from faintspot.loop.control.configuration import Control, ControlOptions
+from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.integrator import Integrator
+from faintspot.loop.control.options import ControlOptions
 from faintspot.slopes.kernels.driver.products import add_slopes
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout

@@ -8,8 +8,9 @@ from tests.loop.control.control_cases import INTERACTION
 
 from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.loop.guard import Guard, LostSpots
-from faintspot.loop.control.configuration import Control, ControlOptions
+from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.integrator import INVALID_PART, MEAN_SQUARE
+from faintspot.loop.control.options import ControlOptions
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout
 

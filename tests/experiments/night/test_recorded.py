@@ -29,7 +29,7 @@ from faintspot.experiments.night.recorded_page import (
     summary_of_recording,
     text_of_recording,
 )
-from faintspot.loop.control.configuration import ControlOptions
+from faintspot.loop.control.options import ControlOptions
 from faintspot.slopes.sensor.layout import Layout
 
 pytest.importorskip("zarr")

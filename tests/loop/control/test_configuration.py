@@ -10,7 +10,8 @@ from tests.loop.control.control_cases import INTERACTION
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.configuration import Control, ControlOptions, load_control, save_control
+from faintspot.loop.control.configuration import Control, load_control, save_control
+from faintspot.loop.control.options import ControlOptions
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.sensor.layout import Layout
 

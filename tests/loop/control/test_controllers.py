@@ -131,13 +131,10 @@ class TestGuardedKalman(ControllerTests):
 
 class TestCompiledKalman(ControllerTests):
     def make(self, line: CommandDelayLine) -> Any:
-        matrix, clean = PLANT.reconstructor.matrix, PLANT.reconstructor.clean
-        return CompiledKalman(line, INTERACTION, matrix, PHASE, predictor(), clean, GAIN, PLANT.leak)
+        return CompiledKalman(line, PLANT, PHASE, predictor(), GAIN)
 
 
 class TestLargeGuarded(ControllerTests):
     def make(self, line: CommandDelayLine) -> Any:
         arrays = local_filter(TURBULENCE.layers(), FRAME_S, ERRORS**2)
-        return LargeGuarded(
-            line, INTERACTION, PLANT.reconstructor, PHASE_OF_COMMANDS, arrays, GAIN, PLANT.leak
-        )
+        return LargeGuarded(line, PLANT, PHASE_OF_COMMANDS, arrays, GAIN)

@@ -107,9 +107,8 @@ def test_a_sub_aperture_that_dies_in_the_loop_is_left_out_until_it_lives(values:
     """Noticed within 200 frames; then its slopes have no influence, also a single other value."""
     lines, controllers, stuck = [CommandDelayLine(12, 2) for _ in range(2)], [], []
     for line in lines:
-        predictor, reconstructor = SlopePredictor(MODEL, np.full(18, 0.25), np.zeros(9)), PLANT.reconstructor
-        of_loop = INTERACTION, reconstructor.matrix, PHASE, predictor, reconstructor.clean, 0.4, PLANT.leak
-        controllers.append(CompiledKalman(line, *of_loop))
+        predictor = SlopePredictor(MODEL, np.full(18, 0.25), np.zeros(9))
+        controllers.append(CompiledKalman(line, PLANT, PHASE, predictor, 0.4))
     for number, open_loop in enumerate(telemetry(450).open_loop_px):
         for which, (controller, line) in enumerate(zip(controllers, lines, strict=True)):
             slopes = open_loop + INTERACTION @ line.acting

@@ -4,10 +4,10 @@ import numpy as np
 from tests.loop.control.control_cases import TURBULENCE, telemetry
 
 from faintspot.loop.control.base import CommandDelayLine, Controller
-from faintspot.loop.control.identification.model import LoopPlant
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 from faintspot.loop.control.phase import residual_phase
+from faintspot.loop.control.plant import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 CELLS = np.array([[row, column] for row in range(5) for column in range(5)])
@@ -64,18 +64,8 @@ def test_a_filter_for_reversed_winds_leaves_no_more_than_the_integrator() -> Non
     )
     noise_px, gain = 1.2, 0.1
     lines = [CommandDelayLine(36, 2) for _ in range(3)]
-    matrix, clean = PLANT.reconstructor.matrix, PLANT.reconstructor.clean
     filters = [
-        CompiledKalman(
-            line,
-            INTERACTION,
-            matrix,
-            PHASE,
-            SlopePredictor(model, np.full(50, noise_px**2)),
-            clean,
-            gain,
-            0.01,
-        )
+        CompiledKalman(line, PLANT, PHASE, SlopePredictor(model, np.full(50, noise_px**2)), gain)
         for line, model in zip(lines, (true, wrong), strict=False)
     ]
     good, bad = (_left(each, line, noise_px, true) for each, line in zip(filters, lines, strict=False))

@@ -7,7 +7,8 @@ import pytest
 from tests.loop.telemetry.alternation_cases import MATRIX
 from tests.refusals import refused
 
-from faintspot.loop.control.configuration import Control, ControlOptions
+from faintspot.loop.control.configuration import Control
+from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.control.recorded import packed_control, unpacked_control
 
 

@@ -11,8 +11,9 @@ from tests.refusals import refused
 import faintspot as fs
 from faintspot.base.flags import SubapertureFlag
 from faintspot.engine.loop.control_loop import ControlLoop
-from faintspot.loop.control.configuration import Control, ControlOptions, load_control, save_control
+from faintspot.loop.control.configuration import Control, load_control, save_control
 from faintspot.loop.control.integrator import MEAN_SQUARE
+from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.control.removed_modes import RemovedModes
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 

@@ -12,10 +12,11 @@ from tests.loop.control.control_cases import CELLS, FRAME_S, INTERACTION, teleme
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime import learn as realtime_learn
 from faintspot.loop.control.base import OpenLoopTelemetry
-from faintspot.loop.control.configuration import Control, ControlOptions, load_control, save_control
+from faintspot.loop.control.configuration import Control, load_control, save_control
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import open_loop_of
 from faintspot.loop.control.integrator import CompiledIntegrator
+from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.telemetry.recording import recorded_loop, site_of
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.pipeline.settings import Settings

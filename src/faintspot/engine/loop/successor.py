@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.loop.control.base import CommandDelayLine, Controller, without_prior
-from faintspot.loop.control.configuration import CONTROLLER, Control
+from faintspot.loop.control.configuration import Control
+from faintspot.loop.control.options import CONTROLLER
 
 Floats = NDArray[np.float64]
 

@@ -26,7 +26,8 @@ from faintspot.engine.telemetry.numbers import MethodDifference, compared_method
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope.simulated_telescope import TRUTH
 from faintspot.loop.control.base import KALMAN
-from faintspot.loop.control.configuration import TABLE, save_control
+from faintspot.loop.control.configuration import save_control
+from faintspot.loop.control.options import TABLE
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
 from faintspot.loop.simulation.engine_files import CONFIGURATION, fixed_window, write_engine_files
 from faintspot.slopes.pipeline.configuration import Configuration, save

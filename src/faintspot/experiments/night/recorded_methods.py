@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintspot.base.toml_files import parse_text
 from faintspot.io.telemetry.recording import Telemetry
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, split_control
-from faintspot.loop.control.configuration import ControlOptions
+from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.control.recorded import RecordedControl
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.slopes.estimators.registry import estimators

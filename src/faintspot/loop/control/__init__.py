@@ -1,9 +1,10 @@
 """Controllers that turn slopes into mirror commands, independent of any simulation. Read in this order.
 
-`commands` (delay line to the mirror), `base` (what every controller offers), `reconstructor` (slopes to
-commands), `integrator`, `kalman` (prediction), `telemetry` (open-loop slopes), `identification` (controllers
-learnt from it), `configuration` (table [control]). Beside them: `mirror_calibration`, from pokes, and
-`flattening`, the command that flattens a measured wavefront.
+`base` (delay line to the mirror, what every controller offers, open-loop slopes), `reconstructor` (slopes
+to commands), `integrator`, `replay` and `plant` (the loop for which controllers are made), `kalman`
+(prediction), `identification` (controllers learnt from telemetry), `options` and `configuration` (table
+[control]). Beside them: `mirror_calibration`, from pokes, and `flattening`, the command that flattens a
+measured wavefront.
 
 For the loops of other systems: `Recording`, `learn` and `PredictiveControl`.
 """

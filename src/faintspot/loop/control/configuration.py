@@ -12,131 +12,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array
-from faintspot.base.config.options import Options, setting
 from faintspot.base.config.tables import Tables, save_tables
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.toml_files import check_keys
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, CommandDelayLine, Controller
 from faintspot.loop.control.integrator import CompiledIntegrator
+from faintspot.loop.control.options import BEYOND_ALL, CONTROLLER, NONE, STREAM, TABLE, ControlOptions
+from faintspot.loop.control.plant import LoopPlant
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
-from faintspot.loop.control.removed_modes import REMOVED_MODES, TIP_TILT_FOCUS, RemovedModes
+from faintspot.loop.control.removed_modes import TIP_TILT_FOCUS, RemovedModes
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
 
 if TYPE_CHECKING:
-    from faintspot.loop.control.identification.model import Kalman, LoopPlant
+    from faintspot.loop.control.identification.model import Kalman
 
 Floats = NDArray[np.float64]
 
-TABLE = "control"
 INTERACTION, REFERENCE = "interaction_matrix", "reference_slopes"
 MODEL = "model"
 FILES = (INTERACTION, REFERENCE, MODEL)
-NONE, CONTROLLER, STREAM = "none", "controller", "stream"
-"""Sources of predictions."""
 PRIOR = "prior_std_px"
 _LARGEST_SLOPE_PX = 1e4
-_BEYOND_ALL = 1e30  # of commands without a limit: finite in float32, too
-
-
-@dataclass(frozen=True, eq=False)
-class ControlOptions(Options, table=TABLE):
-    """Options of the table [control]."""
-
-    controller: str = setting(
-        INTEGRATOR,
-        "Controller that turns slopes into commands; all but the integrator need a `model`.",
-        choices=tuple(CONTROLS),
-    )
-    gain: float = setting(0.4, "Loop gain of the integrator.", low=0, high=2)
-    leak: float = setting(0.01, "Fraction by which commands decay in each frame.", low=0, high=1)
-    delay_frames: int = setting(
-        2,
-        "Delay: the command computed from frame k first acts during the exposure of frame k + delay_frames.",
-        low=1,
-        high=100,
-        whole=True,
-    )
-    largest_command: float | None = setting(
-        None,
-        "Stroke limit, in the unit of the interaction matrix; clipped commands do not accumulate "
-        "(anti-windup). Default: no limit.",
-        low=0,
-        high=_BEYOND_ALL,
-        low_open=True,
-    )
-    largest_condition: float = setting(
-        30.0,
-        "Largest condition number of the reconstructor: modes of the mirror with smaller singular values are "
-        "not controlled.",
-        low=1,
-        high=1e6,
-    )
-    centroid_gain: float = setting(
-        1.0,
-        "Centroid gain relative to the interaction matrix; slopes are divided by it. 1 for a matrix measured "
-        "with the same estimator at the same flux.",
-        low=0.01,
-        high=100,
-    )
-    removed_modes: str = setting(
-        REMOVED_MODES[0],
-        'Modes that slopes of a laser guide star do not show: "tip_tilt" or "tip_tilt_focus". They are '
-        "removed before reconstruction and are not controlled; for integrators.",
-        choices=REMOVED_MODES,
-    )
-    prediction: str | None = setting(
-        None,
-        'Source of the predicted slopes for estimators with a prior: "controller"; "stream", another program '
-        'by the stream NAME_prediction; or "none". Default: "controller" for a Kalman filter, else "none".',
-        choices=(NONE, CONTROLLER, STREAM),
-    )
-    learn_every_s: float = setting(
-        10.0,
-        "Time between two learnings of a Kalman filter while the engine runs, each from the telemetry since "
-        "the one before; 0: never.",
-        unit="s",
-        low=0,
-        high=3600,
-    )
-    guard_frames: int = setting(
-        50,
-        "Number of frames over which the guard averages.",
-        low=1,
-        high=1_000_000,
-        whole=True,
-    )
-    most_invalid: float = setting(
-        0.5,
-        "Fraction of invalid slopes above which the guard opens the loop; 1: never.",
-        low=0,
-        high=1,
-    )
-    largest_residual_px: float | None = setting(
-        None,
-        "Rms of the slopes above which the guard opens the loop. Default: 1.25 times the open-loop rms, if "
-        "the loop was open for `guard_frames` before; else a quarter of a window's side.",
-        unit="px",
-        low=0,
-        high=_BEYOND_ALL,
-        low_open=True,
-    )
-    most_at_limit: float = setting(
-        0.5,
-        "Fraction of commands at `largest_command` above which the guard opens the loop; 1: never.",
-        low=0,
-        high=1,
-    )
-    proven_frames: int = setting(
-        1000,
-        "Number of frames after which a closed loop counts as proven. If the guard opens a proven loop, it "
-        "closes it again after `guard_frames`, with a learnt controller's integrator; 0: never.",
-        low=0,
-        high=1_000_000,
-        whole=True,
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,8 +132,6 @@ class Control:
     @property
     def plant(self) -> LoopPlant:
         """Loop properties that learnt controllers use."""
-        from faintspot.loop.control.identification.model import LoopPlant
-
         options = self.options
         return LoopPlant(self.controlled, self.reconstructor, options.delay_frames, options.leak)
 
@@ -316,7 +213,7 @@ class Control:
     def line(self) -> CommandDelayLine:
         """Return the delay line of commands to a flat mirror."""
         options = self.options
-        return CommandDelayLine(self.commands, options.delay_frames, options.largest_command or _BEYOND_ALL)
+        return CommandDelayLine(self.commands, options.delay_frames, options.largest_command or BEYOND_ALL)
 
     def controller(self, line: CommandDelayLine) -> Controller:
         """Return the controller, which sends its commands along `line`."""

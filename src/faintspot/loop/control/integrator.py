@@ -235,12 +235,33 @@ def displaced_flux(
 
 
 @_compiled
-def integrate(
-    slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, next_row: Any, memory: Any
+def integrate_wavefront(
+    wavefront: Any, latest: Any, gain: Any, keep: Any, largest: Any, command: Any
 ) -> float:
     """Write the next command: `keep` times the latest minus `gain` times the wavefront, clipped.
 
     Return the command's sum before it was clipped.
+
+    Parameters
+    ----------
+    wavefront : (commands,) float32 or float64 array
+        As the commands that cause it.
+    latest, command : (commands,) float64 array
+    gain, keep, largest : float
+    """
+    total = 0.0
+    for c in range(command.shape[0]):
+        value = keep * latest[c] - gain * wavefront[c]
+        total += value
+        command[c] = min(max(value, -largest), largest)
+    return total
+
+
+@_compiled
+def integrate(
+    slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, next_row: Any, memory: Any
+) -> float:
+    """Write the next command from slopes; see `integrate_wavefront`.
 
     Parameters
     ----------
@@ -256,13 +277,9 @@ def integrate(
     memory : ProductMemory
         Of the wavefront.
     """
-    latest, out = rows[(next_row or rows.shape[0]) - 1], rows[next_row]
+    latest = rows[(next_row or rows.shape[0]) - 1]
     finish_product(columns, slopes, memory)
-    total = 0.0
-    for c in range(out.shape[0]):
-        command = keep * latest[c] - gain * memory.result[c]
-        total += command
-        out[c] = min(max(command, -largest), largest)
+    total: float = integrate_wavefront(memory.result, latest, gain, keep, largest, rows[next_row])
     return total
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.configuration import INTERACTION, TABLE, Control, ControlOptions
+from faintspot.loop.control.configuration import INTERACTION, Control
+from faintspot.loop.control.options import TABLE, ControlOptions
 
 _MOST_BYTES = 1 << 20
 _SHAPE, _TYPE = "shape", "<f4"

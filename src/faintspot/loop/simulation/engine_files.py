@@ -11,7 +11,8 @@ import numpy as np
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
 from faintspot.loop.control.base import INTEGRATOR, KALMAN
-from faintspot.loop.control.configuration import TABLE, save_control
+from faintspot.loop.control.configuration import save_control
+from faintspot.loop.control.options import TABLE
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.learning import learnt_control
 from faintspot.loop.simulation.methods import PRIOR, Method

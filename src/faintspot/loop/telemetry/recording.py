@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from faintspot.base.checks import numbers_between
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import INTEGRATOR, KALMAN, split_control, without_prior
-from faintspot.loop.control.configuration import NONE, STREAM, Control
+from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.identification.open_loop import FEWEST_FRAMES
 from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.control.options import NONE, STREAM
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.turbulence.strength import OUTER_SCALE_M
 from faintspot.slopes.sensor.layout import Layout

@@ -10,10 +10,11 @@ from tests.loop.control.control_cases import COVARIANCES, FRAME_S, INTERACTION, 
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
-from faintspot.loop.control.configuration import Control, ControlOptions
+from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.kalman.compiled import CompiledKalman
+from faintspot.loop.control.options import ControlOptions
 from faintspot.slopes.camera.calibration import Calibration
 
 FRAMES = telemetry(600, 0.3)

@@ -23,7 +23,7 @@ Both = list[tuple[Any, CommandDelayLine]]
 def both(model: SlopeModel = MODEL, largest: float = 1e30, steps: int = STEPS, **options: Any) -> Both:
     """Return the filter in NumPy and the compiled one, each with where its commands go."""
     lines = [CommandDelayLine(COMMANDS, 2, largest) for _ in range(2)]
-    matrix, clean = PLANT.reconstructor.matrix, PLANT.reconstructor.clean
+    clean = PLANT.reconstructor.clean
 
     def predictor() -> SlopePredictor:
         return SlopePredictor(model, np.full(M, USUAL_PX2), np.full(M // 2, 0.5 * USUAL_PX2))
@@ -33,9 +33,7 @@ def both(model: SlopeModel = MODEL, largest: float = 1e30, steps: int = STEPS, *
 
     plain = partial(PLANT.integrator, GAIN)
     slow = Guarded(lines[0], INTERACTION, PHASE, learnt, plain, **options)
-    fast = CompiledKalman(
-        lines[1], INTERACTION, matrix, PHASE, predictor(), clean, GAIN, PLANT.leak, steps=steps, **options
-    )
+    fast = CompiledKalman(lines[1], PLANT, PHASE, predictor(), GAIN, steps=steps, **options)
     return list(zip((slow, fast), lines, strict=True))
 
 

@@ -49,12 +49,10 @@ def both() -> tuple[list[GuardedController], list[CommandDelayLine]]:
     plain = partial(PLANT.integrator, GAIN)
     fast = LargeGuarded(
         lines[1],
-        INTERACTION,
-        PLANT.reconstructor,
+        PLANT,
         PHASE_OF_COMMANDS,
         arrays,
         GAIN,
-        PLANT.leak,
         **options,
     )
     slow = Guarded(lines[0], INTERACTION, PHASE, learnt, plain, **options)
@@ -101,7 +99,7 @@ def test_a_command_that_is_begun_while_slopes_are_measured_is_the_same(
     monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
     arrays, rng, chosen = wrong_filter(), np.random.default_rng(3), []
     lines = [CommandDelayLine(COMMANDS, 2, 0.8) for _ in range(2)]
-    others = INTERACTION, PLANT.reconstructor, PHASE_OF_COMMANDS, arrays, GAIN, PLANT.leak
+    others = PLANT, PHASE_OF_COMMANDS, arrays, GAIN
     whole, begun = (LargeGuarded(line, *others, noise_factor=1.3) for line in lines)
     n = M // 2
     for number, open_loop in enumerate(FRAMES.open_loop_px):
@@ -133,7 +131,7 @@ def test_nothing_is_begun_with_a_prior_or_before_the_frame_is_complete(
 ) -> None:
     monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
     line = CommandDelayLine(COMMANDS, 2, 0.8)
-    others = INTERACTION, PLANT.reconstructor, PHASE_OF_COMMANDS, wrong_filter(), GAIN, PLANT.leak
+    others = PLANT, PHASE_OF_COMMANDS, wrong_filter(), GAIN
     controller = LargeGuarded(line, *others)
     controller.update(np.zeros(M), np.full(M, 0.3))
     assert not controller.begin_product(1, 1.0)

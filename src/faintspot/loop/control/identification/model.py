@@ -18,15 +18,11 @@ from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays, save_arrays
 from faintspot.loop.control.base import (
     KALMAN,
-    SETTLE_FRAMES,
     CommandDelayLine,
-    Controller,
     OpenLoopTelemetry,
     Predictor,
     usual_noise,
 )
-from faintspot.loop.control.identification.replay import mean_residual, replayed_frames, replayed_integrators
-from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
@@ -34,13 +30,13 @@ from faintspot.loop.control.kalman.local_model import STEPS
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter, local_shapes
 from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor, steady_covariance
-from faintspot.loop.control.reconstructor import Reconstructor
+from faintspot.loop.control.plant import LoopPlant, settled
+from faintspot.loop.control.replay import mean_residual
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.layers import Identified
 
 Floats = NDArray[np.float64]
-Make = Callable[[CommandDelayLine], Controller]
 
 _MOST_SLOPES = 300  # whose filter lets each correct all others
 _LAYERS = "first", "second", "driving_px2"
@@ -62,50 +58,6 @@ _RANGES = {
     "share": (0.0, 1.0),
 }
 """Accepted ranges of arrays; other values are damaged or in another unit, and products may overflow."""
-
-
-def settled(telemetry: OpenLoopTelemetry) -> int:
-    """Return the number of frames at the start of a replay that are not scored."""
-    return min(SETTLE_FRAMES, len(telemetry) // 3)
-
-
-@dataclass(frozen=True, eq=False)
-class LoopPlant:
-    """Properties of the loop that a controller needs: matrices, delay, leak."""
-
-    interaction: Floats
-    """(m, commands): slopes [px] per unit of each command."""
-    reconstructor: Reconstructor
-    delay_frames: int
-    leak: float
-
-    def integrator(self, gain: float, line: CommandDelayLine) -> Controller:
-        """Return an integrator of this loop."""
-        return Integrator(line, self.interaction, self.reconstructor, gain, self.leak)
-
-    def replayed(self, make: Make, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
-        """Return the squared residual that a controller would have left; see `replayed_frames`."""
-        return replayed_frames(make, telemetry, self.interaction, phase, self.delay_frames)
-
-    def replayed_integrators(
-        self, gains: Sequence[float], telemetry: OpenLoopTelemetry, phase: Floats
-    ) -> Floats:
-        """Return the squared residuals of integrators, (gains, frames)."""
-        of_loop = self.interaction, self.reconstructor, phase, self.delay_frames, self.leak
-        return replayed_integrators(gains, telemetry, *of_loop)
-
-    def best_gain(
-        self, gains: Sequence[float], telemetry: OpenLoopTelemetry, phase: Floats
-    ) -> tuple[float, float]:
-        """Return the gain of the integrator that leaves the least phase variance, and that variance."""
-        residuals = self.replayed_integrators(gains, telemetry, phase)
-        variances = [mean_residual(residual, telemetry, settled(telemetry)) for residual in residuals]
-        best = int(np.argmin(variances))
-        return gains[best], variances[best]
-
-    def residual(self, make: Make, telemetry: OpenLoopTelemetry, phase: Floats) -> float:
-        """Return the phase variance that a controller would have left; see `mean_residual`."""
-        return mean_residual(self.replayed(make, telemetry, phase), telemetry, settled(telemetry))
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,15 +142,12 @@ class Kalman:
         }
         if not self.is_local:
             return self._compiled(plant, line, self.phase(plant), **options)
-        of_loop = plant.interaction, plant.reconstructor, self.phase_of_commands
-        return LargeGuarded(line, *of_loop, self.arrays, self.plain_gain, plant.leak, **options)
+        return LargeGuarded(line, plant, self.phase_of_commands, self.arrays, self.plain_gain, **options)
 
     def _compiled(
         self, plant: LoopPlant, line: CommandDelayLine, phase: Floats, **options: Any
     ) -> CompiledKalman:
-        reconstruct, clean = plant.reconstructor.matrix, plant.reconstructor.clean
-        of_filter = phase, self.slope_predictor, clean, self.plain_gain, plant.leak
-        return CompiledKalman(line, plant.interaction, reconstruct, *of_filter, **options)
+        return CompiledKalman(line, plant, phase, self.slope_predictor, self.plain_gain, **options)
 
     def replayed(self, plant: LoopPlant, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
         """Return the squared residual that the filter would have left; see `replayed_frames`."""

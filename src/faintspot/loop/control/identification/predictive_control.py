@@ -18,7 +18,7 @@ from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.model import Kalman, LoopPlant
+from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.open_loop import (
     Measured,
     OpenLoop,
@@ -31,6 +31,7 @@ from faintspot.loop.control.identification.open_loop import (
 )
 from faintspot.loop.control.identification.recording import Prepared, Recording, prepared
 from faintspot.loop.control.identification.state_space import state_space, write_matrices
+from faintspot.loop.control.plant import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 Floats = NDArray[np.float64]

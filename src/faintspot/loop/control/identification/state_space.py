@@ -14,8 +14,9 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
 from faintspot.base.npz import save_arrays
 from faintspot.io.arrays.fits_units import write_images
-from faintspot.loop.control.identification.model import Kalman, LoopPlant
+from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.kalman.local_model import slopes_ahead, state_of_state, state_of_surprise
+from faintspot.loop.control.plant import LoopPlant
 
 Floats = NDArray[np.float64]
 Matrices = dict[str, Any]

@@ -14,21 +14,21 @@ from faintspot.loop.control.base import (
     OpenLoopTelemetry,
 )
 from faintspot.loop.control.kalman.guarded import CHOSEN, GuardedController
-from faintspot.loop.control.kalman.kernels import (
+from faintspot.loop.control.kalman.kernels import FOLLOW, GO_ON, HOLD, replay
+from faintspot.loop.control.kalman.memory import (
     COMMAND_ROWS,
-    FOLLOW,
-    GO_ON,
     HELD,
-    HOLD,
     LATEST_PLAIN,
     PREDICTED,
     SLOPE_ROWS,
+    Frame,
     Lines,
     Matrices,
     Memory,
-    replay,
+    Recorded,
 )
 from faintspot.loop.control.kalman.predictor import SlopePredictor, shares
+from faintspot.loop.control.plant import LoopPlant
 
 Floats = NDArray[np.float64]
 
@@ -50,15 +50,11 @@ class CompiledKalman(GuardedController):
     ----------
     line : CommandDelayLine
         To the mirror.
-    interaction : (m, commands) array
-    reconstruct : (commands, m) array
-        From slopes to what the integrator integrates.
+    plant : LoopPlant
     phase : (commands, m) array
         From slopes to what is compared, see `residual_phase`.
     predictor : SlopePredictor
-    clean : (commands, m) array
-        The wavefront, as commands that cause it, from open-loop slopes without noise.
-    plain_gain, leak : float
+    plain_gain : float
         Of the integrator.
     steps : int
         Of conjugate gradients.
@@ -69,24 +65,21 @@ class CompiledKalman(GuardedController):
     def __init__(
         self,
         line: CommandDelayLine,
-        interaction: Floats,
-        reconstruct: Floats,
+        plant: LoopPlant,
         phase: Floats,
         predictor: SlopePredictor,
-        clean: Floats,
         plain_gain: float,
-        leak: float,
         *,
         steps: int = STEPS,
         **options: Any,
     ) -> None:
-        super().__init__(line, interaction, **options)
-        slopes, commands = interaction.shape
-        ahead = -clean @ predictor.model.ahead(line.delay_frames)
+        super().__init__(line, plant.interaction, **options)
+        slopes, commands = plant.interaction.shape
+        ahead = -plant.reconstructor.clean @ predictor.model.ahead(line.delay_frames)
         usual = predictor.usual_px2
         self._matrices = Matrices(
-            np.ascontiguousarray(interaction.T),
-            np.ascontiguousarray(reconstruct.T),
+            np.ascontiguousarray(plant.interaction.T),
+            np.ascontiguousarray(plant.reconstructor.matrix.T),
             np.ascontiguousarray(phase.T),
             np.ascontiguousarray(predictor.with_slopes.T),
             predictor.predicted_px2,
@@ -102,7 +95,7 @@ class CompiledKalman(GuardedController):
             np.zeros((SLOPE_ROWS, slopes)),
             np.zeros((COMMAND_ROWS, commands)),
         )
-        self._numbers = float(plain_gain), 1.0 - leak, float(line.largest), steps
+        self._numbers = float(plain_gain), 1.0 - plant.leak, float(line.largest), steps
         self._std_px, self._shares = predictor.std_px, shares(predictor.model)
         self._independent = np.zeros(slopes // 2)
         self._is_behind = False
@@ -137,18 +130,14 @@ class CompiledKalman(GuardedController):
         """
         self.complete()
         prior = self.prior_std_px
-        total = FOLLOW(
+        frame = Frame(
             slopes_px,
             self._errors_to_use(slopes_px, standard_error_px),
             self._independent if covariance_xy_px2 is None else covariance_xy_px2,
             _NO_PRIOR if prior is None else prior,
             self._noise_factor,
-            self._numbers,
-            self._matrices,
-            self._rows,
-            self._next_rows(),
-            self._memory,
         )
+        total = FOLLOW(frame, self._numbers, self._matrices, self._rows, self._next_rows(), self._memory)
         self.line.sent(total)
         self._is_behind = True
 
@@ -163,8 +152,8 @@ class CompiledKalman(GuardedController):
         covariance = self._noise_factor * telemetry.covariances_px2
         self._memory.state[:], self._memory.slopes[PREDICTED] = 0.0, 0.0
         line = np.zeros_like(self._rows.learnt)
-        recorded = slopes, variance, covariance, trust
-        replay(*recorded, self._numbers[-1], self._matrices, line, self._memory, squares)
+        recorded = Recorded(slopes, variance, covariance, trust)
+        replay(recorded, self._numbers[-1], self._matrices, line, self._memory, squares)
         return squares
 
     def complete(self) -> None:

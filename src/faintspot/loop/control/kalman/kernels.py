@@ -1,7 +1,7 @@
 """Kernels of the guarded Kalman filter: command from a frame's slopes, then the rest of the update.
 
-What they do is written in NumPy in `guarded`, `predictive`, `kalman` and `telemetry`; `compiled_kalman` calls
-them in their order.
+What they do is written in NumPy in `guarded`, `predictive`, `predictor` and `base`; `compiled` calls them in
+their order.
 """
 
 from __future__ import annotations
@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from faintspot.loop.control import integrator
 from faintspot.loop.control.base import LEAST_SHARE, LEAST_VARIANCE_PX2
+from faintspot.loop.control.integrator import integrate_wavefront
 from faintspot.loop.control.kalman import guarded
+from faintspot.loop.control.kalman import memory as arrays
 from faintspot.loop.control.kalman.guarded import (
     AT_LIMIT,
     BLENDED,
@@ -26,71 +29,40 @@ from faintspot.loop.control.kalman.guarded import (
     SURPRISE,
     choose,
 )
+from faintspot.loop.control.kalman.memory import (
+    COVARIANCE,
+    DIRECTION,
+    FOR_PLAIN,
+    HELD,
+    HELD_LEARNT,
+    HELD_PLAIN,
+    IMAGE,
+    INNOVATION,
+    LATEST_PLAIN,
+    LEFT,
+    LEFT_LEARNT,
+    LEFT_PLAIN,
+    MADE,
+    OFFSET,
+    PREDICTED,
+    SCALE,
+    SOLUTION,
+    SPARE,
+    VARIANCE,
+)
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.slopes.kernels.compilation.compiling import Direct, _kernel
 from faintspot.slopes.kernels.driver.products import add_products
 
-# Compiled anew when the guard changes, too.
-_compiled = partial(_kernel, sources=(Path(__file__), Path(guarded.__file__)))
-
-# Rows of memory: of slopes, and of commands; the first four are commands and what they add to slopes.
-HELD, HELD_LEARNT, HELD_PLAIN, LATEST_PLAIN, _LEFT_LEARNT, _LEFT_PLAIN, _FOR_PLAIN = range(7)
-_VARIANCE, _COVARIANCE, _SCALE, _SURPRISE, _SOLUTION, _DIRECTION, _IMAGE, _SPARE, PREDICTED = range(7, 16)
-SLOPE_ROWS = 16
-_MADE, _LEFT, _OFFSET = 4, 5, 7
-COMMAND_ROWS = 8
-
-
-class Matrices(NamedTuple):
-    """Constant matrices, transposed so that the terms of a sum are adjacent in memory."""
-
-    interaction: Any
-    """(commands, m)"""
-    reconstruct: object
-    """(m, commands)"""
-    phase: Any
-    """(m, commands)"""
-    covariance: Any
-    """(m, states): covariance of the errors of slopes and state before a measurement."""
-    uncertainty: object
-    """(m, m): covariance of the slopes' error."""
-    usual_inverse: object
-    """(m, m): inverse of the slopes' covariance with their usual noise."""
-    usual_variance: Any
-    """(m,): diagonal of that covariance."""
-    onward: Any
-    """(layers, 2 m, m)"""
-    command: Any
-    """(states, commands): matrix from the state to commands."""
-
-
-class Lines(NamedTuple):
-    """Delayed commands: of the mirror, and of both controllers."""
-
-    true: Any
-    """(delay + 1, commands)"""
-    learnt: Any
-    plain: Any
-
-
-class Memory(NamedTuple):
-    """State that persists between frames, and work arrays."""
-
-    state: Any
-    """(layers, 2, m): predicted state of the next frame."""
-    guard: Any
-    """(GUARD_NUMBERS,)"""
-    slopes: Any
-    """(SLOPE_ROWS, m)"""
-    commands: Any
-    """(COMMAND_ROWS, commands)"""
+# Compiled anew when guard, integrator or rows of memory change, too.
+_SOURCES = __file__, guarded.__file__, integrator.__file__, arrays.__file__
+_compiled = partial(_kernel, sources=tuple(map(Path, _SOURCES)))
 
 
 @_compiled
-def _take(
-    slopes: Any, errors: Any, covariance: Any, prior_std: Any, noise_factor: Any, rows: Any, chosen: Any
-) -> None:
+def _take(frame: Any, rows: Any, chosen: Any) -> None:
     """Write the inputs of both controllers; see `telemetry.without_prior`."""
+    slopes, errors, covariance, prior_std, noise_factor = frame
     for s in range(slopes.shape[0]):
         caused, of_learnt, of_plain = rows[HELD, s], rows[HELD_LEARNT, s], rows[HELD_PLAIN, s]
         latest = rows[LATEST_PLAIN, s]
@@ -105,14 +77,14 @@ def _take(
             variance = prior / share
             trust = trust * share / (1.0 + share)
         open_loop = slope - caused
-        rows[_LEFT_LEARNT, s] = trust * (open_loop + of_learnt)
+        rows[LEFT_LEARNT, s] = trust * (open_loop + of_learnt)
         residual, expects = open_loop + of_plain, of_plain - latest
-        rows[_LEFT_PLAIN, s] = trust * residual
-        rows[_FOR_PLAIN, s] = expects + trust * (residual - expects)
+        rows[LEFT_PLAIN, s] = trust * residual
+        rows[FOR_PLAIN, s] = expects + trust * (residual - expects)
         noise = noise_factor * variance
         measured = measured and noise < LARGEST_VARIANCE_PX2
-        rows[_VARIANCE, s] = noise if measured else math.inf
-        rows[_SURPRISE, s] = open_loop - rows[PREDICTED, s] if measured else 0.0
+        rows[VARIANCE, s] = noise if measured else math.inf
+        rows[INNOVATION, s] = open_loop - rows[PREDICTED, s] if measured else 0.0
     # Of an estimator with a prior, the covariance of the frame alone is not known.
     _correlate(covariance, noise_factor if prior_std.shape[0] == 0 else 0.0, rows)
 
@@ -122,8 +94,8 @@ def _correlate(covariance: Any, factor: Any, rows: Any) -> None:
     """Write the covariances of x and y, 0 where one was not measured."""
     n = covariance.shape[0]
     for s in range(n):
-        measured = rows[_VARIANCE, s] < math.inf and rows[_VARIANCE, n + s] < math.inf
-        rows[_COVARIANCE, s] = factor * covariance[s] if measured else 0.0
+        measured = rows[VARIANCE, s] < math.inf and rows[VARIANCE, n + s] < math.inf
+        rows[COVARIANCE, s] = factor * covariance[s] if measured else 0.0
 
 
 @_compiled
@@ -131,9 +103,9 @@ def _failure(matrices: Any, rows: Any) -> float:
     """Return the mean square of the surprises in their expected deviations."""
     total, count = 0.0, 0.0
     for s in range(rows.shape[1]):
-        if rows[_VARIANCE, s] < math.inf:
+        if rows[VARIANCE, s] < math.inf:
             count += 1.0
-            total += rows[_SURPRISE, s] ** 2 / (matrices.uncertainty[s, s] + rows[_VARIANCE, s])
+            total += rows[INNOVATION, s] ** 2 / (matrices.uncertainty[s, s] + rows[VARIANCE, s])
     return total / max(count, 1.0)
 
 
@@ -146,8 +118,8 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
     than usual.
     """
     m, n = rows.shape[1], rows.shape[1] // 2
-    variance, covariance, scale, residual = rows[_VARIANCE], rows[_COVARIANCE], rows[_SCALE], rows[_SURPRISE]
-    solution, direction = rows[_SOLUTION], rows[_DIRECTION]
+    variance, covariance, scale, residual = rows[VARIANCE], rows[COVARIANCE], rows[SCALE], rows[INNOVATION]
+    solution, direction = rows[SOLUTION], rows[DIRECTION]
     for s in range(m):
         predicted = matrices.uncertainty[s, s]
         scale[s] = math.sqrt(matrices.usual_variance[s] / (predicted + variance[s]))  # 0: not measured
@@ -155,33 +127,33 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
     before = 0.0
     for _ in range(steps):
         for s in range(m):
-            rows[_SPARE, s] = scale[s] * residual[s]
-            rows[_IMAGE, s] = 0.0
-        add_products(matrices.usual_inverse, rows[_SPARE : _SPARE + 1], rows[_IMAGE : _IMAGE + 1])
+            rows[SPARE, s] = scale[s] * residual[s]
+            rows[IMAGE, s] = 0.0
+        add_products(matrices.usual_inverse, rows[SPARE : SPARE + 1], rows[IMAGE : IMAGE + 1])
         descent = 0.0
         for s in range(m):
-            rows[_IMAGE, s] *= scale[s]
-            descent += rows[_IMAGE, s] * residual[s]
+            rows[IMAGE, s] *= scale[s]
+            descent += rows[IMAGE, s] * residual[s]
         if not descent > 0.0:
             return
         share = descent / before if before > 0.0 else 0.0
         before = descent
         for s in range(m):
-            direction[s] = rows[_IMAGE, s] + share * direction[s]
+            direction[s] = rows[IMAGE, s] + share * direction[s]
         for s in range(n):
-            rows[_IMAGE, s] = covariance[s] * direction[n + s]
-            rows[_IMAGE, n + s] = covariance[s] * direction[s]
-        add_products(matrices.uncertainty, rows[_DIRECTION : _DIRECTION + 1], rows[_IMAGE : _IMAGE + 1])
+            rows[IMAGE, s] = covariance[s] * direction[n + s]
+            rows[IMAGE, n + s] = covariance[s] * direction[s]
+        add_products(matrices.uncertainty, rows[DIRECTION : DIRECTION + 1], rows[IMAGE : IMAGE + 1])
         curvature = 0.0
         for s in range(m):
             if scale[s] > 0.0:
-                rows[_IMAGE, s] += variance[s] * direction[s]
-                curvature += direction[s] * rows[_IMAGE, s]
+                rows[IMAGE, s] += variance[s] * direction[s]
+                curvature += direction[s] * rows[IMAGE, s]
         step = descent / curvature
         for s in range(m):
             if scale[s] > 0.0:
                 solution[s] += step * direction[s]
-                residual[s] -= step * rows[_IMAGE, s]
+                residual[s] -= step * rows[IMAGE, s]
 
 
 @_compiled
@@ -190,8 +162,8 @@ def _filter(matrices: Any, memory: Any, steps: Any, largest: Any, command: Any) 
     rows = memory.slopes
     state = memory.state.reshape(1, memory.state.size)
     _solve(matrices, rows, steps)
-    add_products(matrices.covariance, rows[_SOLUTION : _SOLUTION + 1], state)
-    product, total = memory.commands[_MADE : _MADE + 1], 0.0
+    add_products(matrices.covariance, rows[SOLUTION : SOLUTION + 1], state)
+    product, total = memory.commands[MADE : MADE + 1], 0.0
     product[:] = 0.0
     add_products(matrices.command, state, product)
     for c in range(command.shape[0]):
@@ -203,21 +175,18 @@ def _filter(matrices: Any, memory: Any, steps: Any, largest: Any, command: Any) 
 @_compiled
 def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, command: Any) -> float:
     """Write the integrator's command; return its sum before clipping."""
-    product = memory.commands[_MADE : _MADE + 1]
+    product = memory.commands[MADE : MADE + 1]
     product[:] = 0.0
-    add_products(matrices.reconstruct, memory.slopes[_FOR_PLAIN : _FOR_PLAIN + 1], product)
-    total = 0.0
-    for c in range(command.shape[0]):
-        value = keep * memory.commands[LATEST_PLAIN, c] - gain * product[0, c]
-        total += value
-        command[c] = min(max(value, -largest), largest)
+    add_products(matrices.reconstruct, memory.slopes[FOR_PLAIN : FOR_PLAIN + 1], product)
+    latest = memory.commands[LATEST_PLAIN]
+    total: float = integrate_wavefront(product[0], latest, gain, keep, largest, command)
     return total
 
 
 @_compiled
 def _send(command: Any, true: Any, row: Any, memory: Any, largest: Any) -> None:
     """Write the mirror's command; see `GuardedController`."""
-    guard, offset = memory.guard, memory.commands[_OFFSET]
+    guard, offset = memory.guard, memory.commands[OFFSET]
     if guard[SENT] != guard[CHOSEN]:
         guard[SENT], guard[BLENDED] = guard[CHOSEN], HANDOVER_FRAMES
         for c in range(command.shape[0]):
@@ -235,7 +204,7 @@ def _send(command: Any, true: Any, row: Any, memory: Any, largest: Any) -> None:
 def _advance(matrices: Any, memory: Any) -> None:
     """Predict the filter's state of the next frame."""
     state, rows = memory.state, memory.slopes
-    now, m = rows[_SPARE : _SPARE + 1], rows.shape[1]
+    now, m = rows[SPARE : SPARE + 1], rows.shape[1]
     rows[PREDICTED] = 0.0
     for layer in range(state.shape[0]):
         now[:] = 0.0
@@ -270,30 +239,12 @@ def hold(matrices: Any, lines: Any, next_rows: Any, memory: Any) -> None:
 
 
 @_compiled
-def follow(
-    slopes: Any,
-    errors: Any,
-    covariance: Any,
-    prior_std: Any,
-    noise_factor: Any,
-    numbers: Any,
-    matrices: Any,
-    lines: Any,
-    next_rows: Any,
-    memory: Any,
-) -> float:
+def follow(frame: Any, numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) -> float:
     """Write the selected controller's command for the mirror; return its sum before clipping.
 
     Parameters
     ----------
-    slopes, errors : (m,) float64 arrays
-        Finite; infinite error: not measured.
-    covariance : (m / 2,) float64 array
-        Covariances of the noise of x and y.
-    prior_std : (m,) or (0,) float64 array
-        Prior of the estimator; none.
-    noise_factor : float
-        Of the errors' variances.
+    frame : Frame
     numbers : (float, float, float, int)
         The integrator's gain, what it keeps of its command, stroke, steps of conjugate gradients.
     matrices, lines, next_rows, memory
@@ -302,7 +253,7 @@ def follow(
     row, of_learnt, of_plain = next_rows
     gain, keep, largest, steps = numbers
     plainly = memory.guard[CHOSEN] > 0.0
-    _take(slopes, errors, covariance, prior_std, noise_factor, memory.slopes, plainly)
+    _take(frame, memory.slopes, plainly)
     memory.guard[SURPRISE] = _failure(matrices, memory.slopes)
     if plainly:
         total: float = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
@@ -324,9 +275,9 @@ def go_on(numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) 
         total: float = _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
     else:
         total = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
-    wavefronts = memory.commands[_LEFT : _LEFT + 2]
+    wavefronts = memory.commands[LEFT : LEFT + 2]
     wavefronts[:] = 0.0
-    add_products(matrices.phase, memory.slopes[_LEFT_LEARNT : _LEFT_PLAIN + 1], wavefronts)
+    add_products(matrices.phase, memory.slopes[LEFT_LEARNT : LEFT_PLAIN + 1], wavefronts)
     learnt, plain = 0.0, 0.0
     for c in range(wavefronts.shape[1]):
         learnt += wavefronts[0, c] * wavefronts[0, c]
@@ -352,24 +303,12 @@ def _adopt(lines: Any, next_rows: Any, guard: Any) -> None:
 
 
 @_compiled
-def replay(
-    open_loop: Any,
-    variance: Any,
-    covariance: Any,
-    trust: Any,
-    steps: Any,
-    matrices: Any,
-    line: Any,
-    memory: Any,
-    squares: Any,
-) -> None:
+def replay(recorded: Any, steps: Any, matrices: Any, line: Any, memory: Any, squares: Any) -> None:
     """Write the squared residual that the filter alone would have left in each recorded frame.
 
     Parameters
     ----------
-    open_loop, variance, trust : (frames, m) float64 arrays
-        See `OpenLoopTelemetry`.
-    covariance : (frames, m / 2) float64 array
+    recorded : Recorded
     steps : int
         Of conjugate gradients.
     matrices : Matrices
@@ -379,6 +318,7 @@ def replay(
     squares : (frames,) float64 array
         Infinite from the first command on that is not finite.
     """
+    open_loop, variance, covariance, trust = recorded
     rows, delay = memory.slopes, line.shape[0] - 1
     squares[:] = math.inf
     for frame in range(open_loop.shape[0]):
@@ -388,13 +328,13 @@ def replay(
         add_products(matrices.interaction, line[acting : acting + 1], rows[HELD : HELD + 1])
         for s in range(rows.shape[1]):
             measured = variance[frame, s] < LARGEST_VARIANCE_PX2
-            rows[_LEFT_LEARNT, s] = trust[frame, s] * (open_loop[frame, s] + rows[HELD, s])
-            rows[_VARIANCE, s] = variance[frame, s] if measured else math.inf
-            rows[_SURPRISE, s] = open_loop[frame, s] - rows[PREDICTED, s] if measured else 0.0
+            rows[LEFT_LEARNT, s] = trust[frame, s] * (open_loop[frame, s] + rows[HELD, s])
+            rows[VARIANCE, s] = variance[frame, s] if measured else math.inf
+            rows[INNOVATION, s] = open_loop[frame, s] - rows[PREDICTED, s] if measured else 0.0
         _correlate(covariance[frame], 1.0, rows)
-        wavefront, square = memory.commands[_LEFT : _LEFT + 1], 0.0
+        wavefront, square = memory.commands[LEFT : LEFT + 1], 0.0
         wavefront[:] = 0.0
-        add_products(matrices.phase, rows[_LEFT_LEARNT : _LEFT_LEARNT + 1], wavefront)
+        add_products(matrices.phase, rows[LEFT_LEARNT : LEFT_LEARNT + 1], wavefront)
         for c in range(wavefront.shape[1]):
             square += wavefront[0, c] * wavefront[0, c]
         if not np.isfinite(_filter(matrices, memory, steps, math.inf, line[row])):

@@ -13,7 +13,7 @@ from faintspot.loop.control.integrator import SlopeProduct
 from faintspot.loop.control.kalman.guarded import SURPRISE, GuardedController
 from faintspot.loop.control.kalman.local_model import replies
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor
-from faintspot.loop.control.reconstructor import Reconstructor
+from faintspot.loop.control.plant import LoopPlant
 from faintspot.slopes.kernels.driver.products import ProductPart
 
 Floats = NDArray[np.float64]
@@ -56,13 +56,12 @@ class LargeGuarded(GuardedController):
     ----------
     line : CommandDelayLine
         To the mirror.
-    interaction : (m, commands) array
-    reconstructor : Reconstructor
+    plant : LoopPlant
     phase_of_commands : (commands, commands) array
         From commands to the compared amplitudes, see `phase.phase_of_commands`.
     arrays : mapping
         Of the filter, as from `local_filter`.
-    plain_gain, leak : float
+    plain_gain : float
         Of the integrator.
     options
         As for `GuardedController`.
@@ -73,16 +72,16 @@ class LargeGuarded(GuardedController):
     def __init__(
         self,
         line: CommandDelayLine,
-        interaction: Floats,
-        reconstructor: Reconstructor,
+        plant: LoopPlant,
         phase_of_commands: Floats,
         arrays: Mapping[str, object],
         plain_gain: float,
-        leak: float,
         **options: Any,
     ) -> None:
+        interaction, reconstructor = plant.interaction, plant.reconstructor
         super().__init__(line, interaction, **options)
-        self._predictor, self._gain, self._keep = LocalPredictor(arrays), plain_gain, 1.0 - leak
+        self._predictor = LocalPredictor(arrays)
+        self._integrator = plant.integrator(plain_gain, self._lines[_PLAIN])
         self._product, self._reconstruct = SlopeProduct(interaction), SlopeProduct(reconstructor.matrix)
         self._clean, self._compare = SlopeProduct(reconstructor.clean), SlopeProduct(phase_of_commands)
         matrices = replies(arrays, line.delay_frames)
@@ -128,7 +127,7 @@ class LargeGuarded(GuardedController):
             self._predict(frame)
         else:
             residual = trust * (slopes - (self._held - frame.by_plain))
-            self._integrate(self._reconstruct(residual + frame.missing))
+            self._integrator.follow(self._reconstruct(residual + frame.missing))
         self._send()
 
     def begin_product(self, threads: int, scale: float) -> Sequence[ProductPart]:
@@ -143,11 +142,6 @@ class LargeGuarded(GuardedController):
         """Compute the predictive command."""
         surprise, self._level = self._predictor.surprise(frame.surprise, frame.variance)
         self._lines[_LEARNT].put(self._if_as_predicted - self._replies[self._level](surprise))
-
-    def _integrate(self, wavefront: Floats) -> None:
-        """Compute the integrator's command."""
-        line = self._lines[_PLAIN]
-        line.put(self._keep * line.latest - self._gain * wavefront)
 
     def complete(self) -> None:
         """See `Controller`; also compute what does not need the slopes of the next frame."""
@@ -170,10 +164,10 @@ class LargeGuarded(GuardedController):
             return self._reconstruct.several(*residuals)
         if not missing.any():
             wavefronts = self._reconstruct.several(*residuals)
-            self._integrate(wavefronts[_PLAIN])
+            self._integrator.follow(wavefronts[_PLAIN])
             return wavefronts
         wavefronts = self._reconstruct.several(*residuals, missing)
-        self._integrate(wavefronts[_PLAIN] + wavefronts[-1])
+        self._integrator.follow(wavefronts[_PLAIN] + wavefronts[-1])
         return wavefronts[:-1]
 
     def _follow_mirror(self, *, is_new: bool) -> None:
