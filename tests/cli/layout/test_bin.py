@@ -44,7 +44,9 @@ def test_colour_mosaic(folder: Path, run: Commands) -> None:
     frames *= np.where(rows != columns, 0.25, np.where(rows == 0, 1.0, 0.05))
     rise, flux, valid = measured(run, frames, "--bin", 2)
     assert rise == pytest.approx(2.0, abs=0.03)
-    assert flux == pytest.approx(5000 * 1.55 / 4, rel=0.05)  # of spots that the filters sharpen
+    # 3.8 % high: most of the flux is in one pixel of four, and the flux under the weight is scaled for
+    # Gaussian spots, which these are not. The sum over a window is right to 0.3 %.
+    assert flux == pytest.approx(5000 * 1.55 / 4, rel=0.05)
     assert valid == 1
     layout = Layout.load("new.toml")
     assert (layout.bin, layout.frame_shape) == (2, (220, 220))
