@@ -10,7 +10,7 @@ from tests.loop.telemetry.loop_cases import recorded
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
-from faintspot.loop.control.faults import STUCK_FRAMES, followers, still_actuators
+from faintspot.loop.control.faults import STUCK_FRAMES, StuckWatch, followers, still_actuators
 from faintspot.loop.control.identification.recording import Recording, prepared
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.predictor import SlopePredictor
@@ -73,7 +73,7 @@ def test_a_recording_in_which_everything_is_stuck() -> None:
         prepared(replace(loop, slopes=np.sign(loop.slopes)))
 
 
-def loop_with(still: int | None, noise_px: float) -> Recording:
+def loop_with(still: int | None, noise_px: float, delay: int) -> Recording:
     """Return a loop of an integrator, one of whose actuators does not move."""
     loop, rng = recorded(frames=1500), np.random.default_rng(4)
     interaction = np.asarray(loop.interaction_matrix)
@@ -84,22 +84,39 @@ def loop_with(still: int | None, noise_px: float) -> Recording:
     turbulence = loop.slopes - before @ interaction.T
     slopes, commands = np.zeros_like(loop.slopes), np.zeros_like(loop.commands)
     matrix = np.linalg.pinv(interaction, rcond=0.05)
-    for k in range(2, len(slopes)):
-        slopes[k] = turbulence[k] + mirror @ commands[k - 2] + noise_px * rng.standard_normal(2 * N)
+    for k in range(delay, len(slopes)):
+        slopes[k] = turbulence[k] + mirror @ commands[k - delay] + noise_px * rng.standard_normal(2 * N)
         commands[k] = 0.99 * commands[k - 1] - 0.35 * matrix @ slopes[k]
     return replace(loop, slopes=slopes, commands=commands)
 
 
 @pytest.mark.parametrize("still", [None, 0, 14])
-@pytest.mark.parametrize("noise_px", [0.0, 0.5])
-def test_an_actuator_that_does_not_move(still: int | None, noise_px: float) -> None:
-    loop = loop_with(still, noise_px)
+@pytest.mark.parametrize(("noise_px", "delay"), [(0.0, 2), (0.5, 2), (0.5, 3), (0.0, 1), (0.2, 1)])
+def test_an_actuator_that_does_not_move(still: int | None, noise_px: float, delay: int) -> None:
+    loop = loop_with(still, noise_px, delay)
     found = still_actuators(loop.slopes, loop.commands, np.asarray(loop.interaction_matrix))
     assert np.flatnonzero(found).tolist() == ([] if still is None else [still])
     ready = prepared(loop).recording
     assert (
         np.flatnonzero(~np.any(ready.interaction_matrix, axis=0)).tolist() == np.flatnonzero(found).tolist()
     )
+
+
+def test_a_sub_aperture_that_begins_to_follow_another_one() -> None:
+    """Noticed within 200 frames: neither is used until they differ again. Common motion is no fault."""
+    rng, watch, m = np.random.default_rng(3), StuckWatch(2 * N), 2 * N
+    errors, stuck = np.full(m, 0.1), []
+    for frame in range(900):
+        slopes = rng.standard_normal(m)
+        if 100 <= frame < 500:
+            slopes[N + 9] = 2.0 * slopes[3] + 1.0
+        if frame >= 700:
+            slopes[:] = slopes[0]
+        assert np.array_equal(np.isinf(watch(slopes, errors)), np.tile(watch.is_stuck, 2))
+        stuck.append(np.flatnonzero(watch.is_stuck).tolist())
+    assert stuck[100] == []
+    assert stuck[299] == [3, 9]
+    assert stuck[700:] == [[]] * 200
 
 
 @pytest.mark.parametrize("values", [[0.0], [0.33], [0.0, 1.0]])

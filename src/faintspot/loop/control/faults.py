@@ -26,14 +26,61 @@ _VALUES = 3
 _STILL, _WANDERS = 0.5, 10.0
 """Response and variance of the commands of an actuator that does not move, in those of the median one."""
 _SURE = 2.0  # standard errors
-_DELAYS = range(2, 6)  # after one frame, the noise of both is the same
-_RIDGE = 1e-3
+# After one frame the noise of both is the same: there, the steps before stand for those sent. So it is where
+# no later response of the median actuator is as large as the second number.
+_DELAYS, _LATER = range(2, 6), 0.15
+_RIDGE, _RCOND = 1e-3, 0.05
 _ALIKE = 1e-9  # difference of two slopes that follow each other, in their standard deviations
+# In the loop: frames after which slopes are compared (those alike twice in a row follow each other), the
+# largest part of them that may, and a sequence in [0, 1) on which they are projected.
+_BLOCK, _MOST_ALIKE, _SEQUENCE = 64, 0.25, 0.6180339887498949
+# Rows of a table: sums of the slopes, their squares and products with the sequence; the slope that is alike,
+# how often it was once more, and what is equal for both.
+_SUM, _SQUARES, _PROJECTION, _PARTNER, _TIMES, _KEY = range(6)
 
 
 @partial(compiled_with, source=__file__)
-def _watch(slopes: Any, errors: Any, recent: Any, used: Any) -> float:
-    """Write the errors of slopes, infinite for sub-apertures that are stuck; see `StuckWatch`.
+def _compare(slopes: Any, sums: Any, clock: Any, table: Any) -> None:
+    """Find slopes that follow each other, whose equal keys meet in a hash table; see `StuckWatch`."""
+    m, value = slopes.shape[0], (clock[1] * _SEQUENCE) % 1.0
+    clock[0] += 1.0
+    clock[1] += 1.0
+    clock[2] += value
+    for s in range(m):
+        sums[_SUM, s] += slopes[s]
+        sums[_SQUARES, s] += slopes[s] * slopes[s]
+        sums[_PROJECTION, s] += slopes[s] * value
+    if clock[0] < _BLOCK:
+        return
+    mean, alike = clock[2] / clock[0], 0
+    for i in range(table.shape[0]):
+        table[i] = -1
+    for s in range(m):
+        average = sums[_SUM, s] / clock[0]
+        variance = sums[_SQUARES, s] / clock[0] - average * average
+        key, before, partner = 0.0, sums[_PARTNER, s], -1
+        if variance > 1e-9 * average * average:
+            key = abs(sums[_PROJECTION, s] / clock[0] - average * mean) / math.sqrt(variance)
+            place = int(key * 1e6) * 7919 % table.shape[0]
+            while table[place] >= 0 and partner < 0:
+                if abs(sums[_KEY, table[place]] - key) < _ALIKE:
+                    partner = table[place]
+                place = (place + 1) % table.shape[0]
+            if partner < 0:
+                table[place] = s
+        sums[_KEY, s], sums[_PARTNER, s] = key, partner
+        sums[_TIMES, s] = sums[_TIMES, s] + 1.0 if partner >= 0 and partner == before else 0.0
+        alike += partner >= 0
+        sums[_SUM, s] = sums[_SQUARES, s] = sums[_PROJECTION, s] = 0.0
+    clock[0] = clock[2] = 0.0
+    if alike > _MOST_ALIKE * m:
+        for s in range(m):
+            sums[_TIMES, s] = 0.0
+
+
+@partial(compiled_with, source=__file__)
+def _watch(slopes: Any, errors: Any, recent: Any, sums: Any, used: Any) -> float:
+    """Write the errors of slopes, infinite for sub-apertures that measure nothing; see `StuckWatch`.
 
     Return the mean square of slopes that are not used but change, in that of those that are used.
     """
@@ -55,6 +102,10 @@ def _watch(slopes: Any, errors: Any, recent: Any, used: Any) -> float:
             count = 2.0 * STUCK_FRAMES if count >= STUCK_FRAMES else count
         recent[_VALUES, s] = 0.0 if count == STUCK_FRAMES else count
     for s in range(m):
+        if sums[_TIMES, s] > 0:
+            for one in (s, int(sums[_PARTNER, s])):
+                used[one] = used[(one + m // 2) % m] = math.inf
+    for s in range(m):
         if max(recent[_VALUES, s], recent[_VALUES, (s + m // 2) % m]) > STUCK_FRAMES:
             used[s] = math.inf
         elif used[s] < math.inf:
@@ -64,11 +115,11 @@ def _watch(slopes: Any, errors: Any, recent: Any, used: Any) -> float:
     return left_out * inside / max(size * others, 1e-300) if inside > 0.0 else 0.0
 
 
-_WATCH = Direct(_watch)
+_WATCH, _COMPARE = Direct(_watch), Direct(_compare)
 
 
 class StuckWatch:
-    """Find the sub-apertures whose slopes stick, frame by frame.
+    """Find the sub-apertures whose slopes stick or follow those of another one exactly, frame by frame.
 
     Parameters
     ----------
@@ -79,20 +130,31 @@ class StuckWatch:
     def __init__(self, slopes: int) -> None:
         self._recent = np.full((_VALUES + 1, slopes), np.nan)
         self._recent[_VALUES] = 0.0
+        self._sums, self._clock = np.zeros((_KEY + 1, slopes)), np.zeros(3)
+        self._table = np.empty(2 * slopes, np.int64)
         self.used = np.zeros(slopes)
-        """(2 n,): standard errors of the latest frame, infinite for sub-apertures that are stuck."""
+        """(2 n,): standard errors of the latest frame, infinite for sub-apertures that measure nothing."""
         self.left_out = 0.0
         """Mean square of the slopes that are not used but change, in that of those that are used."""
 
     @property
-    def is_stuck(self) -> Mask:
-        """(n,): whether each sub-aperture is stuck."""
+    def sticks(self) -> Mask:
+        """(n,): whether the slopes of each sub-aperture stick."""
         return np.asarray((self._recent[_VALUES] > STUCK_FRAMES).reshape(2, -1).any(axis=0))
+
+    @property
+    def is_stuck(self) -> Mask:
+        """(n,): whether each sub-aperture sticks, follows another one or is followed."""
+        follows = self._sums[_TIMES] > 0
+        partners = self._sums[_PARTNER][follows].astype(np.int64)
+        follows[partners] = True
+        return np.asarray(self.sticks | follows.reshape(2, -1).any(axis=0))
 
     def __call__(self, slopes: Floats, errors: Floats) -> Floats:
         """Return the standard errors to use for the slopes of a frame, which are finite."""
         arrays = np.ascontiguousarray(slopes, np.float64), np.ascontiguousarray(errors, np.float64)
-        self.left_out = _WATCH(*arrays, self._recent, self.used)
+        _COMPARE(arrays[0], self._sums, self._clock, self._table)
+        self.left_out = _WATCH(*arrays, self._recent, self._sums, self.used)
         return self.used
 
 
@@ -111,7 +173,7 @@ def stuck_slopes(slopes: Floats) -> Mask:
         watch = StuckWatch(slopes.shape[1])
         for frame in order:
             watch(known[frame], errors[frame])
-            stuck[frame] |= watch.is_stuck
+            stuck[frame] |= watch.sticks
     return stuck
 
 
@@ -161,6 +223,14 @@ def still_actuators(slopes: Floats, commands: Floats, interaction: Floats) -> Ma
         error = np.sqrt(np.square(later).mean() * np.diag(inverse))
         best = max(best, (float(np.median(response)), response, error), key=lambda fit: fit[0])
     usual, response, error = best
+    if usual < _LATER:
+        moved = change[2:] @ np.linalg.pinv(interaction, rcond=_RCOND).T
+        before, sent = steps[:-2] - steps[:-2].mean(axis=0), steps[1:-1]
+        common = (before * sent).sum(axis=0)
+        common[common == 0.0] = np.inf  # of commands that are constant
+        response = (before * moved).sum(axis=0) / common
+        spread = (moved - response * sent).std(axis=0)
+        usual, error = 1.0, np.sqrt(np.square(before).sum(axis=0)) * spread / np.abs(common)
     variance = commands.var(axis=0)
     is_still = np.abs(response) + _SURE * error < _STILL * usual
     return np.asarray(is_still & (variance > _WANDERS * np.median(variance)))

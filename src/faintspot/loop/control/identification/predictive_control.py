@@ -122,7 +122,7 @@ class PredictiveControl:
 
     @property
     def left_out(self) -> NDArray[np.int64]:
-        """Numbers of sub-apertures not in use: without slopes in the recording, or stuck for 50 frames."""
+        """Numbers of sub-apertures not in use: without slopes in the recording, or measuring nothing now."""
         learnt = np.isinf(self._loop.standard_error).reshape(2, -1).any(axis=0)
         return np.flatnonzero(learnt | self._controller.is_stuck)
 
