@@ -16,7 +16,7 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, lines_of, neighbours_of
 from faintspot.slopes.sensor.windows import Windows, find_windows
 
-_GHOST = 0.25  # of the median flux of the neighbours
+_GHOST = 0.3  # of the median flux of the neighbours
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,9 @@ _SMALLEST_GIVEN_PITCH_PX = 4
 # Distance from a node (pitches) within which a hot pixel may be a sharp spot, and standard deviations by
 # which there must be more of these than of hot pixels by chance; and which part of them must be.
 _ON_NODE, _BEYOND_CHANCE, _MOSTLY = 0.2, 5.0, 0.7
+# Pitches from a lit lenslet within which a dark one may have lost its spot as a hot pixel, and the least part
+# of a spot's flux in its brightest pixel.
+_BESIDE, _PEAK = 1.5, 0.25
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,8 @@ class LensletGrid:
     spot_px : float
         Standard deviation of the spot shape.
     elsewhere : float array (m, 2)
-        x, y of other spots that are as bright as those of illuminated lenslets.
+        x, y of other spots that are as bright as those of illuminated lenslets, and of hot pixels that may be
+        the spots of dark ones.
     doubt : str
         Reason why the choice of illuminated lenslets may be wrong, in one line; empty if it is clear.
     """
@@ -146,7 +150,8 @@ def find_lenslets(
     image, fit = fitted(bad[part.slices] | hot)
     if fit is not None and (on_lattice := _hot_on_lattice(hot, fit)).any():
         sharp = fitted((bad[part.slices] | hot) & ~on_lattice)[1]
-        fit = sharp if sharp is not None and sharp.lit >= fit.lit else fit
+        if sharp is not None and sharp.lit >= fit.lit:
+            fit, hot = sharp, hot & ~on_lattice
     if fit is None:
         raise InputError(_nothing_found(image, pitch_range_px, geometry))
     lattice, spots, illuminated = fit.lattice, fit.spots, fit.illuminated
@@ -164,7 +169,7 @@ def find_lenslets(
         drifts=as_rows(spots.drifts[illuminated.nodes]),
         spots=as_rows(spots.positions[illuminated.nodes] + corner),
         spot_px=fit.width_px,
-        elsewhere=as_rows(fit.elsewhere + corner),
+        elsewhere=as_rows(np.concatenate([fit.elsewhere, _lost_as_hot(raw, hot, fit)]) + corner),
         doubt=illuminated.doubt,
     )
 
@@ -260,6 +265,18 @@ def _hot_on_lattice(hot: NDArray[np.bool_], fit: LatticeFit) -> NDArray[np.bool_
     if significant and surplus > _MOSTLY * np.count_nonzero(near):
         spots[y[near], x[near]] = True
     return spots
+
+
+def _lost_as_hot(
+    image: NDArray[np.float64], hot: NDArray[np.bool_], fit: LatticeFit
+) -> NDArray[np.complex128]:
+    """Return the hot pixels that may be the spots of dark lenslets beside lit ones."""
+    y, x = np.nonzero(hot & (image > np.median(image) + _PEAK * fit.illuminated.least_flux))
+    lit, pitch_px = fit.illuminated.nodes, fit.lattice.pitch_px
+    expected = fit.lattice.positions(fit.spots.cells) + fit.spots.drifts
+    distance, nearest = as_tree(expected).query(as_rows(x + 1j * y))
+    beside = as_tree(expected[lit]).query(as_rows(expected))[0] < _BESIDE * pitch_px
+    return np.asarray((x + 1j * y)[(distance < _ON_NODE * pitch_px) & (beside & ~lit)[nearest]])
 
 
 def _robust_mean(frames: NDArray[np.generic]) -> NDArray[np.float64]:
