@@ -1,5 +1,6 @@
 """Sizes that files state are limited: refused in one line before the memory is used."""
 
+import gzip
 import tracemalloc
 import zlib
 from collections.abc import Callable, Iterator
@@ -11,11 +12,13 @@ import numpy as np
 import pytest
 import scipy.io
 from tests import refusals
-from tests.io.frame_files import h5py, zarr
+from tests.io.frame_files import fits, h5py, tifffile, zarr
 from tests.io.slope_files import result, write
 
 from faintspot.base.npz import read_arrays
 from faintspot.io import open_frames, read_array, read_slopes
+from faintspot.io.arrays.fits_units import units_of
+from faintspot.io.arrays.inflation import check_inflated
 from faintspot.io.references import read_reference
 from faintspot.io.stored import slopes_format
 from faintspot.slopes.camera.calibration import Calibration
@@ -23,11 +26,19 @@ from faintspot.slopes.spots.psf import PSF
 
 MIB = 1 << 20
 
+numcodecs: Any = pytest.importorskip("numcodecs")
+
 
 @pytest.fixture(autouse=True)
 def small_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Limits of 8 MiB, so that files that exceed them are made quickly."""
-    for module in ("frames", "arrays.stored_array", "arrays.zarr_store", "formats.hdf5_files"):
+    for module in (
+        "frames",
+        "arrays.stored_array",
+        "arrays.zarr_store",
+        "arrays.inflation",
+        "arrays.fits_units",
+    ):
         monkeypatch.setattr(f"faintspot.io.{module}.MOST_WHOLE_BYTES", 8 * MIB)
     monkeypatch.setattr(read_arrays, "__defaults__", (None, (), 8 * MIB))
     monkeypatch.setattr(slopes_format, "memory_bytes", lambda: 16 * MIB)
@@ -86,24 +97,106 @@ def test_large_chunks(tmp_path: Path) -> None:
             open_frames([tmp_path / name])
 
 
-def test_chunks_that_inflate_to_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Chunks of 20 kB that are inflated to 64 MiB: deflated twice, or once."""
-    monkeypatch.setattr("faintspot.io.formats.hdf5_files._MOST_SURE", 8 * MIB // 1032)
-    for name, times in (("once.h5", 1), ("twice.h5", 2)):
-        content = bytes(64 * MIB)
-        with h5py.File(tmp_path / name, "w") as file:
-            layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-            layout.set_chunk((1, 100, 100))
-            for _ in range(times):
+@pytest.mark.parametrize("filters", ["deflate", "deflate, deflate", "shuffle, deflate", "zstd"])
+def test_hdf5_chunks_that_inflate_to_more(tmp_path: Path, filters: str) -> None:
+    """A chunk of 20 kB that is inflated to 64 MiB; also one that says that it was not shuffled."""
+    content = bytes(64 * MIB)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        layout.set_chunk((1, 100, 100))
+        for name in filters.split(", "):
+            if name == "shuffle":
+                layout.set_shuffle()
+            elif name == "zstd":
+                layout.set_filter(32015, h5py.h5z.FLAG_OPTIONAL)
+                content = numcodecs.Zstd().encode(content)
+            else:
                 layout.set_deflate(1)
                 content = zlib.compress(content, 1)
-            space, kind = h5py.h5s.create_simple((2, 100, 100)), h5py.h5t.NATIVE_UINT16
-            stored = h5py.h5d.create(file.id, b"frames", kind, space, layout)
+        space, kind = h5py.h5s.create_simple((2, 100, 100)), h5py.h5t.NATIVE_UINT16
+        stored = h5py.h5d.create(file.id, b"frames", kind, space, layout)
+        if filters != "zstd":  # HDF5 itself has no such filter
             stored.write_direct_chunk((0, 0, 0), zlib.compress(bytes(20000)))
-            stored.write_direct_chunk((1, 0, 0), content)
-        with refused(name), open_frames([tmp_path / name]) as frames:
-            assert not frames.block(0, 1).any()
-            frames.block(1, 2)
+        stored.write_direct_chunk((1, 0, 0), content, int(filters.startswith("shuffle")))
+    reason = "compressed 2 times" if filters == "deflate, deflate" else "inflates to more"
+    with refused("a.h5", reason), open_frames([tmp_path / "a.h5"]) as frames:
+        assert filters == "zstd" or not frames.block(0, 1).any()
+        frames.block(1, 2)
+
+
+@pytest.mark.parametrize("codec", ["", "zlib", "gzip", "zstd", "blosc", "lz4", "bz2", "lzma"])
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_zarr_chunks_that_inflate_to_more(tmp_path: Path, codec: str, zarr_format: int) -> None:
+    """The file of a chunk is too large, or inflates to 64 MiB; that of gzip after a small first part."""
+    if zarr_format == 3 and codec in ("zlib", "lz4", "bz2", "lzma"):
+        pytest.skip("formats of other codecs are not fixed")
+    numcodec = numcodecs.get_codec({"id": codec}) if codec else None
+    of_format_3 = {
+        "gzip": zarr.codecs.GzipCodec,
+        "zstd": zarr.codecs.ZstdCodec,
+        "blosc": zarr.codecs.BloscCodec,
+    }
+    compressor = numcodec if zarr_format == 2 else of_format_3[codec]() if codec else None
+    values = np.ones((2, 1000, 1000), np.uint16)
+    path = tmp_path / "a.zarr"
+    zarr.create_array(
+        str(path),
+        data=values,
+        chunks=(1, 1000, 1000),
+        compressors=compressor,
+        zarr_format=zarr_format,
+    )
+    content = bytes(64 * MIB) if numcodec is None else bytes(numcodec.encode(bytes(64 * MIB)))
+    if codec == "gzip":
+        content = gzip.compress(bytes(100)) + content
+    (path / ("1.0.0" if zarr_format == 2 else "c/1/0/0")).write_bytes(content)
+    with (
+        refused("a.zarr", "inflates to more" if codec else "a chunk of at most"),
+        open_frames([path]) as frames,
+    ):
+        assert frames.block(0, 1).all()
+        frames.block(1, 2)
+
+
+def test_zstd_that_states_no_size() -> None:
+    """Its blocks state how much they inflate to at most."""
+    frame = b"\x28\xb5\x2f\xfd\x00\x58"
+    block = (1 | 1 << 1 | (1 << 20) << 3).to_bytes(3, "little") + b"\0"  # the last one: a byte, 2^20 times
+    check_inflated("a", frame + block, "zstd")
+    more = ((1 << 1 | (1 << 20) << 3).to_bytes(3, "little") + b"\0") * 8
+    with refused("inflates to more"):
+        check_inflated("a", frame + more + block, "zstd")
+
+
+def test_tiff_strips_and_tiles(tmp_path: Path) -> None:
+    strips = iter([zlib.compress(bytes(64 * MIB))])
+    tifffile.imwrite(
+        tmp_path / "strips.tif", strips, shape=(64, 64), dtype=np.uint16, compression="zlib", rowsperstrip=64
+    )
+    tifffile.imwrite(tmp_path / "tiles.tif", np.ones((64, 64), np.uint16), compression="zlib", tile=(64, 64))
+    with tifffile.TiffFile(tmp_path / "tiles.tif", mode="r+b") as file:
+        for tag in (322, 323):
+            file.pages[0].tags[tag].overwrite(1 << 14)
+    for name, words in (("strips.tif", "inflates to more"), ("tiles.tif", "a chunk of at most 8 MiB")):
+        with refused(name, words):
+            read_array(tmp_path / name)
+
+
+@pytest.mark.parametrize("is_damaged", [False, True])
+def test_fits_tiles(tmp_path: Path, is_damaged: bool) -> None:
+    """A tile of 64 MiB, which inflates to more than the image of 64 x 64 px where the header is changed."""
+    image = fits.CompImageHDU(
+        np.zeros((8192, 8192), np.uint8), compression_type="GZIP_1", tile_shape=(8192, 8192)
+    )
+    fits.HDUList([fits.PrimaryHDU(), image]).writeto(tmp_path / "a.fits")
+    content = (tmp_path / "a.fits").read_bytes()
+    if is_damaged:
+        content = content.replace(b"=                 8192 ", b"=                   64 ")
+    (tmp_path / "a.fits").write_bytes(content)
+    with refused("a.fits", "inflates to more" if is_damaged else "a chunk of at most 8 MiB"):
+        read_array(tmp_path / "a.fits")
+    (unit,) = (unit for unit in units_of(tmp_path / "a.fits") if unit.compressed)
+    assert unit.value_bytes == (64 * 64 if is_damaged else 64 * MIB)
 
 
 def test_tiny_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +16,10 @@ from numpy.typing import ArrayLike
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
-from faintspot.io.arrays.streams import open_plain_or_gzip
+from faintspot.base.sizes import check_bytes
+from faintspot.io.arrays.inflation import check_inflated, is_surely_small
+from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES
+from faintspot.io.arrays.streams import GZIP_SIGNATURE, open_plain_or_gzip
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_fits
 
@@ -33,6 +37,47 @@ class HeaderDataUnit:
     compressed: bool
     shape: tuple[int, ...]
     data_start: int
+
+    @property
+    def value_bytes(self) -> int:
+        """Size of the values, decompressed."""
+        if not self.compressed:
+            return int(self.header.data_size)
+        return math.prod(self.shape) * abs(int(self.header["ZBITPIX"])) // 8
+
+    @property
+    def tile(self) -> tuple[int, ...] | None:
+        """Shape of the tiles in which an image is compressed."""
+        if not self.compressed:
+            return None
+        n_axes = len(self.shape)
+        whole_rows = {1: self.shape[-1]} if self.shape else {}
+        return tuple(
+            int(self.header.get(f"ZTILE{axis}", whole_rows.get(axis, 1))) for axis in range(n_axes, 0, -1)
+        )
+
+    def check_tiles(self, name: str, path: Path) -> None:
+        """Refuse compressed tiles that are larger, or inflate to more, than a chunk may be.
+
+        Raises
+        ------
+        InputError
+            If there are such tiles.
+        """
+        if not self.compressed:
+            return
+        itemsize = abs(int(self.header["ZBITPIX"])) // 8
+        check_bytes(name, math.prod(self.tile or ()) * itemsize, MOST_WHOLE_BYTES, "a chunk")
+        with open_plain_or_gzip(path) as stream:
+            opened = load_fits().open(stream, memmap=False, disable_image_compression=True)
+            rows = np.asarray(opened[self.index].data)
+            heap = self.data_start + int(self.header.get("THEAP", rows.nbytes))
+            for column in {"COMPRESSED_DATA", "GZIP_COMPRESSED_DATA"} & set(rows.dtype.names or ()):
+                for size, offset in rows[column].tolist():
+                    if not is_surely_small(size, "deflate"):
+                        stream.seek(heap + offset)
+                        if (content := stream.read(size))[:2] == GZIP_SIGNATURE:
+                            check_inflated(name, content, "deflate")
 
     @classmethod
     def of(cls, index: int, header: Any, data_start: int) -> HeaderDataUnit:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import shutil
 from collections.abc import Iterator, Mapping
@@ -13,16 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import read_bytes, replace_file, sync_file, sync_folder
+from faintspot.base.files import check_file_size, read_bytes, replace_file, sync_file, sync_folder
 from faintspot.base.json_text import parse_json, to_json
 from faintspot.base.sizes import MOST_TEXT_BYTES, check_bytes
+from faintspot.io.arrays.inflation import check_inflated, is_surely_small
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
 
 TELEMETRY = "faintspot telemetry"
 """Format attribute of a telemetry store."""
-_COMPRESSIONS = "zlib", "gzip", "zstd", "blosc", "lz4", "bz2", "lzma"
+_COMPRESSIONS = {
+    "zlib": "deflate",
+    "gzip": "deflate",
+    **{name: name for name in ("zstd", "blosc", "lz4", "bz2", "lzma")},
+}
+_SPARE_BYTES = 1 << 16  # of a chunk that compression has enlarged
 _MARKS = ("zarr.json", ".zgroup", ".zarray")
 
 
@@ -63,13 +70,49 @@ def check_array(name: str, array: Any) -> int:
     InputError
         When the array is refused.
     """
-    codecs = [
-        getattr(codec, "codec_id", type(codec).__name__) for codec in (*array.filters, *array.compressors)
-    ]
+    codecs = _codecs(array)
     if "pickle" in codecs:
         raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
     check_bytes(name, math.prod(array.chunks) * array.dtype.itemsize, MOST_WHOLE_BYTES, "a chunk")
-    return sum(any(word in str(codec).lower() for word in _COMPRESSIONS) for codec in codecs)
+    return sum(codec in _COMPRESSIONS.values() for codec in codecs)
+
+
+def _codecs(array: Any) -> list[str]:
+    """Return the names of the codecs of an array's chunks; compressions have those of `check_inflated`."""
+    codecs = (*array.filters, *array.compressors)
+    names = [str(getattr(codec, "codec_id", type(codec).__name__)) for codec in codecs]
+    known = _COMPRESSIONS.items()
+    return [next((codec for word, codec in known if word in name.lower()), name) for name in names]
+
+
+class CheckedChunks:
+    """An array of a store in a folder, whose chunks are checked before they are read."""
+
+    def __init__(self, name: str, path: Path, array: Any) -> None:
+        self._name, self._path, self._array = name, path, array
+        self._sides: tuple[int, ...] = array.shards or array.chunks
+        self._codec = next((codec for codec in _codecs(array) if codec in _COMPRESSIONS.values()), "")
+
+    def __getitem__(self, part: Any) -> NDArray[Any]:
+        """Return items of the first axis, or of a later one after numbers of the items of the first."""
+        selection = part if isinstance(part, tuple) else (part,)
+        spans = []
+        for axis, (length, side) in enumerate(zip(self._array.shape, self._sides, strict=True)):
+            item = selection[axis] if axis < len(selection) else slice(None)
+            start, stop, _ = (slice(item, item + 1) if isinstance(item, int) else item).indices(length)
+            spans.append(range(start // side, -(-stop // side)))
+        for numbers in itertools.product(*spans):
+            self._check(self._path / self._array.metadata.encode_chunk_key(numbers))
+        return np.asarray(self._array[part])
+
+    def _check(self, file: Path) -> None:
+        """Refuse a file that is larger than its chunk, or inflates to more than a chunk may have."""
+        if not file.is_file():
+            return
+        most = math.prod(self._sides) * self._array.dtype.itemsize
+        size = check_file_size(file, "a chunk", most + most // 8 + _SPARE_BYTES)
+        if self._codec and not self._array.shards and not is_surely_small(size, self._codec):
+            check_inflated(self._name, file.read_bytes(), self._codec)
 
 
 def stored_attributes(path: Path) -> dict[str, object]:
@@ -120,9 +163,12 @@ def read_items(path: Path, array: Any, start: int, stop: int) -> NDArray[Any]:
                 f"{path}: the store is damaged: {array.basename} of frame {number * array.chunks[0]} "
                 "(counted from 0) and later is lost"
             )
-    check_array(f"{path}: {array.basename}", array)
+    name = f"{path}: {array.basename}"
+    check_array(name, array)
     try:
-        return np.asarray(array[start:stop])
+        return CheckedChunks(name, path / array.path, array)[start:stop]
+    except InputError:
+        raise
     except Exception as error:  # each codec raises its own kind of error on broken chunks
         raise InputError(
             f"{path}: the store is damaged: {array.basename} cannot be read ({one_line(error)})"

@@ -94,7 +94,7 @@ class Fits(FileFormat):
     def read(self, path: Path) -> StoredSlopes:
         """Read a file of slopes and verify its checksums."""
         units = {unit.name.lower(): unit for unit in units_of(path)}
-        total = sum(unit.header.data_size for unit in units.values())
+        total = sum(unit.value_bytes for unit in units.values())
         check_bytes(path, total, most_slopes_bytes(), "slopes")
         check_stated(path, {name: units[name].shape for name in VARIABLES if name in units})
         fits = load_fits()
@@ -151,6 +151,7 @@ def _image(name: str, path: Path, unit: HeaderDataUnit) -> StoredArray:
     compressed_file = is_gzip(path)
     if not compressed_file:
         check_present(name, path, unit.data_start + unit.header.data_size)
+    unit.check_tiles(name, path)
     bits = unit.header["ZBITPIX" if unit.compressed else "BITPIX"]
     if bits not in fits.BITPIX2DTYPE:
         raise InputError(f"{name}: BITPIX = {bits}: expected one of {', '.join(map(str, fits.BITPIX2DTYPE))}")
@@ -167,7 +168,7 @@ def _image(name: str, path: Path, unit: HeaderDataUnit) -> StoredArray:
             image.stored = StreamedArray(stream, start, numbers, unit.shape, compressed=compressed_file)
         return image
 
-    return StoredArray(name, unit.shape, image[:].dtype, open_array)
+    return StoredArray(name, unit.shape, image[:].dtype, open_array, chunks=unit.tile)
 
 
 class _Image:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import zlib
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -12,14 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
+from faintspot.io.arrays.inflation import check_inflated, is_surely_small
+from faintspot.io.arrays.stored_array import StoredArray
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.locations import choose_name
 from faintspot.io.optional_packages import load_hdf5
 
 _KEEPING_SIZE = (2, 3)  # shuffle, Fletcher's checksum
-_MOST_SURE = MOST_WHOLE_BYTES // 1032  # bytes that cannot inflate to more than the limit
-_SUM_BYTES, _PIECE_BYTES = 4, 1 << 20  # of a checksum; inflated at once
+_CODECS = {
+    1: "deflate",
+    4: "szip",
+    307: "bz2",
+    32001: "blosc",
+    32004: "hdf5-lz4",
+    32008: "hdf5-lz4",
+    32015: "zstd",
+}
+"""Compressing filters by number; of others (lzf), no chunk inflates to more than a hundred times its size."""
 
 
 class Hdf5(FileFormat):
@@ -75,9 +82,13 @@ def _check(name: str, data_set: Any) -> int:
         raise InputError(f"{name}: expected data in this file, they are stored in other files")
     if data_set.dtype.hasobject:
         raise InputError(f"{name}: expected numbers, got {data_set.dtype}")
+    return sum(code not in _KEEPING_SIZE for code in _filters(data_set))
+
+
+def _filters(data_set: Any) -> list[int]:
+    """Return the numbers of the filters of the chunks, in the order in which they were applied."""
     filters = data_set.id.get_create_plist()
-    codes = [filters.get_filter(number)[0] for number in range(filters.get_nfilters())]
-    return sum(code not in _KEEPING_SIZE for code in codes)
+    return [int(filters.get_filter(number)[0]) for number in range(filters.get_nfilters())]
 
 
 class _DataSet:
@@ -86,11 +97,14 @@ class _DataSet:
     def __init__(self, name: str, data_set: Any, reverse: bool) -> None:
         self._name, self._data_set, self._reverse = name, data_set, reverse
         self._large: set[tuple[int, ...]] = set()  # chunks that may inflate to more than the limit
-        if data_set.compression == "gzip" and data_set.id.get_storage_size() > _MOST_SURE:
+        filters = enumerate(_filters(data_set))
+        known = ((place, _CODECS[code]) for place, code in filters if code in _CODECS)
+        self._place, self._codec = next(known, (0, ""))
+        if self._codec and not is_surely_small(data_set.id.get_storage_size(), self._codec):
             data_set.id.chunk_iter(self._note)
 
     def _note(self, chunk: Any) -> None:
-        if chunk.size > _MOST_SURE:
+        if not (is_surely_small(chunk.size, self._codec) or chunk.filter_mask >> self._place & 1):
             self._large.add(chunk.chunk_offset)
 
     def __getitem__(self, part: Any) -> NDArray[Any]:
@@ -98,7 +112,7 @@ class _DataSet:
         across = self._reverse and self._data_set.ndim == 2
         selection = (slice(None), part) if across else part if isinstance(part, tuple) else (part,)
         for first in self._large and self._chunks_of(selection):
-            self._check_chunk(first)
+            check_inflated(self._name, self._data_set.id.read_direct_chunk(first)[1], self._codec)
             self._large.remove(first)
         values = np.asarray(self._data_set[selection])
         return values.swapaxes(-1, -2) if self._reverse else values
@@ -117,15 +131,3 @@ class _DataSet:
                 for at, side, span in zip(first, self._data_set.chunks, spans, strict=False)
             )
         ]
-
-    def _check_chunk(self, first: tuple[int, ...]) -> None:
-        """Refuse a chunk that inflates to more than its size, before HDF5 makes room for it."""
-        inflating = zlib.decompressobj()
-        n_bytes = math.prod(self._data_set.chunks) * self._data_set.dtype.itemsize
-        mask, content = self._data_set.id.read_direct_chunk(first)
-        left = n_bytes + _SUM_BYTES + 1
-        while content and left > 0 and not mask & 1:
-            left -= len(inflating.decompress(content, min(left, _PIECE_BYTES)))
-            content = inflating.unconsumed_tail
-        if left <= 0:
-            raise InputError(f"{self._name}: damaged: a chunk of {n_bytes:,} bytes inflates to more")

@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.io.arrays.inflation import check_inflated, is_surely_small
 from faintspot.io.arrays.stored_array import EQUAL_COLOURS, StoredArray, grey
 from faintspot.io.arrays.streams import StreamedArray, check_present
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.optional_packages import load_pillow, load_tifffile
 
 _PLAIN = (1, 8, 32946)  # uncompressed or deflated
+_CODECS = {8: "deflate", 32946: "deflate", 34925: "lzma", 34926: "zstd", 50000: "zstd"}
 
 
 class Tiff(FileFormat):
@@ -105,7 +107,9 @@ def _array(name: str, path: Path, chosen: list[Any], numbers: list[int]) -> Stor
         pages = _Pages(path, [page for number in numbers for page in file.series[number].pages])
         return pages if count > 1 else pages[0:1][0]
 
-    return StoredArray(name, shape, dtype, open_pages, note=EQUAL_COLOURS if is_colour else "")
+    chunks = (*(1 for _ in shape[:-2]), *series.keyframe.chunks[:2])  # strips or tiles
+    note = EQUAL_COLOURS if is_colour else ""
+    return StoredArray(name, shape, dtype, open_pages, note=note, chunks=chunks)
 
 
 class _Pages:
@@ -121,9 +125,18 @@ class _Pages:
 
     def _decoded(self, page: Any) -> NDArray[np.generic]:
         if page.compression in _PLAIN or importlib.util.find_spec("imagecodecs"):
+            self._check(page)
             return np.asarray(page.asarray(maxworkers=1))
         if page.dtype.itemsize > 4:
             raise MissingExtraError("imagecodecs", "io", f"Reading {page.compression.name} of {page.dtype}")
         with load_pillow().open(self._path, formats=["TIFF"]) as image:
             image.seek(page.index)
             return np.asarray(image)
+
+    def _check(self, page: Any) -> None:
+        """Refuse strips or tiles that inflate to more than one may have."""
+        codec = _CODECS.get(int(page.compression), "")
+        for offset, size in zip(page.dataoffsets, page.databytecounts, strict=False):
+            if codec and not is_surely_small(size, codec):
+                page.parent.filehandle.seek(offset)
+                check_inflated(str(self._path), page.parent.filehandle.read(size), codec)

@@ -9,7 +9,7 @@ import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.io.arrays.stored_array import StoredArray
-from faintspot.io.arrays.zarr_store import check_array, is_store, open_store
+from faintspot.io.arrays.zarr_store import CheckedChunks, check_array, is_store, open_store
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.locations import choose_name
 from faintspot.io.optional_packages import load_zarr
@@ -41,7 +41,8 @@ class Zarr(FileFormat):
             node = arrays[choose_name(path, {name: array.ndim for name, array in arrays.items()}, None)]
         name = f"{path}:{node.path}" if node.path else str(path)
         options: dict[str, Any] = {"chunks": node.chunks, "compressions": check_array(name, node)}
-        return StoredArray(name, node.shape, np.dtype(node.dtype), lambda _: node, **options)
+        chunks = CheckedChunks(name, path / node.path, node)
+        return StoredArray(name, node.shape, np.dtype(node.dtype), lambda _: chunks, **options)
 
     def require(self) -> None:
         """Raise MissingExtraError when zarr is not installed."""

@@ -161,8 +161,10 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
         raise InputError(f"{path}: no such file or directory")
     if not is_aot(path):
         raise InputError(f"{path}: expected an AOT file, whose header has {AOT_VERSION}")
-    total = sum(unit.header.data_size for unit in units_of(path))
+    total = sum(unit.value_bytes for unit in units_of(path))
     check_bytes(path, total, memory_bytes() // 2, "telemetry")
+    for unit in units_of(path):
+        unit.check_tiles(str(path), path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about data that faintspot does not read
         try:
