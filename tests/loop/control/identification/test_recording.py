@@ -1,11 +1,13 @@
 """Conventions of recorded loops: sign, rows and unit."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from tests.loop.telemetry.loop_cases import recorded
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.loop_delay import LoopDelay
@@ -78,6 +80,53 @@ def test_commands_of_another_loop() -> None:
 def test_refusals(change: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         prepared(replace(recorded(), **change))
+
+
+REFUSED: dict[str, list[Any]] = {
+    "frame_rate_hz": [1e300, 0.0, -1.0, 1e-5, None],
+    "subaperture_m": [1e300, 0.0, -1.0, 1e-5],
+    "pixel_scale_arcsec": [1e300, 0.0, -1.0, 1e-10],
+    "delay_frames": [1e300, 0.0, -1.0, 1e-5],
+    "sent_after_frames": [1e300, -1.0, 0.5],
+    "largest_command": [1e300, 0.0, -1.0],
+    "gain_error": [1e300, 0.0, -1.0, 1e-7],
+    "outer_scale_m": [1e300, 0.0, -1.0, 1e-5],
+    "science_wavelength_m": [1e300, 0.0, -1.0, None],
+    "unit": [1e300, 0.0, -1.0, None],
+    "is_closed": [1e300, 0.0, None, "yes"],
+    "remarks": [1e300, 0.0, None, "text"],
+    "slopes": [1e300, 0.0, None],
+    "commands": [1e300, 0.0],
+    "interaction_matrix": [1e300, 0.0],
+    "cells": [1e300, 0.0],
+    "frame": [1e300, 0.0],
+    "standard_errors": [1e300, 0.0, -1.0],
+    "covariance_xy": [1e300, 0.0],
+    "prior_std": [1e300, 0.0, -1.0],
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_each_field_is_checked(name: str) -> None:
+    """Also numbers that are not finite, in one line that names the field; of arrays, one wrong number."""
+    loop = recorded().part(slice(0, 20))
+    arrays = {
+        "slopes": loop.slopes,
+        "commands": loop.commands,
+        "interaction_matrix": loop.interaction_matrix,
+        "standard_errors": np.ones((20, 50)),
+        "covariance_xy": np.ones((20, 25)),
+        "prior_std": np.ones(50),
+    }
+    infinite = () if name in ("standard_errors", "covariance_xy", "prior_std") else (math.nan, math.inf)
+    for value in (*REFUSED[name], *infinite):
+        with refused(name):
+            replace(loop, **{name: value})
+        if name in arrays and value in (1e300, -1.0):
+            damaged = arrays[name].copy()
+            damaged.flat[3] = value
+            with refused(name):
+                replace(loop, **{name: damaged})
 
 
 def test_standard_errors_of_frames() -> None:

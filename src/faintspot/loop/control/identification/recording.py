@@ -9,7 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import finite_array, increasing, numbers_between, real_array
+from faintspot.base.checks import (
+    finite_array,
+    increasing,
+    number_between,
+    numbers_between,
+    real_array,
+    strings_of,
+)
 from faintspot.base.config.options import Option
 from faintspot.base.errors import InputError
 from faintspot.loop.control.faults import followers, still_actuators, stuck_slopes
@@ -23,9 +30,11 @@ _CLEAR = 0.5  # correlation of an integrator's steps with its slopes, above whic
 _UNRELATED = 0.1  # correlation below which commands are not those of the loop
 _STEPS_FOR_TEST = 200  # fewest of them
 _PER_FRAME = ("slopes", "commands", "frame", "standard_errors", "covariance_xy")
+_ARRAYS = ("slopes", "commands", "interaction_matrix", "standard_errors", "covariance_xy", "prior_std")
 _MOST_CELLS = 1000  # rows or columns of the lenslet array
 _NAMED = 5  # sub-apertures in a remark
 _BROKEN = 1e6  # rms of a slope relative to the median one
+_LARGEST = 1e30  # whose square is a number
 
 
 def _positive(meaning: str, unit: str, low: float, high: float) -> Option:
@@ -117,10 +126,17 @@ class Recording:
         frame = np.arange(len(slopes))
         if self.frame is not None:
             frame = increasing("frame", self.frame, len(slopes), integer=True)
-        values: dict[str, object] = {"slopes": slopes, "cells": cells, "frame": frame}
+        values: dict[str, Any] = {"slopes": slopes, "cells": cells, "frame": frame}
         for name, declared in NUMBERS.items():
             if hasattr(self, name):
                 values[name] = declared.checked(name, getattr(self, name))
+        for name in ("frame_rate_hz", "science_wavelength_m"):
+            if values[name] is None:
+                raise InputError("expected a number", name=name, value=None)
+        values["unit"] = number_between("unit", self.unit, 1 / _LARGEST, _LARGEST)
+        values["remarks"] = strings_of("remarks", self.remarks)
+        if not isinstance(self.is_closed, bool | np.bool_):
+            raise InputError("expected true or false", name="is_closed", value=self.is_closed)
         for name in ("commands", "interaction_matrix"):
             if getattr(self, name) is not None:
                 array = finite_array(name, getattr(self, name), minimum_dimensions=2).astype(np.float64)
@@ -128,6 +144,12 @@ class Recording:
         for name in ("standard_errors", "covariance_xy", "prior_std"):
             if getattr(self, name) is not None:
                 values[name] = real_array(name, getattr(self, name)).astype(np.float64)
+                if name != "covariance_xy" and (values[name] < 0.0).any():
+                    raise InputError(f"{name}: expected no negative numbers")
+        for name in _ARRAYS:
+            array = np.abs(values.get(name, np.zeros(0)))
+            if (array[array < np.inf] > _LARGEST).any():
+                raise InputError(f"{name}: expected numbers of at most {_LARGEST:g}")
         for name, value in values.items():
             object.__setattr__(self, name, value)
         self._check_shapes()
