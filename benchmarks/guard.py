@@ -253,9 +253,15 @@ def _fault_table(flux_e: float) -> Table:
     return Table(f"guard-faults-{flux_e:g}", f"Faults of sensor and mirror, {flux_e:g} e-", rows, [note])
 
 
+@cache
+def learnt_with(flux_e: float, damage: Damage, still: tuple[int, ...]) -> PredictiveControl:
+    """Return the filter learnt from a recording with a fault."""
+    return learn(recorded(flux_e, _FAULT_GAIN, damage, still))
+
+
 def fault_row(name: str, damage: Damage, flux_e: float, still: tuple[int, ...], is_later: bool) -> Row:
     """Return the Strehl ratios of filter and integrator with a fault."""
-    control = learn(recorded(flux_e, _FAULT_GAIN, FAULTS["none"] if is_later else damage, still))
+    control = learnt_with(flux_e, FAULTS["none"] if is_later else damage, still)
     ratios, predicting = [], []
     for seed in SEEDS:
         control.reset()
