@@ -36,7 +36,7 @@ _FEWEST_UPDATES_HZ = 10.0
 
 def run() -> list[Table]:
     """Measure latencies with and without clients."""
-    camera = ["--frame-rate-hz", str(RATE_HZ), "--rows-per-block", "4", "--flux-e", "200"]
+    camera = ["--frame-rate-hz", str(RATE_HZ), "--rows-per-block", "4"]
     engine = ["--images-every", "30"]
     with engine_and_camera({**SMALL, **USUAL}, camera, engine) as processes:
         processes.until_processed(3 * RATE_HZ)

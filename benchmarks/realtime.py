@@ -39,15 +39,8 @@ _SLOW = {"noise_std": 1.15, "tolerance": 1e-6}
 
 def _latency(values: dict[str, Any], rows_per_block: int, flux_e: float = 200.0) -> dict[str, float]:
     """Return the engine's latencies over FRAMES frames, us."""
-    camera = [
-        "--frame-rate-hz",
-        str(RATE_HZ),
-        "--rows-per-block",
-        str(rows_per_block),
-        "--flux-e",
-        str(flux_e),
-    ]
-    with engine_and_camera({**SMALL, **USUAL, **values}, camera) as processes:
+    camera = ["--frame-rate-hz", str(RATE_HZ), "--rows-per-block", str(rows_per_block)]
+    with engine_and_camera({**SMALL, **USUAL, **values}, camera, flux_e=flux_e) as processes:
         status = processes.until_processed(FRAMES)
     return {name: status["latency"][f"{name}_us"] for name in _NAMES}
 

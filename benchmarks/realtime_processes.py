@@ -12,9 +12,13 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import numpy as np
+
+import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.engine.requests.private_socket import socket_path
 from faintspot.engine.requests.requests import request
+from faintspot.slopes.simulate import Detector, sensor_frames
 
 CONFIGURATION = """
 [layout.grid]
@@ -37,7 +41,7 @@ SMALL = {"across": 7, "pixels": 16, "outer_radius": 3.5, "inner_radius": 0.5}
 """36 sub-apertures of 16 x 16 pixels."""
 USUAL = {"noise_std": 1.0, "tolerance": 0.0, "iterations": 10}
 _COMMAND = [sys.executable, "-m", "faintspot", "realtime"]
-PATIENCE_S = 120.0
+PATIENCE_S, _REPLAYED = 120.0, 100
 
 
 class Processes:
@@ -66,12 +70,26 @@ class Processes:
 
 @contextmanager
 def engine_and_camera(
-    values: dict[str, Any], camera: Sequence[str], engine: Sequence[str] = (), priority: int = 0
+    values: dict[str, Any],
+    camera: Sequence[str],
+    engine: Sequence[str] = (),
+    priority: int = 0,
+    flux_e: float = 200.0,
 ) -> Iterator[Processes]:
-    """Start both with a configuration of these values, perhaps with real-time priority; end them."""
+    """Start both with a configuration of these values, perhaps with real-time priority; end them.
+
+    The camera replays simulated frames again and again, with options of `faintspot realtime replay`.
+    """
     name = f"faintspot_benchmark_{uuid4().hex[:8]}"
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "faintspot.toml").write_text(CONFIGURATION.format(**values))
+        path = Path(folder) / "faintspot.toml"
+        path.write_text(CONFIGURATION.format(**values))
+        layout = fs.Layout.load(path)
+        sensor = layout.corners, layout.window, layout.frame_shape, _REPLAYED
+        frames, _ = sensor_frames(
+            *sensor, flux_e=flux_e, detector=Detector(1.0), rng=np.random.default_rng(1)
+        )
+        np.save(path.with_name("frames.npy"), frames)
         first = ["chrt", "-f", str(priority)] if priority else []
         started = [
             subprocess.Popen(
@@ -79,7 +97,7 @@ def engine_and_camera(
             )
             for arguments in (
                 ["run", "--priority", str(priority), *engine],
-                ["camera", "--seed", "1", *camera],
+                ["replay", "frames.npy", "--repeat", *camera],
             )
         ]
         try:

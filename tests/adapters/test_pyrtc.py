@@ -188,6 +188,39 @@ def test_signals_are_pyrtcs_own() -> None:
     assert np.ptp(found[0]) > 1.0
 
 
+class SlopesStandIn:
+    """Stand-in of pyRTC's SlopesProcess: the signal has the slopes of the valid sub-apertures."""
+
+    def __init__(self, conf: dict[str, Any]) -> None:
+        vars(self).update(vars(process()))
+        self.valid_sub_aps[[1, GRID + 1], 2] = False
+
+    def compute_signal(self, image: np.ndarray) -> None:
+        maps: np.ndarray = self._compute_slopes_shwfs(image)  # type: ignore[attr-defined]
+        self.signal = maps[self.valid_sub_aps]
+
+    def read(self, *, block: bool) -> np.ndarray:
+        assert not block
+        return self.signal
+
+
+def test_a_recording_has_no_slopes_that_were_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are 0 in the stream."""
+    tool = SimpleNamespace(SlopesProcess=SlopesStandIn, open_stream=no_stream)
+    monkeypatch.setattr(pyrtc, "_pyrtc", lambda: tool)
+    tables = {**TABLES, **ESTIMATORS["centroid"].to_tables()}
+    component = pyrtc.slopes_process.__wrapped__()({"faintspot": tables})
+    with refused("no frame has been measured yet"):
+        component.recorded()
+    stack = images()
+    stack[4] = 0.0
+    component.compute_signal(frame_of(stack))
+    dark = [4, N - 1 + 4]  # before the one that is not valid
+    assert not component.signal[dark].any()
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(component.recorded())), dark)
+    np.testing.assert_array_equal(np.nan_to_num(component.recorded()), component.signal)
+
+
 class LoopStandIn:
     """Stand-in of pyRTC's Loop: signals in a list, None where its input is stale."""
 
