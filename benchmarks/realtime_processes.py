@@ -84,11 +84,8 @@ def engine_and_camera(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "faintspot.toml"
         path.write_text(CONFIGURATION.format(**values))
-        layout = fs.Layout.load(path)
-        sensor = layout.corners, layout.window, layout.frame_shape, _REPLAYED
-        frames, _ = sensor_frames(
-            *sensor, flux_e=flux_e, detector=Detector(1.0), rng=np.random.default_rng(1)
-        )
+        detector, rng = Detector(1.0), np.random.default_rng(1)
+        frames, _ = sensor_frames(fs.Layout.load(path), _REPLAYED, flux_e=flux_e, detector=detector, rng=rng)
         np.save(path.with_name("frames.npy"), frames)
         first = ["chrt", "-f", str(priority)] if priority else []
         started = [

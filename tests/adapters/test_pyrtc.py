@@ -191,13 +191,15 @@ def test_signals_are_pyrtcs_own() -> None:
 class SlopesStandIn:
     """Stand-in of pyRTC's SlopesProcess: the signal has the slopes of the valid sub-apertures."""
 
+    valid_sub_aps: np.ndarray
+
     def __init__(self, conf: dict[str, Any]) -> None:
         vars(self).update(vars(process()))
         self.valid_sub_aps[[1, GRID + 1], 2] = False
 
     def compute_signal(self, image: np.ndarray) -> None:
         maps: np.ndarray = self._compute_slopes_shwfs(image)  # type: ignore[attr-defined]
-        self.signal = maps[self.valid_sub_aps]
+        self.signal: np.ndarray = maps[self.valid_sub_aps]
 
     def read(self, *, block: bool) -> np.ndarray:
         assert not block

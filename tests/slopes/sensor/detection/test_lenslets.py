@@ -318,7 +318,8 @@ def test_sharp_spots_over_a_clipped_background_are_no_hot_pixels(
 @pytest.mark.parametrize("place", ["beside the pupil", "far away", "between the spots"])
 def test_a_spot_that_was_taken_for_a_hot_pixel_is_listed(place: str) -> None:
     """A bright pixel at the node of a dark lenslet of the pupil's edge may be its spot, others are not."""
-    nodes = 20.0 + 20.0j + 12.0 * np.stack(np.meshgrid(np.arange(6), np.arange(6)), axis=-1) @ [1.0, 1j]
+    rows, columns = np.mgrid[:6, :6]
+    nodes: NDArray[np.complex128] = 20.0 + 12.0 * columns + 1j * (20.0 + 12.0 * rows)
     frame = spot_frame(nodes.ravel()[1:], (150, 150), flux_e=4000.0)
     y, x = {"beside the pupil": (20, 20), "far away": (140, 140), "between the spots": (50, 50)}[place]
     frame[y, x] += 2000.0
