@@ -1,12 +1,15 @@
 import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from tests.cli.cli_cases import Commands
 from tests.experiments.experiment_cases import SEARCH, small
 
-from faintspot.experiments.closed_loop import budget, experiment
-from faintspot.experiments.night import protocol
+from faintspot.cli.loop import command
+from faintspot.experiments.closed_loop import budget, experiment, magnitude
+from faintspot.experiments.night import page, protocol
 from faintspot.experiments.night.blocks import load_night
 from faintspot.experiments.night.protocol import NightPlan
 from faintspot.loop.control.configuration import load_control
@@ -70,6 +73,39 @@ def test_night(run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
         refused = run(*arguments, option, "x")
         assert refused.code != 0
         assert words in refused.err
+
+
+def test_options_of_a_night_are_passed_on(run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: dict[str, Any] = {}
+
+    def simulate(loop: LoopConfiguration, folder: Path, **options: Any) -> None:
+        taken.update(options, loop=loop, folder=folder)
+
+    monkeypatch.setattr(command, "simulate_night", simulate)
+    monkeypatch.setattr(page, "night_summary_text", lambda night: "")
+    np.save("factors.npy", [1.0, 0.5, 2.0])
+    given = ("--strengths", "0.4,0.8", "--strength-factors", "factors.npy", "--tuned", "--overwrite")
+    run.ok("loop", "night", "small.toml", "--workers", 3, "--methods", "tv,ml", "-o", "here", *given)
+    plan = NightPlan(methods=("tv", "ml"), strengths_e=(0.4, 0.8), strength_factors=(1.0, 0.5, 2.0))
+    assert taken == {
+        "loop": load_loop("small.toml"), "folder": Path("here"), "plan": plan, "quick": False, "tuned": True,
+        "overwrite": True, "workers": 3, "scheduler": None,
+    }  # fmt: skip
+
+
+def test_what_magnitude_recommends_is_for_the_configuration(
+    run: Commands, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured: list[Any] = []
+    saved: list[Any] = []
+    monkeypatch.setattr(command, "_measure", lambda *what, **options: measured.append((what, options)))
+    monkeypatch.setattr(magnitude, "save_recommended", lambda *what: saved.append(what))
+    given = ("--methods", "tv,ml", "--flux-e", "20,50", "--write-config", "best.toml", "--workers", 2)
+    run.ok("loop", "magnitude", "small.toml", "--quick", *given)
+    [(what, options)] = measured
+    assert what == ("small.toml", "magnitude", magnitude.run_magnitude, ("tv", "ml"), (20.0, 50.0))
+    assert options == {"output": None, "quick": True, "overwrite": False, "workers": 2, "scheduler": None}
+    assert saved == [(None, load_loop("small.toml"), "best.toml")]
 
 
 def test_budget(run: Commands) -> None:

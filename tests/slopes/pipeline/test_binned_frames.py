@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.refusals import refused
 
-from faintspot import Calibration, Layout, Settings, SlopePipeline
+from faintspot import PSF, Calibration, Layout, Settings, SlopePipeline
 from faintspot.base.flags import SubapertureFlag
 from faintspot.engine.path.pipeline_maker import PipelineMaker
 from faintspot.slopes.sensor.binning import binned_layout, magnified_layout
@@ -54,6 +54,20 @@ def test_standard_errors_are_in_camera_pixels() -> None:
     )
     slopes = SlopePipeline(LAYOUT, settings, camera)(frames)
     assert slopes.x.std(axis=0).mean() == pytest.approx(slopes.standard_error_x.mean(), rel=0.15)
+
+
+def test_predictions_are_in_camera_pixels() -> None:
+    """The prior of 0.02 px rules over spots elsewhere; one prediction for all frames, or one for each."""
+    settings = Settings("map", prior_std_px=0.02, flux_e=100.0)
+    psf = PSF.analytic("gaussian", size=1.5)  # in binned pixels
+    pipeline = SlopePipeline(LAYOUT, settings, Calibration(read_noise_e=5.0), psf=psf)
+    frames, prior = np.stack([spots() / 40] * 2), np.repeat([1.5, -0.7], 6)
+    slopes = pipeline(frames, prior)
+    np.testing.assert_allclose(slopes.vector, [prior, prior], atol=0.1)
+    np.testing.assert_array_equal(slopes.vector, pipeline(frames, prior.reshape(2, 6).T).vector)
+    each = pipeline(frames, np.stack([prior, -prior])).vector
+    np.testing.assert_array_equal(each[0], slopes.vector[0])
+    np.testing.assert_allclose(each[1], -prior, atol=0.1)
 
 
 def test_one_saturated_pixel_is_seen() -> None:

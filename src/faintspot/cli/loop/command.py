@@ -170,7 +170,7 @@ def budget(configuration: str, methods: Names | None, **options: Any) -> None:
 @option(
     "--strength-factors",
     metavar="FILE",
-    help="Factor on the strength in each sub-aperture (.npy, .csv).",
+    help="Factor on the strength in each sub-aperture (.npy or .fits).",
     show_default="1",
 )
 @option(
