@@ -1,13 +1,16 @@
 import functools
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.cli.cli_cases import LAYOUT, Commands, simulated
 
-from faintspot import Calibration, Layout, SlopePipeline
-from faintspot.cli.tune import _binned
+from faintspot import Calibration, Layout, Settings, SlopePipeline
+from faintspot.cli.tune import _binned, _save_in_camera_pixels
 from faintspot.experiments.planner import tuning
+from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.sensor.binning import binned_layout
 
 KNOWN = ("--read-noise-e", 3, "--pixels", 8, "--fwhm-px", "1.8", "--flux-e", 200)
@@ -97,6 +100,22 @@ def test_values_of_binned_frames() -> None:
         }
     )  # fmt: skip
     assert _binned({"budget": "50mas"}, layout)["budget"] == "50mas"
+
+
+def test_what_is_found_of_binned_frames_is_written_in_camera_pixels(tmp_path: Path) -> None:
+    layout, path = Layout.grid((4, 4), pixels=16, bin=2), tmp_path / "faintspot.toml"
+    promise = {"contradicted": False, "flux_e": 100.0, "noise_ratio": 1.1, "measured_px": 0.1}
+    answer: Any = SimpleNamespace(
+        calibration=Calibration(read_noise_e=3.0),
+        best=SimpleNamespace(settings=Settings("smoothed", smoothing_px=0.8)),
+        promise=SimpleNamespace(to_table=lambda: promise),
+    )
+    _save_in_camera_pixels(answer, path, layout)
+    described = Configuration(path)
+    assert described.layout == layout
+    assert described.calibration.read_noise_e == 1.5
+    assert described.settings.smoothing_px == 1.6
+    assert described.tables["promise"] == {**promise, "measured_px": 0.2}
 
 
 @pytest.mark.slow
