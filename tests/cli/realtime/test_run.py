@@ -14,6 +14,7 @@ from tests.loop.control.control_cases import INTERACTION
 from faintspot import Layout, Settings
 from faintspot.base.errors import InputError
 from faintspot.engine import engine
+from faintspot.engine.options import EngineOptions
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.loop.control.configuration import save_control
 
@@ -21,15 +22,17 @@ pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared 
 
 
 def test_options_are_passed_on(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    taken: list[dict[str, Any]] = []
+    layout, settings = Layout.grid((3, 3), pixels=8), Settings("brightest")
+    taken: list[tuple[EngineOptions, dict[str, Any]]] = []
 
-    def no_engine(*_: Any, **options: Any) -> None:
-        taken.append(options)
+    def no_engine(_: str, maker: Any, changing: Settings, options: EngineOptions, **parts: Any) -> None:
+        assert (maker.layout, changing) == (layout, settings)
+        taken.append((options, parts))
         raise InputError("no engine")
 
     monkeypatch.setattr(engine, "Engine", no_engine)
     monkeypatch.chdir(tmp_path)
-    for part in (Layout.grid((3, 3), pixels=8), Settings("brightest")):
+    for part in (layout, settings):
         part.save("faintspot.toml")
     np.save("matrix.npy", INTERACTION)
     save_control("faintspot.toml", interaction_matrix="matrix.npy", gain=0.2)
@@ -37,13 +40,9 @@ def test_options_are_passed_on(run: Commands, tmp_path: Path, monkeypatch: pytes
     methods = ("--interleave", "none,tv:0.6", "--every", 20)
     run.refused("realtime", "run", *machine, "--flux-frames", 30, *methods, naming=("no engine",))
     run.refused("realtime", "run", "--no-control", naming=("no engine",))
-    with_control, without = taken
-    control, interleaving = with_control.pop("control"), with_control.pop("interleaving")
-    assert control.options.gain == 0.2
-    assert (interleaving.labels, interleaving.every) == (["none", "tv:0.6"], 20)
-    assert with_control.pop("deadline_s") == pytest.approx(2.5e-3)
-    assert with_control == {
-        "threads": 2, "cpus": [0, 1], "images_every": 7, "polls": True, "mean_flux": 30.0, "source": None,
-    }  # fmt: skip
-    assert without["control"] is without["interleaving"] is None
-    assert without["deadline_s"] == pytest.approx(1e-3)
+    (options, parts), (usual, without) = taken
+    assert options == EngineOptions(2, [0, 1], 2500.0 * 1e-6, 7, 30.0, True)
+    assert parts["control"].options.gain == 0.2
+    assert (parts["interleaving"].labels, parts["interleaving"].every) == (["none", "tv:0.6"], 20)
+    assert usual == EngineOptions(deadline_s=1000.0 * 1e-6)
+    assert without == {"source": None, "interleaving": None, "control": None}
