@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import errno
+import io
 import os
 import secrets
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -99,6 +101,15 @@ def derived(path: str | Path, ending: str) -> Path:
         raise InputError(f"{path}: expected the name of a file or folder, got the root of all")
     known_ending = next((ending for ending in _ENDINGS if path.name.lower().endswith(ending)), "")
     return path.with_name(f"{path.name[: len(path.name) - len(known_ending)]}{ending}")
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table as CSV text."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return stream.getvalue()
 
 
 def write_atomically(path: str | Path, content: Content) -> None:

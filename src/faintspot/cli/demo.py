@@ -121,16 +121,13 @@ def write_files(
         with progress_bar(f"slopes, {name}") as advance:
             measure_recorded([folder / "frames.npy"], config, output, overwrite=True, progress=advance)
         stored = read_slopes(output).variables
-        methods.append(
-            MeasuredSlopes(name, *(stored[key] for key in ("x", "y", "flux", "flags", "iterations")))
-        )
+        methods.append(MeasuredSlopes(name, *(stored[key] for key in ("x", "y", "flux", "flags"))))
         stages[name] = SlopePipeline.from_file(config).explain(frames[0])
     return {"methods": methods, "layout": layout, "stages": stages, "truth": truth}
 
 
 def write_page(folder: Path, methods: list[MeasuredSlopes], **shown: Any) -> None:
     """Make the report."""
-    from faintspot.base.files import write_atomically
     from faintspot.slopes.recorded.report.page import slopes_report
     from faintspot.slopes.recorded.report.run import SlopesRun
 
@@ -146,4 +143,4 @@ def write_page(folder: Path, methods: list[MeasuredSlopes], **shown: Any) -> Non
         facts=facts,
         configurations={"Configuration": (folder / "tv.toml").read_text(encoding="utf-8")},
     )
-    write_atomically(folder / "report.html", report.html())
+    report.write(folder / "report.html")

@@ -44,10 +44,6 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
       faintspot report night.zarr
       faintspot report canary -o canary.html
     """
-    from faintspot.base.files import write_atomically
-    from faintspot.experiments.report.page import report_of_study
-    from faintspot.slopes.recorded.report.stored import report_of_stored
-
     paths = [Path(path) for path in slopes]
     if output is not None and Path(output).resolve() in [path.resolve() for path in paths]:
         raise InputError(f"{output}: expected a name for the page, got the slopes' own")
@@ -57,22 +53,24 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
         )
     for name in recording:
         split_location(name)  # refuses what is not there
+    target = Path(output) if output is not None else derived(paths[0], ".html")
     if len(paths) == 1 and holds_loop_results(paths[0]):
         from faintspot.experiments.closed_loop.page import loop_page
         from faintspot.experiments.closed_loop.verdict import LoopResults
 
-        page = Path(output) if output is not None else paths[0] / "report.html"
-        loop_page(LoopResults.load(paths[0])).write(page)
-        click.echo(f"{page}: open it in a browser")
-        return
-    if len(paths) == 1 and kind_of_store(paths[0]) == "study":
+        report = loop_page(LoopResults.load(paths[0]))
+        target = target if output is not None else paths[0] / "report.html"
+    elif len(paths) == 1 and kind_of_store(paths[0]) == "study":
+        from faintspot.experiments.report.page import report_of_study
+
         report = report_of_study(paths[0])
     elif len(paths) == 1 and holds_telemetry(paths[0]):
         from faintspot.engine.telemetry.page import report_of_telemetry
 
         report = report_of_telemetry(paths[0])
     else:
+        from faintspot.slopes.recorded.report.stored import report_of_stored
+
         report = report_of_stored(paths, frames=[Path(path) for path in recording] or None)
-    target = output or str(derived(paths[0], ".html"))
-    write_atomically(target, report.html())
+    report.write(target)
     click.echo(f"{target}: open it in a browser")

@@ -136,9 +136,8 @@ def command(
     pieces = [] if every is None else _over_time(loop, every)
     report = report_of_loop(loop, lambda step: click.echo(f"{step} ...", err=True))
     numbers = derived(page, ".json")
-    values = report.as_values() | {"over_time": [piece.as_values() for piece in pieces]}
-    write_atomically(numbers, to_json(values, indent=1))
-    write_atomically(page, page_of_loop(report, pieces).html())
+    write_atomically(numbers, to_json(report.as_values(), indent=1))
+    page_of_loop(report, pieces).write(page)
     if pieces:
         table = derived(page, "-over-time.csv")
         write_atomically(table, table_of_pieces(pieces))

@@ -40,7 +40,7 @@ from faintspot.slopes.wavefront.words import (
     "-o",
     metavar="FILE",
     multiple=True,
-    help="File to write, .csv, .json or .fits; may be repeated.",
+    help="File to write, .csv or .json; may be repeated.",
 )
 @option("--picture", metavar="PNG", help="Picture to write.", show_default="beside the slopes")
 @option(
@@ -57,7 +57,7 @@ from faintspot.slopes.wavefront.words import (
     "maps",
     metavar="FILE",
     multiple=True,
-    help="Map of the mean wavefront to write, .csv or .fits; may be repeated.",
+    help="Map of the mean wavefront to write, .fits; may be repeated.",
 )
 @option("--unit", type=click.Choice(UNITS), help="Unit of the wavefront.", show_default="nm, if known")
 @option("--wavelength-nm", type=float, metavar="NM", help="Wavelength, for waves.")
@@ -111,7 +111,7 @@ def command(
         check_wavefront_file(Path(name))
     for name in maps:
         check_map_file(Path(name))
-    if any(Path(name).suffix.lower() == ".fits" for name in output + maps):
+    if maps:
         require("io", "astropy", purpose="Writing a FITS file")
     target = Path(command_file) if command_file else derived(slopes, "_command.npy")
     check_command_file(target)

@@ -42,8 +42,7 @@ def test_missing_matplotlib_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> 
     for module in (
         "base.report.plots",
         "slopes.recorded.layout_picture",
-        "slopes.recorded.report.frame_pictures",
-        "slopes.recorded.report.maps",
+        "slopes.recorded.report.pictures",
     ):
         for name in ("faintspot.base.report.plots", f"faintspot.{module}"):
             monkeypatch.delitem(sys.modules, name, raising=False)

@@ -22,7 +22,7 @@ def test_lines_levels_and_legend() -> None:
 
 def test_panels_that_share_an_axis_show_all_lines() -> None:
     panels = [Panel([Line("", [0, 1], [0.0, height])], "x") for height in (1.0, 5.0)]
-    figure = plot([panels], 3.0, legend="", sharey="row")
+    figure = plot([panels], 3.0, legend="", shared=True)
     assert all(axes.get_ylim()[1] > 5 for axes in figure.axes)
     figure = plot([[Panel([], "")]], 3.0, legend="")
     figure.axes[0].bar([1], [7.0])

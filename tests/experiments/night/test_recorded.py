@@ -20,6 +20,7 @@ from tests.loop.telemetry.alternation_cases import (
 )
 from tests.refusals import refused
 
+from faintspot.base.report.page import Table
 from faintspot.experiments.night.analysis import difference, drift_of_r0, groups
 from faintspot.experiments.night.measured_strehl import MeasuredStrehl, read_strehl
 from faintspot.experiments.night.recorded import alternates, recorded_night
@@ -191,7 +192,8 @@ def test_page(tmp_path: Path) -> None:
     assert [section.name for section in page.sections][-2:] == ["phase", "blocks"]
     blocks = page.sections[-1]
     assert "60 turns" in str(blocks.parts)
-    assert [row[0] for row in blocks.tables[0].rows] == list(METHODS)
+    (table,) = (part for part in blocks.parts if isinstance(part, Table))
+    assert [row[0] for row in table.rows] == list(METHODS)
 
 
 def test_what_cannot_be_compared(tmp_path: Path) -> None:

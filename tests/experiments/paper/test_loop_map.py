@@ -1,11 +1,13 @@
 """Where denoising pays in a loop: winners and gains of cells, and what each cell simulates."""
 
+import csv
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from faintspot.base.report.page import Table
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.paper import loop_map
 from faintspot.experiments.paper.loop_map import METHODS, R0_M, cells_of, loop_map_page, run_loop_map
@@ -47,10 +49,12 @@ def test_the_page_counts_winners_and_has_every_number() -> None:
     (section,) = loop_map_page(cells).sections
     assert "in 2 of 4 cells and lowers it in 2" in str(section.parts[0])
     assert "maximum a posteriori in 2" in str(section.parts[0]).replace("with a prior on the position", "")
-    (figure,), (table,) = section.figures, section.tables
-    assert len(figure.rows) == len(table.rows) == 4
-    assert all(len(row) == len(figure.header) for row in figure.rows)
+    (table,) = (part for part in section.parts if isinstance(part, Table))
+    assert len(table.rows) == 4
     assert all(len(row) == len(table.header) for row in table.rows)
+    assert table.csv is not None
+    header, *numbers = csv.reader(table.csv[1].splitlines())
+    assert [len(row) for row in numbers] == [len(header)] * 4
 
 
 def test_every_cell_simulates_its_own_turbulence_and_camera(

@@ -4,7 +4,7 @@ import pytest
 from tests.experiments.night_cases import night_with
 from tests.experiments.study_cases import dataset, power_law
 
-from faintspot.base.report.page import TableCell
+from faintspot.base.report.page import Table, TableCell
 from faintspot.experiments.night.analysis import OPEN
 from faintspot.experiments.paper.whole import (
     FAILS,
@@ -48,7 +48,9 @@ def test_a_night_alone() -> None:
     text = paper_markdown(rows)
     assert text.count("\n") == 2 + 4
     assert all(line.startswith("| ") and line.endswith(" |") for line in text.splitlines())
-    assert paper_section(rows).tables[0].rows[0][1] == TableCell(rows[0].statement)
+    (table,) = paper_section(rows).parts
+    assert isinstance(table, Table)
+    assert table.rows[0][1] == TableCell(rows[0].statement)
 
 
 def test_nothing_at_all() -> None:

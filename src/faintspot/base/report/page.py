@@ -1,18 +1,24 @@
-"""Report made of sections: one HTML text without external files."""
+"""Report made of sections, with tables and figures: one HTML text without external files."""
 
 from __future__ import annotations
 
+import base64
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.base.files import derived, write_atomically
-from faintspot.base.report.figure_data import FigureWithData, data_uri
+from faintspot.base.errors import MissingExtraError
+from faintspot.base.files import write_atomically
 from faintspot.base.version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from faintspot.base.report.plots import Drawing
 
 POSITIONS = "Positions are in pixels from each sub-aperture’s centre, x along columns, y along rows."
 """Remark for the foot of a page."""
@@ -57,6 +63,68 @@ class Table:
         return len(self.rows)
 
 
+_CSS_PIXELS_PER_INCH = 100
+_MEDIA_TYPES = {"png": "image/png", "svg": "image/svg+xml", "csv": "text/csv;charset=utf-8"}
+
+
+@dataclass(frozen=True)
+class FigureWithData:
+    """A figure: drawn as SVG with its numbers to save if it has any, else as PNG.
+
+    Attributes
+    ----------
+    name : str
+        Base name of its files.
+    title, caption : str
+    figure : matplotlib Figure
+    csv : str
+        Its numbers as CSV; "" for images.
+    """
+
+    name: str
+    title: str
+    caption: str
+    figure: Figure
+    csv: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        title: str,
+        caption: str,
+        rows: Sequence[Sequence[Drawing]],
+        height: float,
+        **options: Any,
+    ) -> FigureWithData:
+        """Draw rows of panels, pictures and maps with options of `plot`."""
+        from faintspot.base.report.plots import csv_of, plot
+
+        return cls(name, title, caption, plot(rows, height, **options), csv_of(rows))
+
+    @property
+    def width(self) -> int:
+        """Width in CSS pixels."""
+        return round(float(self.figure.get_size_inches()[0]) * _CSS_PIXELS_PER_INCH)
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """Data URIs of its files by ending, png alone or png, svg and csv."""
+        from faintspot.base.report import plots
+
+        contents = {"png": data_uri("png", plots.png(self.figure))}
+        if self.csv:
+            self.figure.set_layout_engine("none")  # keep the layout, which is slow to compute
+            contents |= {"svg": data_uri("svg", plots.svg(self.figure)), "csv": data_uri("csv", self.csv)}
+        return contents
+
+
+def data_uri(ending: str, content: bytes | str) -> str:
+    """Return a file (png, svg or csv) as a data URI."""
+    octets = content.encode() if isinstance(content, str) else content
+    return f"data:{_MEDIA_TYPES[ending]};base64,{base64.b64encode(octets).decode('ascii')}"
+
+
 Part: TypeAlias = "str | Sequence[str] | Table | FigureWithData"
 """Part of a section: a paragraph, a list of points, a table or a figure."""
 
@@ -82,16 +150,6 @@ class Section:
     parts: Sequence[Part] = ()
     missing: str = ""
     code: str = ""
-
-    @property
-    def tables(self) -> list[Table]:
-        """Its tables."""
-        return [part for part in self.parts if isinstance(part, Table)]
-
-    @property
-    def figures(self) -> list[FigureWithData]:
-        """Its figures."""
-        return [part for part in self.parts if isinstance(part, FigureWithData)]
 
 
 @dataclass(frozen=True)
@@ -124,38 +182,15 @@ class Report:
         values = {"style": _template("page.css"), "version": __version__, "data_uri": data_uri}
         return template.render(page=self, **values)
 
-    def write(self, path: str | Path) -> list[Path]:
-        """Write the page and a folder beside it with each figure that has data: PNG, SVG and numbers as CSV.
-
-        Returns
-        -------
-        list of Path
-            The page, then the figures' files.
+    def write(self, path: str | Path) -> None:
+        """Write the page to a file, as of `html`.
 
         Raises
         ------
         InputError
-            When a file cannot be written.
-        MissingExtraError
-            When matplotlib or jinja2 is not installed.
+            When the file cannot be written.
         """
-        path = Path(path)
         write_atomically(path, self.html())
-        folder = derived(path, "-figures")
-        try:
-            folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{folder}: {error.strerror}; choose another folder") from None
-        contents = {
-            folder / f"{figure.name}.{ending}": content
-            for section in self.sections
-            for figure in section.figures
-            if figure.header
-            for ending, content in figure.files.items()
-        }
-        for file, content in contents.items():
-            write_atomically(file, content)
-        return [path, *contents]
 
 
 def configuration_section(text: str, name: str = "Configuration") -> Section:

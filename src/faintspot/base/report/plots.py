@@ -1,18 +1,20 @@
-"""Figures of reports: their common style, and lines with error bars."""
+"""Figures of reports as rows of what is drawn in a pair of axes: lines with error bars, pictures."""
 
 from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from itertools import chain
+from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import not_none
 from faintspot.base.errors import MissingExtraError
+from faintspot.base.files import csv_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -96,31 +98,21 @@ def plain_ticks(axis: XAxis | YAxis, values: Iterable[float]) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{float(f'{value:.3g}'):g}"))
 
 
-_LONG_LABEL = 6  # letters, from which every other one is left out
-
-
-def axis_above(axes: Axes, positions: Any, values: Iterable[float], label: str) -> Any:
+def _axis_above(axes: Axes, positions: Any, values: Iterable[float], label: str) -> None:
     """Put a second axis on top: numbers to three digits at places of the first one."""
     top = axes.secondary_xaxis("top")
     labels = [f"{float(f'{value:.3g}'):g}" for value in values]
-    if max(map(len, labels), default=0) > _LONG_LABEL:
+    if max(map(len, labels), default=0) > 6:
         labels[1::2] = [""] * len(labels[1::2])
     top.set_xticks(positions, labels)
     top.set_xlabel(label)
-    return top
+    top.tick_params(labelsize=10)
 
 
-def note(axes: Axes, text: str, position: tuple[float, float], coordinates: str, **style: Any) -> None:
-    """Write a text beside a place, some points away; coordinates "data", "axes fraction" or one for each."""
-    x, _, y = coordinates.partition(", ")
-    axes.annotate(text, position, xycoords=(x, y or x), textcoords="offset points", **style)
-
-
-def colour_bar(axes: Axes | list[Axes], mappable: Any, label: str, location: str = "right") -> None:
-    """Add a colour bar to one or several axes."""
-    first = axes[0] if isinstance(axes, list) else axes
-    figure = not_none(first.get_figure())
-    bar = figure.colorbar(mappable, ax=axes, label=label, location=location, shrink=0.85, pad=0.02, aspect=25)
+def colour_bar(axes: Axes, mappable: Any, label: str) -> None:
+    """Add a colour bar."""
+    figure = not_none(axes.get_figure())
+    bar = figure.colorbar(mappable, ax=axes, label=label, shrink=0.85, pad=0.02, aspect=25)
     bar.outline.set_visible(False)
 
 
@@ -138,6 +130,25 @@ LEVEL: Mapping[str, Any] = {"color": GREY, "lw": 1}
 """Style of a horizontal line that is no measurement."""
 
 
+class Mark(Protocol):
+    """Something that is drawn on axes."""
+
+    def draw(self, axes: Axes) -> None:
+        """Draw it."""
+
+
+class Drawing(Mark, Protocol):
+    """Content of a pair of axes."""
+
+    @property
+    def y(self) -> str:
+        """Label of the vertical axis."""
+
+    @property
+    def share(self) -> float:
+        """Width relative to that of others."""
+
+
 @dataclass(frozen=True)
 class Line:
     """Points joined by a line.
@@ -145,7 +156,7 @@ class Line:
     Attributes
     ----------
     label : str
-        "" is not in the legend.
+        Name in the legend and in the table of the numbers.
     x, y : (n,) arrays
         Points that are not finite are left out.
     error : (n,) or (2, n) array, optional
@@ -155,6 +166,7 @@ class Line:
     band : bool
         Whether the errors are a band instead of bars.
     x_error : (n,) array, optional
+    in_legend : bool
     """
 
     label: str
@@ -164,21 +176,29 @@ class Line:
     style: Mapping[str, Any] = field(default_factory=dict)
     band: bool = False
     x_error: ArrayLike | None = None
+    in_legend: bool = True
+
+    @classmethod
+    def of(cls, label: str, points: NDArray[Any], style: Mapping[str, Any]) -> Line:
+        """Return a line through points, (n, 2)."""
+        return cls(label, points[:, 0], points[:, 1], style=style)
+
+    def points(self) -> NDArray[np.float64]:
+        """Return x, y and the lengths of the errors down, up and along x of its points, (n, 5)."""
+        x, y = np.asarray(self.x, np.float64), np.asarray(self.y, np.float64)
+        error, x_error = (np.nan if values is None else values for values in (self.error, self.x_error))
+        columns = x, y, *np.broadcast_to(error, (2, len(x))), np.broadcast_to(x_error, len(x))
+        return np.stack([*columns], axis=1, dtype=np.float64)[np.isfinite(x) & np.isfinite(y)]
 
     def draw(self, axes: Axes) -> None:
         """Draw it."""
-        x, y = np.asarray(self.x, np.float64), np.asarray(self.y, np.float64)
-        known = np.isfinite(x) & np.isfinite(y)
-        x, y = x[known], y[known]
-        error, x_error = (
-            None if values is None else np.nan_to_num(np.asarray(values))[..., known]
-            for values in (self.error, self.x_error)
-        )
-        if error is not None and self.band:
-            down, up = np.broadcast_to(error, (2, len(y)))
+        x, y, *errors = self.points().T
+        down, up, x_error = map(np.nan_to_num, errors)
+        if self.band:
             axes.fill_between(x, y - down, y + up, color=self.style["color"], alpha=0.2, lw=0)
-            error = None
-        axes.errorbar(x, y, error, x_error, label=self.label or None, **self.style)
+        error = None if self.error is None or self.band else (down, up)
+        label = self.label if self.label and self.in_legend else None
+        axes.errorbar(x, y, error, None if self.x_error is None else x_error, label=label, **self.style)
 
 
 @dataclass(frozen=True)
@@ -198,8 +218,13 @@ class Panel:
         Styles of horizontal lines by their height, and of vertical lines by their place.
     above : array, array and str, optional
         Places, numbers there, and label of a second axis on top.
-    log, grid, legend : bool
-        `log` makes both axes logarithmic.
+    log : str
+        Axes that are logarithmic: "", "x", "y" or "xy".
+    names : mapping
+        Names of places on the horizontal axis, in place of numbers.
+    grid, legend : bool
+    share : float
+        Width relative to that of others.
     """
 
     lines: Sequence[Line]
@@ -213,9 +238,11 @@ class Panel:
     levels: Mapping[float, Mapping[str, object]] = field(default_factory=dict)
     at: Mapping[float, Mapping[str, Any]] = field(default_factory=dict)
     above: tuple[ArrayLike, Sequence[float], str] | None = None
-    log: bool = False
+    log: str = ""
+    names: Mapping[float, str] = field(default_factory=dict)
     grid: bool = False
     legend: bool = False
+    share: float = 1.0
 
     def draw(self, axes: Axes) -> None:
         """Draw it."""
@@ -225,72 +252,143 @@ class Panel:
             axes.axhline(height, **{**LEVEL, **style})
         for place, style in self.at.items():
             axes.axvline(place, **{**LEVEL, **style})
-        if self.log:
-            axes.set(xscale="log", yscale="log")
-        if self.x_ticks:
-            axes.set_xscale("log")
-            plain_ticks(axes.xaxis, self.x_ticks)
-        if self.y_ticks:
-            axes.set_yscale("log")
-            plain_ticks(axes.yaxis, self.y_ticks)
+        logarithmic = self.log + "x" * bool(self.x_ticks) + "y" * bool(self.y_ticks)
+        axes.set(**{f"{axis}scale": "log" for axis in logarithmic})
+        for axis, ticks in ((axes.xaxis, self.x_ticks), (axes.yaxis, self.y_ticks)):
+            if ticks:
+                plain_ticks(axis, ticks)
+        if self.names:
+            axes.set_xticks(list(self.names), list(self.names.values()), rotation=90, fontsize=9)
         ranges = {"xlim": self.x_range, "ylim": self.y_range}
         fixed = {name: limits for name, limits in ranges.items() if limits != (None, None)}
         axes.set(xlabel=self.x, ylabel=self.y, title=self.title, **fixed)
         if self.above is not None:
-            axis_above(axes, *self.above).tick_params(labelsize=10)
+            _axis_above(axes, *self.above)
         if self.grid:
             axes.grid(which="major", color=FLUX_GREY, lw=0.7)
         if self.legend:
             axes.legend(frameon=False, fontsize=10, handlelength=1.4)
 
+    def numbers(self) -> Iterator[tuple[object, ...]]:
+        """Yield a row for each point, as of `csv_of`."""
+        for line in self.lines:
+            for point in line.points().tolist():
+                cells = ("" if np.isnan(number) else f"{number:.7g}" for number in point)
+                yield self.title.replace("\n", ", "), self.x, self.y, line.label, *cells
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image, with marks on it.
+
+    Attributes
+    ----------
+    image : (h, w) array
+    unit : str
+        Label of the colour bar; "" draws none.
+    title, x, y : str
+    style : mapping
+        Options of Matplotlib's `imshow`.
+    marks : sequence of Mark
+    x_range, y_range : pair of float, optional
+    background : str
+        Colour where the image has no value.
+    share : float
+        Width relative to that of others.
+    """
+
+    image: NDArray[Any]
+    unit: str = ""
+    title: str = ""
+    x: str = "column (px)"
+    y: str = "row (px)"
+    style: Mapping[str, Any] = field(default_factory=dict)
+    marks: Sequence[Mark] = ()
+    x_range: tuple[float, float] | None = None
+    y_range: tuple[float, float] | None = None
+    background: str = FLUX_GREY
+    share: float = 1.0
+
+    def draw(self, axes: Axes) -> None:
+        """Draw it."""
+        image = axes.imshow(self.image, **{"interpolation": "nearest", **self.style})
+        for mark in self.marks:
+            mark.draw(axes)
+        axes.set(xlabel=self.x, ylabel=self.y, title=self.title, facecolor=self.background)
+        axes.set(xlim=self.x_range or image.get_extent()[:2], ylim=self.y_range or image.get_extent()[2:])
+        if self.unit:
+            colour_bar(axes, image, self.unit)
+
+
+def csv_of(rows: Iterable[Iterable[Drawing]]) -> str:
+    """Return the numbers of all lines as CSV; "" where there are no lines."""
+    numbers = [row for part in chain(*rows) if isinstance(part, Panel) for row in part.numbers()]
+    header = "panel", "x axis", "y axis", "line", "x", "y", "error down", "error up", "error of x"
+    return csv_text(header, numbers) if numbers else ""
+
 
 @styled
 def plot(
-    panels: Sequence[Sequence[Panel]],
+    rows: Sequence[Sequence[Drawing]],
     height: float,
     *,
     width: float = WIDTH,
-    title: str = "",
+    heading: str = "",
     columns: int = 4,
     legend: str = "outside lower center",
     handles: Sequence[Line] = (),
-    **shared: Any,
+    shared: bool = False,
+    **legend_style: Any,
 ) -> Figure:
-    """Draw rows of panels.
+    """Draw rows of panels, pictures and maps.
 
     Parameters
     ----------
-    panels : rows of Panel
+    rows : rows of Drawing
     height, width : float
         Size of the figure [inch].
-    title : str
+    heading : str
+        Above all.
     columns : int
         Columns of the legend.
     legend : str
         Where the legend is; "" draws none.
     handles : sequence of Line
         Further entries of the legend, before the labels of panels without a legend of their own, each once.
-    shared : sharex, sharey
-        As of Matplotlib's `subplots`.
+    shared : bool
+        Whether all share the horizontal axis, and those of a row the vertical one.
+    legend_style
+        Options of Matplotlib's `Figure.legend`.
     """
     figure = new_figure(width, height)
-    grid = figure.subplots(len(panels), max(map(len, panels)), squeeze=False, **shared)
-    for row, of_row in zip(grid, panels, strict=True):
-        for axes, panel in zip(row, of_row, strict=False):
-            panel.draw(axes)
-            axes.tick_params(labelbottom=True)
-            if panel is not of_row[0] and panel.y == of_row[0].y:
+    first: dict[str, Axes] = {}
+    for row, places in zip(rows, _places(figure, rows), strict=True):
+        first.pop("sharey", None)
+        for part, place in zip(row, places, strict=True):
+            axes = figure.add_subplot(place, **(first if shared else {}))
+            first = {"sharex": axes, "sharey": axes, **first}
+            part.draw(axes)
+            if part is not row[0] and part.y == row[0].y:
                 axes.set_ylabel("")
-        for axes in row[len(of_row) :]:
-            axes.set_axis_off()
-    if title:
-        figure.suptitle(title, fontsize=14)
+    if heading:
+        figure.suptitle(heading, fontsize=14)
     if legend:
-        _add_legend(figure, handles, legend, columns)
+        _add_legend(figure, handles, {"loc": legend, "frameon": False, **legend_style}, columns)
     return figure
 
 
-def _add_legend(figure: Figure, handles: Sequence[Line], place: str, columns: int) -> None:
+def _places(figure: Figure, rows: Sequence[Sequence[Drawing]]) -> list[list[Any]]:
+    """Return a place for each drawing, in columns where all have the same share."""
+    if all(part.share == 1 for part in chain(*rows)):
+        grid = figure.add_gridspec(len(rows), max(map(len, rows)))
+        return [[grid[number, column] for column in range(len(row))] for number, row in enumerate(rows)]
+    whole = figure.add_gridspec(len(rows), 1)
+    shares = [[part.share for part in row] for row in rows]
+    grids = [whole[n].subgridspec(1, len(row), width_ratios=row) for n, row in enumerate(shares)]
+    return [[grid[0, column] for column in range(len(row))] for grid, row in zip(grids, rows, strict=True)]
+
+
+def _add_legend(figure: Figure, handles: Sequence[Line], style: dict[str, Any], columns: int) -> None:
     from matplotlib.lines import Line2D
 
     entries: dict[str, Any] = {line.label: Line2D([], [], **line.style) for line in handles}
@@ -300,5 +398,4 @@ def _add_legend(figure: Figure, handles: Sequence[Line], place: str, columns: in
             for handle, label in sorted(found, key=lambda entry: not isinstance(entry[0], tuple)):
                 entries.setdefault(label, handle)  # levels last
     if entries:
-        options: dict[str, Any] = {"loc": place, "ncols": min(columns, len(entries)), "frameon": False}
-        figure.legend(list(entries.values()), list(entries), **options)
+        figure.legend(list(entries.values()), list(entries), ncols=min(columns, len(entries)), **style)

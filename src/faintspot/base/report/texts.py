@@ -10,14 +10,14 @@ from contextlib import suppress
 from functools import cached_property, reduce
 from importlib.resources import files
 from string import Formatter
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.page import Part, Section, Table, TableCell
+from faintspot.base.report.page import FigureWithData, Part, Section, Table, TableCell
 from faintspot.base.statistics import Estimate
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from faintspot.base.report.plots import Drawing
 
 
 NOTHING = "–"
@@ -199,16 +199,16 @@ class Texts:
     def figure(
         self,
         name: str,
-        figure: Figure,
-        rows: Sequence[Sequence[object]] = (),
-        columns: Sequence[str] = (),
-        /,
-        **values: object,
+        rows: Sequence[Sequence[Drawing]],
+        height: float,
+        values: Mapping[str, object] = MappingProxyType({}),
+        *,
+        file: str = "",
+        **options: Any,
     ) -> FigureWithData:
-        """Return a figure with its title and caption, and the columns of its numbers."""
+        """Return what `plot` draws, with options, and its title and caption with values."""
         title, caption = (self(f"{name}.{part}", **values) for part in ("title", "caption"))
-        short = name.partition(".")[0]
-        return FigureWithData(short, title, caption, figure, columns or self[name].get("columns", ()), rows)
+        return FigureWithData.of(file or name.partition(".")[0], title, caption, rows, height, **options)
 
     def table(
         self, name: str, records: Iterable[object], columns: Sequence[str] = (), /, **values: object

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.flags import leave_out
-from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.page import POSITIONS, Report, Section, configuration_section
-from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, Line, Panel, new_figure, styled
+from faintspot.base.report.page import POSITIONS, FigureWithData, Report, Section, configuration_section
+from faintspot.base.report.plots import GREY, METHOD_COLOURS, Line, Panel
 from faintspot.base.report.texts import Texts
 from faintspot.engine.telemetry.numbers import (
     PERCENTILES,
@@ -31,9 +30,6 @@ from faintspot.slopes.recorded.report.page import slopes_sections, warnings_in_w
 from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.slopes.sensor.layout import Layout
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _TEXT = Texts("faintspot.slopes.recorded")
 _MOST_CHANGES = 200
@@ -56,14 +52,17 @@ def report_of_telemetry(path: str | Path) -> Report:
     if len(telemetry.frame) == 0:
         raise InputError(f"{path}: expected telemetry, no frame is recorded yet")
     layout = Layout(**telemetry.attributes["layout"])
-    run = SlopesRun(_measured(telemetry), layout, why_no_stages="", slopes=_slopes(telemetry))
+    methods, slopes = [], {}
+    for name, rows in _methods(telemetry):
+        slopes[name] = of_method = _slopes(telemetry, rows)
+        methods.append(MeasuredSlopes.of(name, of_method, frames=telemetry.frame[rows].astype(np.int64)))
+    run = SlopesRun(methods, layout, why_no_stages="", slopes=slopes)
     return Report(
         title=f"Telemetry of {Path(path).name}",
         facts=_facts(telemetry, Path(path)),
         sections=[
             _timing(telemetry),
-            _lost(telemetry),
-            *([_methods(telemetry)] if len(run.methods) > 1 else []),
+            *([_compared(telemetry)] if len(run.methods) > 1 else []),
             _changes(telemetry),
             *slopes_sections(run),
             configuration_section(str(telemetry.attributes.get("settings", ""))),
@@ -73,18 +72,16 @@ def report_of_telemetry(path: str | Path) -> Report:
     )
 
 
-def _measured(telemetry: Telemetry) -> list[MeasuredSlopes]:
-    """Return the slopes of every method, each with the frames that it measured."""
-    errors = np.hypot(telemetry.standard_error_x, telemetry.standard_error_y) / np.sqrt(2)
-    measured = []
+def _methods(telemetry: Telemetry) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Yield the name of each method, and which frames it measured."""
     for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
-        rows = telemetry.method == method
-        arrays = [getattr(telemetry, array)[rows] for array in ARRAYS]
-        finite = errors[rows][telemetry.valid[rows] & np.isfinite(errors[rows])]
-        stated = float(np.median(finite)) if finite.size else np.nan
-        frames = telemetry.frame[rows].astype(np.int64)
-        measured.append(MeasuredSlopes(name, *arrays, frames=frames, standard_error_px=stated))
-    return measured
+        yield name, telemetry.method == method
+
+
+def _slopes(telemetry: Telemetry, rows: NDArray[np.bool_]) -> Slopes:
+    names = (*ARRAYS, "iterations", "standard_error_x", "standard_error_y", "covariance_xy")
+    arrays = {name: getattr(telemetry, name)[rows] for name in names}
+    return Slopes(**arrays, bad_pixels=np.zeros(arrays["x"].shape, np.int32))
 
 
 def _facts(telemetry: Telemetry, path: Path) -> dict[str, str]:
@@ -115,10 +112,10 @@ def _warnings(telemetry: Telemetry) -> list[str]:
 
 
 def _timing(telemetry: Telemetry) -> Section:
-    measured = timing(telemetry)
+    measured, lost = timing(telemetry), [gap.lost for gap in gaps(telemetry)]
     rows = []
-    for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
-        us = 1e6 * telemetry.latency_s[telemetry.method == method]
+    for name, frames in _methods(telemetry):
+        us = 1e6 * telemetry.latency_s[frames]
         rows.append([name, str(len(us)), *(f"{value:.1f}" for value in np.percentile(us, PERCENTILES))])
     return _TEXT.section(
         "timing",
@@ -126,32 +123,23 @@ def _timing(telemetry: Telemetry) -> Section:
         latency_figure(telemetry),
         rate=measured.rate_hz if np.isfinite(measured.rate_hz) else None,
         longest_ms=1e3 * measured.longest_interval_s,
+        lost=sum(lost) or None,
+        gaps=len(lost),
+        longest=max(lost, default=0),
+        restarts=restarts(telemetry) or None,
+        records=telemetry.attributes.get("dropped_records") or None,
+        images=telemetry.attributes.get("dropped_images") or None,
     )
 
 
-def _lost(telemetry: Telemetry) -> Section:
-    every = gaps(telemetry)
-    numbers = _TEXT.facts(
-        "lost.numbers",
-        lost=sum(gap.lost for gap in every),
-        gaps=len(every),
-        longest=max((gap.lost for gap in every), default=0),
-        restarts=restarts(telemetry),
-        **{name: telemetry.attributes.get(f"dropped_{name}", 0) for name in ("records", "images", "changes")},
-    )
-    return _TEXT.section("lost", _TEXT.table("lost.table", list(numbers.items())))
-
-
-def _methods(telemetry: Telemetry) -> Section:
-    differences = {name: methods_in_turn(telemetry, values) for name, values in quantities(telemetry).items()}
+def _compared(telemetry: Telemetry) -> Section:
     records = []
-    for name, compared in differences.items():
-        for each in compared:
+    for name, values in quantities(telemetry).items():
+        for each in methods_in_turn(telemetry, values):
             too_few = each.difference is not None and not math.isfinite(each.difference.low)
             difference = None if too_few else each.difference
             records.append({"quantity": name, **vars(each), "difference": difference, "too_few": too_few})
-    first = next(iter(differences.values()))[0].method
-    return _TEXT.section("methods", _TEXT.table("methods", records, first=first))
+    return _TEXT.section("methods", _TEXT.table("methods", records, first=records[0]["method"]))
 
 
 def _changes(telemetry: Telemetry) -> Section:
@@ -164,54 +152,29 @@ def _changes(telemetry: Telemetry) -> Section:
     return _TEXT.section("changes", _TEXT.table("changes", shown, some=some, all=len(every)))
 
 
-def _slopes(telemetry: Telemetry) -> dict[str, Slopes]:
-    """Return the slopes of every method."""
-    errors = "standard_error_x", "standard_error_y", "covariance_xy"
-    names = ("x", "y", "flux", "flags", "iterations", *errors)
-    slopes = {}
-    for method, name in zip(np.unique(telemetry.method), method_names(telemetry), strict=True):
-        arrays = {array: getattr(telemetry, array)[telemetry.method == method] for array in names}
-        slopes[name] = Slopes(**arrays, bad_pixels=np.zeros(arrays["x"].shape, np.int32))
-    return slopes
-
-
-@styled
 def latency_figure(telemetry: Telemetry) -> FigureWithData:
     """Draw how often each latency occurred, by method, and its course in time."""
-    figure = new_figure(WIDTH, 4.6)
-    left, right = figure.subplots(1, 2)
     latency = 1e6 * telemetry.latency_s
     low, high = float(latency.min()), float(latency.max())
     edges = np.geomspace(max(low, 0.1), max(high, low + 1, 1.0) * 1.001, _BINS + 1)
-    rows = []
-    for index, (method, name) in enumerate(
-        zip(np.unique(telemetry.method), method_names(telemetry), strict=True)
-    ):
-        counts = np.histogram(latency[telemetry.method == method], edges)[0]
-        left.stairs(counts, edges, color=METHOD_COLOURS[index % len(METHOD_COLOURS)], label=name, lw=1.5)
-        rows += [
-            (name, f"{a:.4g}", f"{b:.4g}", int(n)) for a, b, n in zip(edges, edges[1:], counts, strict=False)
-        ]
-    left.set(xscale="log", yscale="log", xlabel="latency (µs)", ylabel="frames", ylim=(0.7, None))
-    if len(np.unique(telemetry.method)) > 1:
-        left.legend(frameon=False)
-    course = _course(telemetry, latency, right)
-    return _TEXT.figure("latency", figure, rows, course=course)
-
-
-def _course(telemetry: Telemetry, latency: NDArray[np.float64], axes: Axes) -> str:
-    """Draw the course of latencies in time; return what was drawn in words."""
+    often = []
+    for index, (name, frames) in enumerate(_methods(telemetry)):
+        style = {"color": METHOD_COLOURS[index % len(METHOD_COLOURS)], "lw": 1.5, "drawstyle": "steps-post"}
+        often.append(Line(name, edges[:-1], np.histogram(latency[frames], edges)[0], style=style))
     stretches = min(_MOST_TIMES, max(min(_FEW_TIMES, len(latency)), len(latency) // _FEWEST_TOGETHER))
     parts = np.array_split(np.arange(len(latency)), stretches)
     time = (telemetry.last_row_time_ns - telemetry.last_row_time_ns[0]) / 1e9
     middle = [float(time[part].mean()) for part in parts]
-    style = {"marker": "o" if stretches <= _FEW_TIMES else "", "ms": 3}
-    longest, medians = ([reduce(latency[part]) for part in parts] for reduce in (np.max, np.median))
-    lines = [
-        Line("longest", middle, longest, style={**style, "color": GREY, "lw": 1}),
-        Line("median", middle, medians, style={**style, "color": "black", "lw": 1.3}),
+    course = [
+        Line(
+            name,
+            middle,
+            [reduce(latency[part]) for part in parts],
+            style={"color": colour, "lw": 1.2, "marker": "o" if stretches <= _FEW_TIMES else "", "ms": 3},
+        )
+        for name, reduce, colour in (("longest", np.max, GREY), ("median", np.median, "black"))
     ]
-    Panel(lines, "time since the first frame (s)", "latency (µs)", legend=True).draw(axes)
-    axes.set_yscale("log")
-    together = len(parts[0])
-    return f"median and longest of stretches of {together} frames" if together > 1 else "every frame"
+    unit = "latency (µs)"
+    left = Panel(often, unit, "frames", log="xy", y_range=(0.7, None), legend=len(often) > 1)
+    right = Panel(course, "time since the first frame (s)", unit, log="y", legend=True)
+    return _TEXT.figure("latency", [[left, right]], 4.6, {"together": len(parts[0])}, legend="")

@@ -3,45 +3,41 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.report.page import POSITIONS, Report, Section, configuration_section
-from faintspot.base.report.texts import Texts, with_interval
+from faintspot.base.report.page import POSITIONS, FigureWithData, Report, Section, configuration_section
+from faintspot.base.report.plots import Line, Panel
+from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import paired_mean
-from faintspot.experiments.closed_loop.figures import magnitude_figure, strehl_axis
-from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
-from faintspot.experiments.closed_loop.tables import (
-    budget_table,
-    centroid_gain_table,
-    difference_table,
-    gain_table,
-    settings_table,
-    strehl_table,
-)
-from faintspot.experiments.closed_loop.verdict import (
-    LoopResults,
-    loop_verdict,
-    reference_methods,
-)
+from faintspot.experiments.closed_loop.methods import CONTROL_SIGN
+from faintspot.experiments.closed_loop.results import MagnitudeResult, differences_by_flux
+from faintspot.experiments.closed_loop.tables import budget_table, gain_table, settings_table, strehl_table
+from faintspot.experiments.closed_loop.verdict import LoopResults, loop_verdict, reference_methods
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.slopes.estimators.base import Style
+from faintspot.slopes.estimators.registry import estimators
 
 _TEXT = Texts("faintspot.experiments")
 _FEW_REALISATIONS = 5
+_DODGE = 0.008  # of the axis, between methods at the same magnitude
+_LEARNING_LINE = (0, (6, 1.5, 1, 1.5))
 
 
 def loop_page(results: LoopResults) -> Report:
     """Return the report page of closed-loop results."""
     text = "" if results.magnitude is None else results.magnitude.configuration
     configuration = _configuration(text)
-    wavelength_m = 1.65e-6 if configuration is None else configuration.science.wavelength_m
+    wavelength_um = 1.65 if configuration is None else configuration.science.wavelength_m * 1e6
     name = "" if configuration is None else f": “{configuration.name}”"
-    return Report(
-        f"Closed loop with and without TV{name}",
-        {} if configuration is None else _facts(configuration),
-        [*_sections(results, strehl_axis(wavelength_m)), configuration_section(text)],
-        loop_warnings(results),
-        remark=POSITIONS,
-    )
+    sections = [
+        _TEXT.section("verdict", *loop_verdict(results)),
+        *_of_magnitudes(results.magnitude, f"Strehl ratio at {wavelength_um:.3g} µm"),
+        _TEXT.section("budget", None if results.budget is None else budget_table(results.budget)),
+        configuration_section(text),
+    ]
+    facts = {} if configuration is None else _facts(configuration)
+    return Report(f"Closed loop{name}", facts, sections, loop_warnings(results), remark=POSITIONS)
 
 
 def loop_warnings(results: LoopResults) -> list[str]:
@@ -61,44 +57,59 @@ def loop_warnings(results: LoopResults) -> list[str]:
     return lines
 
 
-def _sections(results: LoopResults, strehl: str) -> list[Section]:
-    """Return all sections in the page's order; `strehl` is the label of an axis."""
-    magnitude, budget = results.magnitude, results.budget
-    return [
-        _TEXT.section("verdict", *loop_verdict(results)),
-        *([_TEXT.section("magnitude")] if magnitude is None else _of_magnitudes(magnitude, strehl)),
-        _TEXT.section("budget")
-        if budget is None
-        else _TEXT.section("budget", *_budget_lines(budget), budget_table(budget)),
-    ]
-
-
-def _of_magnitudes(result: MagnitudeResult, strehl: str) -> list[Section]:
+def _of_magnitudes(result: MagnitudeResult | None, strehl: str) -> list[Section]:
+    """Return the sections of Strehl against magnitude; `strehl` is the label of an axis."""
+    if result is None:
+        return [_TEXT.section("magnitude")]
     references = reference_methods(result)
+    gains = [
+        gain_table(result, [n for n in range(len(result.labels)) if n not in references[: rank + 1]], method)
+        for rank, method in enumerate(references)
+    ]
+    tables, figure = [strehl_table(result), *gains], magnitude_figure(result, references[0], strehl)
     base = " and then with ".join(result.labels[method] for method in references)
-    tables = [strehl_table(result)]
-    for rank, reference in enumerate(references):
-        compared = [method for method in range(len(result.labels)) if method not in references[: rank + 1]]
-        tables.append(gain_table(result, compared, reference))
-        if rank:  # the figure has the differences from the first reference
-            tables.append(difference_table(result, [(method, reference) for method in compared]))
-    figure = magnitude_figure(result, references[0], strehl)
     return [
         _TEXT.section("magnitude", *tables, figure, shape=result.strehl.shape, reference=base),
-        _TEXT.section("gain", centroid_gain_table(result)),
         _TEXT.section("settings", settings_table(result)),
     ]
 
 
-def _budget_lines(result: BudgetResult) -> list[str]:
-    """Return how the differences between methods change with each term switched off."""
-    lines = []
-    for name, strehl in zip(result.labels[1:], result.strehl[1:], strict=True):
-        less = map(paired_mean, strehl - result.strehl[0])
-        where = ["in the whole loop", *(f"without {term}" for term in result.terms[1:])]
-        parts = [f"{term} {with_interval(change)}" for term, change in zip(where, less, strict=True)]
-        lines.append(f"{name} less {result.labels[0]}: {'; '.join(parts)}.")
-    return lines
+def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> FigureWithData:
+    """Draw Strehl against magnitude for every method, and its difference from the reference."""
+    shift = _DODGE * float(np.ptp(result.magnitudes) or 1.0)
+    strehls, differences = [], []
+    for method, name in enumerate(result.labels):
+        style = {**_style(result.names[method]), "capsize": 2}
+        strehls.append(Line(name, result.magnitudes, *_means_of(result.strehl[method]), style))
+        if method != reference:
+            found = differences_by_flux(result, method, reference)
+            low, middle, high = np.array([[d.low, d.value, d.high] for d in found]).T
+            shifted = result.magnitudes + (method - len(result.labels) / 2) * shift
+            differences.append(Line(name, shifted, middle, (middle - low, high - middle), style))
+    above = result.magnitudes, result.photons.tolist(), "photo-electrons of a sub-aperture in a frame"
+    than, magnitude = f"Strehl ratio minus that of {result.labels[reference]}, paired", "guide-star magnitude"
+    left = Panel(strehls, magnitude, label, y_range=(0, None), above=above)
+    right = Panel(differences, magnitude, than, levels={0.0: {}}, above=above)
+    return _TEXT.figure("magnitude", [[left, right]], 6.4)
+
+
+def _means_of(runs: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the mean of each row of runs, and its standard error, NaN where that is not known."""
+    means = [paired_mean(values) for values in runs]
+    return np.array([mean.value for mean in means]), np.array([mean.standard_error for mean in means])
+
+
+def _style(name: str) -> dict[str, object]:
+    """Return the style of a method's estimator; markers are hollow where the loop does more than the usual.
+
+    Lines of control that learns are dash-dotted.
+    """
+    kinds = estimators()
+    base = next((name[:end] for end in range(len(name), 0, -1) if name[:end] in kinds), "")
+    style = kinds[base].style if base else Style("#666666")
+    filling = style.colour if name == base else "white"
+    line = _LEARNING_LINE if CONTROL_SIGN in name else style.line
+    return {"color": style.colour, "marker": style.marker, "ms": 6, "mfc": filling, "lw": 1.5, "ls": line}
 
 
 def _configuration(text: str) -> LoopConfiguration | None:
@@ -120,5 +131,4 @@ def _facts(configuration: LoopConfiguration) -> dict[str, str]:
         layers=len(configuration.atmosphere.fraction),
         noise=camera.read_noise_e / camera.em_gain,
         gain=f", multiplication gain {camera.em_gain:g}" if camera.em_gain > 1 else "",
-        science_um=configuration.science.wavelength_m * 1e6,
     )

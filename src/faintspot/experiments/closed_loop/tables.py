@@ -5,21 +5,13 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from faintspot.base.json_text import parse_json
 from faintspot.base.report.page import Table
 from faintspot.base.report.texts import Texts, with_error, with_interval
 from faintspot.base.statistics import paired_mean
 from faintspot.experiments.closed_loop.budget import TERMS
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN
-from faintspot.experiments.closed_loop.results import (
-    BudgetResult,
-    MagnitudeResult,
-    differences_by_flux,
-    gains_in_magnitude,
-)
+from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult, gains_in_magnitude
 
 _TEXT = Texts("faintspot.experiments")
 
@@ -34,25 +26,13 @@ def gain_table(result: MagnitudeResult, methods: Sequence[int], reference: int) 
     return _TEXT.table("tables.gain", rows, columns, reference=result.labels[reference])
 
 
-def difference_table(result: MagnitudeResult, pairs: Sequence[Sequence[int]]) -> Table:
-    """Return the difference in Strehl of pairs of methods at each flux."""
-    rows = [
-        [*(result.labels[method] for method in pair), *map(with_interval, differences_by_flux(result, *pair))]
-        for pair in pairs
-    ]
-    return _TEXT.table("tables.difference", rows, _fluxes(result))
-
-
 def strehl_table(result: MagnitudeResult) -> Table:
     """Return the Strehl ratio of every method at each flux."""
-    stars = zip(result.photons, result.magnitudes, strict=True)
-    columns = [f"{photons:.3g} e⁻, {magnitude:.1f} mag" for photons, magnitude in stars]
-    return _TEXT.table("tables.strehl", _by_flux(result, result.strehl, 3), columns)
-
-
-def centroid_gain_table(result: MagnitudeResult) -> Table:
-    """Return the centroid gain of every method at each flux."""
-    return _TEXT.table("tables.centroid_gain", _by_flux(result, result.centroid_gain, 2), _fluxes(result))
+    rows = [
+        [label, *(with_error(paired_mean(runs)) for runs in of_method)]
+        for label, of_method in zip(result.labels, result.strehl, strict=True)
+    ]
+    return _TEXT.table("tables.strehl", rows, _stars(result))
 
 
 def settings_table(result: MagnitudeResult) -> Table:
@@ -61,24 +41,26 @@ def settings_table(result: MagnitudeResult) -> Table:
         [label, *map(_settings_words, choices, settings)]
         for label, choices, settings in zip(result.labels, result.choices, result.settings, strict=True)
     ]
-    return _TEXT.table("tables.settings", rows, _fluxes(result))
+    return _TEXT.table("tables.settings", rows, _stars(result))
 
 
 def budget_table(result: BudgetResult) -> Table:
     """Return the Strehl ratio and the rms wavefront of every method without each term."""
+    first = result.strehl[0]
     records = [
         {
             "method": name,
-            "term": "–" if number == 0 else term,
+            "term": term if number else "–",
             "strehl": paired_mean(strehl[number]),
             "residual": paired_mean(residual[number]),
             "change": paired_mean(strehl[number] - strehl[0]) if number else None,
+            "less": None if name == result.labels[0] else paired_mean(strehl[number] - first[number]),
         }
         for name, strehl, residual in zip(result.labels, result.strehl, result.residual_nm, strict=True)
         for number, term in enumerate(result.terms)
     ]
     meanings = "; ".join(f"{term}: {_TEXT[f'terms.{term}']}" for term in result.terms[1:] if term in TERMS)
-    return _TEXT.table("tables.budget", records, meanings=meanings)
+    return _TEXT.table("tables.budget", records, meanings=meanings, first=result.labels[0])
 
 
 def in_columns(table: Table, most: int | None = None) -> str:
@@ -89,15 +71,9 @@ def in_columns(table: Table, most: int | None = None) -> str:
     return "\n".join(f"{row[0]:{widths[0]}}  {line}" for row, line in zip(rows, lines, strict=True))
 
 
-def _by_flux(result: MagnitudeResult, values: NDArray[np.float64], digits: int) -> list[list[str]]:
-    return [
-        [label, *(with_error(paired_mean(runs), digits) for runs in of_method)]
-        for label, of_method in zip(result.labels, values, strict=True)
-    ]
-
-
-def _fluxes(result: MagnitudeResult) -> list[str]:
-    return [f"{photons:.3g}" for photons in result.photons]
+def _stars(result: MagnitudeResult) -> list[str]:
+    stars = zip(result.photons, result.magnitudes, strict=True)
+    return [f"{photons:.3g} e⁻, {magnitude:.1f} mag" for photons, magnitude in stars]
 
 
 def _settings_words(choice: str, text: str) -> str:

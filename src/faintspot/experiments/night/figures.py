@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.plots import FLUX_GREY, METHOD_COLOURS, WIDTH, Line, Panel, plot
+from faintspot.base.report.page import FigureWithData
+from faintspot.base.report.plots import FLUX_GREY, METHOD_COLOURS, WIDTH, Line, Panel
 from faintspot.base.report.texts import Texts
-from faintspot.experiments.closed_loop.figures import strehl_axis
 from faintspot.experiments.night.analysis import ALL_STRENGTHS, BEST, by_strength, groups, lines
 from faintspot.experiments.night.blocks import Night
 
@@ -29,7 +28,7 @@ _POINT: dict[str, object] = {"ls": "", "ms": 5, "elinewidth": 0.7, "alpha": 0.85
 
 def panels_figure(night: Night) -> FigureWithData:
     """Draw Strehl ratio against time, measured r0 and strength, with errors."""
-    label, shown = strehl_axis(night.wavelength_m), _shown(night)
+    label, shown = f"Strehl ratio at {night.wavelength_m * 1e6:.3g} µm", _shown(night)
     lowest = float(np.nanmin(night.strehl - np.nan_to_num(night.strehl_error)))
     bottom: dict[str, Any] = {"y": label, "y_range": (min(0.0, 1.1 * lowest), None)}
     starts = [night.start_s[night.set_number == number][0] / 60 for number in np.unique(night.set_number)[1:]]
@@ -41,27 +40,14 @@ def panels_figure(night: Night) -> FigureWithData:
         panels.append(Panel([*_unnamed(points), *fits], "measured r0 at 500 nm (cm)", legend=True, **bottom))
     if night.has_strengths:
         panels.append(_of_strengths(night, shown, bottom))
-    figure = plot(
-        [[panel] for panel in panels],
-        4.1 * len(panels),
-        width=0.72 * WIDTH,
-        columns=3,
-        legend="outside upper center",
-    )
-    columns = (
-        night.middle_s,
-        night.strehl,
-        night.strehl_error,
-        night.r0_m,
-        night.r0_error_m,
-        night.paired_strehl,
-    )
-    rows = [
-        [night.set_names[night.set_number[b]], night.labels[night.method[b]], night.strength_e[b], *values]
-        for b, values in enumerate(zip(*columns, strict=True))
-    ]
-    values = {"seconds": float(np.median(night.duration_s)), "reference": night.labels[night.reference]}
-    return _TEXT.figure("panels", figure, rows, strengths=night.has_strengths, **values)
+    values: dict[str, Any] = {
+        "seconds": float(np.median(night.duration_s)),
+        "reference": night.labels[night.reference],
+    }
+    values["strengths"] = night.has_strengths
+    options: dict[str, Any] = {"width": 0.72 * WIDTH, "columns": 3, "legend": "outside upper center"}
+    rows = [[panel] for panel in panels]
+    return _TEXT.figure("panels", rows, 4.1 * len(panels), values, **options)
 
 
 def _shown(night: Night) -> dict[str, tuple[NDArray[np.bool_], dict[str, object]]]:
@@ -102,7 +88,7 @@ def _points(
 
 
 def _unnamed(points: list[Line]) -> list[Line]:
-    return [replace(line, label="") for line in points]
+    return [replace(line, in_legend=False) for line in points]
 
 
 def _regressions(night: Night) -> list[Line]:

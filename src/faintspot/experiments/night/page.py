@@ -52,7 +52,7 @@ _VERDICT_NAMES = {"paired": "in_the_same_turbulence", "paired_outcome": "outcome
 
 
 def write_night(night: Night, folder: str | Path) -> list[Path]:
-    """Write a night to a folder: `night.zarr`, `night.json` and `night.html` with its figures.
+    """Write a night to a folder: `night.zarr`, `night.json` and `night.html`.
 
     Raises
     ------
@@ -65,8 +65,8 @@ def write_night(night: Night, folder: str | Path) -> list[Path]:
     night.save(folder / NIGHT_STORE)
     text = to_json(night_summary(night), indent=2)
     write_atomically(folder / SUMMARY_FILE, text + "\n")
-    pages = night_page(night).write(folder / PAGE_FILE)
-    return [folder / NIGHT_STORE, folder / SUMMARY_FILE, *pages]
+    night_page(night).write(folder / PAGE_FILE)
+    return [folder / name for name in (NIGHT_STORE, SUMMARY_FILE, PAGE_FILE)]
 
 
 def night_summary(night: Night) -> dict[str, Any]:

@@ -2,38 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.plots import (
-    METHOD_COLOURS,
-    WIDTH,
-    Line,
-    Panel,
-    colour_bar,
-    new_figure,
-    plot,
-    styled,
-)
+from faintspot.base.report.page import FigureWithData
+from faintspot.base.report.plots import METHOD_COLOURS, WIDTH, Line, Panel, Picture
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.methods import NO_TV, TV, knows_the_spot, label_of, style_of
 from faintspot.experiments.paper.claims import fixed_mode
-from faintspot.experiments.paper.tables import (
-    mode_in_words,
-    parameter_in_words,
-    parameters_of,
-    table_of_cells,
-)
+from faintspot.experiments.paper.tables import mode_in_words, parameter_in_words, parameters_of
 from faintspot.experiments.study.curves import kept_panels
 from faintspot.experiments.study.specification import BEST
 from faintspot.experiments.study.sweep import PARAMETERS
 from faintspot.slopes.estimators.algorithms.noise import suggested_strength
 from faintspot.slopes.estimators.algorithms.total_variation import tv_denoise
-from faintspot.slopes.recorded.report.frame_pictures import assembled
+from faintspot.slopes.recorded.report.pictures import assembled
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.simulate import Detector, spots
 
@@ -98,17 +84,17 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
     named = ", ".join(words for words in fixed if not words.startswith("no "))
     handles = {**_LEGEND, **{label: style for label, style in styles.items() if label}}
     height = _ROW_HEIGHT if len(styles) <= _FEW_LINES else 1.3 * _ROW_HEIGHT
-    figure = plot(
+    return FigureWithData.of(
+        name,
+        title,
+        _TEXT("sweep.caption", fixed=", ".join(fixed) or "nothing"),
         panels,
         height * len(panels) + 0.8,
-        title=f"{title}  ({named})" if named else title,
+        heading=f"{title}  ({named})" if named else title,
         columns=5,
         handles=[Line(label, [], [], style=style) for label, style in handles.items()],
-        sharex=True,
-        sharey="row",
+        shared=True,
     )
-    caption = _TEXT("sweep.caption", fixed=", ".join(fixed) or "nothing")
-    return FigureWithData(name, title, caption, figure, *table_of_cells(dataset, cells))
 
 
 def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
@@ -117,30 +103,27 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
     rows_of_panels = [parts for profile in profiles if (parts := kept_panels(dataset, profile))]
     if not rows_of_panels or not {NO_TV, TV} <= set(dataset["estimator"].values):
         return None
-    rows: list[list[object]] = []
     panels: list[list[Panel]] = []
     fixed = fixed_mode(dataset).removeprefix("fixed")
+    scale: dict[str, Any] = {"x": "brightest pixels kept, k", "x_ticks": _KEPT_TICKS, "y": ERROR_AXIS}
+    scale |= {"y_ticks": _ERROR_TICKS[2:], "at": {float(fixed): {"ls": ":"}}, "legend": True}
     for parts in rows_of_panels:
         panels.append([])
         for part in parts:
-            lines: list[Line] = []
             styles = _styles([label for label, _ in part.cells])
-            for label, cell in part.cells:
-                drawn, data = _over_k(dataset, cell, label, styles[label]["color"])
-                lines, rows = lines + drawn, rows + data
+            lines = [
+                line
+                for label, cell in part.cells
+                for line in _over_k(dataset, cell, label, styles[label]["color"])
+            ]
             head, _, tail = part.title.partition(";" if part.title.startswith("signals") else ", ")
-            title = f"{head.strip()}\n{tail.strip().replace(';', ',')}"
-            scale: dict[str, Any] = {
-                "x": "brightest pixels kept, k",
-                "x_ticks": _KEPT_TICKS,
-                "y_ticks": _ERROR_TICKS[2:],
-            }
-            fixed_k = {float(fixed): {"ls": ":"}}
-            panels[-1].append(Panel(lines, y=ERROR_AXIS, title=title, at=fixed_k, legend=True, **scale))
-    title = f"{_TEXT['fig5.title']}  (solid: TV, dashed: no TV)"
-    figure = plot(panels, _ROW_HEIGHT * len(panels) * 1.1, width=WIDTH * 1.25, title=title, legend="")
-    header = ["panel", "method", "k", "R_px", "R_se_px", *PARAMETERS]
-    return _TEXT.figure("fig5", figure, rows, header, fixed=fixed)
+            panels[-1].append(
+                Panel(lines, title=f"{head.strip()}\n{tail.strip().replace(';', ',')}", **scale)
+            )
+    heading = f"{_TEXT['fig5.title']}  (solid: TV, dashed: no TV)"
+    options: dict[str, Any] = {"width": WIDTH * 1.25, "legend": ""}
+    height = _ROW_HEIGHT * len(panels) * 1.1
+    return _TEXT.figure("fig5", panels, height, {"fixed": fixed}, heading=heading, **options)
 
 
 def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | None:
@@ -166,13 +149,14 @@ def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | 
             }
             limits: dict[str, Any] = {"y": "R / R without denoising", "y_range": (lowest, _LARGEST_RATIO)}
             panels[-1].append(Panel(lines, title=title, **scale, **limits))
-    every = [cell for part in cells.values() for cell in part]
-    reach = float(dataset["position_range_px"].values[every[0]])
+    reach = float(dataset["position_range_px"].values[next(iter(cells.values()))[0]])
     title = _TEXT("baselines_figure.title", profile=profile)
     above = f"{title}  (size 1, 16 × 16 px, positions within ±{reach:g} px)"
-    figure = plot(panels, _ROW_HEIGHT * len(cells) + 0.8, title=above, columns=3)
-    caption = _TEXT("baselines_figure.caption", largest=_LARGEST_RATIO)
-    return FigureWithData(f"baselines-{profile}", title, caption, figure, *table_of_cells(dataset, every))
+    caption, height = (
+        _TEXT("baselines_figure.caption", largest=_LARGEST_RATIO),
+        _ROW_HEIGHT * len(cells) + 0.8,
+    )
+    return FigureWithData.of(f"baselines-{profile}", title, caption, panels, height, heading=above, columns=3)
 
 
 def _axis_of(table: list[dict[str, object]]) -> str:
@@ -226,9 +210,9 @@ def _tv_lines(
             if method in dataset["estimator"].values:
                 part = dataset[["error", "error_se"]].sel(estimator=method).isel(cell=cells)
                 style = {**styles[label], "ms": 5, "elinewidth": 1, "lw": 1.9, **line}
-                lines.append(
-                    Line("", part[axis].values, part["error"].values, part["error_se"].values, style)
-                )
+                x, y, error = (part[name].values for name in (axis, "error", "error_se"))
+                name = f"{label_of(method)} {label}".strip()
+                lines.append(Line(name, x, y, error, style, in_legend=False))
     return lines
 
 
@@ -241,26 +225,18 @@ def _range_of(axis: str, values: Any) -> tuple[float | None, float | None]:
     return (low - margin, high + margin) if margin else (None, None)
 
 
-def _over_k(
-    dataset: xarray.Dataset, cell: int, label: str, colour: object
-) -> tuple[list[Line], list[list[object]]]:
-    """Return R of a cell against the number of pixels kept as lines and as rows; circles are those chosen."""
-    lines, rows = [], []
-    k, (parameters,) = dataset["k"].values, parameters_of(dataset, [cell])
+def _over_k(dataset: xarray.Dataset, cell: int, label: str, colour: object) -> Iterator[Line]:
+    """Yield R of a cell against the number of pixels kept; circles are those chosen."""
+    k = dataset["k"].values
     for method in (TV, NO_TV):
         part = dataset.sel(estimator=method).isel(cell=cell)
-        y, se = part["error_at_k"].values, part["error_at_k_se"].values
+        y, error = part["error_at_k"].values, part["error_at_k_se"].values
         style = {"color": colour, "lw": 1.9, "ls": _TV_OR_NOT[method]["ls"]}
-        lines.append(Line(label if method == TV else "", k, y, se, style, band=True))
+        name = label if method == TV else f"{label}, no TV"
+        yield Line(name, k, y, error, style, band=True, in_legend=method == TV)
         chosen = k == float(part["chosen_k"].sel(mode=BEST))
         circle = {"color": colour, "ls": "", "marker": "o", "mfc": "white", "ms": 7, "mew": 1.6}
-        lines.append(Line("", k[chosen], y[chosen], style=circle))
-        rows += [
-            [label, method, int(number), f"{value:.6g}", f"{error:.3g}", *parameters.values()]
-            for number, value, error in zip(k, y, se, strict=True)
-            if np.isfinite(value)
-        ]
-    return lines, rows
+        yield Line(f"{name}, chosen", k[chosen], y[chosen], style=circle, in_legend=False)
 
 
 def _main_cells(dataset: xarray.Dataset, profile: str) -> dict[float, list[int]]:
@@ -315,28 +291,19 @@ def triple_images() -> tuple[Layout, list[NDArray[np.float64]]]:
     return layout, [clean, noisy, denoised]
 
 
-@styled
 def triple_picture() -> FigureWithData:
     """Draw the sensor in three states, and one of its spots below each."""
     layout, images = triple_images()
-    shown = len(layout) // 2
-    figure = new_figure(WIDTH, 9.4)
-    brightest = float(np.percentile(images[1], 99.9))
-    pictures = {
-        f"sensor, {name}": assembled(layout, stack) for name, stack in zip(_NAMES, images, strict=True)
-    }
-    pictures |= {f"one spot, {name}": stack[shown] for name, stack in zip(_NAMES, images, strict=True)}
-    axes = figure.subplots(2, 3)
-    for panel, (title, image) in zip(axes.flat, pictures.items(), strict=True):
-        drawn = panel.imshow(image, vmin=0.0, vmax=brightest, interpolation="nearest")
-        panel.set_title(title, fontsize=12)
-        panel.set(xlabel="column (px)", ylabel="row (px)")
-    for row in axes:
-        colour_bar(list(row), drawn, "signal (e- per pixel)")
+    style = {"vmin": 0.0, "vmax": float(np.percentile(images[1], 99.9))}
+    units = "", "", "signal (e- per pixel)"
+    shown = {"sensor": [assembled(layout, stack) for stack in images]}
+    shown["one spot"] = [stack[len(layout) // 2] for stack in images]
     rows = [
-        [y, x, *(f"{stack[shown, y, x]:.6g}" for stack in images)]
-        for y in range(layout.window[0])
-        for x in range(layout.window[1])
+        [
+            Picture(image, unit, f"{what}, {name}", style=style)
+            for image, unit, name in zip(stack, units, _NAMES, strict=True)
+        ]
+        for what, stack in shown.items()
     ]
     values = {"flux": FLUX_E, "noise": READ_NOISE_E, "reach": POSITION_RANGE_PX}
-    return _TEXT.figure("fig1", figure, rows, **values)
+    return _TEXT.figure("fig1", rows, 9.4, values)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.page import Report, Section, TableCell
-from faintspot.base.report.plots import new_figure, styled
+from faintspot.base.files import csv_text
+from faintspot.base.report.page import FigureWithData, Report, Section, Table
+from faintspot.base.report.plots import Picture
 from faintspot.base.report.texts import NOTHING, Texts, with_error
 from faintspot.base.statistics import Estimate, paired_mean
 from faintspot.experiments.closed_loop.magnitude import run_magnitude
@@ -24,6 +24,9 @@ from faintspot.loop.simulation.configuration.configuration import LoopConfigurat
 from faintspot.loop.simulation.record import make_folder
 from faintspot.slopes.estimators.built_in.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.slopes.estimators.built_in.window import Window
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 METHODS = NO_TV, TV, SMOOTHING, Window.name, MaximumAPosteriori.name
 R0_M = 0.118, 0.18
@@ -137,17 +140,10 @@ def loop_map_section(cells: list[LoopCell]) -> Section:
     wins = ", ".join(f"{label_of(name)} in {count}" for name, count in counts.items() if name and count)
     higher, lower = (sum(cell.gain.decided == sign for cell in cells) for sign in (1, -1))
     gains = [cell.gain.value for cell in cells]
-    records = [
-        [f"{100 * cell.r0_m:g}", cell.camera, f"{cell.photons:g}"]
-        + [with_error(cell.strehl[name]) for name in METHODS]
-        + [with_error(cell.gain, sign=True), label_of(cell.winner) if cell.winner else NOTHING]
-        for cell in cells
-    ]
-    rows: list[list[str | TableCell]] = [list(record) for record in records]
     return _TEXT.section(
         "loop_map",
         _figure(cells),
-        _TEXT.table("loop_map.table", rows),
+        _table(cells),
         cells=len(cells),
         higher=higher,
         lower=lower,
@@ -158,35 +154,53 @@ def loop_map_section(cells: list[LoopCell]) -> Section:
     )
 
 
-@styled
-def _figure(cells: list[LoopCell]) -> FigureWithData:
-    """Draw the gain of TV over flux and camera, one panel for each turbulence."""
-    figure = new_figure(13.0, 4.6)
-    panels = figure.subplots(1, len(R0_M), squeeze=False)[0]
-    cameras, fluxes = (
-        list(dict.fromkeys(getattr(cell, name) for cell in cells)) for name in ("camera", "photons")
-    )
-    reach = max(0.02, *(abs(cell.gain.value) for cell in cells))
-    picture: Any = None
-    for axes, r0 in zip(panels, R0_M, strict=True):
-        gains = np.full((len(cameras), len(fluxes)), np.nan)
-        for cell in (cell for cell in cells if cell.r0_m == r0):
-            row, column = cameras.index(cell.camera), fluxes.index(cell.photons)
-            gains[row, column] = cell.gain.value
-            words = f"{cell.gain.value:+.3f}\n{cell.winner or NOTHING}"
-            axes.text(column, row, words, ha="center", va="center", fontsize=10)
-        picture = axes.imshow(gains, cmap="RdBu", vmin=-reach, vmax=reach, aspect="auto")
-        axes.set_xticks(range(len(fluxes)), [f"{flux:g}" for flux in fluxes])
-        axes.set_yticks(range(len(cameras)), cameras)
-        axes.set_xlabel("photo-electrons of a sub-aperture in a frame")
-        axes.set_title(f"r0 {100 * r0:g} cm")
-    panels[0].set_ylabel("read noise")
-    figure.colorbar(picture, ax=list(panels), label="Strehl ratio with TV minus without")
+def _table(cells: list[LoopCell]) -> Table:
     rows = [
+        [f"{100 * cell.r0_m:g}", cell.camera, f"{cell.photons:g}"]
+        + [with_error(cell.strehl[name]) for name in METHODS]
+        + [with_error(cell.gain, sign=True), label_of(cell.winner) if cell.winner else NOTHING]
+        for cell in cells
+    ]
+    numbers = [
         [cell.r0_m, cell.camera, cell.photons, cell.gain.value, cell.gain.standard_error, cell.winner]
         + [value for name in METHODS for value in (cell.strehl[name].value, cell.strehl[name].standard_error)]
         for cell in cells
     ]
     of_methods = [f"{name}{ending}" for name in METHODS for ending in ("", "_se")]
     header = ["r0_m", "camera", "photons", "gain", "gain_se", "winner", *of_methods]
-    return _TEXT.figure("loop_map", figure, rows, header, quantity="Strehl ratio")
+    return replace(_TEXT.table("loop_map.table", rows), csv=("loop_map.csv", csv_text(header, numbers)))
+
+
+@dataclass(frozen=True)
+class _Words:
+    """Texts in the cells of a picture, and the names of its columns and rows."""
+
+    words: Mapping[tuple[int, int], str]
+    columns: list[str]
+    rows: list[str]
+
+    def draw(self, axes: Axes) -> None:
+        """Write them."""
+        for (column, row), text in self.words.items():
+            axes.text(column, row, text, ha="center", va="center", fontsize=10)
+        axes.set_xticks(range(len(self.columns)), self.columns)
+        axes.set_yticks(range(len(self.rows)), self.rows)
+
+
+def _figure(cells: list[LoopCell]) -> FigureWithData:
+    """Draw the gain of TV over flux and camera, one panel for each turbulence."""
+    cameras, fluxes = list({cell.camera: 0 for cell in cells}), list({cell.photons: 0 for cell in cells})
+    reach = max(0.02, *(abs(cell.gain.value) for cell in cells))
+    style = {"cmap": "RdBu", "vmin": -reach, "vmax": reach, "aspect": "auto"}
+    axes = "photo-electrons of a sub-aperture in a frame", "read noise"
+    pictures = []
+    for r0 in R0_M:
+        gains, words = np.full((len(cameras), len(fluxes)), np.nan), {}
+        for cell in (cell for cell in cells if cell.r0_m == r0):
+            column, row = fluxes.index(cell.photons), cameras.index(cell.camera)
+            gains[row, column] = cell.gain.value
+            words[column, row] = f"{cell.gain.value:+.3f}\n{cell.winner or NOTHING}"
+        unit = "Strehl ratio with TV minus without" if r0 == R0_M[-1] else ""
+        marks = [_Words(words, [f"{flux:g}" for flux in fluxes], cameras)]
+        pictures.append(Picture(gains, unit, f"r0 {100 * r0:g} cm", *axes, style, marks))
+    return _TEXT.figure("loop_map", [pictures], 4.6)

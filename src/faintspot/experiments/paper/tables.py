@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from faintspot.base.report.figure_data import csv_text
+from faintspot.base.files import csv_text
 from faintspot.base.report.page import Section
 from faintspot.base.report.texts import NOTHING, Texts
 from faintspot.experiments.curves import Gain, gain_at_error
@@ -91,7 +92,11 @@ def baselines_section(dataset: xarray.Dataset) -> Section:
         if mode in dataset["mode"].values
         for row in against_tv(dataset, mode)
     ]
-    return _TEXT.section("baselines", _TEXT.table("baselines", records))
+    done = np.flatnonzero(dataset["done"].values).tolist()
+    table = replace(
+        _TEXT.table("baselines", records), csv=("cells.csv", csv_text(*table_of_cells(dataset, done)))
+    )
+    return _TEXT.section("baselines", table)
 
 
 def gains_section(dataset: xarray.Dataset) -> Section:

@@ -140,20 +140,6 @@ def _helps(gain: Estimate) -> bool:
     return gain.value > max(_HELPS_ABOVE_MAG, 2 * gain.standard_error)
 
 
-def below_bound(answer: Answer) -> str:
-    """Return why methods lie below the Cramer-Rao bound, where always answering the reference is worse."""
-    drawn = answer.bound_px < answer.question.search_range_px / 2
-    labels = [
-        result.method.label
-        for result in answer.results
-        if (drawn & (result.error_px + 2 * result.standard_error_px < answer.bound_px)).any()
-    ]
-    if not labels:
-        return ""
-    reach = answer.question.search_range_px
-    return _TEXT("answer.below_bound", labels=", ".join(labels), reach=reach)
-
-
 def _limit(answer: Answer, result: MethodResult) -> str:
     limit: Any = result.limiting_flux_e
     if limit.value == 0:

@@ -1,1 +1,1 @@
-"""Page of a study: `page`, `estimator_figures`, and `efficiency` (tables and findings)."""
+"""Page of a study: `page`, and `estimators` for one that compares estimators."""

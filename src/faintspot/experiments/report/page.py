@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
-from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.page import Report, Section, configuration_section
+from faintspot.base.report.page import FigureWithData, Report, Section, configuration_section
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.night.blocks import NIGHT_STORE, Night, load_night
 from faintspot.experiments.night.page import night_sections
@@ -20,13 +19,14 @@ from faintspot.experiments.paper.figures import (
     sweep_figure,
     triple_picture,
 )
-from faintspot.experiments.paper.tables import (
-    baselines_section,
-    gains_section,
-)
+from faintspot.experiments.paper.tables import baselines_section, gains_section
 from faintspot.experiments.paper.whole import paper_rows, paper_section
-from faintspot.experiments.report.efficiency import calibration_sections, compares_estimators, findings
-from faintspot.experiments.report.estimator_figures import estimator_figures
+from faintspot.experiments.report.estimators import (
+    calibration_sections,
+    compares_estimators,
+    estimator_figures,
+    findings,
+)
 from faintspot.experiments.study.specification import StudySpecification
 from faintspot.experiments.study.sweep import PARAMETERS
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
@@ -105,7 +105,7 @@ def study_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
 
     A sweep is drawn by the first word of its name, so that several make one figure. The paper's pictures
     (figures 1 and 5) come with the paper's sweeps only. A study with methods that know the spot has the
-    figures of `faintspot.experiments.report.estimator_figures` instead.
+    figures of `faintspot.experiments.report.estimators` instead.
     """
     if compares_estimators(dataset):
         yield from estimator_figures(dataset)

@@ -11,8 +11,7 @@ from scipy.optimize import lsq_linear
 
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
-from faintspot.base.files import check_ending, write_atomically
-from faintspot.base.report.figure_data import csv_text
+from faintspot.base.files import check_ending, csv_text, write_atomically
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.slopes.pipeline.slopes import Slopes
 

@@ -6,18 +6,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, new_figure, styled
+from faintspot.base.report.plots import METHOD_COLOURS, Line, Panel, plot
 from faintspot.loop.control.flattening import Flattening
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.wavefront.figure import wavefront_map
-from faintspot.slopes.wavefront.fit import Wavefront, total
+from faintspot.slopes.wavefront.fit import Wavefront
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-@styled
 def flattening_figure(flat: Flattening, before: Wavefront, after: Wavefront, layout: Layout) -> Figure:
     """Draw the wavefront before and after the command, and the command of each actuator.
 
@@ -28,22 +26,15 @@ def flattening_figure(flat: Flattening, before: Wavefront, after: Wavefront, lay
         Fits to the slopes, and to the slopes with those of the command.
     layout : Layout
     """
-    figure = new_figure(WIDTH, 9.6)
-    above, below = figure.subfigures(2, 1, squeeze=False)[:, 0]
     largest = float(np.nanmax(np.abs(before.sheet())))
-    panels = above.subplots(1, 2)
-    for axes, wavefront, when in zip(panels, (before, after), ("measured", "with the command"), strict=True):
-        wavefront_map(axes, wavefront, layout, largest=largest)
-        axes.set_title(f"{when}: {float(total(wavefront.mean)):.3g} {before.unit} rms", fontsize=12)
-    _bars(below.subplots(), flat)
-    figure.suptitle("Command that would flatten the mean wavefront", fontsize=14)
-    return figure
-
-
-def _bars(axes: Axes, flat: Flattening) -> None:
-    axes.bar(np.arange(len(flat.command)), flat.command, 0.8, color=METHOD_COLOURS[1])
-    axes.axhline(0, color="black", lw=0.8)
-    if flat.stroke is not None:
-        for limit in (-flat.stroke, flat.stroke):
-            axes.axhline(limit, color=GREY, lw=1, ls="--")
-    axes.set(title="command", xlabel="actuator", ylabel="unit of the interaction matrix")
+    cases = {"measured": before, "with the command": after}
+    maps = [wavefront_map(wavefront, layout, when, largest=largest) for when, wavefront in cases.items()]
+    style = {"color": METHOD_COLOURS[1], "drawstyle": "steps-mid", "marker": ".", "lw": 1}
+    limits = [] if flat.stroke is None else [-flat.stroke, flat.stroke]
+    levels = {0.0: {}, **{limit: {"ls": "--", "label": "stroke limit"} for limit in limits}}
+    line, unit = (
+        Line("command", np.arange(len(flat.command)), flat.command, style=style),
+        "interaction matrix",
+    )
+    panel = Panel([line], "actuator", f"command (unit of the {unit})", levels=levels, share=2)
+    return plot([maps, [panel]], 9.6, heading="Command that would flatten the mean wavefront")

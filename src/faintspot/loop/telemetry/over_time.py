@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.base.report.figure_data import csv_text
+from faintspot.base.files import csv_text
 from faintspot.loop.control.identification.open_loop import FEWEST_FRAMES, Measured
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.telemetry.report import report_of_loop
@@ -32,16 +31,6 @@ class Piece:
     """By name; layers are left out, as their number changes."""
     missing: str = ""
     """Reason for missing values."""
-
-    def as_values(self) -> dict[str, Any]:
-        """Return plain values, for JSON."""
-        known = [value.as_values() for value in self.values.values()]
-        return {
-            "start_s": self.start_s,
-            "duration_s": self.duration_s,
-            "known": known,
-            "missing": self.missing,
-        }
 
 
 def turbulence_over_time(

@@ -3,24 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 
-from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.page import Report, Table
-from faintspot.base.report.plots import (
-    GREY,
-    METHOD_COLOURS,
-    WIDTH,
-    Line,
-    Panel,
-    colour_bar,
-    new_figure,
-    plot,
-    styled,
-)
+from faintspot.base.report.page import FigureWithData, Report, Table
+from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, Line, Panel, Picture
 from faintspot.base.report.texts import Texts
 from faintspot.loop.control.identification.open_loop import R0, Measured
 from faintspot.loop.telemetry.over_time import Piece
@@ -41,18 +29,17 @@ _MEASURED = {"fmt": "o-", "color": METHOD_COLOURS[1], "capsize": 3}
 
 def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> Report:
     """Return the page of a report, and of pieces of its recording."""
-    figures: dict[str, Callable[[LoopReport], FigureWithData | None]] = {
-        "noise": _noise_figure,
-        "spectra": _spectra_figure,
-    }
     sections = []
     if pieces:
         missing = "; ".join(f"{piece.start_s:g} s: {piece.missing}" for piece in pieces if piece.missing)
         sections.append(_TEXT.section("time", _time_figure(pieces), missing=missing))
+    more = {
+        "noise": _noise_figure(report),
+        "spectra": _spectra_figure(report),
+        "choices": _choices_table(report),
+    }
     for name, part in report.parts.items():
-        figure = figures[name](report) if name in figures else None
-        replayed = _choices_table(report) if name == "choices" else None
-        sections.append(_TEXT.section(name, _table(part), replayed, figure, missing=part.missing))
+        sections.append(_TEXT.section(name, _table(part), more.get(name), missing=part.missing))
     loop = report.loop
     return Report(
         f"{'Loop' if loop.is_closed else 'Turbulence'} of {loop.name}",
@@ -72,7 +59,7 @@ def _table(part: Part) -> Table:
 
 
 def _choices_table(report: LoopReport) -> Table:
-    compared = ("residual", "less", "total", "strehl")
+    compared = ("residual", "less", "strehl")
     records = [
         {
             **vars(choice),
@@ -99,39 +86,31 @@ def _with_interval(measured: Measured, unit: str = "") -> str | None:
 
 def _time_figure(pieces: Sequence[Piece]) -> FigureWithData:
     """Draw r0, coherence time, wind and noise of each piece."""
-    middle = np.array([piece.start_s + piece.duration_s / 2 for piece in pieces])
-    panels: list[list[Panel]] = []
-    rows: list[tuple[object, ...]] = []
+    middle = [piece.start_s + piece.duration_s / 2 for piece in pieces]
+    panels = []
     for name in _AGAINST_TIME:
         values = [piece.values.get(name, Measured(name, "")) for piece in pieces]
-        known = [value for value in values if math.isfinite(value.value)]
-        if known:
+        unit = next((value.unit for value in values if math.isfinite(value.value)), None)
+        if unit is not None:
             numbers = np.array([(value.value, *value.interval) for value in values]).T
-            line = Line("", middle, numbers[0], np.abs(numbers[1:] - numbers[0]), _MEASURED)
-            panels.append([Panel([line], "", known[0].unit, name, y_range=(0, None))])
-            rows += [(name, time, *number) for time, number in zip(middle, numbers.T, strict=True)]
+            line = Line(name, middle, numbers[0], np.abs(numbers[1:] - numbers[0]), _MEASURED)
+            panels.append([Panel([line], "time since the first frame (s)", unit, name, y_range=(0, None))])
     panels = panels or [[Panel([], "")]]
-    panels[-1] = [replace(panels[-1][0], x="time since the first frame (s)")]
-    figure = plot(panels, 2.4 * len(panels), legend="", sharex=True)
-    return _TEXT.figure("time", figure, rows, ("quantity", "time", "value", "low", "high"))
+    return _TEXT.figure("time", panels, 2.6 * len(panels), legend="", shared=True)
 
 
-@styled
 def _noise_figure(report: LoopReport) -> FigureWithData | None:
     """Draw the noise of each sub-aperture along x and y."""
     if report.noise_px is None or len(report.loop.cells) == 1:
         return None
-    figure, cells = new_figure(WIDTH * 0.7, 4.0), report.loop.cells - report.loop.cells.min(axis=0)
-    axes = list(figure.subplots(1, 2))
-    halves = report.noise_px.reshape(2, -1)
-    for panel, values, name in zip(axes, halves, "xy", strict=True):
+    cells, halves = report.loop.cells - report.loop.cells.min(axis=0), report.noise_px.reshape(2, -1)
+    limits, unit = {"vmin": np.nanmin(halves), "vmax": np.nanmax(halves)}, report.loop.slope_unit
+    pictures = []
+    for values, name in zip(halves, "xy", strict=True):
         grid = np.full(cells.max(axis=0) + 1, np.nan)
         grid[tuple(cells.T)] = values
-        shown = panel.imshow(grid, vmin=np.nanmin(halves), vmax=np.nanmax(halves))
-        panel.set(title=f"noise of {name}", xlabel="column", ylabel="row")
-    colour_bar(axes, shown, report.loop.slope_unit)
-    rows = [(*cell, *pair) for cell, pair in zip(report.loop.cells, halves.T, strict=True)]
-    return _TEXT.figure("noise", figure, rows, ("row", "column", "noise x", "noise y"))
+        pictures.append(Picture(grid, f"noise ({unit})", f"noise of {name}", "column", "row", limits))
+    return _TEXT.figure("noise", [pictures], 4.0, width=WIDTH * 0.7)
 
 
 def _spectra_figure(report: LoopReport) -> FigureWithData | None:
@@ -139,26 +118,16 @@ def _spectra_figure(report: LoopReport) -> FigureWithData | None:
     spectra = report.spectra
     if spectra is None:
         return None
+    factor = np.exp(1.96 / np.sqrt(0.55 * spectra.pieces))
     panels: list[Panel] = []
-    rows: list[tuple[object, ...]] = []
-    unit = f"slope² ({report.loop.slope_unit}²/Hz)"
     for name in spectra.measured:
         measured, model = (report.loop.unit**2 * power[name] for power in (spectra.measured, spectra.model))
-        factor = np.exp(1.96 / np.sqrt(0.55 * spectra.pieces))
-        scatter = model - model / factor, model * factor - model
+        scatter, style = (model - model / factor, model * factor - model), {"color": METHOD_COLOURS[0]}
         lines = [
             Line("measured", spectra.frequency_hz, measured, style={"color": GREY, "lw": 1}),
-            Line(
-                "found",
-                spectra.frequency_hz,
-                model,
-                scatter,
-                {"color": METHOD_COLOURS[0], "lw": 1.6},
-                band=True,
-            ),
+            Line("fitted", spectra.frequency_hz, model, scatter, {**style, "lw": 1.6}, band=True),
         ]
-        panels.append(Panel(lines, "frequency (Hz)", unit, name, log=True, legend=True))
-        rows += [(name, *row) for row in zip(spectra.frequency_hz, measured, model, strict=True)]
+        unit = f"slope² ({report.loop.slope_unit}²/Hz)"
+        panels.append(Panel(lines, "frequency (Hz)", unit, name, log="xy", legend=True))
     pairs = [panels[first : first + 2] for first in range(0, len(panels), 2)]
-    figure = plot(pairs, 3.6 * len(pairs), legend="")
-    return _TEXT.figure("spectra", figure, rows, ("slopes", "frequency", "measured", "found"))
+    return _TEXT.figure("spectra", pairs, 3.6 * len(pairs), legend="")

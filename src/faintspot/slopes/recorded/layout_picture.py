@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.files import write_atomically
-from faintspot.base.report.plots import colour_bar, limits_of, new_figure, png, styled
+from faintspot.base.report.plots import Line, Picture, limits_of, plot, png, styled
 from faintspot.base.statistics import MAD_TO_STD
+from faintspot.slopes.sensor.drawing import Outlines
 from faintspot.slopes.sensor.layout import Layout
 
 if TYPE_CHECKING:
@@ -22,9 +23,9 @@ Floats = NDArray[np.float64]
 _WINDOW, _DOUBTFUL = "#E69F00", "#56B4E9"
 _MOST_NUMBERED = 1500
 _MOST_PIXELS = 1400  # a side of the frame; of more, pixels are averaged rather than left out
+_SIDE = 12.0  # inch
 
 
-@styled
 def layout_picture(
     frame: ArrayLike,
     layout: Layout,
@@ -58,62 +59,55 @@ def layout_picture(
     array = np.asarray(frame, dtype=np.float64)
     if array.ndim == 3:
         array = array.mean(axis=0)
-    inside = layout.images(array)
+    n_rows, n_columns = array.shape
+    (height, width), corners = layout.window, layout.corners[:, ::-1] - 0.5
+    points = 72 * _SIDE * 0.85 * width / n_columns  # a window's width in points
     marked = np.zeros(len(layout), bool) if doubtful is None else np.asarray(doubtful, bool)
-    figure = _layout_figure(array, inside, layout, np.reshape(outside, (-1, 2)), marked)
+    windows = {
+        "edgecolors": np.where(marked, _DOUBTFUL, _WINDOW),
+        "linewidths": min(max(points / 14, 0.2), 0.9),  # lines never hide the spots
+    }
+    ring = np.array([[0, 0], [width, 0], [width, height], [0, height]])
+    circle = {"ls": "", "marker": "o", "ms": 0.8 * points, "mfc": "none", "mec": _DOUBTFUL}
+    marks = (
+        Outlines(corners[:, None] + ring, windows),
+        Line.of("", np.reshape(outside, (-1, 2)), circle),
+    )
+    pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
+    title = (
+        f"{len(layout)} sub-aperture{'' if len(layout) == 1 else 's'} of {height} x {width} px, "
+        f"{layout.geometry}{pitch}, angle {layout.angle_deg:.2f}°"
+    )
+    style = {
+        "cmap": "gray",
+        "norm": asinh_stretch(array, layout.images(array)),
+        "interpolation": "nearest" if max(array.shape) <= _MOST_PIXELS else "antialiased",
+    }
+    picture = Picture(array, "frame's units", title, style=style, marks=marks)
+    high = min(max(0.9 * _SIDE * n_rows / n_columns, 3.0), 2 * _SIDE) + 0.9
+    figure = plot([[picture]], high, width=_SIDE, legend="")
+    if points >= 12 and len(layout) <= _MOST_NUMBERED:
+        _number(figure, corners + np.array([0.06 * width, 0.95 * height]), min(points / 3.0, 13.0))
     write_atomically(path, png(figure, tight=False))
 
 
-def _layout_figure(
-    array: Floats, inside: Floats, layout: Layout, outside: Floats, doubtful: NDArray[np.bool_]
-) -> Figure:
+@styled
+def _number(figure: Figure, places: Floats, size: float) -> None:
+    """Write numbers, which take long, when the layout of the figure is found: they are drawn once."""
     from matplotlib import patheffects
-    from matplotlib.collections import PolyCollection
 
-    n_rows, n_columns = array.shape
-    side = 12.0
-    figure = new_figure(side, min(max(0.9 * side * n_rows / n_columns, 3.0), 2 * side) + 0.9)
-    axes = figure.subplots()
-    smooth = "nearest" if max(array.shape) <= _MOST_PIXELS else "antialiased"
-    image = axes.imshow(array, cmap="gray", norm=asinh_stretch(array, inside), interpolation=smooth)
-    colour_bar(axes, image, "frame's units")
-    points = 72 * side * 0.85 * layout.window[1] / n_columns  # a window's width in points
-    boxes, line = _window_outlines(layout), min(max(points / 14, 0.2), 0.9)  # lines never hide the spots
-    colours = [_DOUBTFUL if marked else _WINDOW for marked in doubtful]
-    axes.add_collection(PolyCollection(boxes, facecolors="none", edgecolors=colours, linewidths=line))
-    axes.scatter(
-        outside[:, 0],
-        outside[:, 1],
-        s=(0.8 * points) ** 2,
-        facecolors="none",
-        edgecolors=_DOUBTFUL,
-        linewidths=1.0,
-    )
-    axes.set_xlabel("column (px)")
-    axes.set_ylabel("row (px)")
-    pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
-    plural = "" if len(layout) == 1 else "s"
-    axes.set_title(
-        f"{len(layout)} sub-aperture{plural} of {layout.window[0]} x {layout.window[1]} px, "
-        f"{layout.geometry}{pitch}, angle {layout.angle_deg:.2f}°"
-    )
-    # Numbers, which take long, come when the layout is found, so that they are drawn once.
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    font = min(points / 3.0, 13.0)
-    if font >= 4 and len(layout) <= _MOST_NUMBERED:
-        for number, (row, column) in enumerate(layout.corners):
-            axes.text(
-                column - 0.5 + 0.06 * layout.window[1],
-                row - 0.5 + 0.95 * layout.window[0],
-                str(number),
-                color=_WINDOW,
-                fontsize=font,
-                va="top",
-                clip_on=True,
-                path_effects=[patheffects.withStroke(linewidth=1.6, foreground="black")],
-            )
-    return figure
+    outline = [patheffects.withStroke(linewidth=1.6, foreground="black")]
+    for number, (x, y) in enumerate(places):
+        style: dict[str, Any] = {
+            "color": _WINDOW,
+            "fontsize": size,
+            "va": "top",
+            "clip_on": True,
+            "path_effects": outline,
+        }
+        figure.axes[0].text(x, y, str(number), **style)
 
 
 def asinh_stretch(array: Floats, inside: Floats) -> FuncNorm:
@@ -132,9 +126,3 @@ def asinh_stretch(array: Floats, inside: Floats) -> FuncNorm:
     return FuncNorm(
         (lambda v: np.arcsinh((v - sky) / unit), lambda u: sky + unit * np.sinh(u)), vmin=low, vmax=high
     )
-
-
-def _window_outlines(layout: Layout) -> list[Any]:
-    height, width = layout.window
-    ring = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
-    return list(layout.corners[:, None, ::-1] + ring)

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
 from faintspot.base.flags import NO_FLAG, SubapertureFlag, are_valid
-from faintspot.base.statistics import MAD_TO_STD, Estimate, absolute_errors, slope_statistics
+from faintspot.base.statistics import Estimate, absolute_errors, slope_statistics
+from faintspot.slopes.pipeline.slopes import Slopes
 
 Floats = NDArray[np.float64]
 
 
-ARRAYS = ("x", "y", "flux", "flags", "iterations")
+ARRAYS = ("x", "y", "flux", "flags")
 _BLOCK_NUMBERS = 1 << 22  # numbers worked on at a time: bounds the memory of the double-precision copies
 
 
@@ -40,10 +41,6 @@ class MeasuredSlopes:
     flux : array, electrons
     flags : array of uint8
         Bits of `SubapertureFlag`.
-    iterations : array of int
-    denoised : bool, optional
-        Whether the iterations are those of a denoiser, rather than an estimator's own steps. Default: where
-        there are any.
     frames : (n_frames,) array of int, optional
         Frame numbers; frames follow each other where these do. Default: counted from 0.
     standard_error_px : float
@@ -62,8 +59,6 @@ class MeasuredSlopes:
     y: NDArray[Any]
     flux: NDArray[Any]
     flags: NDArray[Any]
-    iterations: NDArray[Any]
-    denoised: bool | None = field(default=None, kw_only=True)
     frames: NDArray[np.int64] | None = field(default=None, kw_only=True)
     standard_error_px: float = field(default=np.nan, kw_only=True)
     keep: SubapertureFlag = field(default=NO_FLAG, kw_only=True)
@@ -79,8 +74,10 @@ class MeasuredSlopes:
             object.__setattr__(self, name, array)
 
     @classmethod
-    def of(cls, name: str, slopes: Any, **more: Any) -> MeasuredSlopes:
-        """Make one of the `Slopes` of one frame or several."""
+    def of(cls, name: str, slopes: Slopes, **more: Any) -> MeasuredSlopes:
+        """Make one of the slopes of one frame or several."""
+        errors = np.hypot(slopes.standard_error_x, slopes.standard_error_y)[slopes.valid] / np.sqrt(2)
+        more = {"standard_error_px": median(errors.astype(np.float64)), "keep": slopes.keep, **more}
         return cls(name, *(np.atleast_2d(getattr(slopes, array)) for array in ARRAYS), **more)
 
     @property
@@ -108,13 +105,6 @@ class MeasuredSlopes:
     def valid(self) -> NDArray[np.bool_]:
         """Mask of valid measurements."""
         return are_valid(self.flags, self.keep)
-
-    @property
-    def is_denoised(self) -> bool:
-        """Whether the denoiser did anything."""
-        if self.denoised is not None:
-            return self.denoised
-        return bool(np.any(self.iterations) or self.flag_count(SubapertureFlag.INFEASIBLE_STRENGTH))
 
     def flag_count(self, flag: SubapertureFlag) -> int:
         """Return in how many measurements all bits of `flag` are set."""
@@ -144,8 +134,6 @@ class Jitter:
     x_px: Floats
     """Standard deviation (n - 1)."""
     y_px: Floats
-    robust_px: Floats
-    """1.4826 times the median absolute deviation, rms of x and y: blind to rare outliers."""
 
     @property
     def px(self) -> Floats:
@@ -191,9 +179,7 @@ def jitter(x: NDArray[np.generic], y: NDArray[np.generic], valid: NDArray[np.boo
     columns = []
     for block in column_blocks(*x.shape):
         kept = valid[:, block]
-        stds = [std_over_valid(axis[:, block], kept) for axis in (x, y)]
-        robust = [robust_std_over_valid(axis[:, block], kept) for axis in (x, y)]
-        columns.append((*stds, np.sqrt((robust[0] ** 2 + robust[1] ** 2) / 2)))
+        columns.append([std_over_valid(axis[:, block], kept) for axis in (x, y)])
     return Jitter(valid.sum(axis=0), *(np.concatenate(part) for part in zip(*columns, strict=True)))
 
 
@@ -260,27 +246,6 @@ def slope_error(method: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_])
     return Estimate(statistics.error.value, error), statistics.gain.value
 
 
-def error_ratio(
-    method: MeasuredSlopes, reference: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]
-) -> tuple[float, float]:
-    """Return R of `reference` over R of `method`, and its standard error, from paired measurements."""
-    own_errors, reference_errors = (absolute_errors(run.x, run.y, truth) for run in (method, reference))
-    own_mean = own_errors[valid].mean() if valid.any() else 0.0
-    if own_mean == 0:
-        return np.nan, np.nan
-    ratio = float(reference_errors[valid].mean() / own_mean)
-    return ratio, standard_error(reference_errors - ratio * own_errors, valid) / float(own_mean)
-
-
-def flux_gain(ratio: float) -> tuple[float, float]:
-    """Return the range of the flux gain that a ratio of slope errors stands for.
-
-    R falls as 1 / flux where read noise rules and as 1 / sqrt(flux) where photon noise does, so the same R at
-    less flux means a gain in flux between the ratio and its square.
-    """
-    return min(ratio, ratio**2), max(ratio, ratio**2)
-
-
 def standard_error(values: Floats, valid: NDArray[np.bool_]) -> float:
     """Return the standard error of the mean of the valid values; NaN from a single one.
 
@@ -326,14 +291,6 @@ def median_over_valid(values: NDArray[np.generic], valid: NDArray[np.bool_]) -> 
     upper = ordered[np.minimum(count // 2, len(ordered) - 1), columns]
     lower = ordered[np.maximum(count - 1, 0) // 2, columns]
     return _divide(np.where(count > 0, lower + upper, 0.0), 2 * (count > 0))
-
-
-def robust_std_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
-    """Return 1.4826 times the median absolute deviation of each column's valid values; NaN below two."""
-    middle = np.nan_to_num(median_over_valid(values, valid))
-    spread = MAD_TO_STD * median_over_valid(np.abs(values - middle), valid)
-    measured: Floats = np.where(valid.sum(axis=0) >= 2, spread, np.nan)
-    return measured
 
 
 def _divide(sums: Floats, counts: NDArray[np.int64]) -> Floats:

@@ -19,7 +19,7 @@ def moving(gain: float, noise: float, seed: int, n_frames: int = 400, n: int = 3
         axes.append(gain * spots + noise * rng.normal(size=(n_frames, n)) + 0.1 * seed)
     shape = (n_frames, n)
     nothing = np.zeros(shape, int)
-    return MeasuredSlopes(f"{seed}", axes[0], axes[1], np.ones(shape), nothing, nothing)
+    return MeasuredSlopes(f"{seed}", axes[0], axes[1], np.ones(shape), nothing)
 
 
 def test_noise_and_relative_gain_without_a_truth() -> None:
@@ -72,7 +72,7 @@ def test_no_gain_is_claimed_where_nothing_moves() -> None:
     rng, flags = np.random.default_rng(1), np.zeros((50, 20), int)
     flux = np.ones((50, 20))
     methods = [
-        MeasuredSlopes(name, rng.normal(size=(50, 20)), rng.normal(size=(50, 20)), flux, flags, flags)
+        MeasuredSlopes(name, rng.normal(size=(50, 20)), rng.normal(size=(50, 20)), flux, flags)
         for name in "ab"
     ]
     found = NoiseComparison.of(methods, [methods[0].valid] * 2)

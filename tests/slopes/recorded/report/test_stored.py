@@ -59,7 +59,7 @@ def store(
 
 def test_one_store_gives_the_whole_page(tmp_path: Path) -> None:
     page = Page(report_of_stored([store(tmp_path / "slopes.zarr", sensor())]))
-    assert len([tag for tag, _ in page.tags if tag == "img"]) == 6
+    assert len([tag for tag, _ in page.tags if tag == "img"]) == 5
     assert "wavefront" in page.ids
     assert "total-variation denoising of strength 0.3 e-" in page.text
     assert "frames.npy" in page.text

@@ -1,1 +1,1 @@
-"""Report of recorded slopes: `page` shows a `run`, with pictures in `maps` and `frame_pictures`."""
+"""Report of recorded slopes: `page` shows a `run`, with `pictures`; `stored` makes one of files."""

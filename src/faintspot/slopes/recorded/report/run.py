@@ -15,7 +15,7 @@ from faintspot.base.report.texts import Texts
 from faintspot.slopes.estimators.base import Step
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slopes import Slopes, Stages
-from faintspot.slopes.recorded.report.frame_pictures import Followed
+from faintspot.slopes.recorded.report.pictures import Followed
 from faintspot.slopes.recorded.statistics import (
     Floats,
     Jitter,

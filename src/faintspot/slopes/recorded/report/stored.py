@@ -10,21 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.flags import are_valid, leave_out
-from faintspot.base.report.figure_data import FigureWithData
-from faintspot.base.report.page import Report, Section
-from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, Line, Panel, plot
+from faintspot.base.flags import leave_out
+from faintspot.base.report.page import FigureWithData, Report, Section
+from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, Line, Panel
 from faintspot.base.report.texts import Texts
 from faintspot.io import open_frames
 from faintspot.io.frames import FrameSource
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slopes import Slopes, Stages
-from faintspot.slopes.recorded.report.frame_pictures import Followed, farthest_frame
 from faintspot.slopes.recorded.report.page import slopes_report
+from faintspot.slopes.recorded.report.pictures import Followed, farthest_frame
 from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.sodium import sodium_of_frames
-from faintspot.slopes.recorded.statistics import ARRAYS, MeasuredSlopes
+from faintspot.slopes.recorded.statistics import MeasuredSlopes
 from faintspot.slopes.recorded.stored_run import StoredRun, open_run
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.laser_spots import LaserSpots
@@ -35,20 +34,17 @@ _TEXT = Texts("faintspot.slopes.recorded")
 
 def profile_figure(profiles: Mapping[str, SodiumProfile]) -> FigureWithData:
     """Draw the density of profiles against altitude; the last one is emphasised."""
-    *before, newest = profiles
-    lines, rows = [], []
+    *_, newest = profiles
+    lines = []
     for index, (name, profile) in enumerate(profiles.items()):
-        altitude, density = profile.altitudes_m / 1e3, 1e3 * profile.density
         style: dict[str, object] = {"color": METHOD_COLOURS[1], "lw": 2.2}
         if name != newest:
-            dashes = ("--", ":", "-.")[index % 3] if len(before) > 1 else "--"
-            style = {"color": GREY, "lw": 1.6, "ls": dashes}
-        mean = f"mean {profile.mean_m / 1e3:.1f} km, std {profile.std_m / 1e3:.1f} km"
-        lines.append(Line(f"{name}\n({mean})", density, altitude, style=style))
-        rows += [(name, f"{a:.6g}", f"{b:.6g}") for a, b in zip(altitude, density, strict=True)]
+            style = {"color": GREY, "lw": 1.6, "ls": ("--", ":", "-.")[index % 3]}
+        label = f"{name}\n(mean {profile.mean_m / 1e3:.1f} km, std {profile.std_m / 1e3:.1f} km)"
+        lines.append(Line(label, 1e3 * profile.density, profile.altitudes_m / 1e3, style=style))
     flux, height = "return flux per km of altitude", "altitude above sea level (km)"
     panel = Panel(lines, flux, height, x_range=(0, None), legend=True)
-    return _TEXT.figure("sodium", plot([[panel]], 4.6, width=0.6 * WIDTH, legend=""), rows)
+    return _TEXT.figure("sodium", [[panel]], 4.6, width=0.6 * WIDTH, legend="")
 
 
 def sodium_section_of_frames(
@@ -186,13 +182,8 @@ def _methods(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[st
         notes.append(_TEXT["stored.other_sources"])
     methods = []
     for name, store in zip(_names(stores), stores, strict=True):
-        variables = store.stored.variables
-        arrays = [variables[array][: min(counts)] for array in ARRAYS]
-        # Iterations of other estimators are their own steps.
-        denoised = None if store.estimator is None or store.estimator.denoises else False
-        stated = _median_standard_error(store)
-        options: dict[str, Any] = {"denoised": denoised, "standard_error_px": stated, "keep": store.keep}
-        methods.append(MeasuredSlopes(name, *arrays, **options))
+        slopes = Slopes.from_variables(store.stored.variables, min(counts), store.keep)
+        methods.append(MeasuredSlopes.of(name, slopes))
     return methods, notes
 
 
@@ -285,16 +276,6 @@ def _range_in_words(store: StoredRun) -> str:
         return ""
     range_px = store.settings.values("search_range_px", len(store.layout), store.layout.pixels)
     return f"; positions within {np.max(range_px):g} px"
-
-
-def _median_standard_error(store: StoredRun) -> float:
-    """Median over the valid slopes of the rms standard error of x and y, px; NaN without any."""
-    variables = store.stored.variables
-    valid = are_valid(variables["flags"], store.keep)
-    x, y = (variables[f"standard_error_{axis}"][valid].astype(np.float64) for axis in "xy")
-    errors = np.sqrt((x**2 + y**2) / 2)
-    finite = errors[np.isfinite(errors)]
-    return float(np.median(finite)) if finite.size else np.nan
 
 
 def _facts(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:

@@ -1,20 +1,23 @@
 """What pictures are made of: windows in place, chosen sub-apertures, positions, files."""
 
+from typing import Any
+
 import matplotlib
 import numpy as np
-from tests.slopes.recorded.recorded_cases import SETTINGS, sensor, simulated
+import pytest
+from tests.slopes.recorded.recorded_cases import SETTINGS, sensor, simulated, two_methods
 
 from faintspot.base.report.plots import png
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
-from faintspot.slopes.recorded.report.frame_pictures import (
+from faintspot.slopes.recorded.report import pictures
+from faintspot.slopes.recorded.report.pictures import (
     Example,
     assembled,
-    coarseness,
-    coarser,
     example_subapertures,
-    whole_sensor,
+    sensor_figure,
 )
+from faintspot.slopes.recorded.statistics import MeasuredSlopes, jitter, summarise
 from faintspot.slopes.sensor.layout import Layout
 
 
@@ -73,21 +76,10 @@ def test_raw_in_electrons_is_recognised() -> None:
 def test_users_style_is_neither_used_nor_changed() -> None:
     layout = sensor((1, 1))
     stages = {"TV": SlopePipeline(layout, SETTINGS).explain(simulated(layout, 1)[0][0])}
-    plain = png(whole_sensor(Example(layout, stages)))
+    plain = png(sensor_figure(Example(layout, stages), 0).figure)
     with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "black"}):
-        assert png(whole_sensor(Example(layout, stages))) == plain
+        assert png(sensor_figure(Example(layout, stages), 0).figure) == plain
         assert matplotlib.rcParams["font.size"] == 30
-
-
-def test_a_big_sensor_is_shown_coarser_and_its_spots_stay() -> None:
-    small, big = sensor(), Layout.grid((60, 60), pixels=16)
-    assert coarseness(small) == 1
-    assert coarseness(big) == 3
-    sheet = np.full((7, 5), np.nan)
-    sheet[1, 1], sheet[2, 3], sheet[6, 4] = 5.0, 2.0, 1.0
-    found = coarser(sheet, 3)
-    np.testing.assert_array_equal(found, [[5.0, 2.0], [np.nan, np.nan], [np.nan, 1.0]])
-    assert coarser(sheet, 1) is sheet
 
 
 def test_a_raw_frame_in_electrons_is_not_shown_twice_alone() -> None:
@@ -95,3 +87,45 @@ def test_a_raw_frame_in_electrons_is_not_shown_twice_alone() -> None:
     stages = {"ml": SlopePipeline(layout, SETTINGS).explain(simulated(layout, 1)[0][0])}
     assert list(Example(layout, stages, steps=TotalVariation.steps_shown[:2]).shown_steps) == ["raw"]
     assert len(Example(layout, stages, steps=TotalVariation.steps_shown).shown_steps) == 4
+
+
+def slopes(wild: float = 0.0, n: int = 100, usual: float = 0.1) -> MeasuredSlopes:
+    x = np.full((2, n), usual)
+    x[:, 1] += wild
+    nothing = np.zeros(x.shape, np.uint8)
+    return MeasuredSlopes("TV", x, np.zeros_like(x), x + 5, flags=nothing)
+
+
+def test_arrows_are_cut_where_a_few_are_wild() -> None:
+    assert pictures.longest_arrow([summarise(slopes())]) == (0.1, 0)
+    longest, number = pictures.longest_arrow([summarise(slopes(50.0))])
+    assert longest == pytest.approx(0.15)
+    assert number == 1
+    assert pictures.longest_arrow([summarise(slopes(usual=0.0))]) == (1.0, 0)
+
+
+def test_drawn_arrows_are_no_longer_than_the_limit() -> None:
+    layout = Layout.grid((10, 10), pixels=8)
+    summaries = [summarise(slopes(50.0))]
+    figure = pictures.arrows_figure([slopes(50.0)], summaries, layout).figure
+    arrows: Any = next(item for item in figure.axes[0].collections if hasattr(item, "U"))
+    assert np.hypot(arrows.U, arrows.V).max() == pytest.approx(pictures.longest_arrow(summaries)[0])
+
+
+def test_outlines_are_left_out_of_big_sensors() -> None:
+    def drawn(side: int) -> int:
+        method = slopes(n=side**2)
+        made = pictures.arrows_figure([method], [summarise(method)], Layout.grid((side, side), pixels=8))
+        return len(made.figure.axes[0].collections)
+
+    assert drawn(30) == drawn(2) - 1
+
+
+def test_one_frame_has_a_map_of_the_flux_alone() -> None:
+    layout = sensor()
+    frames = simulated(layout, 2)[0]
+    for n_frames, titles in ((1, ["TV: flux"]), (2, ["TV: median flux", "valid frames", "jitter"])):
+        method = two_methods(layout, frames[:n_frames])[0][0]
+        scatter = jitter(method.x, method.y, method.valid)
+        figure = pictures.maps_figure([method], [summarise(method)], [scatter], layout).figure
+        assert [title for panel in figure.axes if (title := panel.get_title())] == titles

@@ -1,0 +1,325 @@
+"""Figures of recorded slopes: a frame after every step, followed spots, and maps over all frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.report.page import FigureWithData
+from faintspot.base.report.plots import (
+    GREY,
+    METHOD_COLOURS,
+    TRUTH_COLOUR,
+    WIDTH,
+    Line,
+    Mark,
+    Picture,
+    limits_of,
+)
+from faintspot.base.report.texts import Texts, plain_number
+from faintspot.slopes.estimators.base import Step
+from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
+from faintspot.slopes.pipeline.slopes import Slopes, Stages
+from faintspot.slopes.recorded.layout_picture import asinh_stretch
+from faintspot.slopes.recorded.statistics import Jitter, MeasuredSlopes, SlopesSummary
+from faintspot.slopes.sensor.drawing import Arrows, Map, map_height
+from faintspot.slopes.sensor.layout import Layout
+
+Floats = NDArray[np.float64]
+
+_TEXT = Texts("faintspot.slopes.recorded")
+_MOST_MARKED = 150  # sub-apertures of the whole sensor's picture: of more, marks would hide the spots
+_MARKS = (("+", "white"), ("x", "#D55E00"), ("1", "#E69F00"), ("2", "#CC79A7"))  # with a black outline
+_ON_DARK = {"facecolor": "#777777", "labelcolor": "white", "edgecolor": "none", "frameon": True}
+_ABOVE: dict[str, Any] = {"legend": "outside upper center", **_ON_DARK}
+_PATH, _VALID, _INVALID = "#56B4E9", "#E69F00", "#CC79A7"
+_MOST_FRAMES = 200  # of which the paths of followed spots are drawn
+_ARROWS_WHOLE_PERCENT = 98  # of the slopes, whose arrows are never cut
+_MOST_SHORT_ARROWS = 400  # of more sub-apertures, arrows within their own could not be seen
+
+
+@dataclass(frozen=True)
+class Example:
+    """One frame after every step.
+
+    Attributes
+    ----------
+    layout : Layout
+    stages : mapping of Stages
+        By method; images (n_subapertures, ny, nx). The first one's images are shown, the positions of all are
+        marked. They must be measured from the sub-apertures' centres (no other reference).
+    truth : array (n_subapertures, 2), optional
+        True x, y, px.
+    steps : sequence of Step
+        What is shown of them; "raw" first.
+    """
+
+    layout: Layout
+    stages: Mapping[str, Stages]
+    truth: Floats | None = None
+    steps: Sequence[Step] = TotalVariation.steps_shown
+
+    @property
+    def first(self) -> Stages:
+        """Stages whose images are shown."""
+        return next(iter(self.stages.values()))
+
+    @property
+    def raw_is_calibrated(self) -> bool:
+        """Whether the raw frame is in electrons already."""
+        return bool(np.allclose(self.first.raw, self.first.calibrated, rtol=1e-5, equal_nan=True))
+
+    @property
+    def shown_steps(self) -> dict[str, str]:
+        """Attributes of `Stages` by title; a raw frame in electrons is not shown twice and nothing else."""
+        only_twice = len(self.steps) == 2 and self.raw_is_calibrated
+        return dict(self.steps[:1] if only_twice else self.steps)
+
+    def positions(self) -> dict[str, Floats]:
+        """Return valid positions by method, and the truth, from the window's middle, px; NaN if invalid."""
+        positions = {}
+        for name, stages in self.stages.items():
+            xy = np.stack([stages.slopes.x, stages.slopes.y], axis=-1).astype(np.float64)
+            positions[name] = np.where(stages.slopes.valid[:, None], xy, np.nan) + self.layout.offsets
+        if self.truth is not None:
+            positions["truth"] = self.truth + self.layout.offsets
+        return positions
+
+
+def sensor_figure(example: Example, frame: int) -> FigureWithData:
+    """Draw all windows of the calibrated frame at their places, with the positions of the spots."""
+    layout, images = example.layout, example.first.calibrated
+    sheet, start = assembled(layout, images), layout.corners.min(axis=0) - 0.5
+    (low, high), (n_rows, n_columns) = limits_of(images, percent=99.8), sheet.shape
+    extent = start[1], start[1] + n_columns, start[0], start[0] + n_rows
+    middles = layout.corners[:, ::-1] + 0.5 * (np.array(layout.window[::-1]) - 1)
+    few = len(layout) <= _MOST_MARKED
+    marks = _crosses({name: xy + middles for name, xy in example.positions().items()}, 6) if few else []
+    style = {"vmin": low, "vmax": high, "extent": extent}
+    picture, width = Picture(sheet, "e- per pixel", style=style, marks=marks), 0.62 * WIDTH
+    values = {
+        "frame": frame,
+        "marked": few,
+        "circles": "" if example.truth is None else ", circles true ones",
+    }
+    height = min(max(0.84 * width * n_rows / n_columns, 1.2), 9.0) + 0.7
+    return _TEXT.figure("sensor", [[picture]], height, values, width=width, **_ABOVE)
+
+
+def steps_figure(example: Example) -> FigureWithData:
+    """Draw the faintest, a median and the brightest valid sub-aperture after every step."""
+    stages, steps, chosen = example.first, example.shown_steps, example_subapertures(example.first)
+    (height, width), one_unit = example.layout.window, example.raw_is_calibrated
+    style: dict[str, Any] = {"extent": (-width / 2, width / 2, -height / 2, height / 2)}
+    positions, rows = example.positions(), list[list[Picture]]()
+    for which, index in chosen.items():
+        limits = limits_of((stages.raw if one_unit else stages.calibrated)[index], percent=99.8)
+        crosses = _crosses({name: xy[index : index + 1] for name, xy in positions.items()}, 13)
+        label = f"{which}\nno. {index}, {plain_number(float(stages.slopes.flux[index]))} e-\ny (px)"
+        row = list[Picture]()
+        for number, (title, step) in enumerate(steps.items()):
+            image, in_adu = getattr(stages, step)[index], title == "raw" and not one_unit
+            low, high = limits_of(image, percent=99.8) if in_adu else limits
+            unit = "ADU" if in_adu else "e- per pixel" if number == len(steps) - 1 else ""
+            title = "" if rows else f"{title} (ADU)" if in_adu else title
+            marks = crosses if number or len(steps) == 1 else []
+            options = {**style, "vmin": low, "vmax": high}
+            row.append(Picture(image, unit, title, "x (px)", "" if number else label, options, marks))
+        rows.append(row)
+    panel = WIDTH / 5.3
+    size = len(rows) * (panel * min(height / width, 2.0) + 0.4) + 0.9
+    values, options = {"shown": next(iter(example.stages))}, {"width": panel * (len(steps) + 1.3), **_ABOVE}
+    return _TEXT.figure("subapertures", rows, size, values, shared=True, **options)
+
+
+def example_subapertures(stages: Stages) -> dict[str, int]:
+    """Return the numbers of the faintest, a median and the brightest valid sub-aperture, each once.
+
+    Without any valid one it is the sub-aperture with the most flux after calibration.
+    """
+    valid = np.flatnonzero(stages.slopes.valid)
+    if valid.size == 0:
+        return {"none is valid": int(np.argmax(stages.calibrated.sum(axis=(-2, -1))))}
+    order = valid[np.argsort(stages.slopes.flux[valid], kind="stable")]
+    places = {"faintest": 0, "median": len(order) // 2, "brightest": len(order) - 1}
+    names = {1: ["brightest"], 2: ["faintest", "brightest"]}.get(len(order), list(places))
+    return {name: int(order[places[name]]) for name in names}
+
+
+def assembled(layout: Layout, images: NDArray[np.generic]) -> Floats:
+    """Return the windows' images (n, ny, nx) at their places; NaN between them."""
+    start = layout.corners.min(axis=0)
+    height, width = layout.corners.max(axis=0) - start + np.array(layout.window)
+    sheet = np.full((height, width), np.nan)
+    rows, columns = layout.window_pixels
+    sheet[rows - start[0], columns - start[1]] = images
+    return sheet
+
+
+def _crosses(positions: Mapping[str, Floats], size: float) -> list[Line]:
+    """Return marks: crosses for each method, the first one's on top, and circles for the truth."""
+    from matplotlib.patheffects import withStroke
+
+    width = 0.5 + 0.08 * size
+    around = [withStroke(linewidth=2.6 * width, foreground="black")]
+    circle = {"marker": "o", "ms": 1.5 * size, "mfc": "none", "mec": TRUTH_COLOUR}
+    crosses = iter(_MARKS)
+    lines = []
+    for order, (name, xy) in enumerate(positions.items()):
+        style = circle
+        if name != "truth":
+            marker, colour = next(crosses)
+            style = {
+                "marker": marker,
+                "ms": size,
+                "color": colour,
+                "path_effects": around,
+                "zorder": 3 - 0.1 * order,
+            }
+        lines.append(Line.of(name, xy, {"ls": "", "mew": width, **style}))
+    return lines
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Spots of a recording that were followed, and the frame of the picture.
+
+    Attributes
+    ----------
+    frame : array (h, w)
+    number : int
+        Its number in the recording.
+    slopes : Slopes
+        Slopes of all frames [px].
+    reference : array (n_subapertures, 2)
+        Reference positions, px from the sub-apertures' centres.
+    """
+
+    frame: NDArray[Any]
+    number: int
+    slopes: Slopes
+    reference: NDArray[np.float64]
+
+    def largest_pitches(self, layout: Layout) -> float:
+        """Return the largest displacement of a valid spot, in pitches."""
+        length = np.hypot(self.slopes.x, self.slopes.y)[self.slopes.valid]
+        return float(length.max(initial=0.0) / (layout.pitch_px or np.nan))
+
+
+def farthest_frame(slopes: Slopes) -> int:
+    """Return the number of the frame in which the valid spots are displaced most, as rms."""
+    squares = np.where(slopes.valid, slopes.x**2 + slopes.y**2, 0.0)
+    return int(np.argmax(squares.sum(axis=1) / np.maximum(slopes.valid.sum(axis=1), 1)))
+
+
+def followed_figure(followed: Followed, layout: Layout) -> FigureWithData:
+    """Draw a frame with an arrow from each reference position to its spot, and the paths of all spots."""
+    slopes, number = followed.slopes, followed.number
+    nodes = layout.centres + followed.reference
+    at = nodes + np.stack([slopes.x, slopes.y], axis=-1)
+    shown = np.where(slopes.valid[..., None], at, np.nan)
+    paths = shown[:: -(-len(shown) // _MOST_FRAMES)].transpose(1, 0, 2)
+    path, cross = (
+        {"color": _PATH, "lw": 0.7},
+        {"ls": "", "marker": "+", "ms": 4, "mew": 0.8, "color": "white"},
+    )
+    valid, doubtful = slopes.valid[number], slopes.measured[number] & ~slopes.valid[number]
+    arrows = {"color": _VALID, "label": "valid spot", "scale": 1.0, "width": 0.004, "zorder": 3}
+    circle = {"ls": "", "marker": "o", "mfc": "none", "color": _INVALID}
+    marks: list[Mark] = [
+        *(Line.of("path over all frames", xy, path) for xy in paths),
+        Line.of("reference", nodes, cross),
+        Arrows(nodes[valid], (at[number] - nodes)[valid], arrows),
+        *([Line.of("crossing or doubtful", at[number][doubtful], circle)] if doubtful.any() else []),
+    ]
+    everything = np.concatenate([nodes, shown.reshape(-1, 2)])
+    frame, margin = np.asarray(followed.frame, np.float64), 0.7 * max(layout.window)
+    left, low = np.maximum(np.nanmin(everything, axis=0) - margin, -0.5)
+    right, high = np.minimum(np.nanmax(everything, axis=0) + margin, np.array(frame.shape[::-1]) - 0.5)
+    style = {"cmap": "gray", "norm": asinh_stretch(frame, layout.images(frame))}
+    limits: dict[str, Any] = {"x_range": (left, right), "y_range": (low, high)}
+    picture = Picture(frame, "frame's units", style=style, marks=marks, **limits)
+    height = min(0.9 * WIDTH * (high - low) / (right - left) + 0.5, 1.3 * WIDTH)
+    return _TEXT.figure("followed-frame", [[picture]], height, {"frame": number}, **_ABOVE)
+
+
+def maps_figure(
+    methods: Sequence[MeasuredSlopes],
+    summaries: Sequence[SlopesSummary],
+    jitters: Sequence[Jitter],
+    layout: Layout,
+) -> FigureWithData:
+    """Draw flux, valid frames and jitter, a row of maps for each method; of one frame, flux only."""
+    several = methods[0].n_frames > 1
+    flux_limits = limits_of(*(summary.flux_e for summary in summaries), low=0.0)
+    jitter_limits = limits_of(*(item.px for item in jitters), low=0.0)
+    rows = []
+    for method, summary, item in zip(methods, summaries, jitters, strict=True):
+        name = f"{method.name}: {'median ' if several else ''}flux"
+        row = [Map(layout, summary.flux_e, "flux (e-)", name, flux_limits)]
+        if several:
+            percent = 100.0 * summary.valid_frames / method.n_frames
+            row.append(Map(layout, percent, "valid frames (%)", "valid frames", (0, 100)))
+            row.append(Map(layout, item.px, "jitter (px)", "jitter", jitter_limits))
+        rows.append(row)
+    columns = len(rows[0])
+    width = WIDTH if several else 0.6 * WIDTH
+    return _TEXT.figure(
+        "flux", rows, len(rows) * map_height(layout, columns), {"several": several}, width=width
+    )
+
+
+def arrows_figure(
+    methods: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
+) -> FigureWithData:
+    """Draw the mean slope of every sub-aperture, one panel per method, all at one scale.
+
+    Those longer than `longest_arrow` are cut to that length and drawn black.
+    """
+    longest, number = longest_arrow(summaries)
+    pitch, several = layout.pitch_px or max(layout.window), methods[0].n_frames > 1
+    length, width = (0.6, 0.004) if len(layout) <= _MOST_SHORT_ARROWS else (2.0, 0.0015)
+    maps = []
+    for method, summary, colour in zip(methods, summaries, METHOD_COLOURS, strict=False):
+        slopes = np.stack([summary.x_px, summary.y_px], axis=-1)
+        known, long = np.isfinite(summary.x_px), np.hypot(*slopes.T)
+        shown = (slopes * np.minimum(1.0, longest / np.maximum(long, longest))[:, None])[known]
+        colours = np.where(long > longest, "black", colour)[known]
+        style = {"color": colours, "scale": longest / (length * pitch), "width": width}
+        cross = Line.of("", layout.centres[~known], {"ls": "", "marker": "x", "color": GREY, "ms": 5})
+        arrows = Arrows(layout.centres[known], shown, style, _round_length(longest))
+        title = f"{method.name}: {'mean slope' if several else 'slope'}"
+        maps.append(Map(layout, title=title, marks=[arrows, cross]))
+    values = {
+        "longest": longest,
+        "percent": _ARROWS_WHOLE_PERCENT,
+        "number": number or None,
+        "several": several,
+    }
+    figure_width = WIDTH if len(maps) > 1 else 0.6 * WIDTH
+    return _TEXT.figure("slopes", [maps], map_height(layout, len(maps)), values, width=figure_width)
+
+
+def longest_arrow(summaries: Sequence[SlopesSummary]) -> tuple[float, int]:
+    """Return the length, px, at which arrows are cut, and how many are longer.
+
+    It is a percentile, so that a few wild slopes do not make all others too short to be seen; lengths within
+    half of it more are left as they are.
+    """
+    lengths = np.concatenate([np.hypot(summary.x_px, summary.y_px) for summary in summaries])
+    lengths = lengths[np.isfinite(lengths)]
+    usual = float(np.percentile(lengths, _ARROWS_WHOLE_PERCENT)) if lengths.size else 0.0
+    if usual <= 0:
+        return float(lengths.max(initial=0.0)) or 1.0, 0
+    longest = min(float(lengths.max()), 1.5 * usual)
+    return longest, int(np.count_nonzero(lengths > longest))
+
+
+def _round_length(length: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not above a length."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-9)))
