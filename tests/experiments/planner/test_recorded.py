@@ -34,7 +34,7 @@ def test_camera_flux_and_spot_are_measured() -> None:
     assert question.gain_e_per_adu == pytest.approx(0.5, rel=0.05)  # 30 frames of 36 spots
     assert question.read_noise_e == pytest.approx(4.0, rel=0.06)  # as the gain
     assert question.star_flux_e == pytest.approx(3000.0, rel=0.06)  # spots off the middle lose a little
-    assert question.fwhm_px == pytest.approx(1.77, rel=0.1)
+    assert question.spots.fwhm_px == pytest.approx(1.77, rel=0.1)
     assert any("PSF learnt" in fact for fact in question.facts)
 
 
@@ -52,7 +52,7 @@ def test_what_is_given_is_not_measured() -> None:
     question = question_from_frames(
         frames[0], layout=LAYOUT, gain_e_per_adu=0.5, read_noise_e=4.0, fwhm_px=1.8, flux_e=50.0
     )
-    assert (question.read_noise_e, question.fwhm_px, question.star_flux_e) == (4.0, 1.8, 50.0)
+    assert (question.read_noise_e, question.spots.fwhm_px, question.star_flux_e) == (4.0, 1.8, 50.0)
     assert question.psf is None
 
 
@@ -99,7 +99,7 @@ def test_a_faint_recording_has_the_range_of_its_spots() -> None:
     frames, _ = frames_of(layout, 30, flux_e=30.0, positions=positions, detector=camera, rng=rng)
     known: dict[str, Any] = {"layout": layout, "gain_e_per_adu": 1.0, "read_noise_e": 3.0, "fwhm_px": 1.77}
     question = question_from_frames(frames, **known)
-    assert question.search_range_px == 1.0  # 7.9 where noise is taken for spots
+    assert question.spots.search_range_px == 1.0  # 7.9 where noise is taken for spots
     assert question.star_flux_e == pytest.approx(30.0, rel=0.15)
     dark = question_from_frames(camera.expose(np.zeros(frames.shape), rng), **known, flux_e=30.0)
     assert dark.search_range_px == 1.0
@@ -136,8 +136,8 @@ def test_flux_that_differs_between_subapertures_is_simulated_so() -> None:
     frames, _ = frames_of(LAYOUT, 12, flux_e=flux, positions=positions, detector=CAMERA, rng=rng)
     question = question_from_frames(frames, layout=LAYOUT, gain_e_per_adu=0.5)
     assert question.star_flux_e == pytest.approx(1000.0, rel=0.03)
-    assert question.relative_flux is not None
-    np.testing.assert_allclose(question.relative_flux, flux / 1000.0, rtol=0.06)  # 6 frames, 2 % each
+    assert question.spots.relative_flux is not None
+    np.testing.assert_allclose(question.spots.relative_flux, flux / 1000.0, rtol=0.06)  # 6 frames, 2 % each
 
 
 @pytest.mark.slow
@@ -146,7 +146,7 @@ def test_unreliable_gain_is_not_used() -> None:
     question = question_from_frames(frames, gain_e_per_adu=2.0, flux_e=200.0)
     assert question.layout is not None
     assert len(question.layout) == 49  # those that the frame's edge does not cut
-    assert question.fwhm_px == pytest.approx(3.7, abs=0.2)
+    assert question.spots.fwhm_px == pytest.approx(3.7, abs=0.2)
     with pytest.raises(InputError, match=r"gain_e_per_adu.*disagree"):
         question_from_frames(frames, layout=question.layout)
 

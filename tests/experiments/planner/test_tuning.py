@@ -99,7 +99,7 @@ def test_speckled_spots_are_measured_without_trusting_their_mean() -> None:
         r0_m=0.15,
         flux_e=500.0,
     )
-    assert answer.question.d_over_r0 > 2
+    assert answer.question.spots.d_over_r0 > 2
     # What is blurred or allowed to be wrong is nearer to the truth than the sharp PSF.
     assert answer["ml"].settings.model_error > 0 or answer["ml"].settings.blur_px > 0
     assert answer.best.statistics.corrected_rms.value < answer["brightest"].statistics.corrected_rms.value

@@ -27,7 +27,8 @@ def test_zero_point_of_v_is_the_textbook_one() -> None:
 
 
 def test_own_zero_point_replaces_the_bands() -> None:
-    assert Photometry(1.0, 1.0, "V", 1e9, 1.0, 1.0).electrons_at_zero == 1e9
+    lossless: dict[str, Any] = {"throughput": 1.0, "quantum_efficiency": 1.0}
+    assert Photometry(1.0, 1.0, band="V", zero_point=1e9, **lossless).electrons_at_zero == 1e9
 
 
 @pytest.mark.parametrize(
@@ -42,4 +43,4 @@ def test_values_out_of_range_are_named(name: str, value: float) -> None:
 
 def test_unknown_band_is_refused() -> None:
     with pytest.raises(InputError, match="band"):
-        Photometry(1.0, 1.0, "Q")
+        Photometry(1.0, 1.0, band="Q")

@@ -98,7 +98,7 @@ class Answer:
     @property
     def prior_rms_px(self) -> float:
         """Rms per axis of the spots' positions, and so of always answering the reference."""
-        return float(self.question.search_range_px / math.sqrt(3))
+        return float(self.question.spots.search_range_px / math.sqrt(3))
 
     @property
     def is_hopeless(self) -> bool:
@@ -158,7 +158,7 @@ class Answer:
             return None
         optics = {name: getattr(question, name) for name in ("pixel_scale_arcsec", "subaperture_m")}
         star = question.laser.star_of(replace(question.whole_layout, **optics))
-        return question.laser.psf(star, question.shape)
+        return question.laser.psf(star, question.spots.shape)
 
     def save(self, path: str | Path) -> None:
         """Write the recommended settings as a configuration file; what else it holds stays.

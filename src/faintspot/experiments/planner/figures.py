@@ -36,7 +36,7 @@ def tune_figure(answer: Answer) -> Figure:
     """
     magnitudes, question = answer.magnitudes(answer.flux_e), answer.question
     budget, limit = question.budget_px, answer.best.limiting_flux_e
-    saturated = question.search_range_px / 2
+    saturated = question.spots.search_range_px / 2
     bound = np.where(answer.bound_px < 1.5 * saturated, answer.bound_px, np.nan)
     lines = [_line(answer, result, magnitudes) for result in answer.results]
     style: dict[str, Any] = {"color": "black", "lw": 1.3, "zorder": 6}

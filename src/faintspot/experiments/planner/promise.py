@@ -143,7 +143,7 @@ def check_promises(
     Parameters
     ----------
     question : Question
-        With `recording`.
+        With recorded frames.
     methods : dict of str to (Method, float)
         Each with the options to check and R at the star's flux as promised.
     rng : numpy.random.Generator, optional
@@ -167,12 +167,12 @@ def check_promises(
     flux, excess = float(fitted.flux_e.mean()), question.detector.excess_noise_factor
     share = min(_LARGEST_SHARE, question.star_flux_e / flux)
     dark = question.read_noise_photoelectrons**2 + excess * question.background_e
-    flat = images.reshape(-1, *question.shape)
+    flat = images.reshape(-1, *question.spots.shape)
     ratio = variance_over_expected(flat, fitted, dark_variance_e2=dark, excess_noise=excess)
     if question.read_noise_photoelectrons < _COUNTABLE_E and excess == 1:
         pair = _dealt(images, share, question, pair_rng)
     else:
-        spots = np.maximum(fitted.psf.images(fitted.positions, question.shape, fitted.flux_e), 0.0)
+        spots = np.maximum(fitted.psf.images(fitted.positions, question.spots.shape, fitted.flux_e), 0.0)
         pair = _split(images, excess * spots.reshape(images.shape), dark, ratio, share, pair_rng)
     positions, camera = _spot_positions(question, fitted), question.detector
     exposed_images = []
@@ -238,19 +238,17 @@ def _recorded(question: Question) -> tuple[Floats, LearntPSF]:
     """Images (n_frames, n, ny, nx) of the recording in photo-electrons, and the spots fitted to them."""
     layout, calibration = not_none(question.layout), not_none(question.calibration)
     images = images_e(not_none(question.recording)[: frames_to_check(layout)], layout, calibration)
-    psf = question.psf
-    if psf is None:
-        psf = PSF.analytic(question.profile, size=question.size, radius_px=max(question.shape))
+    psf = question.spots.known_psf(max(question.spots.shape))
     camera = Calibration(read_noise_e=question.read_noise_photoelectrons, background_e=question.background_e)
-    search = question.search_range_px + float(np.abs(layout.offsets).max())
-    flat = images.reshape(-1, *question.shape)
+    search = question.spots.search_range_px + float(np.abs(layout.offsets).max())
+    flat = images.reshape(-1, *question.spots.shape)
     return images, fit_spots(flat, psf, calibration=camera, search_range_px=search)
 
 
 def _spot_positions(question: Question, fitted: LearntPSF) -> Floats:
     """Positions (n, 2) of spots that vary as the recorded ones do, without the noise of their positions."""
     layout = not_none(question.layout)
-    n_frames, reach = len(fitted.positions) // len(layout), question.search_range_px
+    n_frames, reach = len(fitted.positions) // len(layout), question.spots.search_range_px
     middle = np.tile(layout.offsets, (n_frames, 1))
     offsets = np.clip(fitted.positions - middle, -reach, reach)
     mean, noise = offsets.mean(axis=0), np.mean(np.square(fitted.standard_error_px), axis=0)
@@ -262,9 +260,10 @@ def _spot_positions(question: Question, fitted: LearntPSF) -> Floats:
 def _simulated(question: Question, psf: PSF, positions: Floats, flux_e: float) -> Floats:
     """Mean images (n, ny, nx) of simulated spots, electrons."""
     layout = not_none(question.layout)
-    relative = np.ones(len(layout)) if question.relative_flux is None else question.relative_flux
+    shares = question.spots.relative_flux
+    relative = np.ones(len(layout)) if shares is None else shares
     flux = flux_e * np.tile(relative, len(positions) // len(layout))
-    return np.maximum(psf.images(positions, question.shape, flux), 0.0)
+    return np.maximum(psf.images(positions, question.spots.shape, flux), 0.0)
 
 
 def _split(
@@ -305,12 +304,7 @@ def _measure(question: Question, method: Method, images: Floats) -> Floats:
     """Slopes (n_frames, n, 2) of images as the pipeline measures them."""
     n_frames, n, ny, nx = images.shape
     # Images are in photo-electrons: the multiplication that is divided out only says how noisy they are.
-    camera = Calibration(
-        gain_e_per_adu=question.em_gain,
-        em_gain=question.em_gain,
-        read_noise_e=question.read_noise_e,
-        background_e=question.background_e,
-    )
+    camera = replace(question.camera, gain_e_per_adu=question.em_gain)
     windows = Layout.grid((n, 1), pixels=(ny, nx))
     pipeline = SlopePipeline(
         windows, method.settings, camera, reference=not_none(question.layout).offsets, **method.parts

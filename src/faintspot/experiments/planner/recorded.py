@@ -16,6 +16,7 @@ from faintspot.experiments.planner.promise import frames_to_check, images_e
 from faintspot.experiments.planner.question import (
     LARGEST_FLUX_E,
     Question,
+    Recorded,
     check_not_quad_cells,
     default_search_range_px,
 )
@@ -115,23 +116,19 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **st
     learning, recording = (stack[0::2], stack[1::2]) if len(stack) > 1 else (stack, None)
     fitted, used = _fitted(learning, layout, calibration, stated, facts)
     calibration = _without_background(calibration, fitted, darks is not None, stated, facts)
-    if stated.get("flux_e") is None and stated.get("magnitude") is None:
-        stated |= {"flux_e": float(fitted.flux_e.mean()), "flux_is_measured": True}
+    flux_is_measured = stated.get("flux_e") is None and stated.get("magnitude") is None
+    if flux_is_measured:
+        stated["flux_e"] = float(fitted.flux_e.mean())
         sums = float(images_e(used, layout, calibration).sum(axis=(-2, -1)).mean())
         facts.append(
             f"light measured by fitting spots and background: {stated['flux_e']:.0f} electrons per "
             f"sub-aperture and frame, on average (pixels above the background add up to {sums:.0f})"
         )
-    stated["relative_flux"] = _relative_flux(fitted, len(layout), facts)
-    values = {
-        "gain_e_per_adu": calibration.gain_e_per_adu,
-        "em_gain": calibration.em_gain,
-        "read_noise_e": calibration.read_noise_e,
-    }
-    values["background_e"] = calibration.background_e
-    earlier = tuple(stated.pop("facts", ()))
-    parts = {"layout": layout, "calibration": calibration, "recording": recording, "whole_layout": whole}
-    return Question(**{**stated, **values, **parts}, facts=(*earlier, *facts))
+    relative = _relative_flux(fitted, len(layout), facts)
+    camera = ("gain_e_per_adu", "em_gain", "read_noise_e", "background_e")
+    stated |= {name: getattr(calibration, name) for name in camera}
+    recorded = Recorded(recording, whole, relative, flux_is_measured, tuple(facts))
+    return Question(**stated, layout=layout, calibration=calibration, recorded=recorded)
 
 
 def _check_stated(layout: Layout, stated: Mapping[str, object]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,11 +14,10 @@ from faintspot.base.generators import spawn
 from faintspot.experiments.planner.question import Question
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.camera.detector import Detector
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.spots.shapes import spots
-from faintspot.slopes.spots.speckled import speckled_spots
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +38,7 @@ class SpotFrames:
 class SimulatedSpots:
     """Noiseless spots, to be exposed at any flux: the same positions and speckles at every one."""
 
-    question: Question
+    detector: Detector
     layout: Layout
     calibration: Calibration
     choosing: tuple[Floats, Floats]
@@ -51,26 +50,21 @@ class SimulatedSpots:
         first, second = spawn(rng, 2)
         n_frames = max(2, -(-realisations // SPOTS_PER_FRAME))
         background = question.background_e * question.em_gain
-        calibration = Calibration(
-            dark=background,
-            em_gain=question.em_gain,
-            read_noise_e=question.read_noise_e,
-            background_e=question.background_e,
-        )
+        spots = question.spots
         return cls(
-            question,
-            Layout.grid((SPOTS_PER_FRAME, 1), pixels=question.shape),
-            calibration,
-            unit_spots(question, -(-n_frames // 2) * SPOTS_PER_FRAME, first),
-            unit_spots(question, n_frames * SPOTS_PER_FRAME, second),
+            question.detector,
+            Layout.grid((SPOTS_PER_FRAME, 1), pixels=spots.shape),
+            replace(question.camera, dark=background, gain_e_per_adu=1.0),
+            spots.simulated(-(-n_frames // 2) * SPOTS_PER_FRAME, first),
+            spots.simulated(n_frames * SPOTS_PER_FRAME, second),
         )
 
     def exposed(self, flux_e: float, rng: np.random.Generator) -> tuple[SpotFrames, SpotFrames]:
         """Return frames to choose on and frames to score on at a flux."""
-        camera, (ny, nx) = self.question.detector, self.layout.window
+        ny, nx = self.layout.window
         samples = []
         for (images, truth), noise in zip((self.choosing, self.scoring), spawn(rng, 2), strict=True):
-            frames = camera.expose(flux_e * images, noise).reshape(-1, SPOTS_PER_FRAME * ny, nx)
+            frames = self.detector.expose(flux_e * images, noise).reshape(-1, SPOTS_PER_FRAME * ny, nx)
             samples.append(SpotFrames(frames, truth.reshape(-1, SPOTS_PER_FRAME, 2)))
         return samples[0], samples[1]
 
@@ -105,43 +99,3 @@ class SimulatedSpots:
         slopes = pipeline(np.tile(sample.frames, (1, count, 1)))
         x, y = (part.reshape(-1, count, SPOTS_PER_FRAME).swapaxes(0, 1) for part in (slopes.x, slopes.y))
         return list(zip(x, y, strict=True))
-
-
-def unit_spots(question: Question, n: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return images (n, ny, nx) of spots and their positions (n, 2), px.
-
-    A spot that is not speckled and in the middle of its window leaves 1 e- in it, on average where
-    sub-apertures differ in their flux.
-    """
-    images, positions = _even_spots(question, n, rng)
-    if question.relative_flux is not None:
-        images = images * spawn(rng, 1)[0].choice(question.relative_flux, n)[:, None, None]
-    return images, positions
-
-
-def _even_spots(question: Question, n: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return such spots, all of the same flux."""
-    position_rng, phase_rng = spawn(rng, 2)
-    half, shape = question.search_range_px, question.shape
-    positions = position_rng.uniform(-half, half, (n, 2))
-    middle = np.zeros((1, 2))
-    if question.psf is not None:
-        index = phase_rng.integers(0, len(question.psf.samples), n)
-        images = question.psf.images(positions, shape, which=index)
-        flux = question.psf.images(np.repeat(middle, n, axis=0), shape, which=index).sum(axis=(1, 2))
-        # A learnt PSF's wings may be a little negative; light is not.
-        return np.maximum(images / flux[:, None, None], 0.0), positions
-    form: dict[str, Any] = {"shape": shape, "profile": question.profile, "size": question.size}
-    flux = spots(middle, **form).sum()
-    if question.d_over_r0:
-        images, _ = speckled_spots(
-            n,
-            d_over_r0=question.d_over_r0,
-            shape=shape,
-            size=question.size,
-            positions=positions,
-            rng=phase_rng,
-        )
-    else:
-        images = spots(positions, **form)
-    return images / flux, positions

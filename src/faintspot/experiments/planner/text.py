@@ -31,11 +31,11 @@ def situation(answer: Answer) -> str:
     star = f"{plain_number(question.star_flux_e)} electrons per sub-aperture and frame"
     if question.photometry is not None:
         star = f"{question.photometry.band} = {_magnitude(answer, question.star_flux_e):.2f}, {star}"
-    kind = f"{question.profile} spots" if question.psf is None else "spots as learnt"
+    kind = f"{question.spots.profile} spots" if question.psf is None else "spots as learnt"
     if question.laser is not None:
         kind = "spots of a laser guide star"
-    if question.d_over_r0:
-        kind = f"speckled spots (sub-aperture {question.d_over_r0:.2g} r0)"
+    if question.spots.d_over_r0:
+        kind = f"speckled spots (sub-aperture {question.spots.d_over_r0:.2g} r0)"
     return _TEXT("answer.situation", star=star, kind=kind, question=question)
 
 
@@ -99,16 +99,17 @@ def promise_lines(answer: Answer) -> list[str]:
 def foundations(answer: Answer) -> list[str]:
     """Describe what the answer is based on."""
     question, laser = answer.question, answer.question.laser
-    is_learnt = laser is None and question.psf is not None
+    is_learnt = question.psf is not None
     lines = _TEXT.lines(
         "answer.foundations",
         question,
         spots=f"{answer.realisations} simulated spots at each of {len(answer.flux_e)} fluxes",
-        laser_words=laser and laser.in_words(question.pixel_scale_arcsec, question.shape),
+        laser_words=laser and laser.in_words(question.pixel_scale_arcsec, question.spots.shape),
         laser=laser is not None,
         learnt=is_learnt,
         assumed=laser is None and not is_learnt,
-        speckled=bool(question.d_over_r0),
+        profile=question.spots.profile,
+        speckled=bool(question.spots.d_over_r0),
     )
     not_tried = [f"{name} was not tried: {reason}" for name, reason in answer.left_out.items()]
     return [*question.facts, *lines, *not_tried]

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -211,11 +210,8 @@ class _Trial:
     @cached_property
     def _psf(self) -> PSF:
         """The user's PSF, or that of the assumed profile."""
-        question = self.question
-        if question.psf is not None:
-            return question.psf
-        radius = math.ceil(max(question.shape) / 2 + question.search_range_px + 1)
-        return PSF.analytic(question.profile, size=question.size, radius_px=radius)
+        spots = self.question.spots
+        return spots.known_psf(math.ceil(max(spots.shape) / 2 + spots.search_range_px + 1))
 
     def _advance(self, count: int) -> None:
         self._finished += count
@@ -263,8 +259,8 @@ class _Trial:
 
 
 def _default_realisations(question: Question) -> int:
-    ny, nx = question.shape
-    share = min(1.0, 256 / (ny * nx)) * (_SPECKLED_SHARE if question.d_over_r0 else 1.0)
+    ny, nx = question.spots.shape
+    share = min(1.0, 256 / (ny * nx)) * (_SPECKLED_SHARE if question.spots.d_over_r0 else 1.0)
     return max(_FEWEST_REALISATIONS, round(_REALISATIONS * share))
 
 
@@ -322,18 +318,14 @@ def _ranked(
 
 def _bound(question: Question, flux: Floats) -> Floats:
     """R of an estimator at the Cramer-Rao bound, without speckles, px."""
-    form: dict[str, Any] = {"profile": question.profile, "size": question.size}
-    if question.psf is not None:
-        form = {"psf": question.psf}
-    shares = np.ones(1)
-    if question.relative_flux is not None:
-        shares = np.quantile(question.relative_flux, (np.arange(_BOUND_SHARES) + 0.5) / _BOUND_SHARES)
+    shares, spots = np.ones(1), question.spots
+    if spots.relative_flux is not None:
+        shares = np.quantile(spots.relative_flux, (np.arange(_BOUND_SHARES) + 0.5) / _BOUND_SHARES)
     errors = cramer_rao(
         np.outer(flux, shares).ravel(),
-        shape=question.shape,
         detector=question.detector,
-        position_range_px=question.search_range_px,
-        **form,
+        position_range_px=spots.search_range_px,
+        **spots.form,
     )
     bound: Floats = MEAN_ABSOLUTE * errors.mean(axis=-1).reshape(len(flux), -1).mean(axis=1)
     return bound

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,11 +37,48 @@ DEFAULT_THROUGHPUT = 0.4  # atmosphere, telescope and the optics before the sens
 DEFAULT_QUANTUM_EFFICIENCY = 0.9
 
 
+_part: dict[str, Any] = {"low": 0.0, "high": 1.0, "low_open": True}
 _above_zero = partial(number, low=0.0, high=math.inf, low_open=True)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Passband(Options):
+    """Photons of a star of magnitude 0, and their way to the detector.
+
+    Parameters
+    ----------
+    band : str
+        B, V, R, I, J, H or K; sets the zero point if that is not given.
+    zero_point : float, optional
+        Photons per second and m^2 of a star of magnitude 0 above the atmosphere, within the sensor's band.
+    throughput : float
+        Fraction of the photons that reaches the detector: atmosphere, telescope, optics. Default: 0.4.
+    quantum_efficiency : float
+        Fraction of these photons that is detected. Default: 0.9.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range.
+    """
+
+    band: str = setting(DEFAULT_BAND, "Band of the magnitude.", choices=tuple(ZERO_POINTS), group="star")
+    zero_point: float | None = _above_zero(
+        None,
+        meaning="Photons/s/m^2 of magnitude 0 in the band. Default: that of --band.",
+        unit="photons",
+        group="star",
+    )
+    throughput: float = setting(
+        DEFAULT_THROUGHPUT, "Of atmosphere, telescope and optics.", group="star", **_part
+    )
+    quantum_efficiency: float = setting(
+        DEFAULT_QUANTUM_EFFICIENCY, "Quantum efficiency.", group="star", **_part
+    )
+
+
 @dataclass(frozen=True)
-class Photometry(Options):
+class Photometry(Passband):
     """Electrons from a star in a sub-aperture and a frame.
 
     electrons = zero_point * 10^(-0.4 magnitude) * area_m2 * frame_time_s * throughput * quantum_efficiency.
@@ -51,14 +89,8 @@ class Photometry(Options):
         Area of a sub-aperture in the entrance pupil of the telescope.
     frame_time_s : float
         Exposure time of a frame.
-    band : str
-        B, V, R, I, J, H or K; sets the zero point if that is not given.
-    zero_point : float, optional
-        Photons per second and m^2 of a star of magnitude 0 above the atmosphere, within the sensor's band.
-    throughput : float
-        Fraction of the photons that reaches the detector: atmosphere, telescope, optics. Default: 0.4.
-    quantum_efficiency : float
-        Fraction of these photons that is detected. Default: 0.9.
+    band, zero_point, throughput, quantum_efficiency
+        See `Passband`.
 
     Raises
     ------
@@ -75,10 +107,6 @@ class Photometry(Options):
 
     area_m2: float = _above_zero(REQUIRED)
     frame_time_s: float = _above_zero(REQUIRED)
-    band: str = setting(DEFAULT_BAND, choices=tuple(ZERO_POINTS))
-    zero_point: float | None = _above_zero(None)
-    throughput: float = number(DEFAULT_THROUGHPUT, 0.0, 1.0, low_open=True)
-    quantum_efficiency: float = number(DEFAULT_QUANTUM_EFFICIENCY, 0.0, 1.0, low_open=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -112,3 +140,17 @@ class Photometry(Options):
         """
         flux = numbers_between("electrons", electrons, 0.0, math.inf, low_open=True)
         return np.asarray(-2.5 * np.log10(flux / self.electrons_at_zero))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StarLight(Passband):
+    """A star by its magnitude."""
+
+    magnitude: float | None = number(
+        None, -30.0, 60.0, "Magnitude; needs --subaperture-m and --frame-rate-hz.", unit="mag", group="star"
+    )
+
+    def photometry_of(self, subaperture_m: float, frame_rate_hz: float) -> Photometry:
+        """Return the relation of magnitude and electrons for a sub-aperture and a frame."""
+        light = {item.name: getattr(self, item.name) for item in fields(Passband)}
+        return Photometry(subaperture_m**2, 1 / frame_rate_hz, **light)

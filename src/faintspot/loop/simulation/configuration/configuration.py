@@ -184,14 +184,7 @@ class LoopConfiguration:
     @property
     def photometry(self) -> Photometry:
         """Conversion between magnitudes and photo-electrons."""
-        return Photometry(
-            self.subaperture_m**2,
-            1 / self.control.frame_rate_hz,
-            self.camera.band,
-            self.camera.zero_point,
-            self.camera.throughput,
-            self.camera.quantum_efficiency,
-        )
+        return self.camera.photometry_of(self.subaperture_m, self.control.frame_rate_hz)
 
     def to_text(self) -> str:
         """Return the configuration as TOML with every value written out."""

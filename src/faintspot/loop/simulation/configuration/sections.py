@@ -11,7 +11,7 @@ from faintspot.base.config.options import FLAG, LIST, NUMBER_OR_LIST, number, se
 from faintspot.base.config.tables import ConfigurationTable
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import LEARNT, WINDS
-from faintspot.slopes.simulate.photometry import DEFAULT_BAND, ZERO_POINTS
+from faintspot.slopes.simulate.photometry import StarLight
 from faintspot.slopes.spots.sodium import SodiumProfile, integration_points
 
 CLOSED, OPEN = "closed", "open"
@@ -76,17 +76,11 @@ class Atmosphere(ConfigurationTable, table="atmosphere"):
 
 
 @dataclass(frozen=True)
-class Camera(ConfigurationTable, table="camera"):
+class Camera(StarLight, ConfigurationTable, table="camera"):
     """The sensor's camera and the star's flux on it; as `faintspot.slopes.simulate.Detector`."""
 
     photons_per_subaperture: float | None = number(None, 0.0, 1e9, low_open=True)
     """Photo-electrons of a fully illuminated sub-aperture in a frame; or give the magnitude."""
-    magnitude: float | None = number(None, -30.0, 60.0)
-    band: str = setting(DEFAULT_BAND, choices=tuple(ZERO_POINTS))
-    zero_point: float | None = number(None, 0.0, 1e20, low_open=True)
-    """Photons per second and m^2 of magnitude 0. Default: that of the band."""
-    throughput: float = number(0.4, 0.0, 1.0, low_open=True)
-    quantum_efficiency: float = number(0.9, 0.0, 1.0, low_open=True)
     read_noise_e: float = number(0.1, 0.0, 1e6)
     """At the camera's output, after multiplication."""
     em_gain: float = number(1.0, 1.0, 1e5)

@@ -1,0 +1,130 @@
+"""Camera and optics that a user states, as options and as tables of a camera file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from faintspot.base.config.options import Options, number, setting
+from faintspot.base.errors import InputError
+from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.camera.detector import Detector
+from faintspot.slopes.estimators.scene import PIXEL_BLUR_PX2
+from faintspot.slopes.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
+from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
+from faintspot.slopes.spots.speckled import LARGEST_D_OVER_R0
+
+PROFILES = tuple(FWHM_OF_SIZE_1_PX)
+SPECKLED_ABOVE = 0.7
+"""Side of a sub-aperture in r0 above which spots count as speckled."""
+SEEING_WAVELENGTH_NM = 500.0
+"""Wavelength at which r0 is given."""
+
+_ARCSEC = math.pi / 180 / 3600
+
+positive = {"low": 0.0, "low_open": True}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StatedCamera(Options):
+    """Camera, see `Question`."""
+
+    read_noise_e: Any = number(
+        None, 0.0, 1e6, "Read noise at the camera's output, before the EM gain.", unit="e-", group="camera"
+    )
+    pixels: Any = number(
+        None, SMALLEST_WINDOW, LARGEST_WINDOW, "Side of a window [px].", whole=True, group="camera"
+    )
+    gain_e_per_adu: float = setting(
+        1.0, "Electrons per ADU, unless measured in the frames.", unit="e-/ADU", group="camera", **positive
+    )
+    em_gain: float = setting(1.0, "Gain of the multiplication register of an EMCCD.", low=1.0, group="camera")
+    background_e: float = number(
+        0.0, 0.0, 1e9, "Electrons of sky and dark current per pixel and frame.", unit="e-", group="camera"
+    )
+
+    @property
+    def camera(self) -> Calibration:
+        """The camera without its maps."""
+        return Calibration(
+            gain_e_per_adu=self.gain_e_per_adu,
+            em_gain=self.em_gain,
+            read_noise_e=self.read_noise_e,
+            background_e=self.background_e,
+        )
+
+    @property
+    def detector(self) -> Detector:
+        """The camera, for simulations; its gain does not matter, as its steps are left out."""
+        return Detector(self.read_noise_e, background_e=self.background_e, em_gain=self.em_gain)
+
+    @property
+    def read_noise_photoelectrons(self) -> float:
+        """Read noise divided by the multiplication gain."""
+        return float(self.read_noise_e / self.em_gain)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StatedOptics(Options):
+    """Optics of the spots, see `Question`."""
+
+    fwhm_px: Any = setting(None, "Width (FWHM) of the optical spot.", unit="px", group="spot", **positive)
+    profile: str = setting(
+        "diffraction", "Shape of the spot; diffraction is sinc^2.", choices=PROFILES, group="spot"
+    )
+    subaperture_m: Any = setting(
+        None, "Side of a sub-aperture in the telescope's pupil.", unit="m", group="spot", **positive
+    )
+    wavelength_nm: Any = setting(None, "Wavelength of the sensor.", unit="nm", group="spot", **positive)
+    pixel_scale_arcsec: Any = setting(
+        None, "Side of a pixel on the sky.", unit="arcsec", group="spot", **positive
+    )
+    r0_m: Any = setting(
+        None,
+        "Fried parameter at 500 nm: decides whether spots are speckled.",
+        unit="m",
+        group="spot",
+        **positive,
+    )
+
+    def width(self, psf: PSF | None, largest_px: float, fwhm_px: float | None) -> tuple[float, str]:
+        """Return the optical spot's full width at half maximum, px, and its profile."""
+        profile = self.profile
+        if psf is not None and fwhm_px is None:
+            # The PSF includes the pixel, which widens it; exact for Gaussian spots.
+            widths = psf.fwhm_px.mean(axis=0)
+            fwhm_px = math.sqrt(max(float(widths.prod()) - PIXEL_BLUR_PX2, 0.01))
+        if fwhm_px is None:
+            if None in (self.subaperture_m, self.wavelength_nm, self.pixel_scale_arcsec):
+                raise InputError(
+                    "spot: expected fwhm_px, or subaperture_m, wavelength_nm and pixel_scale_arcsec together"
+                )
+            width = self.wavelength_nm * 1e-9 / self.subaperture_m / (self.pixel_scale_arcsec * _ARCSEC)
+            fwhm_px, profile = width * FWHM_OF_SIZE_1_PX["diffraction"] / 2, "diffraction"
+        if not (low := 0.3) <= fwhm_px <= largest_px:
+            raise InputError(
+                f"expected {low:g} to {largest_px:g} px, the side of a window; check subaperture_m, "
+                "wavelength_nm and pixel_scale_arcsec, or pixels",
+                name="fwhm_px",
+                value=float(f"{fwhm_px:.4g}"),
+            )
+        return fwhm_px, profile
+
+    def d_over_r0(self, profile: str) -> float:
+        """Return the sub-aperture's side over r0 at the sensor's wavelength, 0 if that makes no speckles."""
+        if self.r0_m is None:
+            return 0.0
+        if self.subaperture_m is None or self.wavelength_nm is None:
+            raise InputError("with it, expected subaperture_m and wavelength_nm as well", name="r0_m")
+        ratio = float(self.subaperture_m / (self.r0_m * (self.wavelength_nm / SEEING_WAVELENGTH_NM) ** 1.2))
+        if ratio <= SPECKLED_ABOVE:
+            return 0.0
+        if ratio > LARGEST_D_OVER_R0:
+            expected = f"expected sub-apertures of at most {LARGEST_D_OVER_R0:g} r0, got {ratio:.3g}"
+            raise InputError(expected, name="r0_m", value=self.r0_m)
+        if profile != "diffraction":
+            expected = f"expected 'diffraction', as spots are speckled (d / r0 = {ratio:.2g})"
+            raise InputError(expected, name="profile", value=profile)
+        return ratio
