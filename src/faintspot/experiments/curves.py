@@ -23,7 +23,8 @@ Floats = NDArray[np.float64]
 
 CONFIDENCE = 0.95
 _RESAMPLES = 400
-_GRID_POINTS = 1000  # over two to three decades of flux: the gain is exact to 0.1 %
+_SAME = 1e-9  # difference of a level from the end of a curve that rounding makes
+_HALVINGS = 50  # of the interval in which a curve crosses the level
 _SMALLEST_ERROR_PX = 1e-6  # of a resampled R
 
 
@@ -151,12 +152,14 @@ def gain_at_flux(
         For a flux that is not above 0 or an unknown method.
     """
     flux_e = number_between("flux_e", flux_e, 0.0, low_open=True)
-    curves = _resampled(curve, reference, method, rng)
-    if curves is None or not curves.log_flux[0] - 1e-9 <= np.log(flux_e) <= curves.log_flux[-1] + 1e-9:
+    knots, curves = _resampled(curve, reference, method, rng)
+    if not len(knots) or not knots[0] - 1e-9 <= np.log(flux_e) <= knots[-1] + 1e-9:
         return None
-    log_flux = np.clip(np.log(flux_e), curves.log_flux[0], curves.log_flux[-1])
-    log_error = _values_at(curves, curves.reference, log_flux)
-    return _gain(log_flux - _crossings(curves, curves.method, log_error))
+    from scipy.interpolate import PchipInterpolator
+
+    log_flux = np.clip(np.log(flux_e), knots[0], knots[-1])
+    log_error = PchipInterpolator(knots, curves[0], axis=-1)(log_flux)
+    return _gain(log_flux - crossings(knots, curves[1], log_error))
 
 
 def gain_at_error(
@@ -175,15 +178,14 @@ def gain_at_error(
         For an error that is not above 0 or an unknown method.
     """
     error_px = number_between("error_px", error_px, 0.0, low_open=True)
-    curves = _resampled(curve, reference, method, rng)
-    if curves is None:
+    knots, curves = _resampled(curve, reference, method, rng)
+    if not len(knots):
         return None
-    log_error = np.full(curves.reference.shape[1], np.log(error_px))
-    log_flux = _crossings(curves, curves.reference, log_error)
+    log_flux, of_method = crossings(knots, curves, np.log(error_px))
     if not np.isfinite(log_flux[0]):
         return None
     finite = np.isfinite(log_flux)  # resamples in which the reference just misses that error
-    return _gain(log_flux[finite] - _crossings(curves, curves.method, log_error)[finite])
+    return _gain(log_flux[finite] - of_method[finite])
 
 
 def magnitude_gain(
@@ -218,33 +220,26 @@ def limiting_flux(curve: Curve, method: str, budget_px: float, rng: np.random.Ge
         For a budget that is not above 0 or an unknown method.
     """
     budget_px = number_between("budget_px", budget_px, 0.0, low_open=True)
-    curves = _resampled(curve, method, method, rng)
-    if curves is None:
+    knots, curves = _resampled(curve, method, method, rng)
+    if not len(knots):
         return Estimate(math.nan)
-    flux = np.exp(_crossings(curves, curves.method, np.full(curves.method.shape[1], np.log(budget_px))))
+    flux = np.exp(crossings(knots, curves[1], np.log(budget_px)))
     drawn = flux[1:][np.isfinite(flux[1:]) & (flux[1:] > 0)]
     is_known = 0 < flux[0] < np.inf and len(drawn) > 1
     return Estimate(float(flux[0]), float(drawn.std()) if is_known else math.nan)
 
 
-@dataclass(frozen=True)
-class _Resampled:
-    """Falling curves of log R on a fine grid of log flux, (grid, 1 + resamples); the first as measured."""
+def _resampled(curve: Curve, reference: str, method: str, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return log flux (n,) and falling curves of log R, (2, 1 + resamples, n), the first as measured.
 
-    log_flux: Floats
-    reference: Floats
-    method: Floats
-
-
-def _resampled(curve: Curve, reference: str, method: str, rng: np.random.Generator) -> _Resampled | None:
-    from scipy.interpolate import PchipInterpolator
-
+    Of reference and method; n is 0 where fewer than two points are measured.
+    """
     pair = [curve.methods.index(method) for method in (reference, method) if curve.has(method)]
     if len(pair) < 2:
         raise InputError(f"methods {reference!r} and {method!r}: expected two of {', '.join(curve.methods)}")
     kept = np.all(np.isfinite(curve.error[:, pair]), axis=1)
     if np.count_nonzero(kept) < 2:
-        return None
+        return np.zeros(0), np.zeros((2, 1, 0))
     error = curve.error[kept][:, pair]
     covariance = curve.covariance[kept][:, pair][:, :, pair]
     variances, axes = np.linalg.eigh(covariance)
@@ -253,33 +248,57 @@ def _resampled(curve: Curve, reference: str, method: str, rng: np.random.Generat
     every = np.maximum(np.concatenate([error[None], drawn]), _SMALLEST_ERROR_PX)
     # Made to fall: where noise makes a curve rise, by 1e-9, far below any error of R.
     falling = np.minimum.accumulate(np.log(every), axis=1) - 1e-9 * np.arange(error.shape[0])[:, None]
-    knots = np.log(curve.flux_e[kept])
-    grid = np.linspace(knots[0], knots[-1], _GRID_POINTS)
-    values = PchipInterpolator(knots, falling, axis=1)(grid)
-    return _Resampled(grid, values[:, :, 0].T, values[:, :, 1].T)
+    return np.log(curve.flux_e[kept]), np.moveaxis(falling, -1, 0)
 
 
-def _values_at(curves: _Resampled, values: Floats, log_flux: float) -> Floats:
-    """Return every curve's log R at a log flux."""
-    step = curves.log_flux[1] - curves.log_flux[0]
-    position = (log_flux - curves.log_flux[0]) / step
-    below = min(int(position), len(curves.log_flux) - 2)
-    weight = position - below
-    result: Floats = (1 - weight) * values[below] + weight * values[below + 1]
-    return result
+def crossings(places: Floats, curves: Floats, level: ArrayLike, *, straight: bool = False) -> Floats:
+    """Return where falling curves reach a level, (...).
+
+    Infinite when a curve stays above within the places, minus infinite when it is never above.
+
+    Parameters
+    ----------
+    places : (n,) array
+        Rising.
+    curves : (..., n) array
+        Values there, which never rise.
+    level : (...) array
+        One for all curves, or one for each.
+    straight : bool
+        Whether points are joined by straight lines. Default: by the monotone cubic of Fritsch & Butland 1984,
+        SIAM J. Sci. Stat. Comput. 5, 300.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    wanted = np.broadcast_to(level, curves.shape[:-1])
+    for end in (curves[..., 0], curves[..., -1]):
+        wanted = np.where(np.abs(wanted - end) < _SAME, end, wanted)
+    after = np.maximum(np.argmax(curves <= wanted[..., None], axis=-1), 1)[..., None]
+
+    def at_both(values: Floats) -> tuple[Floats, Floats]:
+        values = np.broadcast_to(values, curves.shape)
+        ends = (np.take_along_axis(values, index, -1)[..., 0] for index in (after - 1, after))
+        return next(ends), next(ends)
+
+    (first, last), (high, low) = at_both(places), at_both(curves)
+    part = (high - wanted) / np.where(high > low, high - low, 1.0)
+    if not straight:
+        slopes = at_both(PchipInterpolator(places, curves, axis=-1).derivative()(places))
+        part = _crossing((high, low), ((last - first) * slopes[0], (last - first) * slopes[1]), wanted)
+    bounded = np.where(curves[..., -1] > wanted, np.inf, first + part * (last - first))
+    return np.asarray(np.where(curves[..., 0] < wanted, -np.inf, bounded), np.float64)
 
 
-def _crossings(curves: _Resampled, values: Floats, log_error: Floats) -> Floats:
-    """Return the log flux where each falling curve has its wanted value: -inf below the curve, inf beyond."""
-    above = np.count_nonzero(values > log_error, axis=0)
-    index = np.clip(above, 1, len(values) - 1)
-    columns = np.arange(values.shape[1])
-    before, after = values[index - 1, columns], values[index, columns]
-    step = curves.log_flux[1] - curves.log_flux[0]
-    log_flux = curves.log_flux[index - 1] + step * (before - log_error) / (before - after)
-    tolerance = 1e-9
-    log_flux = np.where((above == 0) & (log_error > values[0] + tolerance), -np.inf, log_flux)
-    return np.where((above == len(values)) & (log_error < values[-1] - tolerance), np.inf, log_flux)
+def _crossing(values: tuple[Floats, Floats], slopes: tuple[Floats, Floats], level: Floats) -> Floats:
+    """Return where in [0, 1] falling cubics cross a level, from their values and slopes at both ends."""
+    (high, low), (slope, next_slope) = values, slopes
+    start, end = np.zeros_like(high), np.ones_like(high)
+    for _ in range(_HALVINGS):
+        t = 0.5 * (start + end)
+        rest = 1.0 - t
+        value = rest**2 * ((1 + 2 * t) * high + t * slope) + t**2 * ((3 - 2 * t) * low - rest * next_slope)
+        start, end = np.where(value >= level, t, start), np.where(value >= level, end, t)
+    return 0.5 * (start + end)
 
 
 def _gain(log_factors: Floats) -> Gain:

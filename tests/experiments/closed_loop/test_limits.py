@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from numpy.typing import ArrayLike, NDArray
 from tests.experiments.result_cases import made_up_magnitude
 
 from faintspot.base.statistics import mean_by_blocks
@@ -12,13 +13,17 @@ from faintspot.experiments.closed_loop.results import (
     differences_by_flux,
     falling,
     gains_in_magnitude,
-    limiting_magnitudes,
     magnitude_gain,
     magnitude_limit,
 )
+from faintspot.experiments.curves import crossings
 
 MAGNITUDES = np.linspace(8.0, 13.0, 6)
 numbers = arrays(np.float64, st.integers(1, 12), elements=st.floats(-1, 1))
+
+
+def _crossed(magnitudes: ArrayLike, strehl: ArrayLike, level: float, **options: bool) -> NDArray[np.float64]:
+    return crossings(np.asarray(magnitudes, np.float64), falling(strehl), level, **options)
 
 
 def curves(shift: float, realisations: int = 6, scatter: float = 0.02) -> np.ndarray:
@@ -52,16 +57,16 @@ def test_falling_is_pool_adjacent_violators(values: np.ndarray) -> None:
 def test_many_curves_at_once_are_as_one_by_one() -> None:
     many = np.random.default_rng(9).uniform(0, 1, (50, 6))
     np.testing.assert_allclose(falling(many), [falling(one) for one in many])
-    together = limiting_magnitudes(MAGNITUDES, many, 0.5)
-    np.testing.assert_allclose(together, [limiting_magnitudes(MAGNITUDES, one, 0.5) for one in many])
+    together = _crossed(MAGNITUDES, many, 0.5)
+    np.testing.assert_allclose(together, [_crossed(MAGNITUDES, one, 0.5) for one in many])
 
 
 def test_the_limiting_magnitude_lies_between_points() -> None:
-    assert limiting_magnitudes([8, 9, 10], [0.6, 0.5, 0.3], 0.4, straight=True) == pytest.approx(9.5)
-    assert limiting_magnitudes([8, 9, 10], [0.5, 0.4, 0.3], 0.35) == pytest.approx(9.5)
-    assert limiting_magnitudes([8, 9, 10], [0.6, 0.5, 0.3], 0.5) == pytest.approx(9.0)
-    assert limiting_magnitudes([8, 9], [0.6, 0.5], 0.4) == math.inf
-    assert limiting_magnitudes([8, 9], [0.3, 0.2], 0.4) == -math.inf
+    assert _crossed([8, 9, 10], [0.6, 0.5, 0.3], 0.4, straight=True) == pytest.approx(9.5)
+    assert _crossed([8, 9, 10], [0.5, 0.4, 0.3], 0.35) == pytest.approx(9.5)
+    assert _crossed([8, 9, 10], [0.6, 0.5, 0.3], 0.5) == pytest.approx(9.0)
+    assert _crossed([8, 9], [0.6, 0.5], 0.4) == math.inf
+    assert _crossed([8, 9], [0.3, 0.2], 0.4) == -math.inf
 
 
 @pytest.mark.parametrize("apart", [0.5, 1.0, 1.5])
@@ -76,7 +81,7 @@ def test_limits_of_curves_that_bend_hold_within_their_errors(apart: float) -> No
             limit = magnitude_limit(faint, np.tile(strehl[:, None], 6), level)
             wrong.append(limit.magnitude.value - truth)
             stated.append(limit.estimate.standard_error)
-            straight.append(float(limiting_magnitudes(faint, strehl, level, straight=True)) - truth)
+            straight.append(float(_crossed(faint, strehl, level, straight=True)) - truth)
     rms, of_lines = (float(np.sqrt(np.square(errors).mean())) for errors in (wrong, straight))
     assert rms < 0.6 * of_lines
     assert rms < float(np.sqrt(np.square(stated).mean())) < 1.5 * of_lines

@@ -41,7 +41,7 @@ def test_shapes_and_consistency(measured: dict[str, Any]) -> None:
         assert measured["error_at_k"][i, best - 1] == pytest.approx(measured["error"][i, 0], rel=1e-9)
         assert measured["error_at_k_se"][i, best - 1] == pytest.approx(measured["error_se"][i, 0], rel=1e-6)
         assert np.isnan(measured["chosen_candidate"][i]).all() == (method not in ("tv", "smoothed"))
-    assert measured["chosen_candidate"][thresholded, 0] in SMALL.thresholds
+    assert measured["chosen_candidate"][thresholded, 0] in SMALL.options["threshold_e"]
 
 
 def test_chosen_on_one_half_and_scored_on_the_other(measured: dict[str, Any]) -> None:
@@ -55,16 +55,16 @@ def test_chosen_on_one_half_and_scored_on_the_other(measured: dict[str, Any]) ->
         positions, _, _ = methods.positions("tv", (("noise_std", strength),), images)
         return errors_of(positions, truth[:, None])
 
-    tables = [errors(f, first, first_truth).mean(axis=0) for f in SMALL.strengths]
+    tables = [errors(f, first, first_truth).mean(axis=0) for f in SMALL.options["noise_std"]]
     row, column = map(int, np.unravel_index(np.argmin(tables), np.shape(tables)))
     method = SMALL.estimators.index("tv")
-    assert measured["chosen_candidate"][method, 0] == SMALL.strengths[row]
+    assert measured["chosen_candidate"][method, 0] == SMALL.options["noise_std"][row]
     assert measured["chosen_k"][method, 0] == column + 1
-    scored = errors(SMALL.strengths[row], second, second_truth)[:, column]
+    scored = errors(SMALL.options["noise_std"][row], second, second_truth)[:, column]
     assert measured["error"][method, 0] == pytest.approx(scored.mean(dtype=np.float64))
     assert measured["error_se"][method, 0] == pytest.approx(scored.std(ddof=1) / np.sqrt(200), rel=1e-5)
-    fixed = [errors(f, first, first_truth)[:, 39].mean() for f in SMALL.strengths]
-    assert measured["chosen_candidate"][method, 2] == SMALL.strengths[int(np.argmin(fixed))]
+    fixed = [errors(f, first, first_truth)[:, 39].mean() for f in SMALL.options["noise_std"]]
+    assert measured["chosen_candidate"][method, 2] == SMALL.options["noise_std"][int(np.argmin(fixed))]
 
 
 def test_methods_share_images_and_do_not_disturb_each_other(measured: dict[str, Any]) -> None:
@@ -175,9 +175,7 @@ TUNED = StudySpecification(
     [Sweep("a", flux_e=30, pixels=8, d_over_r0=2)],
     realisations=400,
     estimators=["brightest", "smoothed", "ml"],
-    widths=[0.4, 1.0],
-    blurs=[0.0, 1.5],
-    model_errors=[0.3],
+    options={"smoothing_px": [0.4, 1.0], "blur_px": [0.0, 1.5], "model_error": [0.3]},
     fixed_k=[20],
     corrected=True,
 )

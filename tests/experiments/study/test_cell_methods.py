@@ -134,9 +134,7 @@ def test_candidates_in_a_cell() -> None:
         "x",
         [Sweep("a", pixels=16, d_over_r0=[0, 2])],
         estimators=["brightest", "tv", "ml", "matched", "weighted"],
-        strengths=[0.5, 1.0],
-        blurs=[0.0, 1.0],
-        model_errors=[0.2],
+        options={"noise_std": [0.5, 1.0], "blur_px": [0.0, 1.0], "model_error": [0.2]},
     )
     still, speckled = (CellMethods(cell, specification) for cell in specification.cells())
     assert still.candidates("brightest") == [()]

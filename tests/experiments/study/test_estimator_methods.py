@@ -88,8 +88,7 @@ def test_speckled_spots() -> None:
         realisations=800,
         corrected=True,
         estimators=["brightest", "ml"],
-        blurs=[0.0, 1.8],
-        model_errors=[0.2],
+        options={"blur_px": [0.0, 1.8], "model_error": [0.2]},
     )
     measured = measure_cell(specification.cells()[0], specification)
     assert np.isnan(measured["bound"])

@@ -16,8 +16,10 @@ name = "mine"
 seed = 7
 realisations = 400
 estimators = ["brightest", "tv"]
-strengths = [0.5, 1.0]
 fixed_k = [10]
+
+[options]
+noise_std = [0.5, 1.0]
 
 [sweeps.signal]
 flux_e = { from = 10, to = 1000, points = 3, spacing = "log" }
@@ -34,7 +36,7 @@ def test_toml() -> None:
     specification = StudySpecification.from_text(TEXT)
     assert (specification.name, specification.seed, specification.realisations) == ("mine", 7, 400)
     assert specification.modes == ("best", "fixed10")
-    assert specification.strengths == (0.5, 1.0)
+    assert specification.options["noise_std"] == (0.5, 1.0)
     signal, size = specification.sweeps
     assert signal.flux_e == (10.0, 100.0, 1000.0)
     assert signal.read_noise_e == (0.1, 3.0)
@@ -64,12 +66,7 @@ def test_fingerprint_changes_with_everything() -> None:
         "seed": 2,
         "realisations": 100,
         "estimators": ["brightest", "tv"],
-        "strengths": [0.5],
-        "widths": [0.5],
-        "thresholds": [1],
-        "weight_widths": [1],
-        "blurs": [1],
-        "model_errors": [1],
+        "options": {"noise_std": [0.5]},
         "fixed_k": [],
         "corrected": True,
         "search_range_px": 3,
@@ -108,7 +105,9 @@ def test_search_range_is_the_same_for_all_methods() -> None:
 
 def test_modes() -> None:
     sweep = Sweep("a", pixels=[4, 16], d_over_r0=[0, 2])
-    specification = StudySpecification("x", [sweep], fixed_k=[20], corrected=True, blurs=[0.0, 1.0])
+    specification = StudySpecification(
+        "x", [sweep], fixed_k=[20], corrected=True, options={"blur_px": [0.0, 1.0]}
+    )
     assert specification.modes == ("best", "fixed20", "corrected")
     still, _, still_large, _ = sweep.cells()
     assert specification.kept_pixels(still) == {"best": None, "corrected": None}
@@ -134,8 +133,10 @@ BAD = {
     'name = "x"\nseed = -1' + SWEEP: ("seed = -1",),
     'name = "x"\nestimators = ["brightest", "tvs"]' + SWEEP: ("estimators = 'tvs'", "'tv'"),
     'name = "x"\nestimators = []' + SWEEP: ("estimators", "empty"),
-    'name = "x"\nstrengths = [0]' + SWEEP: ("strengths = 0", "above 0"),
-    'name = "x"\nstrengths = 1.0' + SWEEP: ("strengths", "list"),
+    'name = "x"\noptions.noise_std = [0]' + SWEEP: ("options.noise_std = 0", "above 0"),
+    'name = "x"\noptions.noise_std = 1.0' + SWEEP: ("options.noise_std", "list"),
+    'name = "x"\noptions.noise_std = []' + SWEEP: ("options.noise_std", "empty"),
+    'name = "x"\noptions.strength = [1.0]' + SWEEP: ("options.strength", "noise_std"),
     'name = "x"\nfixed_k = [20, 256]' + SWEEP: ("fixed_k = 256", "256 pixels"),
     'name = "x"\nfixed_k = [2.5]' + SWEEP: ("fixed_k = 2.5", "whole"),
     'name = "x"\n[sweeps.a]\nfluxe = 3': ("sweeps.a.fluxe", "did you mean flux_e"),

@@ -14,10 +14,9 @@ from faintspot.base.errors import InputError
 from faintspot.base.npz import NpzFile
 from faintspot.base.report.texts import with_error
 from faintspot.base.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
+from faintspot.experiments.curves import crossings
 
 Floats = NDArray[np.float64]
-
-_HALVINGS = 50  # of the interval in which a curve crosses the level
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def _limit(faint: Floats, curves: list[Floats], level: float) -> Limit:
         return Limit(Estimate(math.nan), 0.0)
 
     def read_off(*, straight: bool) -> float:
-        found = (limiting_magnitudes(faint, curve.mean(axis=1), level, straight=straight) for curve in curves)
+        found = (crossings(faint, falling(curve.mean(axis=1)), level, straight=straight) for curve in curves)
         first, *others = map(float, found)
         return first - sum(others)
 
@@ -117,58 +116,9 @@ def _limit(faint: Floats, curves: list[Floats], level: float) -> Limit:
     if realisations < FEWEST_PIECES:
         return Limit(Estimate(value), between)
     draws = np.random.default_rng(SEED).integers(0, realisations, (DRAWS, realisations))
-    ends = [limiting_magnitudes(faint, curve[:, draws].mean(axis=2).T, level) for curve in curves]
+    ends = [crossings(faint, falling(curve[:, draws].mean(axis=2).T), level) for curve in curves]
     drawn = ends[0] if len(ends) == 1 else _differences(*ends)
     return Limit(of_draws(value, drawn, realisations), between)
-
-
-def limiting_magnitudes(
-    magnitudes: ArrayLike, strehl: ArrayLike, level: float, *, straight: bool = False
-) -> Floats:
-    """Return the magnitude at which each curve falls below a level, after `falling`.
-
-    Infinite when it stays above within the magnitudes measured, minus infinite when it is never above.
-
-    Parameters
-    ----------
-    magnitudes : (F,) array
-        Rising.
-    strehl : (..., F) array
-    level : float
-    straight : bool
-        Whether points are joined by straight lines. Default: by the monotone cubic of Fritsch & Butland 1984,
-        SIAM J. Sci. Stat. Comput. 5, 300; between stars 1 magnitude apart its error is a third.
-    """
-    from scipy.interpolate import PchipInterpolator
-
-    faint = np.asarray(magnitudes, np.float64)
-    curves = falling(strehl)
-    after = np.maximum(np.argmax(curves < level, axis=-1), 1)[..., None]
-
-    def at_both(values: Floats) -> tuple[Floats, Floats]:
-        values = np.broadcast_to(values, curves.shape)
-        ends = (np.take_along_axis(values, index, -1)[..., 0] for index in (after - 1, after))
-        return next(ends), next(ends)
-
-    (first, last), (high, low) = at_both(faint), at_both(curves)
-    part = (high - level) / np.where(high > low, high - low, 1.0)
-    if not straight:
-        slopes = at_both(PchipInterpolator(faint, curves, axis=-1).derivative()(faint))
-        part = _crossing((high, low), ((last - first) * slopes[0], (last - first) * slopes[1]), level)
-    bounded = np.where(curves[..., -1] >= level, np.inf, first + part * (last - first))
-    return np.asarray(np.where(curves[..., 0] < level, -np.inf, bounded), np.float64)
-
-
-def _crossing(values: tuple[Floats, Floats], slopes: tuple[Floats, Floats], level: float) -> Floats:
-    """Return where in [0, 1] falling cubics cross a level, from their values and slopes at both ends."""
-    (high, low), (slope, next_slope) = values, slopes
-    start, end = np.zeros_like(high), np.ones_like(high)
-    for _ in range(_HALVINGS):
-        t = 0.5 * (start + end)
-        rest = 1.0 - t
-        value = rest**2 * ((1 + 2 * t) * high + t * slope) + t**2 * ((3 - 2 * t) * low - rest * next_slope)
-        start, end = np.where(value >= level, t, start), np.where(value >= level, end, t)
-    return 0.5 * (start + end)
 
 
 def falling(values: ArrayLike) -> Floats:
@@ -206,7 +156,7 @@ class MagnitudeResult(NpzFile):
     FORMAT: ClassVar[int] = 4
 
     names: tuple[str, ...]
-    """(A,): of the methods, see `faintspot.experiments.closed_loop.methods.method_kind`."""
+    """(A,): of the methods, see `faintspot.loop.simulation.Method.named`."""
     labels: tuple[str, ...]
     """(A,)"""
     photons: Floats
@@ -233,7 +183,7 @@ class BudgetResult(NpzFile):
     FORMAT: ClassVar[int] = 2
 
     names: tuple[str, ...]
-    """(A,): of the methods, see `faintspot.experiments.closed_loop.methods.method_kind`."""
+    """(A,): of the methods, see `faintspot.loop.simulation.Method.named`."""
     terms: tuple[str, ...]
     """(T,): what is switched off; the first is nothing."""
     labels: tuple[str, ...]

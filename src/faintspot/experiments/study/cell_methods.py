@@ -38,7 +38,7 @@ Block = tuple[Images, Floats]
 Measured = tuple[Floats, Bools, Floats | None]
 """Positions (n, K, 2), whether they are valid (n, K), and stated standard errors (n, 2), if any, px."""
 
-_KEPT = "keep_brightest"
+_KEPT, _OF_SPECKLED = "keep_brightest", ("blur_px", "model_error")
 _LEAST_FLUX_E = 1e-3  # a mean of noise may be negative
 _TABLE_PIXELS = 1 << 14  # of images at a time, whose tables then stay in the processor's cache
 
@@ -124,22 +124,21 @@ class CellMethods:
     def _axes(self, kind: Kind) -> dict[str, list[float]]:
         """Values of every option that a method chooses, in the units of the specification."""
         listed = {
-            name: list(self._listed(name)) for name in kind.declared() if name in self.specification.LISTED
+            name: list(self._listed(name)) for name in kind.declared() if name in self.specification.options
         }
         found_by_table = {_KEPT} if keeps_every_k(kind) else set()
         estimator = kind(**{name: values[0] * self._unit(name) for name, values in listed.items()})
         automatic = {
             name: list(values)
             for name, values in estimator.tuned(self.scene).items()
-            if name not in self.specification.LISTED.keys() | found_by_table
+            if name not in self.specification.options.keys() | found_by_table
         }
         return {**listed, **automatic}
 
     def _listed(self, option: str) -> tuple[float, ...]:
-        key, only_speckled = self.specification.LISTED[option]
-        if only_speckled and self.cell.d_over_r0 == 0:
+        if option in _OF_SPECKLED and self.cell.d_over_r0 == 0:
             return (0.0,)
-        return tuple(getattr(self.specification, key))
+        return tuple(self.specification.options[option])
 
     def _unit(self, option: str) -> float:
         """Return what a number of the specification is multiplied with."""

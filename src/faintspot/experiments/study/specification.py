@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from faintspot.base.checks import number_between, one_of, strings_of
-from faintspot.base.config.options import FLAG, LIST, REQUIRED, TEXT, Options, number, setting
+from faintspot.base.config.options import FLAG, LIST, REQUIRED, TEXT, Option, Options, number, setting
 from faintspot.base.config.tables import tables_as_text
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.sizes import check_size
@@ -44,7 +43,31 @@ def _checked_estimators(name: str, values: object) -> tuple[str, ...]:
     return tuple(one_of(name, each, list(estimators())) for each in strings_of(name, values))
 
 
-_listed = partial(number, kind=LIST)
+TRIED = {
+    "noise_std": (0.3, 0.5, 0.7, 0.85, 1.0),
+    "smoothing_px": (0.4, 0.6, 0.8, 1.0, 1.3),
+    "threshold_e": (0.0, 1.0, 2.0, 3.0, 4.0, 5.0),
+    "weight_fwhm_px": (1.0, 1.4, 2.0, 3.0, 4.5),
+    "blur_px": (0.0, 0.5, 1.0, 1.8, 3.0, 5.0),
+    "model_error": (0.0, 0.2, 0.5),
+}
+"""Values of options of estimators that a study chooses from."""
+_LARGEST = {"threshold_e": 100.0, "weight_fwhm_px": 100.0}  # others: 10
+_ABOVE_ZERO = ("noise_std", "smoothing_px", "weight_fwhm_px")
+
+
+def _checked_options(name: str, values: Any) -> dict[str, tuple[float, ...]]:
+    """Return the values of all options, those of `TRIED` where there are no others."""
+    given = checked_table(name, values) if values != () else {}
+    check_keys(f"{name}.", given, list(TRIED))
+    checked: dict[str, tuple[float, ...]] = dict(TRIED)
+    for key, listed in given.items():
+        bounds: dict[str, Any] = {"high": _LARGEST.get(key, 10.0), "low_open": key in _ABOVE_ZERO}
+        declared = Option(low=0.0, per_subaperture=False, kind=LIST, **bounds)
+        checked[key] = tuple(dict.fromkeys(declared.checked(f"{name}.{key}", listed)))
+        if not checked[key]:
+            raise InputError("expected at least one value, got an empty list", name=f"{name}.{key}")
+    return checked
 
 
 @dataclass(frozen=True)
@@ -64,20 +87,10 @@ class StudySpecification(Options):
     estimators : sequence of str
         What is compared: names of estimators (`faintspot.slopes.estimators.estimators()`).
         Default: the built-in ones that know nothing of the spot.
-    strengths : sequence of float
-        Strengths of the denoising (option `noise_std`) to choose from, as fractions of the noise of a mean
-        pixel.
-    widths : sequence of float
-        Widths of the smoothing (option `smoothing_px`) to choose from.
-    thresholds : sequence of float
-        Thresholds (option `threshold_e`) to choose from, in units of the noise of a mean pixel.
-    weight_widths : sequence of float
-        Widths of the weight (option `weight_fwhm_px`) to choose from, as fractions of the spot's.
-    blurs : sequence of float
-        Standard deviations of the Gaussian that blurs the PSF (option `blur_px`) to choose from for spots
-        that turbulence has speckled. Other spots are not blurred.
-    model_errors : sequence of float
-        Values of the option `model_error` to choose from, together with the blur, for the same spots.
+    options : mapping of str to sequence of float
+        Values of options of estimators to choose from, instead of those of `TRIED`: noise_std and threshold_e
+        as fractions of the noise of a mean pixel, smoothing_px, weight_fwhm_px as a fraction of the spot's
+        width; for spots that turbulence has speckled also blur_px and model_error, which are 0 for others.
     fixed_k : sequence of int
         Numbers of kept pixels of the modes in which all methods keep the same number.
     corrected : bool
@@ -106,29 +119,14 @@ class StudySpecification(Options):
     seed: int = number(1, 0, 2**63 - 1, whole=True)
     realisations: int = number(10_000, 20, 10_000_000, whole=True)
     estimators: Sequence[str] = setting(DEFAULT_METHODS, check=_checked_estimators)
-    strengths: Sequence[float] = _listed((0.3, 0.5, 0.7, 0.85, 1.0), 0.0, 10.0, low_open=True)
-    widths: Sequence[float] = _listed((0.4, 0.6, 0.8, 1.0, 1.3), 0.0, 10.0, low_open=True)
-    thresholds: Sequence[float] = _listed((0.0, 1.0, 2.0, 3.0, 4.0, 5.0), 0.0, 100.0)
-    weight_widths: Sequence[float] = _listed((1.0, 1.4, 2.0, 3.0, 4.5), 0.0, 100.0, low_open=True)
-    blurs: Sequence[float] = _listed((0.0, 0.5, 1.0, 1.8, 3.0, 5.0), 0.0, 10.0)
-    model_errors: Sequence[float] = _listed((0.0, 0.2, 0.5), 0.0, 10.0)
-    fixed_k: Sequence[int] = _listed((20, 40, 60), 1, 1e9, whole=True)
+    options: Any = setting((), check=_checked_options)
+    fixed_k: Sequence[int] = number((20, 40, 60), 1, 1e9, whole=True, kind=LIST)
     corrected: bool = setting(False, kind=FLAG)
     search_range_px: float | None = number(None, 0.0, math.inf, low_open=True)
 
-    LISTED: ClassVar[Mapping[str, tuple[str, bool]]] = {
-        "noise_std": ("strengths", False),
-        "smoothing_px": ("widths", False),
-        "threshold_e": ("thresholds", False),
-        "weight_fwhm_px": ("weight_widths", False),
-        "blur_px": ("blurs", True),
-        "model_error": ("model_errors", True),
-    }
-    """By option of an estimator, which field lists its values, and whether only for speckled spots."""
-
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("estimators", "fixed_k", *(field for field, _ in self.LISTED.values())):
+        for name in ("estimators", "fixed_k"):
             values = tuple(dict.fromkeys(getattr(self, name)))
             if not values and name != "fixed_k":
                 raise InputError("expected at least one value, got an empty list", name=name)
@@ -178,8 +176,8 @@ class StudySpecification(Options):
         sweeps = {
             sweep.name: {name: list(getattr(sweep, name)) for name in PARAMETERS} for sweep in self.sweeps
         }
-        del known["sweeps"]  # the tables come last
-        return tables_as_text({**known, "sweeps": sweeps})
+        del known["sweeps"], known["options"]  # the tables come last
+        return tables_as_text({**known, "options": self.options, "sweeps": sweeps})
 
     @classmethod
     def from_text(cls, text: str, where: str = "specification") -> StudySpecification:
