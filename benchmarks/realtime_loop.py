@@ -179,8 +179,7 @@ def _loop() -> Table:
             "maximum a posteriori, Kalman filter",
             predicting,
             0.3,
-            predict_prior=True,
-            correct_gain=False,
+            variants=("predicted",),
             control="kalman",
         ),
     ]

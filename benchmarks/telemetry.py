@@ -51,7 +51,8 @@ _SAME_LINE_HZ = 1.0
 
 def recording(record: LoopRecord) -> Recording:
     """Return a simulated loop as a recording: the command of each row follows from its slopes."""
-    later, first = record.delay_frames, record.settle_frames
+    loop = record.loop
+    later, first = loop.control.delay_frames, loop.run.settle_frames
     slopes = record.slopes_px.astype(np.float64) / record.centroid_gain[0]
     slopes[~np.tile(record.valid, 2)] = np.nan
     return Recording(
@@ -59,9 +60,9 @@ def recording(record: LoopRecord) -> Recording:
         record.commands[first + later :],
         record.interaction_matrix,
         record.cells,
-        record.frame_rate_hz,
-        subaperture_m=record.subaperture_m,
-        pixel_scale_arcsec=record.pixel_scale_rad / ARCSEC,
+        loop.control.frame_rate_hz,
+        subaperture_m=loop.subaperture_m,
+        pixel_scale_arcsec=loop.pixel_scale_rad / ARCSEC,
         slope_unit="px",
         name="simulated",
     )
@@ -179,7 +180,7 @@ def _of_flux(photons: float, realisation: int) -> Pairs:
     left = [float(np.sqrt(np.square(each.residual_nm[FRAMES // 2 :]).mean())) for each in (first, *rest)]
     air = configuration.atmosphere
     truth = Truth(
-        first.delay_frames,
+        configuration.control.delay_frames,
         float(np.sqrt(np.square(error[np.isfinite(error)]).mean())),
         float((first.r0_m ** (-5 / 3)).mean() ** (-3 / 5)),
         air.outer_scale_m,

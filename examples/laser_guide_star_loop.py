@@ -51,11 +51,10 @@ def window(width_px: float) -> Method:
 def others() -> list[Method]:
     """Return the methods without a tuned option."""
     linear, ml = fs.Settings("window"), fs.Settings("ml", search_range_px=LARGEST_PX)
-    known: dict[str, Any] = {"matched_weights": True}
     return [
-        Method("linear matched filter, static", linear, **known),
-        Method("linear matched filter, followed", linear, follows_profile=True, **known),
-        Method("ml, followed", ml, follows_profile=True),
+        Method("linear matched filter, static", linear, variants=("filter",)),
+        Method("linear matched filter, followed", linear, variants=("filter", "followed")),
+        Method("ml, followed", ml, variants=("followed",)),
     ]
 
 

@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import eigsh
 
-from faintspot.experiments.closed_loop.methods import method_kind
+from faintspot.experiments.closed_loop.methods import with_choice
 from faintspot.loop.control.kalman.predictor import SlopePredictor
-from faintspot.loop.simulation import LoopConfiguration, load_loop
+from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.learning import learnt_control
 from faintspot.loop.simulation.simulation import DisabledErrors, _Loop
 from faintspot.loop.simulation.telescope.model import LoopOptics, TelescopeModel, prepare
@@ -47,8 +47,9 @@ class Pixels:
     def __init__(self, optics: LoopOptics, configuration: LoopConfiguration, local: Floats) -> None:
         sensor = optics.sensor
         self.amplitude = sensor.amplitude.astype(np.float64)
-        self.rows, self.columns = sensor.rows.astype(np.complex128), sensor.columns.astype(np.complex128)
-        self.to_pixels = sensor.row_pixels.astype(np.float64), sensor.column_pixels.astype(np.float64)
+        axes = sensor.image_y, sensor.image_x
+        self.rows, self.columns = (axis.transform.astype(np.complex128) for axis in axes)
+        self.to_pixels = tuple(axis.to_pixels.astype(np.float64) for axis in axes)
         self.radians = 2e-9 * np.pi / sensor.wavelength_m
         self.flux, self.variance = configuration.photons, configuration.camera.read_noise_e**2
         self.local = local
@@ -254,10 +255,10 @@ class PixelLoop(_Loop):
 
 def closed_loop(configuration: LoopConfiguration, realisations: int) -> None:
     """Print Strehl ratios of the filter that slopes correct, and of the one that pixels correct."""
-    kind = method_kind("window+kalman")
     width = WINDOW_FWHM * configuration.spot_width_px
     choice = {"loop_gain": LOOP_GAIN, "noise_scale": NOISE_SCALE, "window_fwhm_px": width}
-    method, learnt = learnt_control(configuration, kind.method(configuration, choice), configuration.run.seed)
+    method = with_choice(Method.named("window+kalman"), configuration, choice)
+    method, learnt = learnt_control(configuration, method, configuration.run.seed, simulate_loop)
     assert learnt is not None
     model, settle = Model.of(configuration), configuration.run.settle_frames
     print(f"{configuration.name}, {configuration.photons:g} photo-electrons, filter: {learnt.description}")
@@ -267,7 +268,7 @@ def closed_loop(configuration: LoopConfiguration, realisations: int) -> None:
         what = configuration, [(method, learnt)], which, configuration.run.seed, realisation, DisabledErrors()
         by_slopes, by_pixels = _Loop(*what), PixelLoop(*what)
         by_pixels.begin(model, learnt.predictor())
-        found.append([each.run(None).truth[0, settle:].mean() for each in (by_slopes, by_pixels)])
+        found.append([each.run(None).rows["strehl"][settle:].mean() for each in (by_slopes, by_pixels)])
         print(
             f"  Strehl ratio corrected by slopes {found[-1][0]:.3f}, by pixels {found[-1][1]:.3f}", flush=True
         )

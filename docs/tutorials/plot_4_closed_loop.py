@@ -25,13 +25,12 @@ posterior = fs.Settings("map", prior_std_px=0.7, flux_e=20.0)
 methods = [
     Method("brightest pixels", fs.Settings("brightest", keep_brightest=20), gain=0.1),
     Method("fixed window", window, gain=0.4),
-    Method("maximum a posteriori", posterior, gain=0.4, predict_prior=True, correct_gain=False, psf=psf),
+    Method("maximum a posteriori", posterior, gain=0.4, variants=("predicted",), psf=psf),
     Method(
         "the same, Kalman filter",
         posterior,
         gain=0.3,
-        predict_prior=True,
-        correct_gain=False,
+        variants=("predicted",),
         psf=psf,
         control="kalman",
     ),

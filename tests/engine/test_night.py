@@ -38,7 +38,7 @@ def test_a_night_agrees_with_the_simulation(sky: Sky, tmp_path: Path) -> None:
     gain = float(control.options.gain / control.options.centroid_gain)
     without = fs.Settings("brightest", keep_brightest=20)
     made = [
-        Method(label, each, gain=gain, correct_gain=False)
+        Method(label, each, gain=gain, variants=("uncorrected",))
         for label, each in (("none", without), ("tv:1", settings))
     ]
     run = CONFIGURATION.replace("run", frames=FRAMES, settle_frames=0)

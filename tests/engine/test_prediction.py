@@ -39,7 +39,7 @@ def test_the_kalman_filter_s_loop_is_the_simulated_one(sky: Sky, tmp_path: Path)
     run = run.replace("run", frames=FRAMES, settle_frames=10)
     path, control = configured(tmp_path, SETTINGS, run, "kalman")
     assert (control.prediction, control.options.centroid_gain) == ("controller", 1.0)
-    method = Method("-", SETTINGS, predict_prior=True, correct_gain=False, control="kalman")
+    method = Method("-", SETTINGS, variants=("predicted",), control="kalman")
     told, _ = learnt_control(
         run, method, run.run.seed, simulate_loop
     )  # the first frame's prior, too, is as wide

@@ -7,7 +7,7 @@ from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeRes
 from faintspot.loop.simulation import LoopConfiguration
 from faintspot.slopes.pipeline.configuration import to_text
 
-NAMES = ("brightest", "tv", "ml", "ml_weighted")
+NAMES = ("brightest", "tv", "ml", "ml+weighted")
 LABELS = (
     "brightest pixels",
     "TV denoising",

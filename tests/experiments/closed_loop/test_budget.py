@@ -8,13 +8,14 @@ from tests.experiments.experiment_cases import HERE, SEARCH, small
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.budget import TERMS, run_budget
 from faintspot.experiments.closed_loop.experiment import scored_runs
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, method_kind
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, with_choice
 from faintspot.experiments.closed_loop.results import BudgetResult
+from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import BUDGET_FILE
 from faintspot.loop.simulation.simulation import simulate_loop
 
 pytest.importorskip("hcipy")
-KIND = method_kind("brightest")
+KIND = Method.named("brightest")
 CHOICE = {LOOP_GAIN: 0.5, "keep_brightest": 16}
 
 RUN = {"frames": 300, "settle_frames": 40, "realisations": 1}
@@ -27,7 +28,7 @@ def strehl(term: str) -> float:
 
 
 def test_without_nothing_it_is_the_loop_itself() -> None:
-    record = simulate_loop(FAINT, [KIND.method(FAINT, CHOICE)])
+    record = simulate_loop(FAINT, [with_choice(KIND, FAINT, CHOICE)])
     assert strehl("nothing") == pytest.approx(record.mean_strehl(), abs=1e-12)
     found = scored_runs(KIND, FAINT, CHOICE, TERMS["nothing"], lambda frames: None)["residual_nm"][0]
     assert found == pytest.approx(np.sqrt(np.mean(record.residual_nm[40:] ** 2)))

@@ -8,7 +8,7 @@ from tests.experiments.experiment_cases import SEARCH, small
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop import search as tuning
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, MethodKind, method_kind
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, tuned_values
 from faintspot.experiments.closed_loop.search import (
     FIRST_TUNING_REALISATION,
     Search,
@@ -17,15 +17,16 @@ from faintspot.experiments.closed_loop.search import (
     stored,
     tune,
 )
+from faintspot.loop.simulation.methods import Method
 
-BRIGHTEST = method_kind("brightest")
-KEPT = BRIGHTEST.tuned(small())["keep_brightest"]
+BRIGHTEST = Method.named("brightest")
+KEPT = tuned_values(BRIGHTEST, small())["keep_brightest"]
 BEST = KEPT.values[2]
-GAINS = BRIGHTEST.tuned(small())[LOOP_GAIN]
+GAINS = tuned_values(BRIGHTEST, small())[LOOP_GAIN]
 TOP = 0.55  # between two values on offer
 
 
-def tuned(kind: MethodKind, search: Search, *more: Any) -> Tuned:
+def tuned(kind: Method, search: Search, *more: Any) -> Tuned:
     return stored(tune(kind, small(), search, *more))
 
 
@@ -97,7 +98,7 @@ def test_without_rounds_the_best_coarse_choice(hill: list[int]) -> None:
 
 
 def test_is_repeatable_and_stored() -> None:
-    centroid = method_kind("centroid")
+    centroid = Method.named("centroid")
     one, other = (tune(centroid, small(), SEARCH) for _ in range(2))
     assert stored(one) == stored(other)
     np.testing.assert_array_equal(one["strehl"], other["strehl"])
@@ -112,9 +113,9 @@ def test_search_is_checked() -> None:
 
 
 def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[int]) -> None:
-    kind = method_kind("brightest+kalman")
+    kind = Method.named("brightest+kalman")
     found = tuned(kind, Search(rounds=9), {LOOP_GAIN: 0.9, "keep_brightest": BEST + 1})
-    highest = max(kind.tuned(small())[LOOP_GAIN].values)
+    highest = max(tuned_values(kind, small())[LOOP_GAIN].values)
     assert found.choice == {LOOP_GAIN: highest, "keep_brightest": BEST + 1}
     assert not hill  # nothing is left to tune
 
@@ -126,7 +127,7 @@ def test_of_known_slopes_only_the_gain_is_tuned(hill: list[int]) -> None:
 
 def test_options_follow_a_power_of_the_flux() -> None:
     """One wrong value among five does not change the line."""
-    kind, fluxes = method_kind("window"), (20.0, 40.0, 80.0, 160.0, 320.0)
+    kind, fluxes = Method.named("window"), (20.0, 40.0, 80.0, 160.0, 320.0)
     stars = [small().replace("camera", photons_per_subaperture=flux) for flux in fluxes]
     power = [2.0 * (flux / 20) ** 0.2 for flux in fluxes]
     choices = [{LOOP_GAIN: 0.1 * k, "window_fwhm_px": width} for k, width in enumerate(power)]

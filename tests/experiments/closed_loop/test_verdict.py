@@ -125,7 +125,7 @@ def test_the_simplest_of_equal_methods_is_recommended() -> None:
     """The baseline where it is as good as the best; another one where it is below beyond the error."""
     steps = np.array([-0.02, -0.01, 0.01, 0.02])
     strehl = np.array([[0.3 + steps], [0.5 + steps], [0.5 - steps], [0.7 + steps]])
-    names = ("brightest", "window", "map_predicted", "map+kalman")
+    names = ("brightest", "window", "map+predicted", "map+kalman")
     made = replace(
         made_up_magnitude(),
         names=names,

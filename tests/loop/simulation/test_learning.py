@@ -6,7 +6,7 @@ from tests.experiments.experiment_cases import small
 
 import faintspot as fs
 from faintspot.base.errors import InputError
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, NOISE_SCALE, method_kind
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, NOISE_SCALE, tuned_values, with_choice
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import open_loop_of
@@ -28,7 +28,7 @@ MAP = fs.Settings("map", prior_std_px=0.5)
 
 
 def _method(control: str = INTEGRATOR, gain: float = 0.4) -> Method:
-    return Method("map", MAP, gain, predict_prior=True, correct_gain=False, control=control)
+    return Method("map", MAP, gain, variants=("predicted",), control=control)
 
 
 def test_the_integrator_is_the_recursion() -> None:
@@ -116,26 +116,28 @@ def test_the_centroid_gain_is_learnt() -> None:
     assert learnt.centroid_gain == pytest.approx(float(record.centroid_gain[0]), rel=0.2)
     assert learnt.centroid_gain < 0.9
     assert record.mean_strehl() > simulate_loop(loop, [replace(method, control=INTEGRATOR)]).mean_strehl()
-    uncorrected = replace(method, correct_gain=False)
+    uncorrected = replace(method, variants=("uncorrected",))
     _, learnt = learnt_control(loop, uncorrected, loop.run.seed, simulate_loop)
     assert learnt is not None
     assert learnt.centroid_gain == 1.0
 
 
 def test_names_of_methods_say_their_control() -> None:
-    for name in ("map+kalman", "brightest+kalman", "ml_weighted+kalman"):
-        assert method_kind(name).name == name
-    assert method_kind("map+integrator") == method_kind("map")
-    kind = method_kind("map+kalman")
-    assert kind.is_predicted
-    assert "predictive Kalman filter" in kind.label
-    tuned = kind.tuned(FAINT)
+    for name in ("map+kalman", "brightest+kalman", "ml+weighted+kalman"):
+        assert Method.named(name).name == name
+    assert Method.named("map+integrator").name == "map"
+    named = Method.named("map+kalman")
+    assert named.is_predicted
+    assert "predictive Kalman filter" in named.label
+    tuned = tuned_values(named, FAINT)
     assert {LOOP_GAIN, NOISE_SCALE} <= set(tuned)
     assert PRIOR not in tuned
-    method = kind.method(FAINT, {name: each.first[0] for name, each in tuned.items()})
+    method = with_choice(named, FAINT, {name: each.first[0] for name, each in tuned.items()})
     assert (method.control, method.noise_scale) == ("kalman", tuned[NOISE_SCALE].first[0])
-    with pytest.raises(InputError, match="control of the method = 'lqg'"):
-        method_kind("map+lqg")
+    with pytest.raises(InputError, match=r"method 'map.lqg' = 'lqg'"):
+        Method.named("map+lqg")
+    with pytest.raises(InputError, match="expected the control once"):
+        Method.named("map+kalman+weighted")
 
 
 def test_assumed_winds_are_of_the_configuration() -> None:

@@ -79,7 +79,7 @@ def test_slopes_follow_the_interaction_matrix() -> None:
     per cent from the mean gradient in partly lit sub-apertures.
     """
     loop = quiet().replace("run", frames=60)
-    record = simulate_loop(loop, [Method("true", PLAIN, true_slopes=True)], seed=4)
+    record = simulate_loop(loop, [Method("true", PLAIN, variants=("true",))], seed=4)
     atmosphere, sensor = make_atmosphere(loop, 4), prepare(loop).sensor
     frames = np.arange(20, 60)
     expected = np.array([sensor.mean_slopes_px(atmosphere.wavefront_nm((k + 0.5) / 250)) for k in frames])
@@ -96,7 +96,7 @@ def test_noise_free_loop_lies_between_fitting_error_and_its_budget() -> None:
     Aliasing adds up to 0.4 of the fitting variance (Rigaut, Veran & Lai 1998, SPIE 3353, 1038).
     """
     loop = quiet()
-    record = simulate_loop(loop, [Method("true", PLAIN, true_slopes=True, gain=0.5)])
+    record = simulate_loop(loop, [Method("true", PLAIN, variants=("true",), gain=0.5)])
     optics, atmosphere = prepare(loop), make_atmosphere(loop, loop.run.seed)
     fit = BestFit.of(optics.mirror, optics.pupil)
     fitting, lag = [], []
@@ -119,10 +119,10 @@ def test_open_loop_control() -> None:
     settings = fs.Settings("brightest", keep_brightest=150)
     bright = loop.replace("camera", photons_per_subaperture=2000.0)
     corrected = simulate_loop(bright, [Method("corrected", settings)])
-    not_corrected = simulate_loop(bright, [Method("not", settings, correct_gain=False)])
+    not_corrected = simulate_loop(bright, [Method("not", settings, variants=("uncorrected",))])
     assert corrected.mean_strehl() > 0.5
     assert corrected.mean_strehl() > not_corrected.mean_strehl()
-    assert not corrected.closed
+    assert corrected.loop.control.mode == "open"
     # The sensor sees the whole wavefront: slopes do not shrink when the mirror acts.
     assert np.std(corrected.slopes_px[40:]) > 0.7 * np.std(corrected.slopes_px[:3])
 
@@ -144,7 +144,8 @@ def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
     loop = loop.replace("run", frames=100, settle_frames=40)
     settings = fs.Settings("brightest", keep_brightest=80)
     corrected, not_corrected = (
-        simulate_loop(loop, [Method("k", settings, gain=0.3, correct_gain=flag)]) for flag in (True, False)
+        simulate_loop(loop, [Method("k", settings, gain=0.3, variants=variants)])
+        for variants in ((), ("uncorrected",))
     )
     assert corrected.centroid_gain[0] < 0.8
     assert corrected.mean_strehl() > not_corrected.mean_strehl()

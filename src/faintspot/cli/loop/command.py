@@ -103,15 +103,15 @@ def magnitude(
     Each method is tuned at each flux, its settings and the loop gain together, on other turbulence; one is
     recommended for each flux: the simplest of those not below the best beyond the error. Methods:
     every estimator by its name (`faintspot estimators` lists them); after the name may follow
-    _predicted (its prior is what the loop predicts), _weighted (slopes count by their standard errors),
-    _uncorrected (slopes are not divided by the centroid gain), with a laser guide star _filter (weights of
-    `window` are the linear matched filter) and _followed (the sodium profile is followed), and then the
+    +predicted (its prior is what the loop predicts), +weighted (slopes count by their standard errors),
+    +uncorrected (slopes are not divided by the centroid gain), with a laser guide star +filter (weights of
+    `window` are the linear matched filter) and +followed (the sodium profile is followed), and then the
     control: +kalman in place of the integrator.
 
     \b
     Examples:
       faintspot loop magnitude --quick
-      faintspot loop magnitude diffraction_limit --methods map_predicted,map+kalman --flux-e 20
+      faintspot loop magnitude diffraction_limit --methods map+predicted,map+kalman --flux-e 20
       faintspot loop magnitude camera_3e --methods brightest,smoothed,tv,ml --flux-e 60,200,640
     """
     from faintspot.experiments.closed_loop.magnitude import run_magnitude, save_recommended
@@ -277,12 +277,13 @@ def _measure(
 
 def _methods(names: Names | None) -> Names | None:
     """Return the methods that are asked for; name those that could use the loop's prediction but do not."""
-    from faintspot.experiments.closed_loop.methods import method_kind
+    from faintspot.loop.simulation.methods import Method
 
     for name in names or ():
-        kind = method_kind(name)
-        if kind.estimator.takes_prior and not kind.is_predicted:
-            own = kind.estimator.name
-            rest = kind.name.removeprefix(own)
-            click.echo(f"{name}: without the loop's prediction; {own}_predicted{rest} uses it", err=True)
+        method = Method.named(name)
+        if method.estimator.takes_prior and not method.is_predicted:
+            own, plus, rest = method.name.partition("+")
+            click.echo(
+                f"{name}: without the loop's prediction; {own}+predicted{plus}{rest} uses it", err=True
+            )
     return names

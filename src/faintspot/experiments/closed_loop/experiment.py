@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.json_text import to_json
-from faintspot.experiments.closed_loop.methods import MethodKind, method_kind
+from faintspot.experiments.closed_loop.methods import tuned_values, with_choice
 from faintspot.experiments.closed_loop.search import (
     QUICK,
     Search,
@@ -27,8 +27,10 @@ from faintspot.experiments.closed_loop.search import (
 from faintspot.experiments.methods import Choice
 from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
 from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
+from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.disabled_errors import DisabledErrors
+from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import make_folder
 from faintspot.loop.simulation.simulation import simulate_loop
 
@@ -68,7 +70,7 @@ class Experiment:
         self._pool = pool or WorkerPool()
 
     def measured(
-        self, kinds: Sequence[MethodKind], columns: Mapping[str, tuple[float, DisabledErrors]]
+        self, kinds: Sequence[Method], columns: Mapping[str, tuple[float, DisabledErrors]]
     ) -> dict[str, NDArray[Any]]:
         """Tune every method at every flux, then score it in every column.
 
@@ -78,7 +80,7 @@ class Experiment:
 
         Parameters
         ----------
-        kinds : sequence of MethodKind
+        kinds : sequence of Method
         columns : mapping
             Flux and errors that are switched off, by name.
 
@@ -90,9 +92,9 @@ class Experiment:
         """
         stars = {flux: with_flux(self.configuration, flux) for flux, _ in columns.values()}
         plain = list({kind.name: kind for kind in map(with_integrator, kinds)}.values())
-        learning = [kind for kind in kinds if kind not in plain]
+        learning = [kind for kind in kinds if kind.control != INTEGRATOR]
         guess: Choices = {
-            (kind.name, flux): {name: axis.first[0] for name, axis in kind.tuned(star).items()}
+            (kind.name, flux): {name: axis.first[0] for name, axis in tuned_values(kind, star).items()}
             for kind in plain
             for flux, star in stars.items()
         }
@@ -118,7 +120,7 @@ class Experiment:
         return {**arrays, "choices": np.array(texts)}
 
     def _choices(
-        self, plain: Sequence[MethodKind], stars: Stars, alone: WorkerPool, again: WorkerPool
+        self, plain: Sequence[Method], stars: Stars, alone: WorkerPool, again: WorkerPool
     ) -> Choices:
         """Return the tuned values of the slopes, tuned now where they are not stored."""
         first = self._tuned("tuning", plain, stars, {}, alone)
@@ -134,7 +136,7 @@ class Experiment:
         return best
 
     def _tuned(
-        self, stage: str, kinds: Sequence[MethodKind], stars: Stars, slopes: Choices, pool: WorkerPool
+        self, stage: str, kinds: Sequence[Method], stars: Stars, slopes: Choices, pool: WorkerPool
     ) -> dict[tuple[str, float], Tuned]:
         """Return the tuned values of every method with every star, given those of its slopes."""
         units = self._tuning(kinds, stars, slopes)
@@ -144,7 +146,7 @@ class Experiment:
         return {key: stored(results[unit.key]) for key, unit in units.items()}
 
     def _tuning(
-        self, kinds: Sequence[MethodKind], stars: Stars, slopes: Choices
+        self, kinds: Sequence[Method], stars: Stars, slopes: Choices
     ) -> dict[tuple[str, float], Unit]:
         units = {}
         for kind in kinds:
@@ -157,7 +159,7 @@ class Experiment:
 
     def _scoring(
         self,
-        kinds: Sequence[MethodKind],
+        kinds: Sequence[Method],
         columns: Mapping[str, tuple[float, DisabledErrors]],
         stars: Stars,
         choices: Choices,
@@ -193,7 +195,7 @@ def _digest(value: object) -> str:
 
 
 def scored_runs(
-    kind: MethodKind, star: LoopConfiguration, choice: Choice, off: DisabledErrors, advance: Advance
+    kind: Method, star: LoopConfiguration, choice: Choice, off: DisabledErrors, advance: Advance
 ) -> dict[str, NDArray[np.generic]]:
     """Run a tuned method in all realisations of the turbulence, in one process: control learns only once.
 
@@ -202,7 +204,7 @@ def scored_runs(
     dict
         Long-exposure Strehl ratio, rms of the wavefront, centroid gain and settings as TOML, (realisations,).
     """
-    method, frames, results = kind.method(star, choice), star.run.frames, []
+    method, frames, results = with_choice(kind, star, choice), star.run.frames, []
     for run in range(star.run.realisations):
 
         def progress(done: int, total: int, before: int = run * frames) -> None:
@@ -228,7 +230,7 @@ def quick_run(configuration: LoopConfiguration) -> LoopConfiguration:
     return configuration.replace("run", **run)
 
 
-def checked_methods(names: Sequence[str]) -> list[MethodKind]:
+def checked_methods(names: Sequence[str]) -> list[Method]:
     """Return methods by their names, each once.
 
     Raises
@@ -238,4 +240,4 @@ def checked_methods(names: Sequence[str]) -> list[MethodKind]:
     """
     if not names:
         raise InputError("methods: expected at least one, got none")
-    return list({kind.name: kind for kind in map(method_kind, names)}.values())
+    return list({kind.name: kind for kind in map(Method.named, names)}.values())

@@ -13,13 +13,14 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import derived, write_atomically
 from faintspot.base.json_text import parse_json
 from faintspot.experiments.closed_loop.experiment import Experiment, checked_methods, with_flux
-from faintspot.experiments.closed_loop.methods import default_methods, method_kind
+from faintspot.experiments.closed_loop.methods import default_methods, with_choice
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.closed_loop.search import Search
 from faintspot.experiments.closed_loop.verdict import equal_methods
 from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.disabled_errors import DisabledErrors
+from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import MAGNITUDE_FILE
 from faintspot.loop.simulation.telescope.camera import camera_calibration
 from faintspot.slopes.estimators.base import Need
@@ -58,7 +59,7 @@ def run_magnitude(
     folder : path
         Where finished units are remembered; made where it is not there.
     methods : sequence of str, optional
-        See `experiments.closed_loop.methods.method_kind`. Default: `default_methods`; with `quick`, four.
+        Names, see `faintspot.loop.simulation.Method.named`. Default: `default_methods`; with `quick`, four.
     photons : sequence of float, optional
         Photo-electrons of a fully lit sub-aperture in a frame. Default: the configuration's.
     quick : bool
@@ -131,8 +132,8 @@ def save_recommended(result: MagnitudeResult, configuration: LoopConfiguration, 
     if not methods:
         raise InputError(f"{path}: expected a measured flux near {configuration.photons:g}, got none")
     best, star = methods[0], with_flux(configuration, float(result.photons[flux]))
-    kind, choice = method_kind(result.names[best]), parse_json(str(result.choices[best, flux]))
-    method = kind.method(star, choice)
+    choice = parse_json(str(result.choices[best, flux]))
+    method = with_choice(Method.named(result.names[best]), star, choice)
     settings, psf = method.settings, method.psf
     if settings.estimator.uses_flux:
         settings = settings.replace(flux_e=float(f"{star.photons:.4g}"))
@@ -144,7 +145,7 @@ def save_recommended(result: MagnitudeResult, configuration: LoopConfiguration, 
     if not configuration_file.has(path, "calibration"):
         configuration_file.save(path, camera_calibration(star))
     strehl = float(result.strehl[best, flux].mean())
-    table = {"method": kind.name, "control": kind.control, "strehl": round(strehl, 4), **choice}
+    table = {"method": method.name, "control": method.control, "strehl": round(strehl, 4), **choice}
     save_tables(path, {"loop": table})
     loop = derived(path, "-loop.toml")
     gain = {} if method.gain is None else {"gain": method.gain}

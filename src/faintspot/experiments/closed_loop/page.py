@@ -10,11 +10,11 @@ from faintspot.base.report.page import POSITIONS, FigureWithData, Report, Sectio
 from faintspot.base.report.plots import Line, Panel
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import paired_mean
-from faintspot.experiments.closed_loop.methods import CONTROL_SIGN
 from faintspot.experiments.closed_loop.results import MagnitudeResult, differences_by_flux
 from faintspot.experiments.closed_loop.tables import budget_table, gain_table, settings_table, strehl_table
 from faintspot.experiments.closed_loop.verdict import LoopResults, loop_verdict, reference_methods
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.control.base import split_control
 from faintspot.slopes.estimators.base import Style
 from faintspot.slopes.estimators.registry import estimators
 
@@ -108,7 +108,7 @@ def _style(name: str) -> dict[str, object]:
     base = next((name[:end] for end in range(len(name), 0, -1) if name[:end] in kinds), "")
     style = kinds[base].style if base else Style("#666666")
     filling = style.colour if name == base else "white"
-    line = _LEARNING_LINE if CONTROL_SIGN in name else style.line
+    line = _LEARNING_LINE if split_control(name)[1] else style.line
     return {"color": style.colour, "marker": style.marker, "ms": 6, "mfc": filling, "lw": 1.5, "ls": line}
 
 

@@ -14,11 +14,12 @@ from scipy.stats import theilslopes
 
 from faintspot.base.checks import number_between
 from faintspot.base.json_text import parse_json, to_json
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, MethodKind, Tunable
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Tunable, tuned_values, with_choice
 from faintspot.experiments.methods import Choice
 from faintspot.experiments.running import Advance
 from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.simulation import simulate_loop
 
 _LEARNING_FRAMES = 3000  # that take as long as learning from telemetry
@@ -83,7 +84,7 @@ class Tuned:
 
 
 def tune(
-    kind: MethodKind,
+    method: Method,
     configuration: LoopConfiguration,
     search: Search,
     slopes: Choice | None = None,
@@ -101,7 +102,7 @@ def tune(
 
     Parameters
     ----------
-    kind : MethodKind
+    method : Method
     configuration : LoopConfiguration
     search : Search
     slopes : mapping, optional
@@ -115,37 +116,37 @@ def tune(
     dict
         What `stored` reads.
     """
-    if slopes is None and kind.control != INTEGRATOR:
-        slopes = stored(tune(with_integrator(kind), configuration, search, None, advance)).choice
-    search, tuned = _searched(kind, configuration, search, slopes)
+    if slopes is None and method.control != INTEGRATOR:
+        slopes = stored(tune(with_integrator(method), configuration, search, None, advance)).choice
+    search, tuned = _searched(method, configuration, search, slopes)
     if all(len(tunable.values) == 1 for tunable in tuned.values()):
         best = Tuned({name: tunable.values[0] for name, tunable in tuned.items()}, math.nan)
     else:
-        best = _Trials(kind, configuration, search, tuned, advance).best()
+        best = _Trials(method, configuration, search, tuned, advance).best()
     return {"choice": np.asarray(to_json(best.choice)), "strehl": np.asarray(best.strehl)}
 
 
 def _searched(
-    kind: MethodKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None
+    method: Method, configuration: LoopConfiguration, search: Search, slopes: Choice | None
 ) -> tuple[Search, dict[str, Tunable]]:
     """Return the search and what it tunes where the settings of the slopes are known, or None."""
-    tuned = kind.tuned(configuration)
+    tuned = tuned_values(method, configuration)
     if slopes is None:
         return search, tuned
     for name in tuned.keys() & slopes.keys():
         value = slopes[name]
         if name != LOOP_GAIN:
             tuned[name] = Tunable((value,), (value,))
-        elif kind.control == INTEGRATOR:
+        elif method.control == INTEGRATOR:
             tuned[name] = replace(tuned[name], first=tuned[name].nearest(value).first)
         else:
             tuned[name] = tuned[name].nearest(value)
     return replace(search, finalists=1), tuned
 
 
-def with_integrator(kind: MethodKind) -> MethodKind:
+def with_integrator(method: Method) -> Method:
     """Return the method with the same slopes whose control need not learn."""
-    return replace(kind, control=INTEGRATOR)
+    return replace(method, control=INTEGRATOR)
 
 
 def _is_scale(values: Sequence[object]) -> bool:
@@ -154,7 +155,7 @@ def _is_scale(values: Sequence[object]) -> bool:
 
 
 def smoothed(
-    kind: MethodKind, stars: Sequence[LoopConfiguration], choices: Sequence[Choice]
+    method: Method, stars: Sequence[LoopConfiguration], choices: Sequence[Choice]
 ) -> list[dict[str, Any]]:
     """Return the choices at several fluxes, with numbers among the options that are a power of the flux.
 
@@ -165,7 +166,7 @@ def smoothed(
     """
     if len(stars) < _FEWEST_FLUXES:
         return [dict(choice) for choice in choices]
-    tuned, declared = [kind.tuned(star) for star in stars], kind.estimator.declared()
+    tuned, declared = [tuned_values(method, star) for star in stars], method.estimator.declared()
     flux = np.log([star.photons for star in stars])
     results = [dict(choice) for choice in choices]
     for name in tuned[0].keys() & declared.keys():
@@ -185,10 +186,10 @@ def stored(result: Mapping[str, NDArray[np.generic]]) -> Tuned:
 
 
 def tuning_frames(
-    kind: MethodKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None = None
+    method: Method, configuration: LoopConfiguration, search: Search, slopes: Choice | None = None
 ) -> int:
     """Return about how many frames `tune` simulates, with `slopes` for control that learns."""
-    search, tuned = _searched(kind, configuration, search, slopes)
+    search, tuned = _searched(method, configuration, search, slopes)
     combinations = math.prod(len(tunable.first) for tunable in tuned.values())
     several = sum(len(tunable.values) > 1 for tunable in tuned.values())
     if several == 0:
@@ -196,12 +197,12 @@ def tuning_frames(
     climbs = min(search.climbs, search.finalists)
     looks = search.finalists + 2 * several * climbs * min(2, search.rounds) if search.rounds else 0
     simulated = combinations * search.coarse_frames + looks * search.frames * search.realisations
-    return simulated + learning_frames(kind, configuration)
+    return simulated + learning_frames(method, configuration)
 
 
-def learning_frames(kind: MethodKind, configuration: LoopConfiguration) -> int:
+def learning_frames(method: Method, configuration: LoopConfiguration) -> int:
     """Return about how many frames could be simulated while a method's control learns."""
-    if kind.control == INTEGRATOR:
+    if method.control == INTEGRATOR:
         return 0
     return configuration.control.telemetry_frames + _LEARNING_FRAMES
 
@@ -211,13 +212,13 @@ class _Trials:
 
     def __init__(
         self,
-        kind: MethodKind,
+        method: Method,
         configuration: LoopConfiguration,
         search: Search,
         tuned: Mapping[str, Tunable],
         advance: Advance | None,
     ) -> None:
-        self._kind, self._configuration, self._search = kind, configuration, search
+        self._method, self._configuration, self._search = method, configuration, search
         self._tuned, self._advance, self._frames = tuned, advance, 0
         self._strehl: dict[tuple[tuple[Any, ...], int, int], float] = {}
 
@@ -247,7 +248,7 @@ class _Trials:
         if key not in self._strehl:
             run = {"frames": frames, "settle_frames": self._search.settle_frames}
             short = self._configuration.replace("run", **run)
-            method = self._kind.method(short, choice)
+            method = with_choice(self._method, short, choice)
             runs = range(FIRST_TUNING_REALISATION, FIRST_TUNING_REALISATION + realisations)
             strehl = [simulate_loop(short, [method], realisation=run).mean_strehl() for run in runs]
             self._strehl[key] = float(np.mean(strehl))

@@ -12,7 +12,6 @@ from faintspot.base.errors import InputError
 from faintspot.base.json_text import parse_json
 from faintspot.base.report.texts import plain_number, with_interval
 from faintspot.base.statistics import Estimate, paired_mean
-from faintspot.experiments.closed_loop.methods import VARIANTS, MethodKind, method_kind
 from faintspot.experiments.closed_loop.results import (
     BudgetResult,
     MagnitudeResult,
@@ -23,6 +22,7 @@ from faintspot.experiments.closed_loop.results import (
 from faintspot.experiments.closed_loop.tables import budget_table, in_columns, strehl_table
 from faintspot.experiments.methods import Knowledge
 from faintspot.loop.control.base import INTEGRATOR
+from faintspot.loop.simulation.methods import VARIANTS, Method
 from faintspot.loop.simulation.record import BUDGET_FILE, MAGNITUDE_FILE
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
@@ -84,12 +84,12 @@ def equal_methods(result: MagnitudeResult, flux: int) -> list[int]:
     best = measured[np.argmax(runs[measured].mean(axis=1))]
     comparisons = max(1, len(measured) - 1)
     same = [int(m) for m in measured if paired_mean(runs[best] - runs[m], comparisons).decided != 1]
-    return sorted(same, key=lambda method: _simplicity(method_kind(result.names[method])))
+    return sorted(same, key=lambda method: _simplicity(Method.named(result.names[method])))
 
 
-def _simplicity(kind: MethodKind) -> tuple[object, ...]:
-    beyond_baseline = kind.name != REFERENCES[0], kind.control != INTEGRATOR
-    return *beyond_baseline, int(Knowledge.of(kind.estimator)), kind.estimator.cost, kind.name
+def _simplicity(method: Method) -> tuple[object, ...]:
+    beyond_baseline = method.name != REFERENCES[0], method.control != INTEGRATOR
+    return *beyond_baseline, int(Knowledge.of(method.estimator)), method.estimator.cost, method.name
 
 
 def _recommendations(result: MagnitudeResult) -> list[str]:
@@ -134,10 +134,10 @@ def options_that_may_pay(result: MagnitudeResult) -> list[tuple[str, int, int]]:
     """Return the options that methods differ by, the method with it and the one without, for `VARIANTS`."""
     names = result.names
     return [
-        (variant.label, method, names.index(name.replace(ending, "")))
-        for ending, variant in VARIANTS.items()
+        (label, method, names.index(name.replace(f"+{variant}", "")))
+        for variant, label in VARIANTS.items()
         for method, name in enumerate(names)
-        if ending in name and name.replace(ending, "") in names
+        if f"+{variant}" in name and name.replace(f"+{variant}", "") in names
     ]
 
 

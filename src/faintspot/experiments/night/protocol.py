@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.config.options import LIST, TEXTS, Options, number, setting
 from faintspot.base.errors import InputError
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, MethodKind, method_kind
+from faintspot.experiments.closed_loop.methods import LOOP_GAIN, with_choice
 from faintspot.experiments.methods import Choice
 from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
@@ -56,7 +56,7 @@ class NightPlan(Options, table="plan"):
         Largest strength [e-].
     methods : tuple of str
         Methods of a cycle; the first is the reference. "none": brightest pixels; "tv": all strengths; others
-        as in `method_kind`, with the integrator.
+        as in `Method.named`, with the integrator.
     strengths_e : tuple of float
         Strengths of all sets instead of evenly spaced ones [e-].
     strength_factors : tuple of float
@@ -160,7 +160,7 @@ class NightPlan(Options, table="plan"):
     ) -> Method:
         label = label_of(name, strength_e)
         if name not in PAPER_METHODS:
-            return replace(kind_of(name).method(configuration, choice), label=label)
+            return replace(with_choice(kind_of(name), configuration, choice), label=label)
         values = dict(choice or {_KEPT_OPTION: self.keep_brightest})
         gain = values.pop(LOOP_GAIN, None)
         if name == NONE:
@@ -170,9 +170,9 @@ class NightPlan(Options, table="plan"):
         return Method(label, Settings(TotalVariation(**values)), gain)
 
 
-def kind_of(name: str) -> MethodKind:
+def kind_of(name: str) -> Method:
     """Return a method by its name; "none" is brightest pixels alone."""
-    return method_kind(BrightestPixels.name if name == NONE else name)
+    return Method.named(BrightestPixels.name if name == NONE else name)
 
 
 def label_of(name: str, strength_e: float) -> str:

@@ -17,6 +17,7 @@ from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan, kind_of
 from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
 from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.configuration.sections import CLOSED
 from faintspot.loop.simulation.control import slope_turbulence
 from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import LoopRecord, make_folder
@@ -210,7 +211,7 @@ def _of_block(record: LoopRecord, configuration: LoopConfiguration, rows: slice,
         gain = record.centroid_gain[record.method[rows]][:, None]
         residual = record.slopes_px[rows] / gain
         mirror = record.commands[rows].astype(np.float64) @ record.interaction_matrix.T
-        open_loop = residual - mirror if record.closed else residual
+        open_loop = residual - mirror if configuration.control.mode == CLOSED else residual
         site = slope_turbulence(configuration, record.cells)
         r0 = r0_of_slopes(open_loop, residual, site, configuration.atmosphere.outer_scale_m)
     true = float(np.mean(record.r0_m[rows] ** (-5 / 3)) ** (-3 / 5))

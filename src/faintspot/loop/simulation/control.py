@@ -12,7 +12,7 @@ from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.plant import LoopPlant
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED
-from faintspot.loop.simulation.methods import Method
+from faintspot.loop.simulation.methods import TRUE, WEIGHTED, Method
 from faintspot.loop.simulation.telescope.model import LoopOptics
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 
@@ -38,7 +38,7 @@ def make_controller(
         optics.reconstructor,
         control.gain if method.gain is None else method.gain,
         control.leak,
-        weighted=method.weighted_reconstructor and not method.true_slopes,
+        weighted=WEIGHTED in method.variants and TRUE not in method.variants,
         sees_mirror=control.mode == CLOSED,
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.methods import Method
+from faintspot.loop.simulation.methods import TRUE, Method
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class DisabledErrors:
 
     def method(self, method: Method) -> Method:
         """Return the method as used in such a run."""
-        return replace(method, true_slopes=method.true_slopes or self.true_slopes)
+        return replace(method, variants=(*method.variants, TRUE)) if self.true_slopes else method
 
     def time_s(self, frame: int, frame_rate_hz: float) -> float:
         """Return the middle of a frame."""

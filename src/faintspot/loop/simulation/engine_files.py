@@ -15,7 +15,7 @@ from faintspot.loop.control.configuration import save_control
 from faintspot.loop.control.options import TABLE
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.learning import learnt_control
-from faintspot.loop.simulation.methods import PRIOR, Method
+from faintspot.loop.simulation.methods import PREDICTED, PRIOR, Method
 from faintspot.loop.simulation.simulation import measure_gains, simulate_loop
 from faintspot.loop.simulation.telescope.calibration import make_pipeline, reference_slopes
 from faintspot.loop.simulation.telescope.camera import camera_calibration
@@ -96,7 +96,7 @@ def write_engine_files(
     if learnt is not None:
         replace(learnt, centroid_gain=1.0).save(folder / MODEL)
         measured |= {"controller": control, "model": MODEL, "centroid_gain": learnt.centroid_gain}
-    elif method.correct_gain:
+    elif method.corrects_gain:
         pipeline = make_pipeline(configuration, optics.sensor, method)
         measured["centroid_gain"] = float(measure_gains(configuration, [pipeline], seed=seed)[0])
     save_control(path, **{**usual, **before, **measured})
@@ -121,6 +121,5 @@ def _method(settings: Settings, psf: PSF, score: FixedWeights | None, control: s
         psf=psf,
         score=score,
         control=control,
-        predict_prior=with_prior,
-        correct_gain=not with_prior,
+        variants=(PREDICTED,) if with_prior else (),
     )

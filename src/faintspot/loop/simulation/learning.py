@@ -20,7 +20,7 @@ from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED, ControlParameters, RunLength
 from faintspot.loop.simulation.control import plant_of, slope_turbulence
-from faintspot.loop.simulation.methods import PRIOR, Method
+from faintspot.loop.simulation.methods import PRIOR, TRUE, Method
 from faintspot.loop.simulation.record import LoopRecord
 from faintspot.loop.simulation.telescope.model import prepare
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
@@ -121,8 +121,8 @@ def _telemetry(
     run = configuration.replace("run", frames=frames, settle_frames=0)
     record = simulate(run, [method.method], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)
     loop = recorded_loop(record, method.method)
-    delay = LoopDelay(record.delay_frames, 0.0, 1.0, 0.0)
-    if method.method.correct_gain and not method.method.true_slopes:
+    delay = LoopDelay(record.loop.control.delay_frames, 0.0, 1.0, 0.0)
+    if method.method.corrects_gain and TRUE not in method.method.variants:
         try:
             _, delay = measured_delay(loop)
         except InputError as error:
@@ -134,13 +134,14 @@ def _telemetry(
 
 def recorded_loop(record: LoopRecord, method: Method) -> Recording:
     """Return what a telescope records of a run of one method with the integrator, freed of its prior."""
-    delay = record.delay_frames
+    loop = record.loop
+    delay = loop.control.delay_frames
     sent = record.commands[delay:].astype(np.float64)  # computed from each frame
     slopes, errors = (
         values[: len(sent)].astype(np.float64) for values in (record.slopes_px, record.standard_error_px)
     )
     expected, prior = np.zeros_like(slopes), method.prior_std_px(slopes.shape[1])
-    if method.predict_prior:  # what acts less the latest command, which acts so many frames later
+    if method.is_predicted:  # what acts less the latest command, which acts so many frames later
         acting = record.commands.astype(np.float64) @ record.interaction_matrix.T
         expected = acting[: len(sent)] - acting[delay - 1 :][: len(sent)]
     slopes, variance, _ = without_prior(slopes, errors, expected, prior)
@@ -149,9 +150,9 @@ def recorded_loop(record: LoopRecord, method: Method) -> Recording:
         sent,
         record.interaction_matrix,
         record.cells,
-        record.frame_rate_hz,
-        subaperture_m=record.subaperture_m,
-        pixel_scale_arcsec=record.pixel_scale_rad / ARCSEC,
+        loop.control.frame_rate_hz,
+        subaperture_m=loop.subaperture_m,
+        pixel_scale_arcsec=loop.pixel_scale_rad / ARCSEC,
         delay_frames=delay,
         standard_errors=np.sqrt(variance),
         covariance_xy=record.covariance_xy_px2[: len(sent)].astype(np.float64),

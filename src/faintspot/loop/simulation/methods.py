@@ -1,4 +1,4 @@
-"""Methods that experiments compare: an estimator with settings, knowledge and control."""
+"""Methods that experiments compare: an estimator with settings, its use in a loop, and control."""
 
 from __future__ import annotations
 
@@ -9,16 +9,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import REQUIRED, TEXT, Options, number, setting
+from faintspot.base.checks import one_of
+from faintspot.base.config.options import AUTO, REQUIRED, TEXT, TEXTS, Options, number, setting
 from faintspot.base.errors import InputError
-from faintspot.loop.control.base import CONTROLS, INTEGRATOR
+from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN
 from faintspot.slopes.estimators.base import Estimator
+from faintspot.slopes.estimators.built_in.window import Window
+from faintspot.slopes.estimators.registry import estimator_named
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
 
 PRIOR = "prior_std_px"
 """Option of estimators whose prior the loop sets: standard deviation from the predicted position."""
+PREDICTED, WEIGHTED, UNCORRECTED, TRUE = "predicted", "weighted", "uncorrected", "true"
+FILTER, FOLLOWED = "filter", "followed"
+VARIANTS = {
+    PREDICTED: "predicted",
+    WEIGHTED: "weighted reconstructor",
+    UNCORRECTED: "gain not corrected",
+    FILTER: "matched filter",
+    FOLLOWED: "profile followed",
+    TRUE: "true slopes",
+}
+"""Uses of an estimator in a loop that differ from the usual one: name and label."""
 
 
 def _checked_settings(name: str, value: object) -> Settings:
@@ -37,27 +51,21 @@ class Method(Options, table="method"):
     settings : Settings
     gain : float, optional
         Loop gain, 0 to 2. Default: the configuration's.
-    window_pixels : int, optional
-        Side of the middle part of each sub-aperture's window that is used. Default: all.
-    weighted_reconstructor : bool
-        Whether slopes count by their standard errors.
-    predict_prior : bool
-        Whether estimators that take a prior are given the slopes that the loop predicts.
-    correct_gain : bool
-        Whether slopes are divided by their centroid gain: for the integrator that measured at the run's
-        flux, for control that learns the one learnt from telemetry.
-    true_slopes : bool
-        Whether slopes are the wavefront's true mean gradients instead of measured ones.
+    variants : sequence of str
+        "predicted": estimators that take a prior are given the slopes that the loop predicts. "weighted":
+        slopes count by their standard errors. "uncorrected": slopes are not divided by their centroid gain,
+        as those with a prediction; else it is that measured at the run's flux, for control that learns the
+        one learnt from telemetry. "true": slopes are the wavefront's true mean gradients instead of measured
+        ones. With a laser guide star "filter": the fixed weights of `window` are the linear matched filter of
+        its spots; "followed": spots are those of a sodium profile that is followed, not of the one learnt
+        before the run.
     control : str
         What makes commands of the slopes, see `control.base.CONTROLS`. All but the integrator
         learn from telemetry of a loop with the integrator, in other turbulence.
     noise_scale : float
         What control multiplies the variance of the slopes' noise by that telemetry shows.
-    matched_weights : bool
-        Whether the fixed weights of `window` are the linear matched filter of a laser guide star's spots.
-    follows_profile : bool
-        Whether spots of a laser guide star are those of a sodium profile that is followed, not of the one
-        learnt before the run.
+    window_pixels : int, optional
+        Side of the middle part of each sub-aperture's window that is used. Default: all.
     psf, score : PSF, FixedWeights, optional
         For the estimators that need them. Default PSF: that of a flat wavefront, or with a laser that of the
         profile learnt.
@@ -65,41 +73,82 @@ class Method(Options, table="method"):
     Raises
     ------
     InputError
-        For an empty label, an unknown control, a gain, window or scale out of range.
+        For an empty label, an unknown variant or control, a gain, window or scale out of range.
 
     Examples
     --------
     >>> import faintspot as fs
     >>> from faintspot.loop.simulation import Method
     >>> method = Method("a window, less gain", fs.Settings("window"), gain=0.4)
-    >>> method.control, method.gain
-    ('integrator', 0.4)
+    >>> method.name, method.control, method.gain
+    ('window', 'integrator', 0.4)
+    >>> Method.named("ml+weighted+kalman").label
+    'maximum likelihood, weighted reconstructor, Kalman filter'
     """
 
     label: str = setting(REQUIRED, kind=TEXT)
     settings: Settings = setting(REQUIRED, check=_checked_settings)
     gain: float | None = number(None, 0, 2)
-    window_pixels: int | None = number(None, 2, 64, whole=True)
-    weighted_reconstructor: bool = False
-    predict_prior: bool = False
-    correct_gain: bool = True
-    true_slopes: bool = False
+    variants: tuple[str, ...] = setting((), kind=TEXTS, choices=tuple(VARIANTS))
     control: str = setting(INTEGRATOR, choices=tuple(CONTROLS))
     noise_scale: float = number(1.0, 0, 100, low_open=True)
-    matched_weights: bool = False
-    follows_profile: bool = False
+    window_pixels: int | None = number(None, 2, 64, whole=True)
     psf: PSF | None = None
     score: FixedWeights | None = None
+
+    @classmethod
+    def named(cls, name: str) -> Method:
+        """Return a method by its name, with automatic options of its estimator.
+
+        The name is that of an estimator, of variants and of control, joined by "+": "ml+weighted+kalman".
+        With the Kalman filter, estimators that take a prior are given its prediction.
+
+        Raises
+        ------
+        InputError
+            For an unknown estimator, variant or control, or one that does not suit the estimator.
+        """
+        first, *parts = name.split("+")
+        kind = estimator_named(first)
+        parts = [one_of(f"method {name!r}", part, [*VARIANTS, *CONTROLS]) for part in parts]
+        variants, control = {part for part in parts if part in VARIANTS}, INTEGRATOR
+        if parts and parts[-1] in CONTROLS:
+            control = parts.pop()
+        if len(variants) != len(parts):
+            raise InputError(f"method = {name!r}: expected the control once, at the end")
+        if PREDICTED in variants and not kind.takes_prior:
+            raise InputError(f"method = {name!r}: expected an estimator that takes a prior, got {first!r}")
+        if FILTER in variants and kind is not Window:
+            raise InputError(f"method = {name!r}: expected estimator {Window.name!r} for {FILTER!r}")
+        if control == KALMAN and kind.takes_prior:
+            variants.add(PREDICTED)
+        ordered = tuple(variant for variant in VARIANTS if variant in variants)
+        words = [kind.label, *(VARIANTS[variant] for variant in ordered)]
+        words += [] if control == INTEGRATOR else [CONTROLS[control]]
+        automatic = {option: AUTO for option, declared in kind.declared().items() if declared.automatic}
+        return cls(", ".join(words), Settings(kind(**automatic)), variants=ordered, control=control)
+
+    @property
+    def name(self) -> str:
+        """Name in commands and results, of which `named` makes the method."""
+        implied = PREDICTED if self.control == KALMAN else ""
+        variants = [variant for variant in self.variants if variant != implied]
+        return "+".join([self.estimator.name, *variants, *([self.control] * (self.control != INTEGRATOR))])
+
+    @property
+    def is_predicted(self) -> bool:
+        """Whether the loop's prediction is given to estimators that take a prior."""
+        return PREDICTED in self.variants
+
+    @property
+    def corrects_gain(self) -> bool:
+        """Whether slopes are divided by their centroid gain, which those near a prediction do not have."""
+        return not {PREDICTED, UNCORRECTED} & set(self.variants)
 
     @property
     def estimator(self) -> Estimator:
         """The estimator with its options."""
         return self.settings.estimator
-
-    @property
-    def name(self) -> str:
-        """Name of the estimator."""
-        return self.estimator.name
 
     @property
     def parts(self) -> dict[str, Any]:
@@ -109,7 +158,7 @@ class Method(Options, table="method"):
     @property
     def has_prior(self) -> bool:
         """Whether the estimator uses the controller's prediction as its prior."""
-        has = self.predict_prior and PRIOR in self.settings.declared() and not self.true_slopes
+        has = self.is_predicted and PRIOR in self.settings.declared() and TRUE not in self.variants
         return has and getattr(self.settings, PRIOR) is not None
 
     def prior_std_px(self, slopes: int) -> NDArray[np.float64] | None:

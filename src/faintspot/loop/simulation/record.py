@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.npz import NpzFile
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,7 +20,7 @@ class LoopRecord(NpzFile):
     """One run of `simulate_loop`, n sub-apertures and m commands."""
 
     WHAT: ClassVar[str] = "a record of a loop"
-    FORMAT: ClassVar[int] = 3
+    FORMAT: ClassVar[int] = 4
 
     slopes_px: NDArray[np.float32]
     """(frames, 2 n): all x, then all y, from the reference, before division by a centroid gain."""
@@ -54,19 +56,15 @@ class LoopRecord(NpzFile):
     """(n, 2): row and column of each sub-aperture in the lenslet array."""
     illumination: NDArray[np.float64]
     """(n,): illuminated fraction of each sub-aperture."""
-    frame_rate_hz: float
-    delay_frames: int
-    """The command computed from frame k acted first during frame k + delay_frames."""
-    settle_frames: int
-    closed: bool
-    """Whether the sensor saw the mirror."""
-    subaperture_m: float
-    pixel_scale_rad: float
-    wavelength_m: float
     configuration: str
     """Configuration as TOML."""
     seed: int
     realisation: int
+
+    @cached_property
+    def loop(self) -> LoopConfiguration:
+        """Configuration of the run."""
+        return LoopConfiguration.from_text(self.configuration)
 
     @property
     def frames(self) -> int:
@@ -76,7 +74,7 @@ class LoopRecord(NpzFile):
     @property
     def scored(self) -> NDArray[np.bool_]:
         """(frames,): whether a frame comes after settling."""
-        return np.arange(self.frames) >= self.settle_frames
+        return np.arange(self.frames) >= self.loop.run.settle_frames
 
     def mean_strehl(self, method: int = 0) -> float:
         """Return the long-exposure Strehl ratio of a method: the mean of its frames after settling.
@@ -88,7 +86,8 @@ class LoopRecord(NpzFile):
         """
         chosen = self.scored & (self.method == method)
         if not chosen.any():
-            raise InputError(f"method = {method}: no frame after the {self.settle_frames} settling ones")
+            settling = self.loop.run.settle_frames
+            raise InputError(f"method = {method}: no frame after the {settling} settling ones")
         return float(self.strehl[chosen].mean())
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,10 +14,10 @@ from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import INTEGRATOR, CommandDelayLine
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.configuration.sections import CLOSED, RunLength
+from faintspot.loop.simulation.configuration.sections import RunLength
 from faintspot.loop.simulation.control import make_controller
 from faintspot.loop.simulation.disabled_errors import DisabledErrors
-from faintspot.loop.simulation.methods import Method
+from faintspot.loop.simulation.methods import TRUE, Method
 from faintspot.loop.simulation.record import LoopRecord
 from faintspot.loop.simulation.telescope.calibration import (
     centroid_gain,
@@ -172,13 +172,16 @@ class _Loop:
         self.line = CommandDelayLine(optics.mirror.commands, configuration.control.delay_frames)
         self.controllers = [make_controller(configuration, optics, *pair, self.line) for pair in ready]
         frames, n = len(schedule), len(optics.sensor.layout)
-        self.slopes = np.zeros((frames, 2 * n), np.float32)
-        self.valid = np.zeros((frames, n), np.bool_)
-        self.errors = np.zeros((frames, 2 * n), np.float32)
-        self.covariances = np.zeros((frames, n), np.float32)
-        self.commands = np.zeros((frames, optics.mirror.commands), np.float32)
-        self.truth = np.zeros((3, frames))
-        self.zernike = np.zeros((frames, 10), np.float32)
+        self.rows: dict[str, Any] = {
+            "slopes_px": np.zeros((frames, 2 * n), np.float32),
+            "valid": np.zeros((frames, n), np.bool_),
+            "standard_error_px": np.zeros((frames, 2 * n), np.float32),
+            "covariance_xy_px2": np.zeros((frames, n), np.float32),
+            "commands": np.zeros((frames, optics.mirror.commands), np.float32),
+            "zernike_nm": np.zeros((frames, 10), np.float32),
+            **{name: np.zeros(frames) for name in ("strehl", "residual_nm", "r0_m")},
+        }
+        """Values of each frame, by their names in `LoopRecord`."""
         self.regression = np.zeros((2, len(methods)))
 
     def _first_flux(self, pipeline: SlopePipeline) -> MeanFlux | None:
@@ -208,8 +211,8 @@ class _Loop:
             realisation=self.realisation,
             detector=self.telescope_model.detector,
         )
-        gains = np.where([method.true_slopes for method in self.methods], 1.0, gains)
-        divisors = np.where([method.correct_gain for method in self.methods], gains, 1.0)
+        gains = np.where([TRUE in method.variants for method in self.methods], 1.0, gains)
+        divisors = np.where([method.corrects_gain for method in self.methods], gains, 1.0)
         for number, learnt in enumerate(self.learnt):
             if learnt is not None:  # from its telemetry, as at a telescope
                 divisors[number] = learnt.centroid_gain
@@ -238,23 +241,32 @@ class _Loop:
         if self.laser is not None:
             vector = self.laser.low_orders.merged(self.first_frame + frame, wavefront, vector, slopes.flags)
         self.controllers[number].update(vector, error.astype(np.float64) * per_px, covariance * per_px**2)
-        self.slopes[frame], self.errors[frame] = slopes.vector, error
-        self.covariances[frame] = slopes.covariance_xy
-        self.valid[frame], self.commands[frame] = slopes.valid, commands
+        self._note(
+            frame,
+            slopes_px=slopes.vector,
+            valid=slopes.valid,
+            standard_error_px=error,
+            covariance_xy_px2=slopes.covariance_xy,
+            commands=commands,
+        )
 
     def _observe(self, frame: int, time: float, wavefront: NDArray[np.float32]) -> None:
         """Record the true values."""
-        truth = self.telescope_model.truth(time, wavefront)
-        self.truth[:, frame] = truth.strehl, truth.rms_nm, truth.r0_m
-        self.zernike[frame] = self.optics.pupil.zernike(wavefront)
+        truth, zernike = self.telescope_model.truth(time, wavefront), self.optics.pupil.zernike(wavefront)
+        true = {"strehl": truth.strehl, "residual_nm": truth.rms_nm, "r0_m": truth.r0_m}
+        self._note(frame, zernike_nm=zernike, **true)
+
+    def _note(self, frame: int, **values: ArrayLike) -> None:
+        for name, value in values.items():
+            self.rows[name][frame] = value
 
     def _measure(self, frame: int, wavefront: NDArray[np.float32]) -> Slopes:
         """Measure the slopes of the camera's frame."""
         number, sensor = int(self.schedule[frame]), self.optics.sensor
-        if self.methods[number].true_slopes:
+        if TRUE in self.methods[number].variants:
             return _true_slopes(sensor.mean_slopes_px(wavefront))
         prior = None
-        if self.methods[number].predict_prior:
+        if self.methods[number].is_predicted:
             prior = self.controllers[number].expected().mean_px
         pixels = self.telescope_model.frame(self.first_frame + frame, wavefront)
         slopes = self.pipelines[number](pixels, prior)
@@ -278,34 +290,18 @@ class _Loop:
 
     def record(self) -> LoopRecord:
         """Return the record of the run."""
-        configuration, sensor = self.configuration, self.optics.sensor
-        strehl, residual, r0 = self.truth
+        sensor = self.optics.sensor
         return LoopRecord(
-            slopes_px=self.slopes,
-            valid=self.valid,
-            standard_error_px=self.errors,
-            covariance_xy_px2=self.covariances,
-            commands=self.commands,
-            strehl=strehl,
-            residual_nm=residual,
-            zernike_nm=self.zernike,
-            r0_m=r0,
+            **self.rows,
             method=self.schedule.astype(np.int8),
             interaction_matrix=self.optics.interaction,
             centroid_gain=self.gains,
-            corrected=np.array([method.correct_gain for method in self.methods]),
+            corrected=np.array([method.corrects_gain for method in self.methods]),
             labels=tuple(method.label for method in self.methods),
             method_settings=tuple(to_text(method.settings) for method in self.methods),
             cells=sensor.layout.cells,
             illumination=sensor.illumination,
-            frame_rate_hz=configuration.control.frame_rate_hz,
-            delay_frames=configuration.control.delay_frames,
-            settle_frames=configuration.run.settle_frames,
-            closed=configuration.control.mode == CLOSED,
-            subaperture_m=configuration.subaperture_m,
-            pixel_scale_rad=configuration.pixel_scale_rad,
-            wavelength_m=configuration.sensor.wavelength_m,
-            configuration=configuration.to_text(),
+            configuration=self.configuration.to_text(),
             seed=self.seed,
             realisation=self.realisation,
         )

@@ -73,12 +73,19 @@ class LoopReport:
     turbulence: Identified | None = None
     spectra: ModalSpectra | None = None
     choices: list[ControlChoice] = field(default_factory=list)
-    advice: str = ""
-    """Recommendation in one sentence; empty if no control was compared."""
     delay: LoopDelay | None = None
     """Delay and centroid gain that were measured and are used."""
     observed: ObservedLoop | None = None
     """From which a controller can be learnt; None if delay or turbulence are unknown."""
+
+    @property
+    def advice(self) -> str:
+        """Recommendation in one sentence; empty if no control was compared."""
+        if not self.choices:
+            return ""
+        from faintspot.loop.telemetry.choices import advice  # with all filters
+
+        return advice(self.choices)
 
     def as_values(self) -> dict[str, Any]:
         """Return the report as plain values, for JSON; null is not known."""
@@ -366,7 +373,7 @@ def _choices(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> None:
     if loop.interaction_matrix is None:
         part.missing = "The recording has no interaction or control matrix: no mirror can be replayed."
         return
-    from faintspot.loop.telemetry.choices import advice, compared_choices  # with all filters
+    from faintspot.loop.telemetry.choices import compared_choices  # with all filters
 
     turbulence = report.parts["turbulence"].values
     r0 = next((value for value in turbulence if value.name == R0), Measured(R0, "m"))
@@ -374,8 +381,6 @@ def _choices(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> None:
         report.choices = compared_choices(loop, open_loop, delay, site_of_loop(loop), r0, report.turbulence)
     except InputError as error:
         part.missing = str(error)
-        return
-    report.advice = advice(report.choices)
 
 
 def _rounded(values: Floats) -> list[float]:

@@ -8,7 +8,7 @@ from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.base.errors import InputError
-from faintspot.experiments.closed_loop.methods import default_methods, method_kind
+from faintspot.experiments.closed_loop.methods import default_methods, tuned_values, with_choice
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.engine_files import write_engine_files
 from faintspot.loop.simulation.telescope.laser import (
@@ -112,8 +112,8 @@ def test_a_natural_star_gives_tip_tilt_and_slow_focus() -> None:
 ML = fs.Settings("ml", search_range_px=2.0)
 METHODS = [
     Method("window", fs.Settings("window")),
-    Method("filter", fs.Settings("window"), matched_weights=True),
-    Method("ml, followed", ML, follows_profile=True),
+    Method("filter", fs.Settings("window"), variants=("filter",)),
+    Method("ml, followed", ML, variants=("followed",)),
 ]
 
 
@@ -144,16 +144,15 @@ def test_the_followed_profile_is_that_of_later_frames(source: LaserSource) -> No
 
 def test_methods_by_name() -> None:
     for name in default_methods(LOOP):
-        assert method_kind(name).name == name
-    kind = method_kind("window_filter_followed")
-    choice = {name: each.first[0] for name, each in kind.tuned(LOOP).items()}
-    method = kind.method(LOOP, choice)
-    assert method.matched_weights
-    assert method.follows_profile
+        assert Method.named(name).name == name
+    kind = Method.named("window+filter+followed")
+    choice = {name: each.first[0] for name, each in tuned_values(kind, LOOP).items()}
+    method = with_choice(kind, LOOP, choice)
+    assert method.variants == ("filter", "followed")
     with pytest.raises(InputError, match="expected a configuration with a laser"):
-        kind.method(LoopConfiguration(), choice)
+        with_choice(kind, LoopConfiguration(), choice)
     with pytest.raises(InputError, match="expected estimator 'window'"):
-        method_kind("ml_filter")
+        Method.named("ml+filter")
 
 
 def test_text_and_shipped_configuration() -> None:

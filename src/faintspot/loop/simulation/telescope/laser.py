@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from faintspot.base.checks import not_none
 from faintspot.loop.control.removed_modes import TIP_TILT, RemovedModes
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.methods import Method
-from faintspot.loop.simulation.telescope.wavefront_sensor import ShackHartmann
+from faintspot.loop.simulation.methods import FILTER, FOLLOWED, Method
+from faintspot.loop.simulation.telescope.wavefront_sensor import ImageAxis, ShackHartmann
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.fixed_weights import FixedWeights
@@ -55,7 +55,7 @@ def laser_guide_star(
 
 @dataclass(frozen=True, eq=False)
 class ElongatedShackHartmann(ShackHartmann):
-    """Lenslets that see a laser guide star; `row_pixels` and `column_pixels` lead to fine nodes of an image.
+    """Lenslets that see a laser guide star; its axes lead to fine nodes of an image.
 
     The image of a point at the focus is taken on nodes within its unaliased field, and convolved with the
     image of the sodium layer, which has the beam's width and is integrated over the pixels.
@@ -151,7 +151,8 @@ def _with_nodes(configuration: LoopConfiguration, sensor: ShackHartmann) -> Shac
     square = np.sinc(angle / samples) / samples
     transform = (np.exp(-2j * np.pi * np.outer(angle, line)) * square[:, None]).astype(np.complex64)
     weights = np.eye(len(angle), dtype=np.float32) / np.float32(width * _NODES)
-    return replace(sensor, rows=transform, columns=transform, row_pixels=weights, column_pixels=weights)
+    axis = ImageAxis(transform, weights)
+    return replace(sensor, image_y=axis, image_x=axis)
 
 
 def _terms(
@@ -266,7 +267,7 @@ def with_spots(sodium: KnownSodium, configuration: LoopConfiguration, method: Me
     """Return a method that knows the spots."""
     pixels = method.window_pixels or configuration.sensor.pixels
     psf, scene = sodium.psf((pixels, pixels)), configuration.scene
-    if not method.matched_weights:
+    if FILTER not in method.variants:
         return replace(method, psf=psf)
     weights = FixedWeights.matched(
         psf,
@@ -379,7 +380,7 @@ class LaserRun:
         self._followed = {
             number: FollowedSodium(configuration, layout, known)
             for number, method in enumerate(methods)
-            if method.follows_profile
+            if FOLLOWED in method.variants
         }
 
     def follow(self, number: int, frame_adu: NDArray[np.generic], slopes_px: Floats) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,15 @@ from faintspot.loop.simulation.telescope.pupil import PupilAmplitude
 from faintspot.slopes.sensor.layout import Layout
 
 Floats = NDArray[np.float32]
+
+
+class ImageAxis(NamedTuple):
+    """One axis of a lenslet's image."""
+
+    transform: NDArray[np.complex64]
+    """Fourier transform to samples of the image, (image samples, samples)."""
+    to_pixels: Floats
+    """From image samples to pixels, (pixels, image samples)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +43,8 @@ class ShackHartmann:
     wavelength_m: float
     px_per_nm: float
     """Displacement of a spot [px] for a tilt of 1 nm across the sub-aperture."""
-    rows: NDArray[np.complex64]
-    columns: NDArray[np.complex64]
-    """Fourier transforms along y and x, (image samples, samples)."""
-    row_pixels: Floats
-    column_pixels: Floats
-    """From image samples to pixels, (pixels, image samples)."""
-
+    image_y: ImageAxis
+    image_x: ImageAxis
     points: int
     """Number of points across the pupil."""
 
@@ -66,9 +70,9 @@ class ShackHartmann:
         if displacement_px:
             phase += self._tilt(displacement_px)
         phase, lit = (np.ascontiguousarray(part.transpose(1, 2, 0)) for part in (phase, self.amplitude))
-        amplitude = _both_axes(self.rows, _field(phase, lit), self.columns)
+        amplitude = _both_axes(self.image_y.transform, _field(phase, lit), self.image_x.transform)
         intensity = amplitude.real**2 + amplitude.imag**2
-        images = _both_axes(self.row_pixels, intensity, self.column_pixels)
+        images = _both_axes(self.image_y.to_pixels, intensity, self.image_x.to_pixels)
         return np.ascontiguousarray(images.transpose(2, 0, 1))
 
     def frame(self, spots: Floats) -> NDArray[np.float64]:
@@ -121,26 +125,20 @@ def make_sensor(configuration: LoopConfiguration, pupil: PupilAmplitude) -> Shac
         )
     layout = Layout((across * pixels,) * 2, (pixels, pixels), cells * pixels, cells=cells, pitch_px=pixels)
     width = configuration.spot_width_px
-    along_y = _image_axis(pixels, width, samples, 0.0)
-    along_x = _image_axis(pixels, width, samples, blur_px(configuration))
     return ShackHartmann(
         layout,
         illumination[cells[:, 0], cells[:, 1]],
         np.ascontiguousarray(squares[cells[:, 0], cells[:, 1]], np.float32),
         sensor.wavelength_m,
         1e-9 / configuration.subaperture_m / configuration.pixel_scale_rad,
-        along_y[0],
-        along_x[0],
-        along_y[1],
-        along_x[1],
+        _image_axis(pixels, width, samples, 0.0),
+        _image_axis(pixels, width, samples, blur_px(configuration)),
         across * samples,
     )
 
 
-def _image_axis(
-    pixels: int, width_px: float, samples: int, blur_px: float
-) -> tuple[NDArray[np.complex64], Floats]:
-    """Return one axis's Fourier transform to samples of the image, and from these to pixels.
+def _image_axis(pixels: int, width_px: float, samples: int, blur_px: float) -> ImageAxis:
+    """Return one axis of an image.
 
     Gauss-Legendre samples in each pixel; with a blur, pixels beside the window shine into it.
     """
@@ -161,7 +159,7 @@ def _image_axis(
         to_pixels = np.diff(ndtr(edges), axis=0) * weight
     else:
         to_pixels = np.where(np.abs(samples_px - window[:, None]) < 0.5, weight, 0.0)
-    return transform.astype(np.complex64), to_pixels.astype(np.float32)
+    return ImageAxis(transform.astype(np.complex64), to_pixels.astype(np.float32))
 
 
 def _field(phase: Floats, amplitude: Floats) -> NDArray[np.complex64]:
