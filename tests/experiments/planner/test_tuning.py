@@ -12,6 +12,7 @@ from tests.experiments.planner_cases import CAMERA, QUICK, answered
 from faintspot.base.errors import InputError
 from faintspot.experiments import Question, tune
 from faintspot.experiments.methods import method_for_scene
+from faintspot.experiments.planner.question import Recorded
 from faintspot.experiments.planner.simulated import SPOTS_PER_FRAME, SimulatedSpots
 from faintspot.experiments.planner.tuning import _bound, _error_scale, _ranked
 from faintspot.slopes.estimators import Estimator, Scene, estimators, registry
@@ -36,7 +37,7 @@ def test_errors_are_near_the_bound_where_the_spot_is_known() -> None:
 
 def test_the_bound_is_the_mean_over_sub_apertures_that_differ_in_flux() -> None:
     question = Question(**CAMERA)
-    shared = dataclasses.replace(question, relative_flux=np.repeat([0.5, 1.5], 50))
+    shared = dataclasses.replace(question, recorded=Recorded(relative_flux=np.repeat([0.5, 1.5], 50)))
     of_half, whole, of_more = (_bound(question, np.array([flux]))[0] for flux in (100.0, 200.0, 300.0))
     # Nine quantiles: four or five of each half, or one between them.
     assert _bound(shared, np.array([200.0]))[0] == pytest.approx((of_half + of_more) / 2, rel=0.06)
@@ -58,7 +59,7 @@ def test_stated_errors_are_scaled_to_the_actual_ones() -> None:
 def test_spots_are_exposed_and_measured_in_photo_electrons() -> None:
     """EM gain and background are the camera's; values tried together are each measured as one alone."""
     camera = {**CAMERA, "read_noise_e": 60.0, "em_gain": 20.0, "background_e": 2.0}
-    question = Question(**camera, relative_flux=np.array([0.5, 1.5]))
+    question = Question(**camera, recorded=Recorded(relative_flux=np.array([0.5, 1.5])))
     spots = SimulatedSpots.of(question, 256, np.random.default_rng(1))
     _, scored = spots.exposed(300.0, np.random.default_rng(2))
     assert scored.truth.shape == (4, SPOTS_PER_FRAME, 2)

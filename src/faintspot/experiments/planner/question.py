@@ -50,11 +50,11 @@ def default_search_range_px(fwhm_px: float) -> float:
 class Recorded:
     """What recorded frames tell beside camera and spots."""
 
-    frames: NDArray[Any] | None
+    frames: NDArray[Any] | None = None
     """(n_frames, h, w) ADU, not used for the values of the question, on which promised errors are checked;
     None of a single frame."""
-    whole_layout: Layout
-    """Layout to write; that of the question lacks sub-apertures that the recording shows no spots in."""
+    whole_layout: Layout | None = None
+    """Layout to write, where that of the question lacks sub-apertures in which no spots were seen."""
     relative_flux: NDArray[np.float64] | None = None
     """(n,): flux of sub-apertures in units of their mean; None: all have the same."""
     flux_is_measured: bool = False
@@ -240,7 +240,8 @@ class Question(StarLight, StatedOptics, StatedCamera):
     @property
     def whole_layout(self) -> Layout | None:
         """Layout to write."""
-        return self.layout if self.recorded is None else self.recorded.whole_layout
+        whole = None if self.recorded is None else self.recorded.whole_layout
+        return self.layout if whole is None else whole
 
     @property
     def budget_px(self) -> float | None:
