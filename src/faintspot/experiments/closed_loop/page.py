@@ -13,8 +13,8 @@ from faintspot.base.statistics import paired_mean
 from faintspot.experiments.closed_loop.results import MagnitudeResult, differences_by_flux
 from faintspot.experiments.closed_loop.tables import budget_table, gain_table, settings_table, strehl_table
 from faintspot.experiments.closed_loop.verdict import LoopResults, loop_verdict, reference_methods
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.control.base import split_control
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.slopes.estimators.base import Style
 from faintspot.slopes.estimators.registry import estimators
 
