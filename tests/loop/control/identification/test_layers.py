@@ -8,7 +8,7 @@ from tests.loop.control.frozen_flow import frozen_slopes
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.layers import Identification, Identified
-from faintspot.loop.control.identification.vibrations import mode_shapes
+from faintspot.loop.control.identification.vibrations import Vibration, mode_shapes
 
 RATE_HZ = 250.0
 CELLS = np.array([[row, column] for row in range(5) for column in range(5)], np.float64)
@@ -152,3 +152,27 @@ def test_too_little_is_refused() -> None:
     unmeasured = replace(telemetry, variance_px2=np.full(telemetry.variance_px2.shape, np.inf))
     with pytest.raises(InputError, match="measured in half of the frames, got none"):
         Identification(unmeasured, UNKNOWN, RATE_HZ)
+
+
+@pytest.mark.slow
+def test_waves_between_the_subapertures_are_no_vibration() -> None:
+    """Winds are fitted to 40 of 80 sub-apertures, every other column: there alone a wave is tip."""
+    cells = np.argwhere(np.ones((10, 8)))
+    column, time_s = cells[:, 1] - 3.5, np.arange(1500) / RATE_HZ
+    wave = np.cos(np.pi * (column - 0.5)) + 4 / 42 * column  # without tip and focus
+    slopes = 0.1 * np.random.default_rng(4).standard_normal((1500, 160))
+    slopes[:, :80] += 0.3 * wave * np.sin(2 * np.pi * 16.0 * time_s)[:, None]
+    site, winds = (
+        replace(UNKNOWN, positions_m=np.asarray(0.6 * cells[:, ::-1], np.float64)),
+        np.array([[9.0, 0.0]]),
+    )
+
+    def found() -> tuple[Vibration, ...]:
+        telemetry = OpenLoopTelemetry(slopes, np.full(slopes.shape, 0.01), np.ones(slopes.shape))
+        return Identification(telemetry, site, RATE_HZ, [1.0]).of_winds(winds).vibrations
+
+    assert found() == ()
+    slopes[:, :80] += 0.1 * np.sin(2 * np.pi * 31.0 * time_s)[:, None]
+    (line,) = found()
+    assert line.mode == "tip"
+    assert line.frequency_hz == pytest.approx(31.0, abs=0.1)

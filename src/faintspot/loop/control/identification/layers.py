@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -225,8 +226,8 @@ class Identification:
         averaged: Sequence[float] = AVERAGED,
     ) -> None:
         self._site, self._rate_hz, self._averaged = site, rate_hz, tuple(averaged)
-        records = SlopeRecords.of(telemetry, site)
-        self._vibrations = find_vibrations(records.modes(), rate_hz, records.slopes.shape[1])
+        records, whole = SlopeRecords.of(telemetry, site), SlopeRecords.of(telemetry, site, sys.maxsize)
+        self._vibrations = find_vibrations(whole.modes(), rate_hz, whole.slopes.shape[1])
         self._likelihood = LayerLikelihood(records, rate_hz, self._vibrations)
         self._records = records
         self._anywhere: dict[float, tuple[LayerLikelihood, Layers]] = {}

@@ -44,8 +44,19 @@ class SlopeRecords:
     """(frames,): whether most of the slopes were measured."""
 
     @classmethod
-    def of(cls, telemetry: OpenLoopTelemetry, site: SlopeTurbulence) -> SlopeRecords:
+    def of(
+        cls, telemetry: OpenLoopTelemetry, site: SlopeTurbulence, most: int = _MOST_SUBAPERTURES
+    ) -> SlopeRecords:
         """Prepare telemetry of a sensor.
+
+        Parameters
+        ----------
+        telemetry : OpenLoopTelemetry
+        site : SlopeTurbulence
+        most : int
+            Largest number of sub-apertures; of more, some are left out evenly. A model that knows which ones
+            these are can do without the others. Sums over those alone are no modes of the sensor: waves
+            as long as their distance add up.
 
         Raises
         ------
@@ -60,7 +71,7 @@ class SlopeRecords:
         enough = measured.mean(axis=0).reshape(2, n).min(axis=0) >= _LEAST_MEASURED
         if not enough.any():
             raise InputError("telemetry: expected slopes that were measured in half of the frames, got none")
-        kept = np.flatnonzero(enough)[:: math.ceil(np.count_nonzero(enough) / _MOST_SUBAPERTURES)]
+        kept = np.flatnonzero(enough)[:: math.ceil(np.count_nonzero(enough) / most)]
         columns = np.concatenate([kept, kept + n])
         slopes = interpolated(telemetry.open_loop_px[:, columns], measured[:, columns])
         counted = np.where(measured[:, columns], variance[:, columns], np.nan)
