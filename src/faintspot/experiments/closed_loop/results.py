@@ -14,7 +14,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.npz import NpzFile
 from faintspot.base.report.texts import with_error
 from faintspot.base.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
-from faintspot.experiments.curves import crossings
+from faintspot.experiments.crossings import crossings
 
 Floats = NDArray[np.float64]
 
