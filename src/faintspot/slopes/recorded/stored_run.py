@@ -44,13 +44,19 @@ class StoredRun:
     layout: Layout | None = None
     settings: Settings | None = None
     calibration: Calibration | None = None
-    psf: PSF | None = None
-    score: FixedWeights | None = None
+    spot: dict[str, Any] = field(default_factory=dict)
+    """PSF and score, as for `SlopePipeline`; None where there are none."""
     laser: LaserSpots | None = None
     lost: list[str] = field(default_factory=list)
     """Optional parts of a pipeline: a PSF or a score, whose file may be missing."""
-    about_reference: str = ""
-    """Note about the terms that its slopes lack, as their reference was fitted to a frame."""
+
+    @property
+    def about_reference(self) -> str:
+        """Note about the terms that its slopes lack, as their reference was fitted to a frame."""
+        if self.layout is None or not self.layout.fitted or "reference" in self.stored.attributes:
+            return ""
+        text = reference_in_words(self.layout.fitted)
+        return f"{text[0].upper()}{text[1:]}."
 
     @property
     def estimator(self) -> Estimator | None:
@@ -96,9 +102,7 @@ class StoredRun:
         if estimator is not None:
             settings = settings.replace(estimator=estimator)
         try:
-            return SlopePipeline(
-                self.layout, settings, self.calibration, reference, psf=self.psf, score=self.score
-            )
+            return SlopePipeline(self.layout, settings, self.calibration, reference, **self.spot)
         except InputError as error:
             raise InputError("; ".join(self.lost) or str(error)) from None
 
@@ -121,9 +125,7 @@ def open_run(path: Path, *, layout_only: bool = False) -> StoredRun:
     if store.layout is not None and store.layout.doubts:
         doubts = "; ".join(store.layout.doubts)
         store.notes.append(f"The layout of {path.name} was doubtful: {doubts}.")
-    if store.layout is not None and store.layout.fitted and "reference" not in stored.attributes:
-        text = reference_in_words(store.layout.fitted)
-        store.about_reference = f"{text[0].upper()}{text[1:]}."
+    if store.about_reference:
         store.notes.append(store.about_reference)
     n = stored.variables["x"].shape[1]
     if store.layout is not None and len(store.layout) != n:
@@ -149,8 +151,8 @@ def _rebuild(store: StoredRun, layout_only: bool) -> None:
         store.calibration = _original_calibration(store, table)
     else:
         store.calibration = stored.calibration
-    store.psf = _of_the_spot(store, "psf", PSF.load)
-    store.score = _of_the_spot(store, "score", FixedWeights.load)
+    loaders = {"psf": PSF.load, "score": FixedWeights.load}
+    store.spot = {part: _of_the_spot(store, part, load) for part, load in loaders.items()}
     store.laser = _of_the_spot(store, "laser", lambda path: configuration.Configuration(path).laser)
 
 

@@ -43,21 +43,10 @@ class Wavefront(OfLength):
     """Coefficients, (n_frames, k): rms over the disk, as each mode has mean square 1; NaN if not `fitted`."""
     standard_errors: Floats
     """Standard errors of the coefficients from the slopes' noise, (n_frames, k); NaN if unknown."""
-    errors_from: str
-    """Source of the errors: "slopes" (their standard errors) or "residuals" (their scatter about the fitted
-    modes, which counts modes that are not fitted as noise)."""
     residual_px: Floats
     """Rms of the slopes about the fitted modes, px per axis, (n_frames,)."""
-    unit: str
-    """Unit: one of `units.UNITS`, or "px × sub-aperture" (slopes in pixels, lengths in sub-apertures)."""
-    pupil: Pupil
     condition: float
     """Condition number of the fit with every sub-aperture that is ever valid."""
-    left_out: str = ""
-    """Line about the slopes that were left out; empty if there are none."""
-    wavelength_nm: float | None = None
-    """Length of a wave, for the unit "waves"."""
-
     other_standard_error: Floats | None = None
     """Standard error of a mean wavefront that was subtracted, (k,)."""
 
@@ -190,12 +179,12 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
         np.arange(2, 2 + gradients.shape[1]),
         scale * coefficients,
         scale * standard_errors,
-        "slopes" if has_errors else "residuals",
         residual,
-        unit,
-        pupil,
         condition,
-        left_out,
+        unit=unit,
+        pupil=pupil,
+        errors_from="slopes" if has_errors else "residuals",
+        left_out=left_out,
     )
 
 

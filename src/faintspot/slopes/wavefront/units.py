@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -19,11 +19,21 @@ POINTS = 201
 _NM_PER_ARCSEC_M = 1e9 * np.pi / (180 * 3600)
 
 
+@dataclass(frozen=True, kw_only=True)
 class OfLength:
-    """Base of dataclasses whose values are lengths along the light's path."""
+    """Base of fits whose values are lengths along the light's path."""
 
     unit: str
-    wavelength_nm: float | None
+    """Unit: one of `UNITS`, or "px × sub-aperture" (slopes in pixels, lengths in sub-apertures)."""
+    pupil: Pupil
+    errors_from: str
+    """Source of the standard errors: "frames" (the scatter over them), "slopes" (their standard errors) or
+    "residuals" (the slopes' scatter about the fit, which counts as noise what is not fitted)."""
+    left_out: str = ""
+    """Line about the slopes that were left out; empty if there are none."""
+    wavelength_nm: float | None = None
+    """Length of a wave, for the unit "waves"."""
+
     _amounts: ClassVar[tuple[str, ...]] = ()
     """Names of the fields in the unit."""
 

@@ -122,8 +122,6 @@ class ZonalMap(OfLength):
     """Standard error of each value relative to the mean of its part, (n,); NaN if unknown."""
     parts: NDArray[np.int64]
     """Number of the connected part, (n,), from 0, the largest first; -1 where there is none."""
-    errors_from: str
-    """Source of the errors: "frames" (their scatter), "slopes" (their standard errors) or "residuals"."""
     residual_px: float
     """Rms of the slopes about those of the map, px per axis."""
     sheet: Floats
@@ -132,11 +130,6 @@ class ZonalMap(OfLength):
     """Sub-aperture at each point of the map; -1 where there is none."""
     reach: float
     """Distance of the map's outermost points from the pupil's centre, in its radii."""
-    pupil: Pupil
-    unit: str
-    wavelength_nm: float | None = None
-    left_out: str = ""
-    """Line about the slopes that were left out; empty if there are none."""
 
     _amounts: ClassVar[tuple[str, ...]] = "values", "standard_errors", "sheet"
 
@@ -243,8 +236,19 @@ def zonal_map(slopes: Slopes, layout: Layout) -> ZonalMap:
         values[used] = grid.values(centres) @ surface
         sheet[inside] = grid.values(points[inside]) @ surface
     residual = float(np.sqrt(np.nanmean(squares)))
-    maps = scale * values, scale * errors, parts, measured.source, residual, scale * sheet
-    return ZonalMap(*maps, nearest, reach, pupil, unit, left_out=left_out)
+    return ZonalMap(
+        scale * values,
+        scale * errors,
+        parts,
+        residual,
+        scale * sheet,
+        nearest,
+        reach,
+        unit=unit,
+        pupil=pupil,
+        errors_from=measured.source,
+        left_out=left_out,
+    )
 
 
 @dataclass(frozen=True)
