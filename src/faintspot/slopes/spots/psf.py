@@ -138,18 +138,20 @@ class PSF(NpzFile):
         nodes = (n, side * _ANALYTIC_OVERSAMPLING, side * _ANALYTIC_OVERSAMPLING)
         check_size("psf.samples", nodes, hint="give a smaller radius_px")
         samples = np.empty(nodes)
-        # A spot displaced by a fraction of a pixel samples the nodes in between.
+        # Spots displaced by fractions of a pixel sample the nodes in between.
+        fractions = -step * np.arange(_ANALYTIC_OVERSAMPLING)
+        size_of, elongation_of, angle_of = (np.repeat(kind, _ANALYTIC_OVERSAMPLING) for kind in kinds)
         for row in range(_ANALYTIC_OVERSAMPLING):
-            for column in range(_ANALYTIC_OVERSAMPLING):
-                moved = np.broadcast_to([-column * step, -row * step], (n, 2))
-                samples[:, row::_ANALYTIC_OVERSAMPLING, column::_ANALYTIC_OVERSAMPLING] = spots(
-                    moved,
-                    shape=(side, side),
-                    profile=profile,
-                    size=kinds[0],
-                    elongation=kinds[1],
-                    angle_deg=kinds[2],
-                )
+            images = spots(
+                np.column_stack([np.tile(fractions, n), np.full(len(size_of), fractions[row])]),
+                shape=(side, side),
+                profile=profile,
+                size=size_of,
+                elongation=elongation_of,
+                angle_deg=angle_of,
+            )
+            between = images.reshape(n, _ANALYTIC_OVERSAMPLING, side, side).transpose(0, 2, 3, 1)
+            samples[:, row::_ANALYTIC_OVERSAMPLING] = between.reshape(n, side, -1)
         last = 1 - _ANALYTIC_OVERSAMPLING  # symmetric about the spot, with as many nodes on either side
         return cls(samples[:, :last, :last], _ANALYTIC_OVERSAMPLING, index)
 
