@@ -12,12 +12,7 @@ from faintspot.slopes.simulate import Detector, sensor_frames
 
 QUAD = Layout.grid((8, 8), pixels=2, outer_radius=4.2, inner_radius=1.0)
 
-
-@pytest.fixture(autouse=True)
-def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "faintspot.slopes.recorded.layout_picture.layout_picture", lambda frame, layout, path: None
-    )
+pytestmark = pytest.mark.usefixtures("no_picture")
 
 
 def save_frames(layout: Layout = QUAD) -> None:
