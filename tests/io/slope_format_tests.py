@@ -36,13 +36,8 @@ from faintspot.io.stored import slopes_writer, slopes_zarr
 CHANGED = {**result(), "x": result()["y"]}
 
 
-class SlopeFormatTests:
-    """Tests of a format of slopes; override the fixture `name` with a file's name."""
-
-    memory_limit_bytes = 14_000_000
-    """Blocks, chunks and buffers, of which a busy machine keeps some longer; 24 MB of slopes are written."""
-    texts = (".csv", ".plain")
-    """Endings of texts, for which measuring the memory takes too long."""
+class SlopeFile:
+    """A file of slopes; override the fixture `name` with its name."""
 
     @pytest.fixture
     def name(self) -> str:
@@ -66,11 +61,19 @@ class SlopeFormatTests:
         """A mark after every chunk."""
         monkeypatch.setattr(slopes_writer, "_MARK_SECONDS", 0.0)
 
+
+class SlopeFormatTests(SlopeFile):
+    """Tests of a format of slopes."""
+
+    memory_limit_bytes = 14_000_000
+    """Blocks, chunks and buffers, of which a busy machine keeps some longer; 24 MB of slopes are written."""
+    texts = (".csv", ".plain")
+    """Endings of texts, for which measuring the memory takes too long."""
+
     # Content ----------------------------------------------------------------------------------------
 
-    @pytest.mark.parametrize("step", [8, 10])
-    def test_gives_back_what_it_got(self, path: Path, step: int) -> None:
-        write(path, result(), step)
+    def test_gives_back_what_it_got(self, path: Path) -> None:
+        write(path, result(), 8)
         assert_alone(path, result())
 
     def test_equal_slopes_give_equal_files(self, path: Path, is_store: bool) -> None:
@@ -117,25 +120,9 @@ class SlopeFormatTests:
         finally:
             tracemalloc.stop()
 
-    @pytest.mark.parametrize("wrong", ["late", "shape", "missing", "many", "none"])
-    def test_wrong_blocks(self, path: Path, wrong: str) -> None:
-        whole = result()
-        start, block, text = {
-            "late": (3, part(whole, 3, 5), "starts at frame 0"),
-            "shape": (0, {**part(whole, 0, 5), "y": whole["y"][:4]}, "y: expected shape"),
-            "missing": (0, {"x": whole["x"]}, "expected x, y, flux"),
-            "many": (0, result(51), "1 to 50 more frames, got 51"),
-            "none": (0, part(whole, 0, 0), "got 0"),
-        }[wrong]
-        with writer_for(path) as writer:
-            with refused(text):
-                writer.append(start, block)
-            assert writer.finished() == 0
-
     # Interruptions ----------------------------------------------------------------------------------
 
-    @pytest.mark.parametrize("step", [8, 10])
-    def test_interrupted_and_resumed_is_the_same(self, path: Path, is_store: bool, step: int) -> None:
+    def test_interrupted_and_resumed_is_the_same(self, path: Path, is_store: bool) -> None:
         def interrupted() -> None:
             with writer_for(path) as writer:
                 writer.append(0, part(result(), 0, 13))
@@ -150,75 +137,7 @@ class SlopeFormatTests:
         assert (stored.complete, stored.n_finished) == (False, 13)
         np.testing.assert_array_equal(stored.variables["flux"], result()["flux"][:13])
         assert writer_for(path).finished() == 13
-        write(path, result(), step)
-        assert_alone(path, result())
-
-    @pytest.mark.usefixtures("all_marks")
-    def test_data_are_on_the_disk_before_the_mark(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Whatever has content when the mark is set has been synchronised since it was written."""
-        synchronise, replace = files.sync_file, files.replace_file
-        synchronised: dict[str, bytes] = {}
-        missing: list[Mapping[str, bytes]] = []
-        store = store_of(path).name
-
-        def sync_file(file: Path) -> None:
-            synchronised[str(file).replace(f".{store}.new", store)] = file.read_bytes()
-            synchronise(file)
-
-        def replace_file(file: Path, content: str) -> None:
-            chunks = [chunk for chunk in file.parent.rglob("c.*") if chunk.is_file()]
-            now = {str(chunk): chunk.read_bytes() for chunk in chunks}
-            missing.append({chunk: data for chunk, data in now.items() if synchronised.get(chunk) != data})
-            replace(file, content)
-
-        monkeypatch.setattr(slopes_zarr, "sync_file", sync_file)
-        monkeypatch.setattr(zarr_store, "sync_file", sync_file)
-        monkeypatch.setattr(zarr_store, "replace_file", replace_file)
-        write(path, result(), 10)
-        assert len(missing) >= 5
-        assert not any(missing)
-
-    @pytest.mark.usefixtures("all_marks")
-    @pytest.mark.parametrize("marks_before", [0, 1, 4])
-    def test_disk_full_at_a_mark(
-        self, path: Path, is_store: bool, marks_before: int, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """One line says so, and the run resumes after space is made."""
-        replace = files.replace_file
-        calls = 0
-
-        def full(file: Path, text: str) -> None:
-            nonlocal calls
-            calls += 1
-            if calls > marks_before:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            replace(file, text)
-
-        with monkeypatch.context() as patch, refused(path.name, "disk is full"):
-            patch.setattr(zarr_store, "replace_file", full)
-            write(path, result(), 10)
-        assert is_store or not path.exists()
-        write(path, result(), 10)
-        assert_alone(path, result())
-
-    @pytest.mark.usefixtures("all_marks")
-    def test_chunk_cannot_be_written(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        from zarr.storage import LocalStore
-
-        set_item = LocalStore.set
-
-        async def full(self: Any, key: str, value: Any, *rest: Any) -> None:
-            if key.startswith("iterations/c.2"):
-                raise OSError(errno.ENOSPC, "No space left on device")
-            await set_item(self, key, value, *rest)
-
-        with monkeypatch.context() as patch, refused(path.name, "disk is full"):
-            patch.setattr(LocalStore, "set", full)
-            write(path, result(), 10)
-        stored = read_slopes(store_of(path))
-        assert (stored.n_finished, stored.complete) == (20, False)
-        np.testing.assert_array_equal(stored.variables["iterations"], result()["iterations"][:20])
-        write(path, result(), 10)
+        write(path, result(), 8)
         assert_alone(path, result())
 
     def test_file_cannot_be_made(self, path: Path, is_store: bool, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,18 +179,6 @@ class SlopeFormatTests:
         else:
             assert writer_for(path).finished() == 50
             assert_alone(path, result())
-
-    def test_damaged_store(self, path: Path) -> None:
-        begin(path, 13)
-        shutil.rmtree(store_of(path) / "flux")
-        assert_refused(path, "damaged", "delete it", "flux")
-        (store_of(path) / "zarr.json").write_text("{")
-        assert_refused(path, "damaged data", "delete it")
-
-    def test_damaged_chunk_of_an_interrupted_run(self, path: Path) -> None:
-        begin(path, 13)
-        (store_of(path) / "y" / "c.1.0").write_bytes(b"")
-        assert_refused(path, "the store is damaged: y ")
 
     # Existing outputs -------------------------------------------------------------------------------
 
@@ -333,24 +240,6 @@ class SlopeFormatTests:
 
     # Other programs and damage ----------------------------------------------------------------------
 
-    def test_second_writer_is_refused(self, path: Path) -> None:
-        with writer_for(path) as writer:
-            writer.append(0, part(result(), 0, 20))
-            other_run = {"attributes": OTHER_RUN, "overwrite": True}
-            for changes in ({}, other_run, {"overwrite": True, "resume": False}):
-                assert_refused(path, path.name, f"is being written by process {os.getpid()}", **changes)
-            writer.append(20, part(result(), 20, 50))
-        assert_alone(path, result())
-
-    def test_closed_writer_takes_no_more(self, path: Path) -> None:
-        writer = writer_for(path)
-        writer.append(0, part(result(), 0, 20))
-        writer.close()
-        with refused("closed, expected no more frames, got frame 20"):
-            writer.append(20, part(result(), 20, 30))
-        write(path, result())
-        assert_alone(path, result())
-
     def test_one_wrong_bit_anywhere(self, path: Path, is_store: bool) -> None:
         """Refused, or the slopes that were written: blocks are filled up, and time stamps are not read."""
         if is_store or path.suffix not in (".npz", ".fits", ".gz"):
@@ -390,3 +279,120 @@ class SlopeFormatTests:
 
         monkeypatch.setattr(Path, "mkdir", refuse)
         assert_refused(path, "read-only", "choose another folder")
+
+
+class SlopeStoreTests(SlopeFile):
+    """Tests of the store that a run writes first, whatever its format."""
+
+    @pytest.mark.parametrize("wrong", ["late", "shape", "missing", "many", "none"])
+    def test_wrong_blocks(self, path: Path, wrong: str) -> None:
+        whole = result()
+        start, block, text = {
+            "late": (3, part(whole, 3, 5), "starts at frame 0"),
+            "shape": (0, {**part(whole, 0, 5), "y": whole["y"][:4]}, "y: expected shape"),
+            "missing": (0, {"x": whole["x"]}, "expected x, y, flux"),
+            "many": (0, result(51), "1 to 50 more frames, got 51"),
+            "none": (0, part(whole, 0, 0), "got 0"),
+        }[wrong]
+        with writer_for(path) as writer:
+            with refused(text):
+                writer.append(start, block)
+            assert writer.finished() == 0
+
+    @pytest.mark.usefixtures("all_marks")
+    def test_data_are_on_the_disk_before_the_mark(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Whatever has content when the mark is set has been synchronised since it was written."""
+        synchronise, replace = files.sync_file, files.replace_file
+        synchronised: dict[str, bytes] = {}
+        missing: list[Mapping[str, bytes]] = []
+        store = store_of(path).name
+
+        def sync_file(file: Path) -> None:
+            synchronised[str(file).replace(f".{store}.new", store)] = file.read_bytes()
+            synchronise(file)
+
+        def replace_file(file: Path, content: str) -> None:
+            chunks = [chunk for chunk in file.parent.rglob("c.*") if chunk.is_file()]
+            now = {str(chunk): chunk.read_bytes() for chunk in chunks}
+            missing.append({chunk: data for chunk, data in now.items() if synchronised.get(chunk) != data})
+            replace(file, content)
+
+        monkeypatch.setattr(slopes_zarr, "sync_file", sync_file)
+        monkeypatch.setattr(zarr_store, "sync_file", sync_file)
+        monkeypatch.setattr(zarr_store, "replace_file", replace_file)
+        write(path, result(), 10)
+        assert len(missing) >= 5
+        assert not any(missing)
+
+    @pytest.mark.usefixtures("all_marks")
+    @pytest.mark.parametrize("marks_before", [0, 4])
+    def test_disk_full_at_a_mark(
+        self, path: Path, is_store: bool, marks_before: int, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """One line says so, and the run resumes after space is made."""
+        replace = files.replace_file
+        calls = 0
+
+        def full(file: Path, text: str) -> None:
+            nonlocal calls
+            calls += 1
+            if calls > marks_before:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            replace(file, text)
+
+        with monkeypatch.context() as patch, refused(path.name, "disk is full"):
+            patch.setattr(zarr_store, "replace_file", full)
+            write(path, result(), 10)
+        assert is_store or not path.exists()
+        write(path, result(), 10)
+        assert_alone(path, result())
+
+    @pytest.mark.usefixtures("all_marks")
+    def test_chunk_cannot_be_written(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        from zarr.storage import LocalStore
+
+        set_item = LocalStore.set
+
+        async def full(self: Any, key: str, value: Any, *rest: Any) -> None:
+            if key.startswith("iterations/c.2"):
+                raise OSError(errno.ENOSPC, "No space left on device")
+            await set_item(self, key, value, *rest)
+
+        with monkeypatch.context() as patch, refused(path.name, "disk is full"):
+            patch.setattr(LocalStore, "set", full)
+            write(path, result(), 10)
+        stored = read_slopes(store_of(path))
+        assert (stored.n_finished, stored.complete) == (20, False)
+        np.testing.assert_array_equal(stored.variables["iterations"], result()["iterations"][:20])
+        write(path, result(), 10)
+        assert_alone(path, result())
+
+    def test_damaged_store(self, path: Path) -> None:
+        begin(path, 13)
+        shutil.rmtree(store_of(path) / "flux")
+        assert_refused(path, "damaged", "delete it", "flux")
+        (store_of(path) / "zarr.json").write_text("{")
+        assert_refused(path, "damaged data", "delete it")
+
+    def test_damaged_chunk_of_an_interrupted_run(self, path: Path) -> None:
+        begin(path, 13)
+        (store_of(path) / "y" / "c.1.0").write_bytes(b"")
+        assert_refused(path, "the store is damaged: y ")
+
+    def test_second_writer_is_refused(self, path: Path) -> None:
+        with writer_for(path) as writer:
+            writer.append(0, part(result(), 0, 20))
+            other_run = {"attributes": OTHER_RUN, "overwrite": True}
+            for changes in ({}, other_run, {"overwrite": True, "resume": False}):
+                assert_refused(path, path.name, f"is being written by process {os.getpid()}", **changes)
+            writer.append(20, part(result(), 20, 50))
+        assert_alone(path, result())
+
+    def test_closed_writer_takes_no_more(self, path: Path) -> None:
+        writer = writer_for(path)
+        writer.append(0, part(result(), 0, 20))
+        writer.close()
+        with refused("closed, expected no more frames, got frame 20"):
+            writer.append(20, part(result(), 20, 30))
+        write(path, result())
+        assert_alone(path, result())

@@ -15,7 +15,7 @@ from tests.io.slope_files import (
     write,
     writer_for,
 )
-from tests.io.slope_format_tests import SlopeFormatTests
+from tests.io.slope_format_tests import SlopeFormatTests, SlopeStoreTests
 from tests.refusals import refused
 
 from faintspot.base.errors import MissingExtraError
@@ -29,6 +29,12 @@ fits = pytest.importorskip("astropy.io.fits")
 
 class TestEveryFormat(SlopeFormatTests):
     @pytest.fixture(params=NAMES)
+    def name(self, request: pytest.FixtureRequest) -> str:
+        return str(request.param)
+
+
+class TestStore(SlopeStoreTests):
+    @pytest.fixture(params=["slopes.zarr", "slopes.npz"])
     def name(self, request: pytest.FixtureRequest) -> str:
         return str(request.param)
 
