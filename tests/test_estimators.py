@@ -58,6 +58,7 @@ class TestAgainstOracle:
         case = with_noise_map(random_case(seed, estimator), seed)
         assert_equals_oracle(case, case.measure())
 
+    @pytest.mark.slow  # compiled for noise maps, as the next one
     @pytest.mark.parametrize("estimator", ["matched", "ml"])
     @given(seed=SEEDS)
     @examples(3)
@@ -65,6 +66,7 @@ class TestAgainstOracle:
         case = on_unknown_background(with_noise_map(random_case(seed, estimator), seed), seed)
         assert_equals_oracle(case, case.measure())
 
+    @pytest.mark.slow
     @given(seed=SEEDS)
     @example(seed=487)  # no position of the grid is both near the prior and within the limits
     @examples(2)
@@ -153,12 +155,12 @@ class TestIndependence:
     def test_threads_and_frames(self, estimator: str) -> None:
         case = random_case(5, estimator, n=19)
         height, width = case.layout.frame_shape
-        frames = np.stack([case.images.reshape(height, width)] * 9)
-        frames += np.arange(9, dtype=np.float32)[:, None, None]
-        prior = np.random.default_rng(2).normal(0.0, 0.5, (9, 19, 2))
+        frames = np.stack([case.images.reshape(height, width)] * 4)
+        frames += np.arange(4, dtype=np.float32)[:, None, None]
+        prior = np.random.default_rng(2).normal(0.0, 0.5, (4, 19, 2))
         together = case.pipeline(threads=1)(frames, prior)
         assert_same(together, case.pipeline(threads=7)(frames, prior))
-        for i in range(9):
+        for i in range(4):
             alone = case.pipeline()(frames[i], prior[i])
             for name in FIELDS:
                 assert np.array_equal(getattr(together, name)[i], getattr(alone, name)), name

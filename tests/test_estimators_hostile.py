@@ -147,7 +147,7 @@ class TestImages:
         ("estimator", "dtype"),
         [
             *product(["brightest"], ["uint8", "uint16", "int16", "float16", "float64", ">f4"]),
-            ("ml", "uint16"),
+            pytest.param("ml", "uint16", marks=pytest.mark.slow),
         ],
     )
     def test_dtypes(self, estimator: str, dtype: str) -> None:

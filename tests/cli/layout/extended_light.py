@@ -1,5 +1,6 @@
 """Frames with light that is no spot: reflections, a background that varies, a colour mosaic."""
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ def gaussian(shape: tuple[int, int], x: float, y: float, std: float) -> Floats:
     return np.outer(rows, columns)
 
 
+@cache
 def flat_frame(reflection_e: float) -> Frame:
     """Return 221 spots of FWHM 4.7 px and 1000 ADU, without aberration, under one reflection."""
     rng = np.random.default_rng(2)
@@ -41,6 +43,7 @@ def flat_frame(reflection_e: float) -> Frame:
     return Frame(np.clip(np.round(adu), 0, 255).astype(np.uint8), spots)
 
 
+@cache
 def eye_frame(seed: int, n: int = 15) -> Frame:
     """Return an aberrated eye: speckled spots of 5 px with haloes, haze, and reflections of cornea and lens.
 
@@ -86,6 +89,7 @@ def narrow_centroid(images: Floats) -> Floats:
     return found
 
 
+@cache
 def mosaic_frames(gains: tuple[float, float, float, float]) -> NDArray[np.uint16]:
     """Return a frame of 9 x 9 spots of FWHM 3.5 px through filters of a Bayer mosaic."""
     rng = np.random.default_rng(1)

@@ -76,6 +76,7 @@ def test_background_beyond_a_stated_dark_is_reported(folder: Path, run: Commands
     assert known.settings.spot_fwhm_px == pytest.approx(4.7, rel=0.15)
 
 
+@pytest.mark.usefixtures("no_trials")
 @pytest.mark.parametrize("gains", [(1.0, 0.25, 0.25, 0.05), (0.6, 1.0, 1.0, 0.4)])
 def test_colour_mosaic_is_refused(
     folder: Path, run: Commands, gains: tuple[float, float, float, float]
@@ -87,6 +88,7 @@ def test_colour_mosaic_is_refused(
     assert not Path("new.toml").exists()
 
 
+@pytest.mark.usefixtures("no_trials")
 def test_flat_field_corrects_a_colour_mosaic(folder: Path, run: Commands) -> None:
     gains = (0.6, 1.0, 1.0, 0.4)
     np.save("a.npy", mosaic_frames(gains))
@@ -94,11 +96,13 @@ def test_flat_field_corrects_a_colour_mosaic(folder: Path, run: Commands) -> Non
     run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--flat", "flat.npy")
 
 
+@pytest.mark.usefixtures("no_trials")
 def test_equal_pixels_are_no_mosaic(folder: Path, run: Commands) -> None:
     np.save("a.npy", mosaic_frames((0.9, 1.0, 1.0, 0.9)))
     run.ok("layout", "a.npy", "-o", "new.toml")
 
 
+@pytest.mark.usefixtures("no_trials")
 @pytest.mark.parametrize("kind", ["offset", "pattern", "with light"])
 def test_a_dark_never_makes_a_layout_worse(folder: Path, run: Commands, kind: str) -> None:
     """The same windows as without a dark, except for single ones at the pupil's edge."""
@@ -121,6 +125,7 @@ def test_a_dark_never_makes_a_layout_worse(folder: Path, run: Commands, kind: st
     assert len(layouts[1]) == pytest.approx(len(layouts[0]), abs=3)
 
 
+@pytest.mark.usefixtures("no_trials")
 def test_a_dark_that_takes_off_a_pattern_is_used(folder: Path, run: Commands) -> None:
     pixels, spots = flat_frame(0.0)
     pattern = np.random.default_rng(4).normal(0, 20, pixels.shape)

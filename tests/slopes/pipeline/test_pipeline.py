@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.patience import examples
 from tests.pipeline_cases import FIELDS, assert_equals_oracle, assert_same, random_case
 from tests.refusals import refused
 
@@ -17,6 +18,7 @@ DTYPES = ("uint8", "uint16", "int16", "int32", "float32", "float64", ">u2", ">f4
 class TestAgainstOracle:
     @pytest.mark.parametrize("dtype", DTYPES)
     @given(seed=st.integers(0, 2**32 - 1))
+    @examples(8)
     def test_random_sensors(self, dtype: str, seed: int) -> None:
         case = random_case(seed, dtype)
         assert_equals_oracle(case, case.pipeline()(case.frame))

@@ -53,6 +53,7 @@ def test_saturation_is_that_of_the_type() -> None:
     assert not measure(np.minimum(frame, 255)).flags[0] & fs.SubapertureFlag.SATURATED
 
 
+@pytest.mark.slow  # compiled for 4 lanes
 def test_other_widths_and_stacks_do_not_share_it() -> None:
     measure, frame = pipeline(), frame_of(np.uint16)
     measure(frame)

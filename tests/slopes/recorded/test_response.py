@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from faintspot.slopes.spots.speckled import speckled_images
 SIDE, N, FRAMES, FLUX_E = 12, 4, 1500, 40.0
 
 
+@cache
 def movie(shift_px: float) -> np.ndarray:
     """Speckled spots that move by 1 px rms, without noise, all displaced by the shift along x."""
     moved = np.random.default_rng(1).normal([shift_px, 0.0], 1.0, (FRAMES * N, 2))

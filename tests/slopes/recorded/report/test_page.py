@@ -16,6 +16,7 @@ from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.statistics import MeasuredSlopes
 from faintspot.slopes.sensor.layout import Layout
 
+pytestmark = pytest.mark.usefixtures("undrawn_pictures")
 SECTIONS = ["numbers", "frame", "flux", "slopes", "configuration"]
 
 
@@ -33,7 +34,6 @@ def plain_page(methods: list[MeasuredSlopes], layout: Layout | None) -> Page:
     return Page(slopes_report(run, title="t", facts={}, configurations={"Configuration": ""}))
 
 
-@pytest.mark.usefixtures("undrawn_pictures")
 def test_page_has_all_sections_pictures_and_numbers() -> None:
     layout = sensor()
     frames, truth = simulated(layout, 6)
@@ -86,7 +86,6 @@ def test_everything_invalid() -> None:
     assert "nan" not in page.text.lower().split()
 
 
-@pytest.mark.usefixtures("undrawn_pictures")
 def test_one_method_and_hexagonal_layout() -> None:
     corners = np.array([[0, 2], [0, 12], [9, 7]])
     layout = Layout((20, 22), (8, 8), corners, geometry="hexagonal", pitch_px=10.0)
@@ -101,14 +100,12 @@ def test_one_method_and_hexagonal_layout() -> None:
     assert "no frame was given" in text
 
 
-@pytest.mark.usefixtures("undrawn_pictures")
 def test_without_layout_the_page_says_so() -> None:
     layout = sensor()
     page = page_of(layout, simulated(layout, 3)[0], layout=None)
     assert page.text.count("the layout of the sub-apertures is not known") == 3
 
 
-@pytest.mark.usefixtures("undrawn_pictures")
 def test_warnings_say_what_to_do_next() -> None:
     x = np.zeros((4, 5))
     flags = np.zeros((4, 5), np.uint8)
@@ -123,7 +120,6 @@ def test_warnings_say_what_to_do_next() -> None:
     assert "1 of 5 sub-apertures were never valid (no. 0)" in text
 
 
-@pytest.mark.usefixtures("undrawn_pictures")
 def test_parts_that_do_not_fit_are_refused_in_one_line() -> None:
     layout = sensor()
     frames, truth = simulated(layout, 2)
@@ -141,7 +137,6 @@ def test_parts_that_do_not_fit_are_refused_in_one_line() -> None:
             plain_page(wrong, layout)
 
 
-@pytest.mark.usefixtures("undrawn_pictures")
 def test_missing_jinja2_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "jinja2", None)
     layout = sensor((1, 1))

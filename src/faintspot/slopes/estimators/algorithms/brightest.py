@@ -81,8 +81,9 @@ def brightest_pixels(images: ArrayLike, keep: ArrayLike, *, rule: str = "subtrac
     except ValueError:
         raise InputError(f"keep: shape {count.shape} does not broadcast to {leading}") from None
 
-    flat = stack.reshape(-1, ny * nx)
-    rank = threshold_rank(count.reshape(-1), rule)
+    # The kernel is compiled for arrays of one kind, not once more for those that are read-only.
+    flat = np.require(stack.reshape(-1, ny * nx), requirements="W")
+    rank = np.require(threshold_rank(count.reshape(-1), rule), requirements=["C", "W"])
     result = np.empty_like(flat)
     lanes = lanes_for(flat.dtype)
     subtract = 0.0 if rule == "threshold" else 1.0

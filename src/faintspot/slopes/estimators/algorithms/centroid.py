@@ -41,7 +41,8 @@ def centre_of_gravity(images: ArrayLike) -> NDArray[Any]:
     """
     stack = image_stack("images", images)
     ny, nx = stack.shape[-2:]
-    flat = _scaled_up(stack.reshape(-1, ny * nx))
+    # The kernel is compiled for arrays of one kind, not once more for those that are read-only.
+    flat = np.require(_scaled_up(stack.reshape(-1, ny * nx)), requirements="W")
     positions = np.empty((len(flat), 2), stack.dtype)
     lanes = lanes_for(flat.dtype)
 

@@ -166,7 +166,8 @@ def tv_denoise(
     limit = usual["max_iterations"] if max_iterations is None else max_iterations
     number_between("max_iterations", limit, 1, 2**31, integer=True)
 
-    flat = stack.reshape(-1, ny * nx)
+    # The kernel is compiled for arrays of one kind, not once more for those that are read-only.
+    flat = np.require(stack.reshape(-1, ny * nx), requirements="W")
     settings = np.empty((3, len(flat)), np.float64)
     settings[0], settings[1], settings[2] = strength.reshape(-1), threshold, limit
     denoised, multiplier = np.empty_like(flat), np.empty(len(flat))
