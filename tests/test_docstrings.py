@@ -33,11 +33,7 @@ WITHOUT_EXAMPLE = {
     "faintspot.slopes.wavefront.ZonalMap": "in that of zonal_map",
     "faintspot.slopes.estimators.Sensor": "made by a pipeline, in that of Estimator",
 }
-NEEDED = {
-    "simulate_loop": ("hcipy",),
-    "run": ("xarray",),
-    "open_study": ("xarray", "zarr"),
-}
+NEEDED = {"simulate_loop": ("hcipy",), "run": ("xarray",), "open_study": ("xarray", "zarr")}
 """Packages of extras that examples need."""
 
 

@@ -11,15 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from tests import naive_estimators as oracle
-from tests.estimator_cases import (
-    FIELDS,
-    Case,
-    assert_same,
-    assert_sane,
-    one_psf,
-    random_case,
-    with_noise_map,
-)
+from tests.estimator_cases import FIELDS, Case, assert_same, assert_sane, one_psf, random_case, with_noise_map
 from tests.estimator_oracle import assert_equals_oracle
 from tests.patience import examples
 
@@ -96,11 +88,7 @@ class TestAgainstOracle:
     @pytest.mark.slow
     # Each is compiled anew: at 8 lanes the families; every estimator is compared at 4 lanes elsewhere.
     @pytest.mark.parametrize(
-        ("width", "estimator"),
-        [
-            *product((16,), QUICK),
-            *product((8,), ("tv", "window", "ml")),
-        ],
+        ("width", "estimator"), [*product((16,), QUICK), *product((8,), ("tv", "window", "ml"))]
     )
     def test_any_simd_width(self, estimator: str, width: int) -> None:
         case = random_case(width, estimator, n=7)

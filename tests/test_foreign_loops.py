@@ -48,5 +48,5 @@ def test_scores_of_all_rows_are_what_the_documentation_shows(tmp_path: Path) -> 
     (tmp_path / "all.json").write_text(json.dumps([result, {"failure": "InputError: no"}]))
     stored = json.loads(publish(tmp_path, tmp_path / "pages").read_text(encoding="utf-8"))
     assert stored["tables"]["loops"]["rows"] == [
-        ["OOPAO: 20 e-", "0.550 (0.4)", "**0.750**", "+0.200 ± 0.010"],
+        ["OOPAO: 20 e-", "0.550 (0.4)", "**0.750**", "+0.200 ± 0.010"]
     ]

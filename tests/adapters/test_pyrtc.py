@@ -116,10 +116,7 @@ def test_refused_in_one_line() -> None:
             {"valid_sub_aps": np.zeros((6, 3), bool)},
             "valid_sub_aps: expected at least one valid sub-aperture",
         ),
-        (
-            {"ref_slopes": np.zeros((4, 2))},
-            r"ref_slopes: expected shape \(6, 3\) .* got \(4, 2\); remake it",
-        ),
+        ({"ref_slopes": np.zeros((4, 2))}, r"ref_slopes: expected shape \(6, 3\) .* got \(4, 2\); remake it"),
         (
             {"ref_slopes": np.full((6, 3), np.nan)},
             "ref_slopes: expected finite numbers, got 18 NaN or infinite",

@@ -19,11 +19,7 @@ pytestmark = [
 
 
 @pytest.mark.parametrize(
-    ("command", "number"),
-    [
-        ("sources.bridge", signal.SIGINT),
-        ("sources.replay", signal.SIGTERM),
-    ],
+    ("command", "number"), [("sources.bridge", signal.SIGINT), ("sources.replay", signal.SIGTERM)]
 )
 def test_ends_in_order(name: str, tmp_path: Path, command: str, number: signal.Signals) -> None:
     module, function = command.split(".")

@@ -68,8 +68,7 @@ class Run:
 
 
 @pytest.mark.parametrize(
-    ("event", "opens"),
-    [({"sign": -1.0}, True), ({"flux_e": 16.0}, False), ({"turbulence_px": 0.9}, False)],
+    ("event", "opens"), [({"sign": -1.0}, True), ({"flux_e": 16.0}, False), ({"turbulence_px": 0.9}, False)]
 )
 def test_spots_that_leave_the_windows_open_the_loop(event: dict[str, float], opens: bool) -> None:
     """A loop of the wrong sign does; a star that fades by two magnitudes and strong turbulence do not."""

@@ -2,14 +2,7 @@
 
 import mmap
 
-from faintspot.engine.path.timing import (
-    IN_TIME,
-    OTHER,
-    PAGE_FAULT,
-    PREPARING,
-    WOKEN_LATE,
-    Lateness,
-)
+from faintspot.engine.path.timing import IN_TIME, OTHER, PAGE_FAULT, PREPARING, WOKEN_LATE, Lateness
 
 
 def test_a_frame_in_time_has_no_cause() -> None:

@@ -11,9 +11,7 @@ from faintspot.base.errors import InputError
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.segment import FOLDER
 
-pytestmark = [
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-]
+pytestmark = [pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")]
 
 SHAPE = (24, 32)
 

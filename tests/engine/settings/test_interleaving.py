@@ -84,18 +84,7 @@ def test_turns() -> None:
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "",
-        "tvv",
-        "none,,tv",
-        "strength=2",
-        "noise_std=",
-        "tv:",
-        "kalmann",
-        "tv+",
-        "tv+kalman+tv",
-        "tv+none",
-    ],
+    ["", "tvv", "none,,tv", "strength=2", "noise_std=", "tv:", "kalmann", "tv+", "tv+kalman+tv", "tv+none"],
 )
 def test_anything_else_is_refused(text: str) -> None:
     with pytest.raises(fs.InputError):

@@ -8,12 +8,7 @@ from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
-from faintspot.loop.simulation.record import (
-    BUDGET_FILE,
-    MAGNITUDE_FILE,
-    holds_loop_results,
-    make_folder,
-)
+from faintspot.loop.simulation.record import BUDGET_FILE, MAGNITUDE_FILE, holds_loop_results, make_folder
 
 
 def assert_equal(one: Any, other: Any) -> None:

@@ -11,12 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 import faintspot as fs
 from faintspot.experiments import StudySpecification, Sweep
-from faintspot.experiments.methods import (
-    keeps_every_k,
-    knows_the_spot,
-    label_of,
-    style_of,
-)
+from faintspot.experiments.methods import keeps_every_k, knows_the_spot, label_of, style_of
 from faintspot.experiments.study.cell import realisations
 from faintspot.experiments.study.cell_methods import CellMethods, position_table
 from faintspot.slopes.estimators import Estimator
@@ -37,11 +32,7 @@ def simulated() -> tuple[NDArray[np.float32], NDArray[np.float64]]:
 
 @pytest.mark.parametrize(
     ("method", "options"),
-    [
-        ("brightest", {}),
-        ("tv", {"noise_std": 1.4}),
-        ("smoothed", {"smoothing_px": 0.8}),
-    ],
+    [("brightest", {}), ("tv", {"noise_std": 1.4}), ("smoothed", {"smoothing_px": 0.8})],
 )
 def test_methods_are_what_they_say(
     simulated: tuple[NDArray[np.float32], NDArray[np.float64]], method: str, options: dict[str, float]

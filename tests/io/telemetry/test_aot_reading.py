@@ -297,10 +297,7 @@ MASK = np.array([[7, 2, -1], [0, -1, 1], [-1, 3, -1]])
 @pytest.mark.parametrize(
     ("change", "naming"),
     [
-        (
-            changed("sensor.detector", None),
-            "one Shack-Hartmann sensor with pixels, it has: WFS1, WFS2",
-        ),
+        (changed("sensor.detector", None), "one Shack-Hartmann sensor with pixels, it has: WFS1, WFS2"),
         (pyramid, "it has: none"),
         (changed("sensor.subaperture_mask.data", MASK), "subaperture_mask: expected the numbers 0 to 3"),
         (

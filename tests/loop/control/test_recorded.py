@@ -31,8 +31,7 @@ def test_what_is_not_recorded() -> None:
 
 
 @pytest.mark.parametrize(
-    "damage",
-    [{"interaction_matrix": "?"}, {"shape": [3, 5]}, {"gain": 7}, {"unknown": 1}],
+    "damage", [{"interaction_matrix": "?"}, {"shape": [3, 5]}, {"gain": 7}, {"unknown": 1}]
 )
 def test_damage_is_refused(damage: dict[str, object]) -> None:
     packed = packed_control(Control(MATRIX))

@@ -13,10 +13,7 @@ from faintspot.loop.turbulence.strength import differential_image_motion, turbul
 
 CELLS = np.argwhere(np.hypot(*(np.indices((7, 7)) - 3)) < 3.6)
 RATE_HZ, SECONDS, PIECES, NOISE_PX = 60.0, 3.0, 16, 0.3
-WINDS = {
-    "fast": ([0.5, 0.3, 0.2], [[5.6, 2.1], [-4.1, 11.3], [-12.9, -15.3]]),
-    "slow": ([1.0], [[3.5, 2.0]]),
-}
+WINDS = {"fast": ([0.5, 0.3, 0.2], [[5.6, 2.1], [-4.1, 11.3], [-12.9, -15.3]]), "slow": ([1.0], [[3.5, 2.0]])}
 
 
 @pytest.mark.slow

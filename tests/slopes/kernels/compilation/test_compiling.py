@@ -11,9 +11,7 @@ from numba.core.caching import NullCache
 from faintspot.slopes.kernels.compilation import compiling
 from faintspot.slopes.kernels.compilation.compiling import Direct, compiled, inlined
 
-pytestmark = [
-    pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
-]
+pytestmark = [pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")]
 
 
 @inlined

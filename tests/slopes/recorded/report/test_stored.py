@@ -178,12 +178,7 @@ def measured(folder: Path, name: str, **options: Any) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("brightest", {}),
-        ("thresholded", {"threshold_e": 0.5}),
-        ("ml", {}),
-    ],
+    ("name", "options"), [("brightest", {}), ("thresholded", {"threshold_e": 0.5}), ("ml", {})]
 )
 def test_the_page_of_an_estimator_speaks_of_it_alone(
     tmp_path: Path, name: str, options: dict[str, Any]
