@@ -34,7 +34,7 @@ def nodes(geometry: str, across: int, pitch_px: float, angle_deg: float = 4.0) -
 @pytest.mark.parametrize("geometry", ["square", "hexagonal"])
 @pytest.mark.parametrize(
     ("across", "pitch_px", "width"),
-    [(30, 5.2, 0.15), (12, 8.0, 0.2), (4, 100.0, 0.02), (4, 100.0, 0.2), (5, 33.0, 0.05)],
+    [(30, 5.2, 0.15), (12, 8.0, 0.2), (4, 100.0, 0.02), (4, 60.0, 0.2), (5, 33.0, 0.05)],
     ids=["dense", "wide", "far and sharp", "far and wide", "few"],
 )
 def test_pitch_and_width_of_spots_of_any_ratio(
