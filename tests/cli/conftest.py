@@ -19,6 +19,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture(autouse=True)
+def _undrawn(undrawn_pictures: None) -> None:
+    """Compose the pictures of commands, but draw only those of layouts: drawing has tests of its own."""
+
+
 @pytest.fixture
 def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw nothing, which takes most of a second, where the picture is not what is tested."""

@@ -33,7 +33,7 @@ def test_demo_twice(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
     for method in ("tv", "no-tv"):
         stored = read_slopes(made / f"{method}.npz").variables
         np.testing.assert_array_equal(stored["x"], SlopePipeline.from_file(made / f"{method}.toml")(frames).x)
-    assert (made / "report.html").stat().st_size > 100_000
+    assert "<img" in (made / "report.html").read_text(encoding="utf-8")
     # The page was made once, and takes longest: the second one only has to replace it.
     monkeypatch.setattr("faintspot.base.report.page.Report.html", lambda report: "second")
     second = run.ok("demo", "--frames", 40, "-o", "new/demo", "--seed", 7)

@@ -58,7 +58,7 @@ def outcome(number: int, found: list[Any]) -> Outcome:
 @pytest.mark.parametrize(
     ("number", "good", "bad"),
     [
-        (1, 2.5, 0.8),
+        (1, 2.8, 0.8),
         (2, 2.5, 0.8),
         (3, lambda cell: 2.5 / cell["size"], lambda cell: 1.5 * cell["size"]),
         (4, 1.2, lambda cell: cell["pixels"] / 10),
