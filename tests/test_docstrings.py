@@ -61,7 +61,7 @@ def test_public_names_have_examples() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(NAMES.keys() - WITHOUT_EXAMPLE.keys()))
-def test_examples(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_give_what_they_show(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     home, _, short = name.rpartition(".")
     for package in NEEDED.get(short, ()):
         pytest.importorskip(package)

@@ -154,7 +154,7 @@ class TestIndependence:
                 assert np.array_equal(getattr(together, name)[i], getattr(alone, name)), name
 
     @EVERY
-    def test_neighbours(self, estimator: str) -> None:
+    def test_slopes_do_not_depend_on_neighbours(self, estimator: str) -> None:
         """Also next to images of another kind, when they are set alike and have one PSF."""
         case = random_case(8, estimator, n=12)
         psf = one_psf() if case.psf is not None else None

@@ -150,7 +150,7 @@ class TestImages:
             pytest.param("ml", "uint16", marks=pytest.mark.slow),
         ],
     )
-    def test_dtypes(self, estimator: str, dtype: str) -> None:
+    def test_slopes_do_not_depend_on_the_type_of_pixels(self, estimator: str, dtype: str) -> None:
         """Whole numbers that all of them hold give one answer; frames are the same for every estimator."""
         images = np.round(one_psf().images([[0.3, -0.2]] * 4, (8, 8), 500.0)).clip(0, 200)
         case = flat_case(estimator, images.astype(np.float32))

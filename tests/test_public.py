@@ -21,7 +21,7 @@ def test_names_exist_and_are_documented(name: str) -> None:
         assert item.__name__ == name
 
 
-def test_version() -> None:
+def test_version_has_three_numbers() -> None:
     assert faintspot.__version__.count(".") == 2
 
 

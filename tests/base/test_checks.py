@@ -22,7 +22,7 @@ class TestRealArray:
         with refused("value", "1 NaN or infinite of 1"):
             checks.finite_array("value", np.nan)
 
-    def test_objects(self) -> None:
+    def test_what_is_no_number_is_refused(self) -> None:
         for bad in ({}, object(), [None], [1, "a"], np.array([1, None]), b"abc", {1, 2}):
             with refused("value"):
                 checks.real_array("value", bad)
@@ -56,12 +56,12 @@ class TestImageStack:
         ("given", "used"),
         [("f2", "f4"), ("f4", "f4"), (">f4", "f4"), ("f8", "f8"), ("i2", "f8"), ("?", "f8")],
     )
-    def test_precision(self, given: str, used: str) -> None:
+    def test_stacks_keep_float32_and_make_others_float64(self, given: str, used: str) -> None:
         stack = checks.image_stack("images", np.ones((3, 2, 2), given))
         assert stack.dtype == np.dtype(used)
         assert stack.dtype.isnative
 
-    def test_contiguous(self) -> None:
+    def test_stacks_are_contiguous(self) -> None:
         array = np.arange(24.0).reshape(4, 6)[::2, ::-1]
         stack = checks.image_stack("images", array)
         assert stack.flags.c_contiguous

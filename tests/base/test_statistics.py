@@ -61,7 +61,7 @@ def test_standard_error_of_r_covers_the_truth() -> None:
     assert abs(np.mean(np.abs(deviations) < 1) - 0.683) < 0.061
 
 
-def test_magnitudes() -> None:
+def test_magnitudes_are_those_of_the_ratio() -> None:
     assert magnitudes(100.0) == pytest.approx(5.0)
     assert magnitudes(1.0) == 0.0
 

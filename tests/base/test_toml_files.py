@@ -17,7 +17,7 @@ def refused(path: Path, content: bytes | None, if_missing: str = "") -> str:
     return str(error.value).removeprefix(f"{path}: ")
 
 
-def test_values(tmp_path: Path) -> None:
+def test_a_file_gives_its_tables(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     path.write_text('# a comment\n[table]\nname = "é"\n', encoding="utf-8")
     assert toml_files.parse_file(path) == {"table": {"name": "é"}}
@@ -43,7 +43,7 @@ def test_files_that_are_too_large_or_have_no_end(tmp_path: Path) -> None:
     assert "expected a regular file" in refused(tmp_path / "zero.toml", None)
 
 
-def test_text() -> None:
+def test_a_text_gives_its_tables_or_says_where_it_is_wrong() -> None:
     assert toml_files.parse_text("a = 1", "there") == {"a": 1}
     with pytest.raises(InputError, match=r"^there: not a TOML file"):
         toml_files.parse_text("a = ", "there")
@@ -57,20 +57,20 @@ def test_text() -> None:
         ({"rule": 1}, "settings.noise_std: expected a value, found none"),
     ],
 )
-def test_keys(table: dict[str, int], message: str) -> None:
+def test_unknown_and_missing_keys_are_named(table: dict[str, int], message: str) -> None:
     toml_files.check_keys("settings.", {"noise_std": 1}, ("noise_std", "rule"), required=["noise_std"])
     with pytest.raises(InputError) as error:
         toml_files.check_keys("settings.", table, ("noise_std", "rule"), required=["noise_std"])
     assert str(error.value) == message
 
 
-def test_names() -> None:
+def test_unknown_names_get_a_suggestion() -> None:
     toml_files.check_known("a.toml: ", "layout", ["layout"], "table")
     with pytest.raises(InputError, match=r"^a\.toml: layuot: unknown table; did you mean layout\?$"):
         toml_files.check_known("a.toml: ", "layuot", (name for name in ["layout"]), "table")
 
 
-def test_tables() -> None:
+def test_what_is_no_table_is_refused() -> None:
     assert toml_files.checked_table("psf", {"a": 1}) == {"a": 1}
     with pytest.raises(InputError, match=r"^psf: expected a table, got 'text'$"):
         toml_files.checked_table("psf", "text")

@@ -29,7 +29,7 @@ def test_everything_is_looked_at_in_one_line_each() -> None:
     assert f"numba {numba.__version__}" in findings[2].value
 
 
-def test_command(run: Commands) -> None:
+def test_findings_are_text_or_json(run: Commands) -> None:
     text = run.ok("doctor").out
     assert all(f"\n{name}" in f"\n{text}" for name in NAMES)
     findings = json.loads(run.ok("doctor", "--json").out)

@@ -18,7 +18,9 @@ COMMANDS = ("demo", "layout", "report", "slopes")
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])
 @pytest.mark.parametrize("columns", ["40", "80", "200"])
-def test_help(run: Commands, command: str, columns: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_fits_the_screen(
+    run: Commands, command: str, columns: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("COLUMNS", columns)
     text = run.ok(*([command] if command else []), "--help").out
     assert max(map(len, text.splitlines())) <= 100
@@ -41,7 +43,7 @@ def test_every_option_says_what_it_is_for(run: Commands) -> None:
             assert parameter.param_type_name == "argument" or parameter.help, parameter.name
 
 
-def test_version(run: Commands) -> None:
+def test_version_is_that_of_the_package(run: Commands) -> None:
     assert run.ok("--version").out == f"faintspot, version {faintspot.__version__}\n"
 
 

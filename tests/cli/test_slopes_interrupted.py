@@ -69,7 +69,9 @@ def prepared(folder: Path, frames: np.ndarray) -> Callable[[str], Path]:
 
 
 @pytest.mark.parametrize("name", ["s.zarr", "s.npz"])
-def test_killed(prepared: Callable[[str], Path], run: Commands, name: str, uninterrupted: Slopes) -> None:
+def test_a_killed_run_goes_on_where_it_ended(
+    prepared: Callable[[str], Path], run: Commands, name: str, uninterrupted: Slopes
+) -> None:
     output = prepared(name)
     code, _ = start_and_stop(output, signal.SIGKILL)
     assert code == -signal.SIGKILL

@@ -55,7 +55,7 @@ def test_unfinished_store(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("shape", [(7, 2), (14,)])
 @pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.npz:one", "a.fits", "a.fits.gz", "a.zarr"])
-def test_arrays(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:
+def test_arrays_are_read_from_every_format(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:
     array = np.random.default_rng(2).normal(size=shape)
     path = tmp_path / name.partition(":")[0]
     if ".fits" in name:

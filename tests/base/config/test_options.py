@@ -47,7 +47,7 @@ class TestOneValue:
             ("kind", "y", "y"),
         ],
     )
-    def test_kept(self, name: str, given: Any, kept: Any) -> None:
+    def test_values_are_kept_as_their_type(self, name: str, given: Any, kept: Any) -> None:
         value = getattr(Sample(**{name: given}), name)
         assert value == kept
         assert isinstance(value, type(kept))
@@ -174,7 +174,7 @@ class TestChanges:
         assert Sample(number=1.0, whole=3, name="b").chosen() == {"whole": 3, "name": "b"}
         assert list(Sample(number=[1.0, 1.0]).chosen()) == ["number"]
 
-    def test_equality(self) -> None:
+    def test_options_are_equal_if_their_values_are(self) -> None:
         assert Sample(number=[1, 2]) == Sample(number=np.array([1.0, 2.0]))
         assert Sample(number=[1, 2]) != Sample(number=[1, 3])
         assert Sample(number=[1, 1]) != Sample(number=1)

@@ -109,7 +109,7 @@ def test_dark_file(folder: Path, run: Commands) -> None:
 
 
 @pytest.mark.usefixtures("no_trials")
-def test_options(folder: Path, run: Commands) -> None:
+def test_options_are_used_or_refused(folder: Path, run: Commands) -> None:
     np.savez("a b.npz", night=frames(), day=frames())
     result = run.ok(
         *("layout", "a b.npz", "--key", "night", "-o", "new.toml", "--picture", "p.png"),

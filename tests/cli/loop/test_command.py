@@ -39,7 +39,7 @@ def test_list_and_show(run: Commands) -> None:
     assert LoopConfiguration.from_text(shown) == load_loop("canary")
 
 
-def test_magnitude(run: Commands) -> None:
+def test_magnitude_writes_a_page_that_report_makes_again(run: Commands) -> None:
     result = run(
         "loop", "magnitude", "small.toml", "--quick", "--workers", 0, "--methods", "brightest", "-o", "here"
     )
@@ -52,7 +52,7 @@ def test_magnitude(run: Commands) -> None:
     assert Path("page.html").is_file()
 
 
-def test_night(run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_night_says_its_verdict_and_repeats_nothing(run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     short = NightPlan(30, 10, (2, 2), (1.0, 0.75), (2, 2), keep_brightest=12)
     monkeypatch.setattr(protocol, "QUICK_PLAN", short)
     arguments = "loop", "night", "small.toml", "--quick", "--workers", 0

@@ -89,7 +89,7 @@ def shown(turns: int) -> Shown:
     return seen
 
 
-def test_table() -> None:
+def test_table_has_the_gain_over_the_first_method() -> None:
     seen = shown(13)
     methods = {method.strehl.method: method for method in seen.by_method()}
     assert [method.strehl.mean.value for method in methods.values()] == pytest.approx([0.3, 0.5, 0.4])
@@ -117,7 +117,9 @@ def test_what_was_not_seen_is_said() -> None:
     assert np.isnan([nothing.open_strehl, nothing.on_time]).all()
 
 
-def test_refusals(folder: Path, run: Commands, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_options_used_names_and_missing_packages_are_refused(
+    folder: Path, run: Commands, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for wrong, naming in (
         (("--flux-e", 0), "photons_per_subaperture"),
         (("-o", "faintspot.toml"), "faintspot.toml: "),

@@ -212,7 +212,7 @@ def test_wrong_use_by_the_writer(name: str) -> None:
         ring.begin()
 
 
-def test_closing(name: str) -> None:
+def test_closing_tells_readers_and_keeps_their_memory(name: str) -> None:
     ring = PixelRing.create(name, SHAPE, np.float32)
     reader = PixelRing.attach(name)
     ring.publish(np.full(SHAPE, 3.0))

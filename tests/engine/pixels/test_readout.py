@@ -93,7 +93,7 @@ def test_numbers_and_rows_only_go_forward(ring: PixelRing) -> None:
     assert ring.progress() == (ring.arrivals - 1, 24)
 
 
-def test_rate(ring: PixelRing) -> None:
+def test_frames_come_at_the_rate_asked_for(ring: PixelRing) -> None:
     """Within 20 % of the schedule, frame times that other work on the machine took away counted in."""
     report = Cycle(ring, rate=200.0).run(100)
     assert report.frames == 100

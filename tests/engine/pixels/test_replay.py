@@ -219,7 +219,7 @@ def no_head_start(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_head_start")
-def test_command(name: str, tmp_path: Path) -> None:
+def test_command_replays_the_frames_asked_for(name: str, tmp_path: Path) -> None:
     path = stored(tmp_path, cube(30))
     options = [str(path), "--name", name, "--frame-rate-hz", "2000", "--first", "5", "--frames", "20"]
     result = CliRunner().invoke(replay, options)

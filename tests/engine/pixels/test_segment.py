@@ -60,7 +60,7 @@ def test_damaged_headers_are_refused(name: str, position: int, text: str) -> Non
         refused(name, text)
 
 
-def test_names(name: str) -> None:
+def test_unknown_and_bad_names_are_refused(name: str) -> None:
     with refusals.refused("no such pixel ring"):
         PixelRing.attach(name)
     for bad in ("", "a/b", "../x", ".hidden", "a b", "x" * 201, "a\n"):

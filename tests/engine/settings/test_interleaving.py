@@ -38,7 +38,9 @@ pytestmark = pytest.mark.slow
         ("window+integrator", {"estimator": "window"}, True, "integrator"),
     ],
 )
-def test_texts(text: str, changes: dict[str, Any], denoises: bool, control: str | None) -> None:
+def test_texts_are_read_as_methods(
+    text: str, changes: dict[str, Any], denoises: bool, control: str | None
+) -> None:
     found = Interleaving.parse(f"none, {text},set", 50)
     method = found.methods[1]
     assert found.labels == ["none", text, "set"]
@@ -77,7 +79,7 @@ def test_none_needs_an_estimator_that_denoises() -> None:
         method.of(fs.Settings("ml"))
 
 
-def test_turns() -> None:
+def test_methods_take_turns() -> None:
     found = Interleaving.parse("none,tv,ml", 2)
     assert [found.method_of(count) for count in range(8)] == [0, 0, 1, 1, 2, 2, 0, 0]
 
@@ -91,7 +93,7 @@ def test_anything_else_is_refused(text: str) -> None:
         Interleaving.parse(text)
 
 
-def test_every() -> None:
+def test_turns_of_no_frame_are_refused() -> None:
     with pytest.raises(fs.InputError, match="every = 0"):
         Interleaving.parse("none,tv", 0)
 

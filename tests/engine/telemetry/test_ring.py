@@ -126,7 +126,7 @@ def test_memory_is_bounded(name: str) -> None:
         assert len(TelemetryRing.attach(name).images.since(0)[0]) == 1
 
 
-def test_changes(name: str) -> None:
+def test_changes_are_read_with_their_frames(name: str) -> None:
     with TelemetryRing.create(name, LAYOUT) as ring:
         reader = TelemetryRing.attach(name)
         ring.write_change(12, 1, {"noise_std": 2.5, "rule": "threshold"}, [1, 2])

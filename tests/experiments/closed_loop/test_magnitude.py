@@ -47,7 +47,7 @@ def test_one_progress_of_all_stages(whole: Path) -> None:
     assert (total == total[0]).all()
 
 
-def test_result(whole: Path) -> None:
+def test_the_result_has_an_entry_for_each_method_and_flux(whole: Path) -> None:
     result = MagnitudeResult.load(whole / MAGNITUDE_FILE)
     assert result.labels == ("centre of gravity", "brightest pixels")
     np.testing.assert_array_equal(result.photons, [40, 400])

@@ -95,7 +95,7 @@ def summary(result: MagnitudeResult, realisations: int = 5) -> str:
     return loop_summary(LoopResults(magnitude=replace(result, **few)))
 
 
-def test_magnitude(result: MagnitudeResult) -> None:
+def test_the_summary_of_magnitudes_has_errors_and_a_verdict(result: MagnitudeResult) -> None:
     heading, brightest, *rest = summary(result).splitlines()
     assert "10 e⁻, 13.0 mag" in heading
     error = np.std([-0.1, 0.0, 0.1, 0.05, -0.05], ddof=1) / np.sqrt(5)
@@ -111,7 +111,7 @@ def test_few_realisations_have_no_error_and_name_no_gain(result: MagnitudeResult
     assert "limiting magnitude" not in summary(result, 2)  # not a figure of a gain whose error is not known
 
 
-def test_budget() -> None:
+def test_the_summary_of_a_budget_has_every_term() -> None:
     shape = (1, len(TERMS), 3)
     strehl = np.broadcast_to(np.linspace(0.3, 0.9, len(TERMS))[:, None], shape)
     residual = np.full(shape, 150.0)

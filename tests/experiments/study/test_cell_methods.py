@@ -110,7 +110,7 @@ def test_positions_become_the_search_range(
     np.testing.assert_array_equal(valid, also_valid)
 
 
-def test_names() -> None:
+def test_methods_of_other_installations_have_a_name_and_a_style() -> None:
     assert label_of("of another installation") == "of another installation"
     assert style_of("of another installation") == Estimator.style
     assert [method for method in ("brightest", "weighted", "ml", "nobody's") if knows_the_spot(method)] == [

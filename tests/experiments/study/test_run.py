@@ -84,7 +84,7 @@ def test_bad_arguments() -> None:
 OTHER = replace(SPECIFICATION, seed=2)
 
 
-def test_schema() -> None:
+def test_a_new_dataset_has_all_variables() -> None:
     dataset = new_dataset(SPECIFICATION)
     assert dict(dataset.sizes) == {"cell": N_CELLS, "estimator": 4, "estimator2": 4, "mode": 3, "k": 63}
     assert set(dataset.data_vars) == {*VARIABLES, "done"}

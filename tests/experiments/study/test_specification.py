@@ -32,7 +32,7 @@ profile = ["diffraction", "gaussian"]
 """
 
 
-def test_toml() -> None:
+def test_a_text_gives_the_specification() -> None:
     specification = StudySpecification.from_text(TEXT)
     assert (specification.name, specification.seed, specification.realisations) == ("mine", 7, 400)
     assert specification.modes == ("best", "fixed10")
@@ -103,7 +103,7 @@ def test_search_range_is_the_same_for_all_methods() -> None:
     assert replace(new, search_range_px=2).search_range_of(far) == 2.0
 
 
-def test_modes() -> None:
+def test_modes_follow_the_cells() -> None:
     sweep = Sweep("a", pixels=[4, 16], d_over_r0=[0, 2])
     specification = StudySpecification(
         "x", [sweep], fixed_k=[20], corrected=True, options={"blur_px": [0.0, 1.0]}

@@ -322,7 +322,7 @@ MASK = np.array([[7, 2, -1], [0, -1, 1], [-1, 3, -1]])
         ),
     ],
 )
-def test_refused(tmp_path: Path, change: Callable[[Any], None], naming: str) -> None:
+def test_damaged_files_are_refused(tmp_path: Path, change: Callable[[Any], None], naming: str) -> None:
     with refused(match=naming):
         read_aot(example(tmp_path / "e.fits", change))
 

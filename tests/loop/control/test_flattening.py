@@ -75,7 +75,7 @@ def test_what_the_slopes_do_not_show_stays_still() -> None:
         assert flat.command[-1] == pytest.approx(0, abs=1e-6)
 
 
-def test_files(tmp_path: Path) -> None:
+def test_commands_are_written_as_arrays_or_tables(tmp_path: Path) -> None:
     command = np.array([1.5, -2.0])
     save_command(tmp_path / "c.npy", command)
     np.testing.assert_array_equal(np.load(tmp_path / "c.npy"), command)
@@ -85,7 +85,7 @@ def test_files(tmp_path: Path) -> None:
         save_command(tmp_path / "c.txt", command)
 
 
-def test_refused() -> None:
+def test_matrices_that_do_not_fit_are_refused() -> None:
     slopes = slopes_of(MATRIX @ WANTED)
     for matrix, message in (
         (MATRIX.T, "transpose"),

@@ -11,7 +11,7 @@ from faintspot.loop.telemetry.alternation import phase_of_turn, turns_of
 SETTLE = [12, 12]
 
 
-def test_turns() -> None:
+def test_turns_are_found_in_the_recording() -> None:
     loop = alternating(1020).loop
     loop.method[400:440] = -1  # open
     loop.conditions[700:] = 1

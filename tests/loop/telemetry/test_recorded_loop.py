@@ -149,7 +149,9 @@ def test_what_is_wrong(tmp_path: Path, change: dict[str, Any], message: str) -> 
 
 
 @pytest.mark.slow
-def test_command(tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_writes_a_page_and_its_numbers(
+    tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A page and its numbers of 500 frames, from which other choices are not known."""
     pytest.importorskip("matplotlib")
     pytest.importorskip("jinja2")

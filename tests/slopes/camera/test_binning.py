@@ -51,7 +51,7 @@ def test_levels_and_variances_add_up() -> None:
     )
 
 
-def test_maps() -> None:
+def test_maps_are_those_of_sums_of_pixels() -> None:
     noise, flat = np.array([[1.0, 1, 3, 4], [1, 1, 0, 0]]), np.array([[1.0, 1.2, 1, 1], [0.8, 1, 1, np.nan]])
     camera = Calibration(dark=np.full((2, 4), 7.0), flat=flat, read_noise_e=noise, bad_pixels=[[0, 3]])
     of_two = binned_calibration(camera, 2, (2, 4))

@@ -47,7 +47,7 @@ class TestMaps:
         maps = fs.Calibration(dark, flat).maps((2, 2))
         assert np.array_equal(np.isfinite(maps).all(axis=0), [[False, False], [False, True]])
 
-    def test_saturation(self) -> None:
+    def test_saturation_is_stated_or_that_of_the_type(self) -> None:
         assert fs.Calibration().saturation(np.dtype("u2")) == 65535
         assert fs.Calibration().saturation(np.dtype(">i2")) == 32767
         assert not np.inf >= fs.Calibration().saturation(np.dtype("f4"))
@@ -75,7 +75,7 @@ def test_who_vouches_for_the_dark() -> None:
     assert fs.Calibration(dark=0.0) != fs.Calibration()
 
 
-def test_equality() -> None:
+def test_calibrations_are_equal_if_all_their_parts_are() -> None:
     dark = np.full((3, 4), np.nan)
     assert fs.Calibration(dark) == fs.Calibration(dark.copy())
     assert fs.Calibration(dark) != fs.Calibration()

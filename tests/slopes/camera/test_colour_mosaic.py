@@ -22,7 +22,7 @@ def contrast(width_px: float, pitch_px: float, gains: tuple[float, float, float,
 
 @pytest.mark.parametrize("pitch_px", [20.0, 20.3])
 @pytest.mark.parametrize("width_px", [1.2, 2.0, 3.0])
-def test_gains(width_px: float, pitch_px: float) -> None:
+def test_the_contrast_is_that_of_the_gains(width_px: float, pitch_px: float) -> None:
     assert contrast(width_px, pitch_px, (0.6, 1.0, 1.0, 0.4)) == pytest.approx(2.5, rel=0.35)
     assert contrast(width_px, pitch_px, (1.0, 1.0, 1.0, 1.0)) == 1.0
 

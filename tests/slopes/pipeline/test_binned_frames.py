@@ -94,7 +94,7 @@ def test_settings_scale_what_is_a_distance() -> None:
     assert (halved.smoothing_px, halved.search_range_px.tolist(), halved.flux_e) == (1.5, [0.5, 1.0], 30.0)
 
 
-def test_refusals() -> None:
+def test_what_cannot_be_binned_is_refused() -> None:
     with refused("layout.corners", "multiples of bin = 2"):
         Layout((64, 64), (8, 8), np.array([[1, 0]]), bin=2)
     with refused("pixels", "multiples of bin = 2"):

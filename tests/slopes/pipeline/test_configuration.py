@@ -229,7 +229,7 @@ def test_to_text(tmp_path: Path) -> None:
 # Reading ---------------------------------------------------------------------------------------------
 
 
-def test_grid(tmp_path: Path) -> None:
+def test_a_grid_is_the_layout_of_its_numbers(tmp_path: Path) -> None:
     text = (
         "[layout.grid]\nshape = [7, 7]\npixels = [8, 10]\nouter_radius = 3.5\ninner_radius = 0.5\n"
         "pitch = 12\norigin = [3, 4]\nframe_shape = [100, 120]\n"

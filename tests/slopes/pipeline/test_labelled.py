@@ -51,7 +51,9 @@ def test_a_table_has_a_row_for_each_slope(slopes: Slopes) -> None:
     assert len(one.to_pandas()) == 6
 
 
-def test_refused(slopes: Slopes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_units_other_layouts_and_missing_packages_are_refused(
+    slopes: Slopes, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(InputError, match="pixel_scale_arcsec"):
         slopes.to_pandas(replace(LAYOUT, pixel_scale_arcsec=None), unit="arcsec")
     with pytest.raises(InputError, match="expected 6 sub-apertures"):

@@ -229,7 +229,7 @@ class TestSettings:
             with refused("reference", words):
                 pipeline(bad)
 
-    def test_fingerprint(self) -> None:
+    def test_every_part_changes_the_fingerprint(self) -> None:
         layout, settings = fs.Layout.grid((2, 2), pixels=4), fs.Settings(noise_std=1)
         prints = {
             fs.SlopePipeline(layout, settings).fingerprint(),

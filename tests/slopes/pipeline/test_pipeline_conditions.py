@@ -34,7 +34,7 @@ class TestBadFrames:
         return slopes
 
     @pytest.mark.parametrize("value", [0.0, 5.0, -3.0, 1e29, 1e-42])
-    def test_constant(self, value: float) -> None:
+    def test_constant_frames_have_no_flux(self, value: float) -> None:
         slopes = self.measure(np.full((30, 30), value, np.float32))
         assert np.all(slopes.flags == Flag.NO_FLUX | Flag.INFEASIBLE_STRENGTH)
         assert np.all(slopes.flux == 0.0)
@@ -58,7 +58,7 @@ class TestBadFrames:
             np.testing.assert_array_equal(getattr(slopes, name), getattr(expected, name))
 
     @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.int32])
-    def test_saturated(self, dtype: Any) -> None:
+    def test_saturated_windows_are_flagged(self, dtype: Any) -> None:
         frame = np.random.default_rng(2).integers(0, 100, (30, 30)).astype(dtype)
         frame[2, 3] = np.iinfo(dtype).max
         slopes = self.measure(frame)
@@ -152,7 +152,7 @@ class TestTooStrong:
 class TestWindows:
     @pytest.mark.parametrize("window", [(4, 4), (64, 64), (5, 9), (9, 5), (16, 16)])
     @pytest.mark.parametrize("n", [1, 3])
-    def test_size(self, window: tuple[int, int], n: int) -> None:
+    def test_windows_of_any_size_and_number_equal_the_oracle(self, window: tuple[int, int], n: int) -> None:
         layout = fs.Layout.grid((1, n), pixels=window)
         rng = np.random.default_rng(7)
         frames, truth = frames_of(layout, 4, flux_e=5000.0, rng=rng)

@@ -114,7 +114,7 @@ class TestConfiguration:
             ('[score]\nfiel = "a.npz"\n', "score.fiel: unknown key"),
         ],
     )
-    def test_mistakes(self, tmp_path: Path, table: str, message: str) -> None:
+    def test_mistakes_in_the_table_are_refused(self, tmp_path: Path, table: str, message: str) -> None:
         path = tmp_path / "faintspot.toml"
         configuration.save(path, LAYOUT)
         configuration.save(path, fs.Settings("brightest"))

@@ -27,7 +27,7 @@ class TestSettings:
         with pytest.raises(AttributeError, match="algorithm"):
             settings.estimator.algorithm = "chambolle"  # type: ignore[attr-defined]
 
-    def test_defaults(self) -> None:
+    def test_defaults_follow_window_and_preset(self) -> None:
         settings = fs.Settings(noise_std=1.0)
         assert settings.values("keep_brightest", 3, 256).tolist() == [20] * 3
         assert settings.values("keep_brightest", 1, 16).tolist() == [5]
@@ -66,7 +66,7 @@ class TestSettings:
 class TestReplace:
     base = fs.Settings(noise_std=1.0, keep_brightest=10)
 
-    def test_everywhere(self) -> None:
+    def test_without_a_place_all_subapertures_change(self) -> None:
         changed = self.base.replace(noise_std=2.0, algorithm="chambolle")
         assert changed == fs.Settings(noise_std=2.0, keep_brightest=10, algorithm="chambolle")
         assert self.base.noise_std == 1.0
@@ -90,7 +90,7 @@ class TestReplace:
             ("keep_brightest: expected a value", [0], {"keep_brightest": None}),
         ],
     )
-    def test_bad(self, words: str, where: Any, changes: dict[str, Any]) -> None:
+    def test_bad_changes_are_refused(self, words: str, where: Any, changes: dict[str, Any]) -> None:
         with refused(words):
             self.base.replace(where=where, **changes)
 

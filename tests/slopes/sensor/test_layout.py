@@ -78,7 +78,7 @@ class TestLayout:
         with pytest.raises(FrozenInstanceError):
             layout.window = (4, 4)  # type: ignore[misc]
 
-    def test_equality(self) -> None:
+    def test_layouts_are_equal_if_all_their_parts_are(self) -> None:
         grid = fs.Layout.grid((3, 3), pixels=8)
         assert grid == fs.Layout.grid((3, 3), pixels=8)
         assert grid != fs.Layout.grid((3, 3), pixels=8, origin=(0, 1))

@@ -149,7 +149,7 @@ def test_quad_cells() -> None:
     np.testing.assert_allclose(found.vector, [0.25, 0.0, 0.0, -0.5], atol=1e-6)
 
 
-def test_files(tmp_path: Path, learnt: fs.FixedWeights) -> None:
+def test_files_give_back_the_weights(tmp_path: Path, learnt: fs.FixedWeights) -> None:
     path = tmp_path / "weights.npz"
     learnt.save(path)
     again = fs.FixedWeights.load(path)

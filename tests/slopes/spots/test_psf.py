@@ -49,7 +49,7 @@ def test_samples_are_normalised_and_not_mine() -> None:
         psf.samples[0, 0, 0] = 2.0
 
 
-def test_widths() -> None:
+def test_widths_are_those_of_the_profile_and_its_pixel() -> None:
     psf = PSF.analytic("gaussian", size=[1.0, 2.0], elongation=[1.0, 1.5], index=[1, 0, 1])
     # FWHM 2 px x size along y; 1/12 px^2 of variance from the pixel.
     pixel = 2.3548**2 / 12
@@ -61,7 +61,7 @@ def test_widths() -> None:
         psf.index_of(4)
 
 
-def test_blurred() -> None:
+def test_blurring_adds_its_variance() -> None:
     psf = PSF.analytic("gaussian", radius_px=12)
     wider = psf.blurred(1.0)
     before, after = (p.fwhm_px[0, 0] / 2.3548 for p in (psf, wider))

@@ -81,7 +81,7 @@ def test_indices_and_modes_are_those_of_hcipy() -> None:
 
 
 @pytest.mark.parametrize("j", NAMES)
-def test_names(j: int) -> None:
+def test_modes_have_their_names(j: int) -> None:
     assert mode_name(j) == NAMES[j]
 
 

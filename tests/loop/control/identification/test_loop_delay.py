@@ -25,7 +25,7 @@ def found(delay: int, gain: float, given: float | None = None, frames: int | Non
 
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", [2, 3])
-def test_delay(delay: int) -> None:
+def test_the_delay_is_found_within_its_error(delay: int) -> None:
     """Within three of its errors, which ten seconds at this noise make 0.1 frames."""
     seen = found(delay, 1.0)
     assert seen.delay_error < 0.25

@@ -9,7 +9,7 @@ from faintspot.loop.control.identification.open_loop import Measured, outer_scal
 from faintspot.loop.turbulence.strength import TurbulenceStrength
 
 
-def test_interval() -> None:
+def test_intervals_are_of_95_per_cent() -> None:
     assert Measured("tilt", "px", -1.0, 0.5).interval == pytest.approx((-1.98, -0.02))
     assert Measured("noise", "px", 1.0, 0.8).interval == pytest.approx((-0.568, 2.568))
     low, high = Measured("r0", "m", 1.0, 0.8, is_positive=True).interval

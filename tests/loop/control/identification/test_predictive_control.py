@@ -53,7 +53,9 @@ def test_what_is_learnt(control: PredictiveControl) -> None:
 
 
 @pytest.mark.slow
-def test_file(control: PredictiveControl, recording: Recording, tmp_path: Path) -> None:
+def test_a_file_gives_back_the_controller(
+    control: PredictiveControl, recording: Recording, tmp_path: Path
+) -> None:
     control.save(tmp_path / "controller.npz")
     read = PredictiveControl.load(tmp_path / "controller.npz")
     np.testing.assert_array_equal(
@@ -170,6 +172,6 @@ def test_learning_again_keeps_the_command(monkeypatch: pytest.MonkeyPatch, sign:
         ({"commands": np.zeros((2550, 36))}, "expected those of a closed loop"),
     ],
 )
-def test_refusals(recording: Recording, change: dict[str, Any], message: str) -> None:
+def test_bad_recordings_are_refused(recording: Recording, change: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         learn(replace(recording, **change))

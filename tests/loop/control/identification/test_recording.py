@@ -77,7 +77,7 @@ def test_commands_of_another_loop() -> None:
         ({"prior_std": np.ones(25)}, r"prior_std: expected shape \(50,\)"),
     ],
 )
-def test_refusals(change: dict[str, Any], message: str) -> None:
+def test_bad_recordings_are_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         prepared(replace(recorded(), **change))
 

@@ -122,7 +122,7 @@ def test_the_lines_for_milk(model: Kalman, tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("ending", ["npz", "mat", "fits"])
-def test_formats(model: Kalman, tmp_path: Path, ending: str) -> None:
+def test_every_format_holds_the_same_matrices(model: Kalman, tmp_path: Path, ending: str) -> None:
     """All hold the same matrices."""
     path = tmp_path / f"matrices.{ending}"
     if ending == "fits":

@@ -39,7 +39,7 @@ def test_strehl_is_the_peak_of_a_fraunhofer_propagation(random_wavefront: np.nda
     assert pupil.strehl(field) == pytest.approx(padded[0, 0] / flat[0, 0], rel=1e-4)
 
 
-def test_marechal() -> None:
+def test_the_strehl_ratio_is_marechals() -> None:
     pupil = make_pupil(quiet())
     rng = np.random.default_rng(2)
     wavefront = (50 * rng.standard_normal((84, 84))).astype(np.float32)

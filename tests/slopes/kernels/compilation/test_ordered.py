@@ -51,7 +51,9 @@ def instructions(function: Callable[..., Any], kinds: tuple[Any, ...], triple: s
         (streaming.rows_are_there.py_func, (CELLS, *[WHOLE] * 4), "ldar", 3),
     ],
 )
-def test_instructions(function: Any, kinds: tuple[Any, ...], instruction: str, times: int) -> None:
+def test_order_costs_only_the_instructions_that_it_needs(
+    function: Any, kinds: tuple[Any, ...], instruction: str, times: int
+) -> None:
     """On aarch64 those that keep the order; on x86-64 none that costs more than a move."""
     arm = instructions(function, kinds, "aarch64-unknown-linux-gnu")
     assert sum(line.startswith(instruction) for line in arm) == times

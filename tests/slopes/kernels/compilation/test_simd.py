@@ -53,7 +53,7 @@ def _apply_all(lanes: Any, a: Any, b: Any, results: Any) -> Any:
 
 
 @pytest.mark.parametrize(("dtype", "width"), [("float32", 4), ("float32", 16), ("float64", 8)])
-def test_operations(dtype: str, width: int) -> None:
+def test_operations_on_lanes_are_those_of_numpy(dtype: str, width: int) -> None:
     lanes = lanes_for(dtype, width)
     width = lanes.width
     rng = np.random.default_rng(1)
