@@ -66,4 +66,4 @@ def undrawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     from faintspot.base.report import plots
 
     for name in ("png", "svg"):
-        monkeypatch.setattr(plots, name, lambda figure: b"")
+        monkeypatch.setattr(plots, name, lambda figure, **options: b"")
