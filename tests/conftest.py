@@ -8,6 +8,7 @@ import multiprocessing.process
 import signal
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -62,8 +63,12 @@ def coarse_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def undrawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compose the figures but do not draw them."""
+    """Leave the figures of pages empty, and draw none: figures have tests of their own."""
     from faintspot.base.report import plots
 
+    def empty(rows: object, height: float, *, width: float = plots.WIDTH, **options: object) -> Any:
+        return plots.new_figure(width, height)
+
+    monkeypatch.setattr(plots, "plot", empty)
     for name in ("png", "svg"):
         monkeypatch.setattr(plots, name, lambda figure, **options: b"")

@@ -21,7 +21,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(autouse=True)
 def _undrawn(undrawn_pictures: None) -> None:
-    """Compose the pictures of commands, but draw only those of layouts: drawing has tests of its own."""
+    """Draw no pictures but those of layouts: figures have tests of their own."""
 
 
 @pytest.fixture

@@ -47,7 +47,6 @@ def test_page_has_all_sections_pictures_and_numbers() -> None:
     assert "slope error R" not in page_of(layout, frames).text
 
 
-@pytest.mark.usefixtures("undrawn_pictures")
 def test_numbers_are_those_of_known_noise() -> None:
     """Of 400 frames of spots that stay, with noise of 0.1 and 0.2 px: medians of 9 sub-apertures know it to
     2 %, from frame to frame to 3 %; three times that.
