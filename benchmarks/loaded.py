@@ -72,18 +72,18 @@ class Task:
 
 TASKS = {
     "SlopePipeline, one TV frame": Task(_FRAME, 8_000),
-    "slopes of a recording": Task(_SLOPES, 10_800, (_FRAMES, _LAYOUT)),
-    "telemetry": Task("telemetry slopes.zarr --frame-rate-hz 250", 12_000, (_FRAMES, _LAYOUT, _SLOPES)),
+    "slopes of a recording": Task(_SLOPES, 11_000, (_FRAMES, _LAYOUT)),
+    "telemetry": Task("telemetry slopes.zarr --frame-rate-hz 250", 12_400, (_FRAMES, _LAYOUT, _SLOPES)),
     "loop magnitude": Task(
-        "loop magnitude diffraction_limit --quick --methods brightest --flux-e 20 --workers 0", 15_400
+        "loop magnitude diffraction_limit --quick --methods brightest --flux-e 20 --workers 0", 15_700
     ),
     "realtime run": Task(
         "realtime run --frames 20 --name {name}",
-        14_500,
+        15_000,
         (_FRAMES, _LAYOUT),
         "realtime replay frames.npy --name {name}",
     ),
-    "tune": Task("tune --read-noise-e 1 --pixels 8 --fwhm-px 1.8 --flux-e 100 -o tuned.toml", 15_800),
+    "tune": Task("tune --read-noise-e 1 --pixels 8 --fwhm-px 1.8 --flux-e 100 -o tuned.toml", 16_000),
 }
 
 
