@@ -16,7 +16,7 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, lines_of, neighbours_of
 from faintspot.slopes.sensor.windows import Windows, find_windows
 
-_GHOST = 0.3  # of the median flux of the neighbours
+_GHOST, _DARK = 0.3, 0.25  # of the median flux of the neighbours, and of all
 
 
 @dataclass(frozen=True)
@@ -133,4 +133,5 @@ def _dim(grid: LensletGrid) -> NDArray[np.bool_]:
     """Return which spots amid others are so dim that they may be ghosts in a dark lenslet."""
     around = np.append(grid.flux, np.nan)[neighbours_of(grid.cells, grid.geometry)]
     around[np.isnan(around).all(axis=1)] = 0.0
-    return np.asarray(grid.flux < _GHOST * np.nanmedian(around, axis=1))
+    brightest = np.maximum(_GHOST * np.nanmedian(around, axis=1), _DARK * np.median(grid.flux))
+    return np.asarray(grid.flux < brightest)
