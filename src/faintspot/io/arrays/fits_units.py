@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import write_atomically
 from faintspot.base.sizes import check_bytes
 from faintspot.io.arrays.inflation import check_inflated, is_surely_small
@@ -146,3 +146,11 @@ def units_of(path: Path) -> Iterator[HeaderDataUnit]:
             yield unit
             next_unit = unit.data_start + header.data_size_padded
             index += 1
+
+
+def is_aot(path: str | Path) -> bool:
+    """Return whether a file is a FITS file of the Adaptive Optics Telemetry standard."""
+    try:
+        return AOT_VERSION in next(units_of(Path(path))).header
+    except (InputError, MissingExtraError, OSError):  # another or a damaged file; its reader gives the reason
+        return False

@@ -19,7 +19,7 @@ from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.json_text import parse_json
 from faintspot.base.sizes import check_bytes, memory_bytes
-from faintspot.io.arrays.fits_units import AOT_VERSION, units_of
+from faintspot.io.arrays.fits_units import AOT_VERSION, is_aot, units_of
 from faintspot.io.locations import one_line
 
 _PIXELS = ("pix", "pixel", "px")
@@ -97,18 +97,6 @@ class AotSensor:
     def has(self, name: str) -> bool:
         """Return whether the file holds a quantity."""
         return getattr(self, name) is not None
-
-
-def is_aot(path: str | Path) -> bool:
-    """Return whether a file is a FITS file of the AOT standard."""
-    try:
-        return AOT_VERSION in next(units_of(Path(path))).header
-    except (
-        InputError,
-        MissingExtraError,
-        OSError,
-    ):  # another or a damaged file; its reader gives the reason
-        return False
 
 
 def frames_of_aot(path: Path, sensor: str | None) -> str:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError, errors_within
+from faintspot.io.arrays.fits_units import is_aot
 from faintspot.io.locations import split_location
-from faintspot.io.telemetry.aot_reading import is_aot, read_aot
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.sensor.layout import Layout
@@ -26,6 +26,8 @@ def configured(
     first = None if described is not None and "layout" in described else _aot_file(frames)
     if first is None:
         return described or Configuration(path), "", None
+    from faintspot.io.telemetry.aot_reading import read_aot  # only for such files
+
     sensor = read_aot(first[0], first[1] or key)
     where = f"{first[0]}: sensor {sensor.name!r}"
     if sensor.layout is None:
