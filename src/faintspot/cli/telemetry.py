@@ -14,7 +14,6 @@ from faintspot.base.errors import InputError, errors_within
 from faintspot.base.extras import require, require_linux
 from faintspot.base.files import derived, write_atomically
 from faintspot.base.json_text import to_json
-from faintspot.cli.realtime.record import record_engine, summary
 from faintspot.cli.shared.commands import declared, option
 from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.progress import progress_bar
@@ -206,6 +205,8 @@ def _over_time(loop: Recording, every_s: float) -> list[Piece]:
 
 def _record(engine: str, store: Path, seconds: float) -> None:
     """Record a running engine to a new store."""
+    from faintspot.cli.realtime.record import record_engine, summary
+
     if store.suffix != ".zarr":
         raise InputError(f"{store}: expected a name that ends in .zarr, for the recording of --engine")
     report = record_engine(engine, store, None, seconds)
