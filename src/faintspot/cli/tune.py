@@ -138,6 +138,7 @@ def answer_table(answer: Answer) -> Table:
     table = results_table("estimator", *headings, wraps=True)
     for result in answer.results:
         found, is_reference = result.statistics, result.method.name == answer_text.BRIGHTEST
+        saved = answer_text.gain_in_words(answer, result.over_brightest, sign=True)
         table.add_row(
             result.method.label,
             f"{found.error.value:.4f}±{found.error.standard_error:.4f}",
@@ -146,7 +147,7 @@ def answer_table(answer: Answer) -> Table:
             *([f"x {answer.promises[result.method.name].ratio.value:.2f}"] if recorded else []),
             f"{100 * found.outlier_fraction.value:.1f} %",
             f"{result.method.estimator.cost:.2f}",
-            "" if is_reference else answer_text.short_gain(answer, result.over_brightest),
+            "" if is_reference else saved.replace(" ± ", "±"),
             style="bold" if result is answer.best else None,
         )
     bound = float(answer.bound_px[answer.at_star])

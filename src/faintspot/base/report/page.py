@@ -6,7 +6,6 @@ import base64
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -107,16 +106,14 @@ class FigureWithData:
         """Width in CSS pixels."""
         return round(float(self.figure.get_size_inches()[0]) * _CSS_PIXELS_PER_INCH)
 
-    @cached_property
-    def files(self) -> dict[str, str]:
-        """Data URIs of its files by ending, png alone or png, svg and csv."""
+    @property
+    def picture(self) -> str:
+        """Data URI of the picture."""
         from faintspot.base.report import plots
 
-        contents = {"png": data_uri("png", plots.png(self.figure))}
-        if self.csv:
-            self.figure.set_layout_engine("none")  # keep the layout, which is slow to compute
-            contents |= {"svg": data_uri("svg", plots.svg(self.figure)), "csv": data_uri("csv", self.csv)}
-        return contents
+        return (
+            data_uri("svg", plots.svg(self.figure)) if self.csv else data_uri("png", plots.png(self.figure))
+        )
 
 
 def data_uri(ending: str, content: bytes | str) -> str:

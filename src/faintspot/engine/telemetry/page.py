@@ -52,11 +52,11 @@ def report_of_telemetry(path: str | Path) -> Report:
     if len(telemetry.frame) == 0:
         raise InputError(f"{path}: expected telemetry, no frame is recorded yet")
     layout = Layout(**telemetry.attributes["layout"])
-    methods, slopes = [], {}
-    for name, rows in _methods(telemetry):
-        slopes[name] = of_method = _slopes(telemetry, rows)
-        methods.append(MeasuredSlopes.of(name, of_method, frames=telemetry.frame[rows].astype(np.int64)))
-    run = SlopesRun(methods, layout, why_no_stages="", slopes=slopes)
+    methods = [
+        MeasuredSlopes.of(name, _slopes(telemetry, rows), frames=telemetry.frame[rows].astype(np.int64))
+        for name, rows in _methods(telemetry)
+    ]
+    run = SlopesRun(methods, layout, why_no_stages="")
     return Report(
         title=f"Telemetry of {Path(path).name}",
         facts=_facts(telemetry, Path(path)),

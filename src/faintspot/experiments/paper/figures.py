@@ -13,7 +13,13 @@ from faintspot.base.report.plots import METHOD_COLOURS, WIDTH, Line, Panel, Pict
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.methods import NO_TV, TV, knows_the_spot, label_of, style_of
 from faintspot.experiments.paper.claims import fixed_mode
-from faintspot.experiments.paper.tables import mode_in_words, parameter_in_words, parameters_of
+from faintspot.experiments.paper.tables import (
+    grouped,
+    in_words,
+    mode_in_words,
+    parameter_in_words,
+    parameters_of,
+)
 from faintspot.experiments.study.curves import kept_panels
 from faintspot.experiments.study.specification import BEST
 from faintspot.experiments.study.sweep import PARAMETERS
@@ -66,22 +72,20 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
     axis = _axis_of(table)
     varied = [key for key in PARAMETERS if len({row[key] for row in table}) > 1]
     labelled = [key for key in varied if key not in (axis, "profile", "position_range_px")]
-    styles = _styles([label for label, _ in _by_label(table, cells, axis, labelled)])
-    rows: dict[tuple[str, float], list[int]] = {}
-    for index, row in enumerate(table):
-        rows.setdefault((row["profile"], row["position_range_px"]), []).append(index)
+    styles = _styles([in_words(labelled, values) for values in grouped(dataset, cells, labelled, axis)])
     scale = axis_of_study(axis) | {"x_range": _range_of(axis, [float(row[axis]) for row in table])}
     panels: list[list[Panel]] = []
-    for (profile, reach), kept in sorted(rows.items()):
-        parts = _by_label([table[i] for i in kept], [cells[i] for i in kept], axis, labelled)
+    for (profile, reach), kept in grouped(dataset, cells, ("profile", "position_range_px"), axis).items():
+        parts = grouped(dataset, kept, labelled, axis)
+        named = {in_words(labelled, values): part for values, part in parts.items()}
         scale |= {"y": ERROR_AXIS, "y_ticks": _ERROR_TICKS, "levels": {reach / 2: {"ls": ":"}}}
         panels.append([])
         for mode in _modes(dataset):
             heading = f"{mode_in_words(mode)}: {profile} spots, positions within ±{reach:g} px"
-            lines = _tv_lines(dataset.sel(mode=mode), parts, styles, axis)
+            lines = _tv_lines(dataset.sel(mode=mode), named, styles, axis)
             panels[-1].append(Panel(lines, title=heading, **scale))
     fixed = [parameter_in_words(key, table[0][key]) for key in PARAMETERS if key not in (*varied, axis)]
-    named = ", ".join(words for words in fixed if not words.startswith("no "))
+    shown = ", ".join(words for words in fixed if not words.startswith("no "))
     handles = {**_LEGEND, **{label: style for label, style in styles.items() if label}}
     height = _ROW_HEIGHT if len(styles) <= _FEW_LINES else 1.3 * _ROW_HEIGHT
     return FigureWithData.of(
@@ -90,7 +94,7 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
         _TEXT("sweep.caption", fixed=", ".join(fixed) or "nothing"),
         panels,
         height * len(panels) + 0.8,
-        heading=f"{title}  ({named})" if named else title,
+        heading=f"{title}  ({shown})" if shown else title,
         columns=5,
         handles=[Line(label, [], [], style=style) for label, style in handles.items()],
         shared=True,
@@ -152,36 +156,21 @@ def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | 
     reach = float(dataset["position_range_px"].values[next(iter(cells.values()))[0]])
     title = _TEXT("baselines_figure.title", profile=profile)
     above = f"{title}  (size 1, 16 × 16 px, positions within ±{reach:g} px)"
-    caption, height = (
-        _TEXT("baselines_figure.caption", largest=_LARGEST_RATIO),
-        _ROW_HEIGHT * len(cells) + 0.8,
-    )
+    caption = _TEXT("baselines_figure.caption", largest=_LARGEST_RATIO)
+    height = _ROW_HEIGHT * len(cells) + 0.8
     return FigureWithData.of(f"baselines-{profile}", title, caption, panels, height, heading=above, columns=3)
 
 
 def _axis_of(table: list[dict[str, object]]) -> str:
-    counts = {name: len({row[name] for row in table}) for name in PARAMETERS if name != "profile"}
-    if counts["flux_e"] > 1:
-        return "flux_e"
-    return max(counts, key=lambda name: counts[name]) if max(counts.values()) > 1 else "flux_e"
+    counts = {
+        name: len({row[name] for row in table}) for name in ("flux_e", *PARAMETERS) if name != "profile"
+    }
+    return "flux_e" if counts["flux_e"] > 1 else max(counts, key=lambda name: counts[name])
 
 
 def _modes(dataset: xarray.Dataset) -> list[str]:
     measured = [str(mode) for mode in dataset["mode"].values]
     return [mode for mode in (BEST, fixed_mode(dataset)) if mode in measured]
-
-
-def _by_label(
-    table: list[dict[str, Any]], cells: Sequence[int], axis: str, labelled: Sequence[str]
-) -> list[tuple[str, list[int]]]:
-    """Return the cells of each line of a panel, by increasing value of what varies, after their label."""
-    groups: dict[tuple[object, ...], list[tuple[float, int]]] = {}
-    for row, cell in zip(table, cells, strict=True):
-        groups.setdefault(tuple(row[key] for key in labelled), []).append((float(row[axis]), cell))
-    return [
-        (", ".join(map(parameter_in_words, labelled, values)), [cell for _, cell in sorted(points)])
-        for values, points in sorted(groups.items())
-    ]
 
 
 def _styles(labels: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -199,13 +188,13 @@ def _styles(labels: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 def _tv_lines(
     dataset: xarray.Dataset,
-    parts: list[tuple[str, list[int]]],
+    parts: dict[str, list[int]],
     styles: dict[str, dict[str, object]],
     axis: str,
 ) -> list[Line]:
     """Return R with and without TV against an axis, for each label."""
     lines = []
-    for label, cells in parts:
+    for label, cells in parts.items():
         for method, line in _TV_OR_NOT.items():
             if method in dataset["estimator"].values:
                 part = dataset[["error", "error_se"]].sel(estimator=method).isel(cell=cells)
@@ -241,19 +230,17 @@ def _over_k(dataset: xarray.Dataset, cell: int, label: str, colour: object) -> I
 
 def _main_cells(dataset: xarray.Dataset, profile: str) -> dict[float, list[int]]:
     """Return the cells of round Nyquist-sampled spots in 16 px, by read noise and flux."""
-    done = np.flatnonzero(dataset["done"].values)
     standard = {"profile": profile, "size": 1.0, "elongation": 1.0, "pixels": 16}
     standard |= {"background_e": 0.0, "em_gain": 1.0, "d_over_r0": 0.0}
-    table = zip(done, parameters_of(dataset, done.tolist()), strict=True)
-    kept = [(int(i), row) for i, row in table if all(row[name] == value for name, value in standard.items())]
-    if not kept:
+    kept = dataset["done"].values & np.all(
+        [dataset[name] == value for name, value in standard.items()], axis=0
+    )
+    if not kept.any():
         return {}
-    reach = min(row["position_range_px"] for _, row in kept)
-    cells: dict[float, list[int]] = {}
-    for i, row in sorted(kept, key=lambda item: item[1]["flux_e"]):
-        if row["read_noise_e"] in MAIN_NOISES_E and row["position_range_px"] == reach:
-            cells.setdefault(row["read_noise_e"], []).append(i)
-    return dict(sorted(cells.items()))
+    reach = dataset["position_range_px"].values
+    kept &= (reach == reach[kept].min()) & np.isin(dataset["read_noise_e"], MAIN_NOISES_E)
+    cells = grouped(dataset, np.flatnonzero(kept).tolist(), ("read_noise_e",), "flux_e")
+    return {noise: part for (noise,), part in cells.items()}
 
 
 def _ratio(

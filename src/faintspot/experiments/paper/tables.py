@@ -51,6 +51,22 @@ def parameter_in_words(name: str, value: object) -> str:
     return str(words) if value == standard else str(_TEXT[f"parameters.{name}"]).format(value)
 
 
+def in_words(names: Sequence[str], values: Sequence[object]) -> str:
+    """Return parameters with their units."""
+    return ", ".join(map(parameter_in_words, names, values))
+
+
+def grouped(
+    dataset: xarray.Dataset, cells: Sequence[int], by: Sequence[str], axis: str
+) -> dict[tuple[Any, ...], list[int]]:
+    """Return cells by the values of some parameters, in order, each by increasing value of another one."""
+    groups: dict[tuple[Any, ...], list[int]] = {}
+    pairs = zip(cells, parameters_of(dataset, cells), strict=True)
+    for cell, row in sorted(pairs, key=lambda pair: pair[1][axis]):
+        groups.setdefault(tuple(row[name] for name in by), []).append(cell)
+    return dict(sorted(groups.items()))
+
+
 def table_of_cells(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[str], list[list[Any]]]:
     """Return a table of all methods and modes of cells."""
     columns = ("chosen_k", "chosen_candidate", "invalid_fraction", *_STATISTICS)

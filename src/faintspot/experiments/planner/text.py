@@ -30,7 +30,7 @@ def situation(answer: Answer) -> str:
     question = answer.question
     star = f"{plain_number(question.star_flux_e)} electrons per sub-aperture and frame"
     if question.photometry is not None:
-        star = f"{question.photometry.band} = {_magnitude(answer, question.star_flux_e):.2f}, {star}"
+        star = f"{question.photometry.band} = {_star(answer, question.star_flux_e)}, {star}"
     kind = f"{question.spots.profile} spots" if question.psf is None else "spots as learnt"
     if question.laser is not None:
         kind = "spots of a laser guide star"
@@ -115,23 +115,12 @@ def foundations(answer: Answer) -> list[str]:
     return [*question.facts, *lines, *not_tried]
 
 
-def gain_in_words(answer: Answer, gain: Estimate) -> str:
+def gain_in_words(answer: Answer, gain: Estimate, *, sign: bool = False) -> str:
     """Return magnitudes gained, `more than` what the plot spans where beyond."""
     if math.isfinite(gain.value):
-        return f"{with_error(gain, 2, smallest=_SMALLEST_ERROR_MAG)} mag"
-    span = _span(answer)
-    return f"more than {span:.1f} mag" if gain.value > 0 else f"-{span:.1f} mag or less"
-
-
-def short_gain(answer: Answer, gain: Estimate) -> str:
-    """Return the same for a table."""
-    if math.isfinite(gain.value):
-        return with_error(gain, 2, sign=True, smallest=_SMALLEST_ERROR_MAG).replace(" ", "")
-    return f">+{_span(answer):.1f}" if gain.value > 0 else f"<-{_span(answer):.1f}"
-
-
-def _span(answer: Answer) -> float:
-    return float(2.5 * math.log10(answer.flux_e[-1] / answer.question.star_flux_e))
+        return with_error(gain, 2, sign=sign, smallest=_SMALLEST_ERROR_MAG)
+    span = 2.5 * math.log10(answer.flux_e[-1] / answer.question.star_flux_e)
+    return f"more than {span:.1f}" if gain.value > 0 else f"less than -{span:.1f}"
 
 
 def _helps(gain: Estimate) -> bool:
@@ -149,15 +138,11 @@ def _limit(answer: Answer, result: MethodResult) -> str:
         return f"brighter than all that was tried ({_star(answer, answer.flux_e[-1])})"
     if answer.question.photometry is None:
         return f"{plain_number(limit.value)} ± {plain_number(limit.standard_error, 1)} electrons"
-    error = 2.5 / math.log(10) * limit.standard_error / limit.value
-    return f"{_magnitude(answer, limit.value):.2f} ± {error:.2f}"
+    return f"{_star(answer, limit.value)} ± {2.5 / math.log(10) * limit.standard_error / limit.value:.2f}"
 
 
 def _star(answer: Answer, flux_e: float) -> str:
+    """Return the brightness of a star, as magnitude if the question has a photometry."""
     if answer.question.photometry is None:
         return f"{plain_number(flux_e)} electrons"
-    return f"{_magnitude(answer, flux_e):.2f}"
-
-
-def _magnitude(answer: Answer, flux_e: float) -> float:
-    return float(answer.magnitudes(flux_e))
+    return f"{float(answer.magnitudes(flux_e)):.2f}"

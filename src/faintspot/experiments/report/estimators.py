@@ -14,7 +14,7 @@ from faintspot.base.report.plots import Line, Panel
 from faintspot.base.report.texts import Texts, number_or_dash
 from faintspot.experiments.methods import knows_the_spot, label_of, style_of
 from faintspot.experiments.paper.figures import axis_of_study
-from faintspot.experiments.paper.tables import parameter_in_words, parameters_of
+from faintspot.experiments.paper.tables import grouped, in_words, parameter_in_words
 from faintspot.experiments.study.curves import StudyConditions
 from faintspot.experiments.study.specification import BEST, CORRECTED
 from faintspot.experiments.study.sweep import PARAMETERS
@@ -102,24 +102,13 @@ def estimator_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
 
 def _groups(dataset: xarray.Dataset, axis: str, by: Sequence[str], *, speckled: bool) -> Iterator[_Group]:
     """Yield the groups of cells that differ in `axis`, within a panel, and in `by`, between panels."""
-    done = [int(cell) for cell in np.flatnonzero(dataset["done"].values)]
-    table = dict(zip(done, parameters_of(dataset, done), strict=True))
-    groups: dict[tuple[Any, ...], dict[tuple[Any, ...], list[int]]] = {}
     common = [name for name in PARAMETERS if name not in (axis, *by)]
-    for cell, row in table.items():
-        if (row["d_over_r0"] > 0) == speckled:
-            panels = groups.setdefault(tuple(row[name] for name in common), {})
-            panels.setdefault(tuple(row[name] for name in by), []).append(cell)
-    for values, panels in sorted(groups.items()):
-        kept = {
-            ", ".join(map(parameter_in_words, by, key)): sorted(
-                cells, key=lambda cell: float(table[cell][axis])
-            )
-            for key, cells in sorted(panels.items())
-            if len(cells) >= _FEWEST_POINTS
-        }
-        if kept:
-            yield _Group(dict(zip(common, values, strict=True)), kept)
+    done = dataset["done"].values & ((dataset["d_over_r0"].values > 0) == speckled)
+    for values, cells in grouped(dataset, np.flatnonzero(done).tolist(), common, axis).items():
+        parts = grouped(dataset, cells, by, axis)
+        panels = {in_words(by, key): part for key, part in parts.items() if len(part) >= _FEWEST_POINTS}
+        if panels:
+            yield _Group(dict(zip(common, values, strict=True)), panels)
 
 
 def _figure(kind: str, group: _Group, rows: list[list[Panel]]) -> FigureWithData:
@@ -177,7 +166,7 @@ def calibration_sections(dataset: xarray.Dataset) -> list[Section]:
     stated = [cells[f"stated_over_actual{part}"].sel(estimator=knowing).values for part in ("", "_all")]
     rows = [
         [words, *(f"{number_or_dash(one)} ({number_or_dash(all_)})" for one, all_ in zip(*pair, strict=True))]
-        for words, *pair in zip(_in_words(cells), *stated, strict=True)
+        for words, *pair in zip(_cells_in_words(cells), *stated, strict=True)
     ]
     return [_TEXT.section("calibration-table", _TEXT.table("calibration-table", rows, knowing))]
 
@@ -192,7 +181,7 @@ def _methods(cells: xarray.Dataset) -> list[str]:
     return [str(method) for method in cells["estimator"].values]
 
 
-def _in_words(cells: xarray.Dataset) -> list[str]:
+def _cells_in_words(cells: xarray.Dataset) -> list[str]:
     """Return each cell in one line."""
     names = StudyConditions.__dataclass_fields__
     columns = [cells[name].values.tolist() for name in names]
@@ -210,7 +199,7 @@ def _efficient(cells: xarray.Dataset) -> list[str]:
         if method in _methods(cells) and any(enough):
             efficiency = bright["photon_efficiency"].sel(mode=BEST, estimator=method).values
             lowest = int(np.argmin(efficiency))
-            values = {"lowest": efficiency[lowest], "where": _in_words(bright)[lowest]}
+            values = {"lowest": efficiency[lowest], "where": _cells_in_words(bright)[lowest]}
             counts = {"reached": np.sum(efficiency >= target), "cells": len(efficiency)}
             sentences.append(_TEXT("findings.efficient", method=method, target=target, **counts, **values))
     return sentences

@@ -43,6 +43,8 @@ class MeasuredSlopes:
         Bits of `SubapertureFlag`.
     frames : (n_frames,) array of int, optional
         Frame numbers; frames follow each other where these do. Default: counted from 0.
+    slopes : Slopes, optional
+        All of them, whose wavefront is shown.
     standard_error_px : float
         Median standard error that the estimator states, per axis; NaN where it is not known.
     keep : SubapertureFlag
@@ -60,6 +62,7 @@ class MeasuredSlopes:
     flux: NDArray[Any]
     flags: NDArray[Any]
     frames: NDArray[np.int64] | None = field(default=None, kw_only=True)
+    slopes: Slopes | None = field(default=None, kw_only=True, repr=False)
     standard_error_px: float = field(default=np.nan, kw_only=True)
     keep: SubapertureFlag = field(default=NO_FLAG, kw_only=True)
 
@@ -77,8 +80,9 @@ class MeasuredSlopes:
     def of(cls, name: str, slopes: Slopes, **more: Any) -> MeasuredSlopes:
         """Make one of the slopes of one frame or several."""
         errors = np.hypot(slopes.standard_error_x, slopes.standard_error_y)[slopes.valid] / np.sqrt(2)
-        more = {"standard_error_px": median(errors.astype(np.float64)), "keep": slopes.keep, **more}
-        return cls(name, *(np.atleast_2d(getattr(slopes, array)) for array in ARRAYS), **more)
+        more |= {"standard_error_px": median(errors.astype(np.float64)), "keep": slopes.keep}
+        arrays = (np.atleast_2d(getattr(slopes, array)) for array in ARRAYS)
+        return cls(name, *arrays, slopes=slopes, **more)
 
     @property
     def number(self) -> NDArray[np.int64]:

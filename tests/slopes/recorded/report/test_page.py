@@ -17,7 +17,7 @@ from faintspot.slopes.recorded.statistics import MeasuredSlopes
 from faintspot.slopes.sensor.layout import Layout
 
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")
-SECTIONS = ["numbers", "frame", "flux", "slopes", "configuration"]
+SECTIONS = ["numbers", "frame", "flux", "slopes", "wavefront", "configuration"]
 
 
 def page_of(of: Layout, frames: Any, true: Any = None, **changes: Any) -> Page:
@@ -39,7 +39,7 @@ def test_page_has_all_sections_pictures_and_numbers() -> None:
     frames, truth = simulated(layout, 6)
     page = page_of(layout, frames, truth)
     assert page.ids == SECTIONS
-    assert [tag for tag, _ in page.tags].count("img") == 4
+    assert [tag for tag, _ in page.tags].count("img") == 6
     methods = two_methods(layout, frames)[0]
     assert f"{np.median(methods[0].flux[methods[0].valid]):#.3g}".rstrip(".") + " e-" in page.text
     errors = (np.abs(methods[0].x - truth[..., 0]) + np.abs(methods[0].y - truth[..., 1])) / 2

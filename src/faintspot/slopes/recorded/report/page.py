@@ -91,10 +91,10 @@ def warnings_in_words(run: SlopesRun) -> list[str]:
 
 def _of_method(method: MeasuredSlopes, summary: SlopesSummary) -> list[str]:
     lines = [] if summary.valid_fraction else [_TEXT["warnings.none_valid"]]
-    for flag, advice in _TEXT["advice"].items():
+    for flag, (most, advice) in _TEXT["advice"].items():
         fraction = method.flag_count(SubapertureFlag[flag]) / method.x.size
-        if fraction > advice["above"]:
-            lines.append(_TEXT(f"advice.{flag}.text", fraction=fraction))
+        if fraction > most:
+            lines.append(f"{percentage(fraction)} of the measurements {advice}")
     never = np.flatnonzero(summary.valid_frames == 0)
     if 0 < len(never) < method.n_subapertures:
         listed = ", ".join(str(number) for number in never[:_MOST_LISTED])
@@ -186,11 +186,12 @@ def _slopes(run: SlopesRun) -> Section:
 
 def _wavefront(run: SlopesRun) -> list[Section]:
     """Return the section with the wavefronts fitted to the slopes of each method; none without a layout."""
-    if run.layout is None or not run.slopes:
+    known = [(method.name, method.slopes) for method in run.methods if method.slopes is not None]
+    if run.layout is None or not known:
         return []
     parts: list[Part] = []
     text, missing = [_TEXT["wavefront.about"]], []
-    for number, (name, slopes) in enumerate(run.slopes.items()):
+    for number, (name, slopes) in enumerate(known):
         try:
             wavefront = fit_wavefront(slopes, run.layout)
         except InputError as error:

@@ -14,7 +14,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.report.texts import Texts
 from faintspot.slopes.estimators.base import Step
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
-from faintspot.slopes.pipeline.slopes import Slopes, Stages
+from faintspot.slopes.pipeline.slopes import Stages
 from faintspot.slopes.recorded.report.pictures import Followed
 from faintspot.slopes.recorded.statistics import (
     Floats,
@@ -110,8 +110,6 @@ class SlopesRun:
         What the page says in place of the frame; "" leaves it out.
     steps : sequence of Step
         Which pictures of the frame are drawn.
-    slopes : mapping of Slopes
-        Slopes by method, whose wavefronts are shown.
     followed : Followed, optional
         Spots that were followed, which are shown in place of the stages.
 
@@ -128,7 +126,6 @@ class SlopesRun:
     example_frame: int = 0
     why_no_stages: str = "Not drawn: no frame was given."
     steps: Sequence[Step] = TotalVariation.steps_shown
-    slopes: Mapping[str, Slopes] = field(default_factory=dict)
     followed: Followed | None = None
 
     def __post_init__(self) -> None:

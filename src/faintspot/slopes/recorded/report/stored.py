@@ -66,8 +66,6 @@ _SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
 _SAME_POSITION_PX = 0.02
 """Recomputed positions differ by less, whatever processor computed the stored ones."""
 _FRAMES_OF_PROFILE = 500
-_SAID_FIRST = ("calibration", "PSF", "score")
-"""Reasons for not drawing the frame that also stand at the top of the page."""
 
 
 def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path] | None = None) -> Report:
@@ -96,6 +94,8 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
     stores = [open_run(Path(path)) for path in paths]
     first = stores[0]
     for store in stores[1:]:
+        if store.path == first.path:
+            raise InputError(f"{first.path}: expected two different files of slopes, got the same twice")
         _check_same_sensor(first, store)
     methods, notes = _methods(stores)
     total = np.where(methods[0].valid, methods[0].flux, 0.0).sum(axis=1)
@@ -105,14 +105,8 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
         followed, reason = _followed(first, frames)
     else:
         stages, reason = _example(stores, methods, example_frame, frames, notes)
-    if any(word in reason for word in _SAID_FIRST):
-        notes.append(reason)
-    slopes = {
-        method.name: Slopes.from_variables(store.stored.variables, method.n_frames, store.keep)
-        for store, method in zip(stores, methods, strict=True)
-    }
     steps = (first.estimator or TotalVariation).steps_shown
-    run = SlopesRun(methods, first.layout, stages, None, example_frame, reason, steps, slopes, followed)
+    run = SlopesRun(methods, first.layout, stages, None, example_frame, reason, steps, followed)
     return slopes_report(
         run,
         title=f"Slopes of {' and '.join(store.path.name for store in stores)}",
@@ -189,19 +183,10 @@ def _methods(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[st
 
 def _names(stores: Sequence[StoredRun]) -> list[str]:
     """Name the methods by what they do where that tells them apart, else by their files."""
-    names = [_label(store) for store in stores]
-    if len(set(names)) == len(names):
-        return names
-    files = [store.path.name for store in stores]
-    if len(set(files)) < len(files):
-        files = [str(store.path) for store in stores]
-    if len(set(files)) < len(files):
-        raise InputError(f"{stores[0].path}: expected two different files of slopes, got the same twice")
-    return files
-
-
-def _label(store: StoredRun) -> str:
-    return store.path.name if store.estimator is None else store.estimator.label
+    names = [store.path.name if store.estimator is None else store.estimator.label for store in stores]
+    if len(set(names)) < len(names):
+        names = [store.path.name for store in stores]
+    return names if len(set(names)) == len(names) else [str(store.path) for store in stores]
 
 
 def _example(
@@ -271,13 +256,6 @@ def _disagreement(store: StoredRun, method: MeasuredSlopes, frame: NDArray[Any],
     return [_TEXT("stored.disagreement", **names, distance=distance.max())]
 
 
-def _range_in_words(store: StoredRun) -> str:
-    if store.layout is None or store.settings is None or store.settings.search_range_px is None:
-        return ""
-    range_px = store.settings.values("search_range_px", len(store.layout), store.layout.pixels)
-    return f"; positions within {np.max(range_px):g} px"
-
-
 def _facts(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
     sources = list(dict.fromkeys(source for store in stores for source in store.sources))
     shown = ", ".join(sources[:4]) + (f" and {len(sources) - 4} more" if len(sources) > 4 else "")
@@ -286,7 +264,7 @@ def _facts(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> di
     for store, method in zip(stores, methods, strict=True):
         words = "not stored"
         if store.estimator is not None and store.layout is not None:
-            words = store.estimator.in_words(len(store.layout), store.layout.pixels) + _range_in_words(store)
+            words = store.estimator.in_words(len(store.layout), store.layout.pixels)
         facts["Settings" if len(methods) == 1 else f"Settings of {method.name!r}"] = words
     if any("reference" in of_run for of_run in attributes):
         facts["Reference"] = _TEXT["stored.reference"]
