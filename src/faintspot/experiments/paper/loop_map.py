@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 METHODS = NO_TV, TV, SMOOTHING, Window.name, MaximumAPosteriori.name
-R0_M = 0.118, 0.18
-"""Turbulence with which the loop without noise has Strehl ratios of about 0.2 and 0.6."""
+R0_M = 0.071, 0.127
+"""Turbulence with which brightest pixels have Strehl ratios of about 0.2 and 0.6 without noise."""
 FLUXES_E = 10.0, 30.0, 100.0, 300.0, 1000.0
 _QUICK_FLUXES_E = FLUXES_E[::2]
 _EMCCD = "EMCCD"
