@@ -29,8 +29,8 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
     """Make a web page of pictures and tables from slopes, a study or a closed loop.
 
     SLOPES is what `faintspot slopes` wrote; with a second one of the same frames (say, without denoising) the
-    page compares the two. It holds the frame raw, calibrated, denoised and after the background subtraction,
-    flux and validity maps, slope arrows, iterations and slope jitter, in one file without any links outside.
+    page compares the two. It holds a frame raw, calibrated, denoised and after the background subtraction,
+    maps of flux, validity and jitter, slope arrows and the wavefront, in one file without any links outside.
 
     The store of a study (`faintspot study`), finished or not, gives the page with its figures and verdicts.
     So does the folder of a closed-loop experiment (`faintspot loop`). Telemetry (`faintspot realtime record`)

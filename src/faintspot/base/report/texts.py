@@ -38,11 +38,6 @@ def number_or_dash(value: float, digits: int = 2) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else NOTHING
 
 
-def change(value: float, digits: int = 3) -> str:
-    """Return a number with its sign to so many digits."""
-    return f"{value:+.{digits}g}".replace("-", "−")
-
-
 def significant(value: float, digits: int = 3) -> str:
     """Return a number with that many significant digits, zeros included."""
     text = f"{value:#.{digits}g}".rstrip(".")
@@ -102,7 +97,6 @@ def in_sigmas(estimate: Estimate, digits: int = 1) -> str:
 _OF_NUMBERS: Mapping[str, Callable[[float, int], str]] = {
     "plain": plain_number,
     "signed": signed,
-    "change": change,
     "significant": significant,
     "percent": percentage,
     "hours": in_hours,

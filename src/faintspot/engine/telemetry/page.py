@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -133,12 +132,11 @@ def _timing(telemetry: Telemetry) -> Section:
 
 
 def _compared(telemetry: Telemetry) -> Section:
-    records = []
-    for name, values in quantities(telemetry).items():
-        for each in methods_in_turn(telemetry, values):
-            too_few = each.difference is not None and not math.isfinite(each.difference.low)
-            difference = None if too_few else each.difference
-            records.append({"quantity": name, **vars(each), "difference": difference, "too_few": too_few})
+    records = [
+        {"quantity": name, **vars(each)}
+        for name, values in quantities(telemetry).items()
+        for each in methods_in_turn(telemetry, values)
+    ]
     return _TEXT.section("methods", _TEXT.table("methods", records, first=records[0]["method"]))
 
 

@@ -69,15 +69,10 @@ class Example:
         return next(iter(self.stages.values()))
 
     @property
-    def raw_is_calibrated(self) -> bool:
-        """Whether the raw frame is in electrons already."""
-        return bool(np.allclose(self.first.raw, self.first.calibrated, rtol=1e-5, equal_nan=True))
-
-    @property
     def shown_steps(self) -> dict[str, str]:
-        """Attributes of `Stages` by title; a raw frame in electrons is not shown twice and nothing else."""
-        only_twice = len(self.steps) == 2 and self.raw_is_calibrated
-        return dict(self.steps[:1] if only_twice else self.steps)
+        """Attributes of `Stages` by title; raw images only where they are not calibrated already."""
+        same = np.allclose(self.first.raw, self.first.calibrated, rtol=1e-5, equal_nan=True)
+        return {title: step for title, step in self.steps if step != "raw" or not same}
 
     def positions(self) -> dict[str, Floats]:
         """Return valid positions by method, and the truth, from the window's middle, px; NaN if invalid."""
@@ -113,22 +108,21 @@ def sensor_figure(example: Example, frame: int) -> FigureWithData:
 def steps_figure(example: Example) -> FigureWithData:
     """Draw the faintest, a median and the brightest valid sub-aperture after every step."""
     stages, steps, chosen = example.first, example.shown_steps, example_subapertures(example.first)
-    (height, width), one_unit = example.layout.window, example.raw_is_calibrated
+    height, width = example.layout.window
     style: dict[str, Any] = {"extent": (-width / 2, width / 2, -height / 2, height / 2)}
     positions, rows = example.positions(), list[list[Picture]]()
     for which, index in chosen.items():
-        limits = limits_of((stages.raw if one_unit else stages.calibrated)[index], percent=99.8)
+        limits = limits_of(stages.calibrated[index], percent=99.8)
         crosses = _crosses({name: xy[index : index + 1] for name, xy in positions.items()}, 13)
-        label = f"{which}\nno. {index}, {plain_number(float(stages.slopes.flux[index]))} e-\ny (px)"
+        y = f"{which}\nno. {index}, {plain_number(float(stages.slopes.flux[index]))} e-\ny (px)"
         row = list[Picture]()
-        for number, (title, step) in enumerate(steps.items()):
-            image, in_adu = getattr(stages, step)[index], title == "raw" and not one_unit
-            low, high = limits_of(image, percent=99.8) if in_adu else limits
-            unit = "ADU" if in_adu else "e- per pixel" if number == len(steps) - 1 else ""
-            title = "" if rows else f"{title} (ADU)" if in_adu else title
-            marks = crosses if number or len(steps) == 1 else []
+        for title, step in steps.items():
+            image, is_raw = getattr(stages, step)[index], step == "raw"
+            low, high = limits_of(image, percent=99.8) if is_raw else limits
+            unit = "ADU" if is_raw else "e- per pixel" if title == list(steps)[-1] else ""
             options = {**style, "vmin": low, "vmax": high}
-            row.append(Picture(image, unit, title, "x (px)", "" if number else label, options, marks))
+            above, marks = "" if rows else title, [] if is_raw else crosses
+            row.append(Picture(image, unit, above, "x (px)", "" if row else y, options, marks))
         rows.append(row)
     panel = WIDTH / 5.3
     size = len(rows) * (panel * min(height / width, 2.0) + 0.4) + 0.9

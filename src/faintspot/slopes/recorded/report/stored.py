@@ -16,7 +16,6 @@ from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, Line, Panel
 from faintspot.base.report.texts import Texts
 from faintspot.io import open_frames
 from faintspot.io.frames import FrameSource
-from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slopes import Slopes, Stages
 from faintspot.slopes.recorded.report.page import slopes_report
@@ -25,8 +24,6 @@ from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.sodium import sodium_of_frames
 from faintspot.slopes.recorded.statistics import MeasuredSlopes
 from faintspot.slopes.recorded.stored_run import StoredRun, open_run
-from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.spots.laser_spots import LaserSpots
 from faintspot.slopes.spots.sodium import SodiumProfile
 
 _TEXT = Texts("faintspot.slopes.recorded")
@@ -45,21 +42,6 @@ def profile_figure(profiles: Mapping[str, SodiumProfile]) -> FigureWithData:
     flux, height = "return flux per km of altitude", "altitude above sea level (km)"
     panel = Panel(lines, flux, height, x_range=(0, None), legend=True)
     return _TEXT.figure("sodium", [[panel]], 4.6, width=0.6 * WIDTH, legend="")
-
-
-def sodium_section_of_frames(
-    source: FrameSource, layout: Layout, calibration: Calibration, laser: LaserSpots, most_frames: int
-) -> Section:
-    """Return the section with the configured profile, and that of frames; or why there is none."""
-    try:
-        found = sodium_of_frames(source, layout, calibration, laser, most_frames=most_frames)
-    except InputError as error:
-        return _TEXT.section("sodium", missing=f"Not fitted: {error}.")
-    sodium = found.sodium
-    profiles = {"configured": sodium.star.focused(laser.profile), "these frames": sodium.fit.profile}
-    figure = profile_figure(profiles)
-    doubt = found.left_out.capitalize() or None
-    return _TEXT.section("sodium", figure, width=sodium.spot_fwhm_arcsec, left_out=doubt)
 
 
 _SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
@@ -124,9 +106,13 @@ def _sodium(store: StoredRun, frames: Sequence[str | Path] | None) -> list[Secti
     try:
         with _source(store, frames) as source:
             parts = store.layout, store.calibration, store.laser
-            return [sodium_section_of_frames(source, *parts, _FRAMES_OF_PROFILE)]
+            found = sodium_of_frames(source, *parts, most_frames=_FRAMES_OF_PROFILE)
     except InputError as error:
         return [_TEXT.section("sodium", missing=f"Not fitted: {error}.")]
+    sodium, doubt = found.sodium, found.left_out.capitalize() or None
+    profiles = {"configured": sodium.star.focused(store.laser.profile), "these frames": sodium.fit.profile}
+    figure = profile_figure(profiles)
+    return [_TEXT.section("sodium", figure, width=sodium.spot_fwhm_arcsec, left_out=doubt)]
 
 
 def _configurations(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
