@@ -183,12 +183,17 @@ def test_tiff_strips_and_tiles(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("is_damaged", [False, True])
-def test_fits_tiles(tmp_path: Path, is_damaged: bool) -> None:
+@pytest.mark.parametrize("is_aot", [False, True])
+def test_fits_tiles(tmp_path: Path, is_damaged: bool, is_aot: bool) -> None:
     """A tile of 64 MiB, which inflates to more than the image of 64 x 64 px where the header is changed."""
     image = fits.CompImageHDU(
         np.zeros((8192, 8192), np.uint8), compression_type="GZIP_1", tile_shape=(8192, 8192)
     )
-    fits.HDUList([fits.PrimaryHDU(), image]).writeto(tmp_path / "a.fits")
+    primary = fits.PrimaryHDU()
+    if is_aot:
+        pytest.importorskip("aotpy")
+        primary.header["AOT-VERS"] = "1.0.0"
+    fits.HDUList([primary, image]).writeto(tmp_path / "a.fits")
     content = (tmp_path / "a.fits").read_bytes()
     if is_damaged:
         content = content.replace(b"=                 8192 ", b"=                   64 ")
