@@ -16,7 +16,7 @@ from pathlib import Path
 
 import click
 
-from benchmarks import compare, foreign_loops, machine, night_frames, results, showing
+from benchmarks import compare, foreign_loops, machine, night_frames, paper_night, results, showing
 from benchmarks.measuring import Table
 
 _ORDER = (
@@ -160,6 +160,7 @@ def main() -> None:
     """Run the command that the first argument names; without one, benchmarks."""
     commands = {"compare": compare_runs, "foreign_loops": foreign_loops.run_command}
     commands["night_frames"] = night_frames.run_command
+    commands["paper_night"] = paper_night.run_command
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if name in commands:
         commands[name](sys.argv[2:], prog_name=f"python -m benchmarks {name}")

@@ -8,10 +8,15 @@ from types import ModuleType
 
 import pytest
 from benchmarks import __main__ as command
-from benchmarks import machine, night_frames, results
+from benchmarks import machine, night_frames, paper_night, results
 from benchmarks.measuring import Table
 from click.testing import CliRunner
 from tests import benchmark_cases as cases
+from tests.experiments.night_cases import night_with
+
+from faintspot.base.report.texts import with_error
+from faintspot.experiments.night.paper import compare_with_paper
+from faintspot.experiments.night.protocol import NightPlan
 
 
 def test_written_and_read_again_they_are_the_same(tmp_path: Path) -> None:
@@ -90,3 +95,20 @@ def test_nights_of_all_packages_are_what_the_documentation_shows(tmp_path: Path)
     stored = json.loads(night_frames.publish(table, "now", tmp_path / "pages").read_text(encoding="utf-8"))
     assert stored["tables"]["nights"]["columns"] == ["frames", "r0 / true"]
     assert stored["tables"]["nights"]["rows"] == [["soapy, 20 e-", "0.92, 0.91"]]
+
+
+def test_both_nights_stand_beside_the_papers_table(tmp_path: Path) -> None:
+    (tmp_path / "paper.json").write_bytes((results.PAGES / "paper.json").read_bytes())
+    nights = [night_with(seed, plan=NightPlan()) for seed in (1, 2)]
+    stored = json.loads(paper_night.publish(*nights, pages=tmp_path).read_text(encoding="utf-8"))
+    compared = [compare_with_paper(night) for night in nights]
+    means, beside = stored["tables"]["night"], stored["tables"]["night_paper"]
+    assert [row[1] for row in means["rows"]][:2] == ["0.184 ± 0.001 (2)", "0.203 ± 0.012 (2)"]
+    for column, each in zip((2, 3), compared, strict=True):
+        assert each is not None
+        assert beside["rows"][4][column] == with_error(each.every.our_mean, sign=True)
+        assert beside["rows"][5][column].startswith(f"{each.every.chi_square:.1f} (")
+    of_study = [row for row in stored["tables"]["verdicts"]["rows"] if not row[0].startswith("Section 3.7")]
+    assert len(of_study) == 8
+    assert len(stored["tables"]["verdicts"]["rows"]) == 8 + 5
+    assert "paper" in stored["figures"]["in_counts"]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from faintspot.experiments.night.blocks import Night
 from faintspot.experiments.night.protocol import NightPlan, label_of
 
-PLAN = NightPlan(strengths=(4, 6, 4, 6), repeats=(4, 2, 4, 2))
+PLAN = NightPlan(strengths=(4, 6, 4, 6), repeats=(4, 2, 4, 2), gap_frames=0)
 BLOCK_S = 600 / 250  # s, a block with its settling
 DRIFT_S = 40.0
 NOISE = 0.02
@@ -51,7 +51,7 @@ def night_with(
         set_names=tuple(plan.set_name(number) for number in range(plan.sets)),
         set_number=np.array([number for number, _, _ in entries]),
         method=np.array([labels.index(label_of(name, strength)) for _, name, strength in entries]),
-        strength_e=strength,
+        strength=strength,
         start_s=start_s,
         duration_s=np.full(count, 2.0),
         strehl=seen + change + noise,

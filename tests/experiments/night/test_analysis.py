@@ -23,20 +23,20 @@ def test_groups_leave_a_strength_of_zero_out() -> None:
     night = night_with()
     found = {group.name: group.rows for group in groups(night)}
     assert list(found) == [ALL_STRENGTHS, BEST]
-    assert (night.strength_e[found[ALL_STRENGTHS]] > 0).all()
-    assert night.strength_e[found[BEST]].min() >= 0.6
-    assert night.strength_e[found[BEST]].max() <= 1.1
-    counted = found[ALL_STRENGTHS] | np.isnan(night.strength_e) | (night.strength_e == 0)
+    assert (night.strength[found[ALL_STRENGTHS]] > 0).all()
+    assert night.strength[found[BEST]].min() >= 0.6
+    assert night.strength[found[BEST]].max() <= 1.1
+    counted = found[ALL_STRENGTHS] | np.isnan(night.strength) | (night.strength == 0)
     assert counted.all()
 
 
 def test_a_method_without_strength_is_a_group_of_its_own() -> None:
     night = night_with()
     labels = (*night.labels, "fixed window")
-    method = np.where(night.strength_e == 0, len(labels) - 1, night.method)
-    strength = np.where(night.strength_e == 0, np.nan, night.strength_e)
+    method = np.where(night.strength == 0, len(labels) - 1, night.method)
+    strength = np.where(night.strength == 0, np.nan, night.strength)
     settings = (*night.settings, "")
-    changed = replace(night, labels=labels, settings=settings, method=method, strength_e=strength)
+    changed = replace(night, labels=labels, settings=settings, method=method, strength=strength)
     assert [group.name for group in groups(changed)] == [ALL_STRENGTHS, BEST, "fixed window"]
 
 
@@ -141,15 +141,15 @@ def test_without_paired_runs_hours_are_those_of_the_measured_effect() -> None:
 def test_ranges_of_strengths_hold_every_strength_once() -> None:
     """One on an edge belongs to the paper's range, else to the lower range."""
     night = night_with(8, best=0.2)
-    strength = night.strength_e.copy()
+    strength = night.strength.copy()
     edges = np.array([0.3, 0.4, 0.6, 1.1, 1.4, 1.6, 1.9])
     strength[strength > 0] = edges[np.arange((strength > 0).sum()) % len(edges)]
-    ranges = by_strength(replace(night, strength_e=strength))
+    ranges = by_strength(replace(night, strength=strength))
     expected = [np.isin(strength, part) for part in ([0.3], [0.4], [0.6, 1.1], [1.4, 1.6], [1.9])]
     assert [each.blocks for _, each in ranges] == [np.count_nonzero(rows) for rows in expected]
     assert [mean for mean, _ in ranges] == pytest.approx([strength[rows].mean() for rows in expected])
     of_night = by_strength(night)
-    assert max((each.measured.value, each.name) for _, each in of_night)[1] == "0.6 to 1.1 e⁻"
+    assert max((each.measured.value, each.name) for _, each in of_night)[1] == "0.6 to 1.1 e-"
 
 
 def test_the_line_against_r0_is_least_squares() -> None:

@@ -34,10 +34,12 @@ def test_store_summary_and_page(tmp_path: Path) -> None:
     html = (tmp_path / "night.html").read_text(encoding="utf-8")
     sections = re.findall(r'<section id="([^"]+)"', html)
     assert sections == [
-        "night-verdicts", "night-panels", "night-means", "night-differences", "night-r0", "night-settings"
+        "night-verdicts", "night-paper", "night-panels", "night-means", "night-differences", "night-r0",
+        "night-settings",
     ]  # fmt: skip
-    assert html.count("paper –") == 12  # four sets, three columns, none of them known
-    assert "not available" in html
+    for mean in ("0.184", "0.203", "0.209", "0.196"):  # Table 1 without TV
+        assert f"{mean}<" in html
+    assert len(summary["paper"]) == 4
 
 
 def test_what_is_not_known_is_null() -> None:
@@ -51,6 +53,6 @@ def test_what_is_not_known_is_null() -> None:
 
 def test_the_text_has_a_line_for_each_verdict_and_difference() -> None:
     lines = night_summary_text(night_with(3)).splitlines()
-    assert len(lines) == 4 + 2
-    assert all(" σ" in line for line in lines)
-    assert all("alternating" in line for line in lines[4:])
+    assert len(lines) == 4 + 4 + 2
+    assert all(" σ" in line for line in lines[:4] + lines[8:])
+    assert all("alternating" in line for line in lines[8:])

@@ -5,7 +5,8 @@ import pytest
 from tests.experiments.experiment_cases import small
 from tests.refusals import refused
 
-from faintspot.experiments.night.protocol import NONE, QUICK_PLAN, TV, NightPlan
+from faintspot.experiments.night.protocol import COUNTS, NONE, QUICK_PLAN, TV, NightPlan, counts_per_e
+from faintspot.loop.simulation import load_loop
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 
@@ -27,10 +28,41 @@ def test_each_cycle_begins_without_tv_and_strengths_rise() -> None:
 
 
 def test_sets_follow_one_another() -> None:
-    plan = QUICK_PLAN
-    assert plan.first_frame(0) == 0
-    for number in range(1, plan.sets):
-        assert plan.first_frame(number) == plan.first_frame(number - 1) + plan.frames(number - 1)
+    for plan in (NightPlan(), QUICK_PLAN):
+        firsts = np.concatenate([plan.first_frames(number) for number in range(plan.sets)])
+        np.testing.assert_array_equal(firsts, 4650 * np.arange(len(firsts)))  # 31 s at 150 frames/s
+        numbers = plan.frame_numbers(1)
+        assert len(numbers) == plan.frames(1) == len(plan.schedule(1))
+        np.testing.assert_array_equal(numbers[:: plan.block_frames], plan.first_frames(1))
+        assert numbers[plan.block_frames - 1] == plan.first_frames(1)[0] + plan.block_frames - 1
+
+
+def test_the_night_is_the_papers() -> None:
+    """Each set without TV and with 8 or 20 strengths, and that repeated: a little more than an hour."""
+    plan, rate_hz = NightPlan(), load_loop("canary").control.frame_rate_hz
+    assert [plan.blocks(number) for number in range(4)] == [18, 42, 18, 42]
+    blocks = sum(plan.blocks(number) for number in range(4))
+    hours = blocks * (plan.block_frames + plan.gap_frames) / rate_hz / 3600
+    assert 1 < hours < 1.1
+
+
+def test_strengths_in_counts_follow_the_multiplication_gain() -> None:
+    loop = small().replace("camera", em_gain=300.0, gain_e_per_adu=10.0)
+    plan = NightPlan(unit=COUNTS, listed_strengths=(0.6, 1.5))
+    for number, counts in ((0, 30.0), (2, 22.5)):  # 300 / 10, and three quarters of it
+        whole = plan.configuration(loop, number)
+        assert counts_per_e(whole) == counts
+        _, *tv = plan.made(whole, number, {})
+        noise = [method.estimator.noise_std for method in tv]  # type: ignore[attr-defined]
+        np.testing.assert_allclose(noise, [0.6 / counts, 1.5 / counts])
+        assert [method.label for method in tv] == ["TV 0.6 counts", "TV 1.5 counts"]
+
+
+def test_the_preset_has_the_papers_signal() -> None:
+    """500 to 1,000 counts, with the full gain and with 75 % of it."""
+    loop, plan = load_loop("canary"), NightPlan()
+    signals = [loop.photons * counts_per_e(plan.configuration(loop, number)) for number in range(4)]
+    np.testing.assert_allclose(signals, [750, 750, 562.5, 562.5])
 
 
 def test_multiplication_gain_is_full_and_then_three_quarters() -> None:
@@ -46,7 +78,7 @@ def test_methods_share_pixels_and_loop_gain_when_nothing_is_tuned() -> None:
     assert isinstance(none.estimator, BrightestPixels)
     assert none.label == "no TV"
     assert {method.estimator.keep_brightest for method in (none, *tv)} == {30}  # type: ignore[attr-defined]
-    assert {method.gain for method in (none, *tv)} == {None}
+    assert {(method.gain, method.corrects_gain) for method in (none, *tv)} == {(None, False)}
     assert all(isinstance(method.estimator, TotalVariation) for method in tv)
     assert [method.estimator.noise_std for method in tv][-1] == 2  # type: ignore[attr-defined]
 
@@ -56,19 +88,19 @@ def test_tuned_values_are_used_except_for_the_strength() -> None:
         NONE: {"loop_gain": 0.3, "keep_brightest": 12},
         TV: {"loop_gain": 0.2, "keep_brightest": 20, "noise_std": 9.0},
     }
-    none, *tv = NightPlan(strengths_e=(0.5, 1.5)).made(small(), 0, choices)
+    none, *tv = NightPlan(listed_strengths=(0.5, 1.5)).made(small(), 0, choices)
     assert (none.gain, none.estimator.keep_brightest) == (0.3, 12)  # type: ignore[attr-defined]
     assert [(method.gain, method.estimator.noise_std) for method in tv] == [(0.2, 0.5), (0.2, 1.5)]  # type: ignore[attr-defined]
 
 
 def test_each_subaperture_may_have_its_own_strength() -> None:
     factors = tuple(np.linspace(0.5, 1, 12))
-    method = NightPlan(strengths_e=(2.0,), strength_factors=factors).made(small(), 0, {})[1]
+    method = NightPlan(listed_strengths=(2.0,), strength_factors=factors).made(small(), 0, {})[1]
     np.testing.assert_allclose(method.estimator.values("noise_std", 12, 64), 2 * np.array(factors))
 
 
 def test_other_methods_are_one_block_of_a_cycle() -> None:
-    plan = NightPlan(methods=("window", "none", "tv"), strengths_e=(0.4, 0.8))
+    plan = NightPlan(methods=("window", "none", "tv"), listed_strengths=(0.4, 0.8))
     assert [name for name, _ in plan.entries(0)] == ["window", "none", "tv", "tv"]
     labels = [method.label for method in plan.made(small(), 0, {})]
     assert labels == ["fixed window", "no TV", "TV 0.4 e-", "TV 0.8 e-"]
@@ -77,13 +109,13 @@ def test_other_methods_are_one_block_of_a_cycle() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"block_frames": 110}, "plan.block_frames = 110"),
+        ({"block_frames": 90}, "plan.block_frames = 90"),
         ({"repeats": (1, 1)}, "for each set"),
         ({"methods": ("none",)}, "two or more"),
         ({"methods": ("none", "none")}, "two or more"),
         ({"methods": ("none", "map+kalman")}, "expected the integrator"),
         ({"methods": ("none", "nothing")}, "nothing"),
-        ({"strengths_e": (-1.0,)}, "strengths"),
+        ({"listed_strengths": (-1.0,)}, "strengths"),
         ({"strengths": (1, 8, 8, 8)}, "plan.strengths = 1"),
         ({"em_fractions": (0.0, 1.0, 1.0, 1.0)}, "plan.em_fractions = 0"),
     ],

@@ -117,7 +117,7 @@ def test_measured_strehl_ratios(tmp_path: Path) -> None:
     measured = drifting_strehl(3000, effect, 4)
     recorded = recorded_night(path, strehl=measured)
     night = recorded.night
-    assert night.strength_e.tolist() == pytest.approx([np.nan, 0.6] * (len(night.strehl) // 2), nan_ok=True)
+    assert night.strength.tolist() == pytest.approx([np.nan, 0.6] * (len(night.strehl) // 2), nan_ok=True)
     found = difference(night, groups(night)[0], drift_of_r0(night)).measured
     assert found.low < effect < found.high
     assert 0.05 * effect < found.standard_error < effect / 3

@@ -19,10 +19,11 @@ pytest.importorskip("zarr")
 PLAN = NightPlan(
     block_frames=60,
     settle_in_block=20,
+    gap_frames=0,
     strengths=(2, 3),
     em_fractions=(1.0, 0.75),
     repeats=(2, 1),
-    strongest_e=1.0,
+    strongest=1.0,
     keep_brightest=12,
 )
 LOOP = small().replace("atmosphere", r0_m=(0.1, 0.2), drift_time_s=2.0).replace("camera", em_gain=100.0)

@@ -52,4 +52,4 @@ def test_without_paired_runs_there_is_no_paired_verdict() -> None:
 
 def test_a_night_without_strengths_has_no_verdicts() -> None:
     night = night_with(4)
-    assert verdicts(replace(night, strength_e=np.full(len(night.strehl), np.nan))) == []
+    assert verdicts(replace(night, strength=np.full(len(night.strehl), np.nan))) == []

@@ -63,8 +63,21 @@ def test_a_run_goes_on_where_another_ended() -> None:
     later = simulate_loop(end, [plain()], first_frame=7)
     np.testing.assert_array_equal(later.slopes_px, record.slopes_px[7:])
     np.testing.assert_array_equal(later.r0_m, record.r0_m[7:])
-    with pytest.raises(InputError, match="first_frame"):
-        simulate_loop(end, [plain()], first_frame=-1)
+    numbers = [0, 1, 2, 9, 11]
+    parts = simulate_loop(end, [plain()], first_frame=numbers)  # frames between them are left out
+    np.testing.assert_array_equal(parts.slopes_px, record.slopes_px[numbers])
+    for wrong in (-1, [0, 1], [0, 1, 3, 2, 4]):
+        with pytest.raises(InputError, match="first_frame"):
+            simulate_loop(end, [plain()], first_frame=wrong)
+
+
+def test_the_static_error_lowers_strehl_ratios_alone() -> None:
+    loop = faint().replace("run", frames=8, settle_frames=1)
+    record = simulate_loop(loop, [plain()])
+    worse = simulate_loop(loop.replace("science", static_error_nm=100.0), [plain()])
+    factor = np.exp(-((2 * np.pi * 100.0 / 1650.0) ** 2))
+    np.testing.assert_allclose(worse.strehl, factor * record.strehl, rtol=1e-12)
+    np.testing.assert_array_equal(worse.commands, record.commands)
 
 
 def test_realisations_differ(record: LoopRecord) -> None:

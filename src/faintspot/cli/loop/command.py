@@ -164,8 +164,14 @@ def budget(configuration: str, methods: Names | None, **options: Any) -> None:
     "--strengths",
     type=NUMBERS,
     metavar="NUMBERS",
-    help="Strengths of TV [e-], with commas.",
+    help="Strengths of TV in --unit, with commas.",
     show_default="8 or 20 from 0 to 2",
+)
+@option(
+    "--unit",
+    type=click.Choice(["e-", "counts"]),
+    default="e-",
+    help="Unit of strengths, which the paper does not state: photo-electrons, or counts of the camera.",
 )
 @option(
     "--strength-factors",
@@ -182,6 +188,7 @@ def night(
     configuration: str,
     methods: Names,
     strengths: tuple[float, ...],
+    unit: str,
     strength_factors: str | None,
     output: str | None,
     quick: bool,
@@ -191,14 +198,15 @@ def night(
 
     The protocol of the observations of Basden et al. 2015: four sets of cycles, each a block without TV, then
     8 or 20 strengths that rise from 0 to 2; the multiplication gain is full in the first two sets and at 75 %
-    in the last two; one atmosphere, whose r0 drifts. The page compares Strehl ratios against time, r0 and
-    strength, judges the paper's statements with their significance, and states how many hours of observing
-    would show each difference. A run without TV in the same turbulence tells the true difference. An
-    interrupted command continues with the sets that are missing.
+    in the last two; one atmosphere, whose r0 drifts. Of its hour a sixth is simulated. The page compares
+    Strehl ratios against time, r0 and strength, judges the paper's statements with their significance,
+    compares its Table 1, and states how many hours of observing would show each difference. A run without TV
+    in the same turbulence tells the true difference. An interrupted command continues with the missing sets.
 
     \b
     Examples:
       faintspot loop night
+      faintspot loop night canary --unit counts
       faintspot loop night canary --tuned -o tuned
       faintspot loop night emccd --methods none,tv,smoothed,window --strengths 0.4,0.8
     """
@@ -209,9 +217,11 @@ def night(
 
     factors = () if strength_factors is None else tuple(read_array(strength_factors).ravel().tolist())
     plan = QUICK_PLAN if quick else NightPlan()
-    plan = replace(plan, methods=methods, strengths_e=strengths or (), strength_factors=factors)
+    listed = strengths or ()
+    plan = replace(plan, methods=methods, listed_strengths=listed, strength_factors=factors, unit=unit)
     loop = load_loop(configuration)
-    folder = Path(output or f"{loop.name}-night{'-quick' if quick else ''}")
+    kind = ("-counts" if unit == "counts" else "") + ("-quick" if quick else "")
+    folder = Path(output or f"{loop.name}-night{kind}")
     click.echo(night_summary_text(simulate_night(loop, folder, plan=plan, quick=quick, **options)))
     click.echo(f"{shlex.quote(str(folder / PAGE_FILE))}: open it in a browser")
 

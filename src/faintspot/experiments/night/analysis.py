@@ -12,17 +12,17 @@ from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.night.alternation import coefficient, jackknife, predicted_by_others
 from faintspot.experiments.night.blocks import Night
-from faintspot.experiments.night.protocol import BEST_STRENGTHS_E
+from faintspot.experiments.night.protocol import BEST_STRENGTHS
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 SIGMA = 3.0
 """Standard errors from which a difference counts as seen."""
-STRENGTH_RANGES_E = ((0.0, 0.3), (0.3, 0.6), BEST_STRENGTHS_E, (1.1, 1.6), (1.6, math.inf))
+STRENGTH_RANGES = ((0.0, 0.3), (0.3, 0.6), BEST_STRENGTHS, (1.1, 1.6), (1.6, math.inf))
 """Strengths taken together; one on an edge belongs to the paper's range, else to the lower range."""
 ALL_STRENGTHS = "TV, all strengths"
-BEST = f"TV, {BEST_STRENGTHS_E[0]:g} to {BEST_STRENGTHS_E[1]:g} e⁻"
+BEST = f"TV, {BEST_STRENGTHS[0]:g} to {BEST_STRENGTHS[1]:g}"
 _FEWEST_ROWS = 3
 _FEWEST_SEEN = 10  # blocks with a measured r0
 
@@ -91,10 +91,10 @@ def groups(night: Night) -> list[BlockGroup]:
 
     A strength of 0 changes nothing and belongs to no group.
     """
-    strength, found = night.strength_e, []
+    strength, found = night.strength, []
     if (strength > 0).any():
         found.append(BlockGroup(ALL_STRENGTHS, strength > 0))
-        low, high = BEST_STRENGTHS_E
+        low, high = BEST_STRENGTHS
         best = (strength >= low) & (strength <= high)
         if best.any():
             found.append(BlockGroup(BEST, best))
@@ -184,14 +184,15 @@ def drift_of_r0(night: Night) -> Floats | None:
 
 def by_strength(night: Night) -> list[tuple[float, Difference]]:
     """Return the mean strength and the difference from the reference of each range of strengths."""
-    seeing, strength, found = drift_of_r0(night), night.strength_e, []
-    low_best, high_best = BEST_STRENGTHS_E
+    seeing, strength, found = drift_of_r0(night), night.strength, []
+    low_best, high_best = BEST_STRENGTHS
     best = (strength >= low_best) & (strength <= high_best)
-    for low, high in STRENGTH_RANGES_E:
+    for low, high in STRENGTH_RANGES:
         rows = best if low == low_best else (strength > low) & (strength <= high) & ~best
         if rows.sum() >= _FEWEST_ROWS:
-            name = f"{low:g} to {high:g} e⁻" if math.isfinite(high) else f"above {low:g} e⁻"
-            found.append((float(strength[rows].mean()), difference(night, BlockGroup(name, rows), seeing)))
+            name = f"{low:g} to {high:g}" if math.isfinite(high) else f"above {low:g}"
+            group = BlockGroup(f"{name} {night.strength_unit}", rows)
+            found.append((float(strength[rows].mean()), difference(night, group, seeing)))
     return found
 
 

@@ -43,8 +43,8 @@ class Night:
     """Index into set_names."""
     method: NDArray[np.int64]
     """Index into labels."""
-    strength_e: Floats
-    """Strength of TV [e-]; NaN for methods without one."""
+    strength: Floats
+    """Strength of TV in `strength_unit`; NaN for methods without one."""
     start_s: Floats
     """First scored frame of the block, from the beginning of the night."""
     duration_s: Floats
@@ -72,6 +72,10 @@ class Night:
     """Source of the blocks: "simulated" or a file."""
     configuration: str
     """TOML text of the simulated configuration, or ""."""
+    strength_unit: str = "e-"
+    """"e-": photo-electrons, or "counts" of the camera."""
+    counts_per_e: Floats | None = None
+    """Counts of the camera for a photo-electron, where they are known."""
     shared_error: Floats | None = None
     """Standard error of `strehl`, against that of the reference, that blocks of a method have in common."""
 
@@ -105,7 +109,7 @@ class Night:
     @property
     def has_strengths(self) -> bool:
         """Whether there are blocks with TV."""
-        return bool((self.strength_e > 0).any())
+        return bool((self.strength > 0).any())
 
     @property
     def is_paired(self) -> bool:

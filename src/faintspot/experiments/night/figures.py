@@ -13,6 +13,8 @@ from faintspot.base.report.plots import FLUX_GREY, METHOD_COLOURS, WIDTH, Line, 
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.night.analysis import ALL_STRENGTHS, BEST, by_strength, groups, lines
 from faintspot.experiments.night.blocks import Night
+from faintspot.experiments.night.paper import PAPER_MEANS
+from faintspot.experiments.night.protocol import COUNTS
 
 Floats = NDArray[np.float64]
 
@@ -30,10 +32,11 @@ def panels_figure(night: Night) -> FigureWithData:
     """Draw Strehl ratio against time, measured r0 and strength, with errors."""
     label, shown = f"Strehl ratio at {night.wavelength_m * 1e6:.3g} µm", _shown(night)
     lowest = float(np.nanmin(night.strehl - np.nan_to_num(night.strehl_error)))
-    bottom: dict[str, Any] = {"y": label, "y_range": (min(0.0, 1.1 * lowest), None)}
+    bottom: dict[str, Any] = {"y": label, "y_range": (min(0.5 * lowest, 1.1 * lowest), None)}
     starts = [night.start_s[night.set_number == number][0] / 60 for number in np.unique(night.set_number)[1:]]
     sets = {start: {"color": FLUX_GREY, "lw": 1.2, "zorder": 0} for start in starts}
-    panels = [Panel(_points(night, shown, night.middle_s / 60), "time (min)", at=sets, **bottom)]
+    points = [*_points(night, shown, night.middle_s / 60), *_paper_means(night)]
+    panels = [Panel(points, "time (min)", at=sets, legend=True, **bottom)]
     if np.isfinite(night.r0_m).any():
         points = _points(night, shown, night.r0_m * 100, night.r0_error_m * 100)
         fits = _regressions(night)
@@ -87,6 +90,20 @@ def _points(
     ]
 
 
+def _paper_means(night: Night) -> list[Line]:
+    """Return the means of the paper's Table 1 as lines as long as the sets."""
+    if not (night.has_strengths and len(night.set_names) == len(PAPER_MEANS)):
+        return []
+    colours = {"no TV": "#000000", "all strengths": "#8a8a8a", "0.6 to 1.1": METHOD_COLOURS[0]}
+    found = []
+    for number, means in enumerate(PAPER_MEANS):
+        minutes = night.start_s[night.set_number == number][[0, -1]] / 60
+        for (name, colour), mean in zip(colours.items(), means, strict=True):
+            style, first = {"color": colour, "lw": 1.5, "ls": "--"}, number == 0
+            found.append(Line(f"paper, {name}", minutes, [mean, mean], style=style, in_legend=first))
+    return found
+
+
 def _unnamed(points: list[Line]) -> list[Line]:
     return [replace(line, in_legend=False) for line in points]
 
@@ -112,10 +129,10 @@ def _of_strengths(
     """Return blocks against strength, and the ranges at the height of the reference plus their difference."""
     reference = night.strehl[night.method == night.reference]
     mean, scatter = float(np.nanmean(reference)), float(np.nanstd(reference))
-    strengths = night.strength_e[night.strength_e > 0]
+    strengths = night.strength[night.strength > 0]
     across, height = [strengths.min(), strengths.max()], [mean, mean]
     band = Line("mean without TV", across, height, [scatter, scatter], {"color": "black", "lw": 1}, band=True)
-    drawn = [band, *_unnamed(_points(night, shown, night.strength_e))]
+    drawn = [band, *_unnamed(_points(night, shown, night.strength))]
     ranges = by_strength(night)
     if ranges:
         found = [each.measured for _, each in ranges]
@@ -123,4 +140,10 @@ def _of_strengths(
         style = {"color": METHOD_COLOURS[1], "marker": "s", "ms": 8, "lw": 2, "capsize": 4}
         middle, y = [strength for strength, _ in ranges], [mean + each.value for each in found]
         drawn.append(Line("ranges of strengths", middle, y, ends, style))
-    return Panel(drawn, "strength (e⁻)", legend=True, **bottom)
+    above = None
+    if night.counts_per_e is not None:
+        most, in_counts = float(night.counts_per_e.max()), night.strength_unit == COUNTS
+        other = ("e⁻", 1 / most) if in_counts else ("counts", most)
+        ticks = np.linspace(0, across[1], 5)
+        above = ticks, (ticks * other[1]).tolist(), f"strength ({other[0]}, full gain)"
+    return Panel(drawn, f"strength ({night.strength_unit})", legend=True, above=above, **bottom)

@@ -13,11 +13,10 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
 from faintspot.base.json_text import to_json
 from faintspot.base.report.page import Report, Section, Table, TableCell, configuration_section
-from faintspot.base.report.texts import Texts
+from faintspot.base.report.texts import Texts, with_error
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.night.analysis import (
     ALL_STRENGTHS,
-    BEST,
     Difference,
     by_strength,
     differences,
@@ -28,7 +27,12 @@ from faintspot.experiments.night.analysis import (
 )
 from faintspot.experiments.night.blocks import NIGHT_STORE, Night
 from faintspot.experiments.night.figures import panels_figure
-from faintspot.experiments.night.protocol import PAPER_MEANS
+from faintspot.experiments.night.paper import (
+    PAPER_CORRELATION,
+    PAPER_MEANS,
+    compare_with_paper,
+    paper_exposures,
+)
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 
 SUMMARY_FILE, PAGE_FILE = "night.json", "night.html"
@@ -89,11 +93,12 @@ def night_summary(night: Night) -> dict[str, Any]:
         },
         "differences": [_plain_record(each, _DIFFERENCE, _DIFFERENCE_NAMES) for each in differences(night)],
         "by_strength": [
-            {"mean_strength_e": plain(strength), **_plain_record(each, _DIFFERENCE, _DIFFERENCE_NAMES)}
+            {"mean_strength": plain(strength), **_plain_record(each, _DIFFERENCE, _DIFFERENCE_NAMES)}
             for strength, each in by_strength(night)
         ],
         "against_r0": [_plain_record(line, _LINE, _DIFFERENCE_NAMES) for line in lines(night)],
         "verdicts": [_plain_record(each, _VERDICT, _VERDICT_NAMES) for each in verdicts(night)],
+        "paper": paper_sentences(night),
     }
 
 
@@ -108,7 +113,8 @@ def plain(value: object) -> Any:
 
 def night_summary_text(night: Night) -> str:
     """Return verdicts and differences as lines of text."""
-    return "\n".join([*(_TEXT("lines.verdict", each) for each in verdicts(night)), *_conclusions(night)])
+    judged = (_TEXT("lines.verdict", each) for each in verdicts(night))
+    return "\n".join([*judged, *paper_sentences(night), *_conclusions(night)])
 
 
 def night_sections(night: Night) -> list[Section]:
@@ -120,10 +126,11 @@ def night_sections(night: Night) -> list[Section]:
     )
     settings = list(zip(night.labels, night.settings, strict=True))
     panels = _TEXT.section("night-panels", panels_figure(night), strengths=night.has_strengths)
-    means = _TEXT.section("night-means", _means_table(night))
+    means, table = _TEXT.section("night-means", _means_table(night)), paper_table(night)
     between = _TEXT.section("night-differences", compared, **names)
     return [
         *([_TEXT.section("night-verdicts", statements)] if statements else [between]),
+        *([_TEXT.section("night-paper", " ".join(paper_sentences(night)), table)] if table else []),
         panels,
         means,
         *([between] if statements else []),
@@ -167,21 +174,38 @@ def _compared(night: Night) -> dict[str, Any]:
 def _means_table(night: Night) -> Table:
     named = _compared(night)
     columns = [group_means(night, rows) for rows in named.values()]
-    of_paper = {night.labels[night.reference]: 0, ALL_STRENGTHS: 1, BEST: 2}
-    with_paper = len(night.set_names) == len(PAPER_MEANS) and BEST in named
     rows: list[list[str | TableCell]] = []
     for row, where in enumerate([*night.set_names, "all sets"]):
-        cells: list[str | TableCell] = [where]
-        for name, column in zip(named, columns, strict=True):
-            known = with_paper and name in of_paper and row < len(PAPER_MEANS)
-            values: dict[str, float | None] = dict(zip(_MEAN, column[row], strict=True))
-            values["paper"] = float(PAPER_MEANS[row, of_paper[name]]) if known else None
-            cells.append(
-                TableCell(_TEXT("night-means.cell", values), small=_TEXT("night-means.small", values))
-            )
-        rows.append(cells)
-    missing = with_paper and not np.isfinite(PAPER_MEANS).any()
-    return _TEXT.table("night-means", rows, list(named), no_paper=missing)
+        values = [dict(zip(_MEAN, column[row], strict=True)) for column in columns]
+        texts = [(_TEXT("night-means.cell", each), _TEXT("night-means.small", each)) for each in values]
+        rows.append([where, *(TableCell(text, small=small) for text, small in texts)])
+    return _TEXT.table("night-means", rows, list(named))
+
+
+def paper_sentences(night: Night) -> list[str]:
+    """Return what the paper's Table 1 and a night say about each other; empty where they have other sets."""
+    compared = compare_with_paper(night)
+    if compared is None:
+        return []
+    by_name = {line.name: line.correlation for line in lines(night)}
+    correlation = {"correlation": by_name.get(ALL_STRENGTHS), "of_paper": PAPER_CORRELATION}
+    return _TEXT.lines("night-paper.sentences", compared, **correlation)
+
+
+def paper_table(night: Night) -> Table | None:
+    """Return the paper's Table 1 beside the means of a night, and the differences of both."""
+    compared = compare_with_paper(night)
+    if compared is None:
+        return None
+    columns: list[list[str]] = []
+    for means in (PAPER_MEANS, compared.means):
+        columns.append([f"{mean:.3f}" for mean in (*means[:, 0], means[:, 0].mean())])
+    for column in (compared.every, compared.best):
+        for sets, mean in ((column.paper, column.paper_mean), (column.ours, column.our_mean)):
+            columns.append([with_error(each, sign=True) for each in (*sets, mean)])
+    names = [*night.set_names, "mean of the sets"]
+    exposures = ", ".join(map(str, paper_exposures()[:2].ravel()))
+    return _TEXT.table("night-paper", list(zip(names, *columns, strict=True)), exposures=exposures)
 
 
 def _quality_of_r0(night: Night) -> dict[str, Any]:

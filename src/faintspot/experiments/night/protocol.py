@@ -17,7 +17,8 @@ from faintspot.experiments.closed_loop.methods import LOOP_GAIN, with_choice
 from faintspot.experiments.methods import Choice
 from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.methods import Method
+from faintspot.loop.simulation.methods import UNCORRECTED, Method
+from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.settings import Settings
@@ -25,20 +26,21 @@ from faintspot.slopes.pipeline.settings import Settings
 NONE, TV = "none", TotalVariation.name
 """Names of the paper's methods: without TV, and with TV at every strength."""
 PAPER_METHODS = NONE, TV
-BEST_STRENGTHS_E = 0.6, 1.1
+BEST_STRENGTHS = 0.6, 1.1
 """Strengths of which the paper's Table 1 has a column of its own, ends included."""
-PAPER_MEANS = np.full((4, 3), np.nan)
-"""Table 1 of the paper: mean Strehl ratio of each set without TV, with TV, and with `BEST_STRENGTHS_E`.
-
-NaN: the numbers could not be looked up; they are not guessed.
-"""
+ELECTRONS, COUNTS = "e-", "counts"
+"""Units of the strength, which the paper does not state: photo-electrons, and counts of the camera."""
 
 _KEPT_OPTION, _STRENGTH_OPTION = "keep_brightest", "noise_std"
 
 
 @dataclass(frozen=True)
 class NightPlan(Options, table="plan"):
-    """Schedule of a night.
+    """Schedule of a night; its default is that of the paper.
+
+    The paper's four sets took a little more than an hour, each with its cycle repeated once; the exposure
+    time is not stated. Here a block begins every 31 s, which makes 62 minutes at 150 frames/s, and 5 s of it
+    are exposed.
 
     Parameters
     ----------
@@ -46,19 +48,23 @@ class NightPlan(Options, table="plan"):
         Frames that one method measures in a cycle.
     settle_in_block : int
         Of these, those at the beginning that are not scored.
+    gap_frames : int
+        Frames between two blocks, in which a telescope stores its data; they are not simulated.
     strengths : tuple of int
-        Number of strengths of TV in each set, evenly spaced from 0 to `strongest_e`.
+        Number of strengths of TV in each set, evenly spaced from 0 to `strongest`.
     em_fractions : tuple of float
         Multiplication gain in each set, as a fraction of the configuration's.
     repeats : tuple of int
         Cycles of each set.
-    strongest_e : float
-        Largest strength [e-].
+    strongest : float
+        Largest strength.
+    unit : str
+        Unit of strengths: "e-", or "counts" of the camera at the gain of each set.
     methods : tuple of str
         Methods of a cycle; the first is the reference. "none": brightest pixels; "tv": all strengths; others
         as in `Method.named`, with the integrator.
-    strengths_e : tuple of float
-        Strengths of all sets instead of evenly spaced ones [e-].
+    listed_strengths : tuple of float
+        Strengths of all sets instead of evenly spaced ones.
     strength_factors : tuple of float
         Factor on the strength in each sub-aperture; empty: 1.
     keep_brightest : int
@@ -70,14 +76,16 @@ class NightPlan(Options, table="plan"):
         For numbers out of range, lists of different lengths or unsuitable methods.
     """
 
-    block_frames: int = number(600, 1, 10**6, whole=True)
-    settle_in_block: int = number(100, 0, 10**6, whole=True)
+    block_frames: int = number(830, 1, 10**6, whole=True)
+    settle_in_block: int = number(80, 0, 10**6, whole=True)
+    gap_frames: int = number(3820, 0, 10**6, whole=True)
     strengths: tuple[int, ...] = number((8, 20, 8, 20), 2, 100, kind=LIST, whole=True)
     em_fractions: tuple[float, ...] = number((1.0, 1.0, 0.75, 0.75), 0, 1, kind=LIST, low_open=True)
-    repeats: tuple[int, ...] = number((4, 2, 4, 2), 1, 10**4, kind=LIST, whole=True)
-    strongest_e: float = number(2.0, 0, 1e6, low_open=True)
+    repeats: tuple[int, ...] = number((2, 2, 2, 2), 1, 10**4, kind=LIST, whole=True)
+    strongest: float = number(2.0, 0, 1e6, low_open=True)
+    unit: str = setting(ELECTRONS, choices=(ELECTRONS, COUNTS))
     methods: tuple[str, ...] = setting(PAPER_METHODS, kind=TEXTS)
-    strengths_e: tuple[float, ...] = number((), 0, 1e6, kind=LIST)
+    listed_strengths: tuple[float, ...] = number((), 0, 1e6, kind=LIST)
     strength_factors: tuple[float, ...] = number((), 0, 1e6, kind=LIST)
     keep_brightest: int = number(40, 1, 10**6, whole=True)
 
@@ -101,7 +109,7 @@ class NightPlan(Options, table="plan"):
 
     def entries(self, number: int) -> list[tuple[str, float]]:
         """Return method and strength (NaN: none) of each block of a cycle, for a set counted from 0."""
-        rising = self.strengths_e or np.linspace(0, self.strongest_e, self.strengths[number]).tolist()
+        rising = self.listed_strengths or np.linspace(0, self.strongest, self.strengths[number]).tolist()
         return [
             (name, float(strength))
             for name in self.methods
@@ -113,7 +121,7 @@ class NightPlan(Options, table="plan"):
         return len(self.entries(number)) * self.repeats[number]
 
     def frames(self, number: int) -> int:
-        """Return the number of frames of a set."""
+        """Return the number of simulated frames of a set."""
         return self.blocks(number) * self.block_frames
 
     def schedule(self, number: int) -> NDArray[np.int64]:
@@ -121,13 +129,19 @@ class NightPlan(Options, table="plan"):
         block = np.arange(self.frames(number)) // self.block_frames
         return np.asarray(block % len(self.entries(number)), np.int64)
 
-    def first_frame(self, number: int) -> int:
-        """Return the first frame of a set, from the beginning of the night."""
-        return sum(self.frames(before) for before in range(number))
+    def first_frames(self, number: int) -> NDArray[np.int64]:
+        """Return the first frame of each block of a set, from the beginning of the night, (blocks,)."""
+        before = sum(self.blocks(each) for each in range(number))
+        return (before + np.arange(self.blocks(number))) * (self.block_frames + self.gap_frames)
+
+    def frame_numbers(self, number: int) -> NDArray[np.int64]:
+        """Return the number of each frame of a set, from the beginning of the night, (frames,)."""
+        return (self.first_frames(number)[:, None] + np.arange(self.block_frames)).ravel()
 
     def set_name(self, number: int) -> str:
         """Return multiplication gain and strengths of a set in words."""
-        fraction, strengths = self.em_fractions[number], self.strengths_e or range(self.strengths[number])
+        fraction = self.em_fractions[number]
+        strengths = self.listed_strengths or range(self.strengths[number])
         gain = "full gain" if fraction == 1 else f"{fraction * 100:g} % of the gain"
         return f"{gain}, {len(strengths)} strengths" if TV in self.methods else gain
 
@@ -156,18 +170,27 @@ class NightPlan(Options, table="plan"):
         ]
 
     def _method(
-        self, configuration: LoopConfiguration, name: str, strength_e: float, choice: Choice | None
+        self, configuration: LoopConfiguration, name: str, strength: float, choice: Choice | None
     ) -> Method:
-        label = label_of(name, strength_e)
+        label = label_of(name, strength, self.unit)
         if name not in PAPER_METHODS:
             return replace(with_choice(kind_of(name), configuration, choice), label=label)
         values = dict(choice or {_KEPT_OPTION: self.keep_brightest})
         gain = values.pop(LOOP_GAIN, None)
-        if name == NONE:
-            return Method(label, Settings(BrightestPixels(**values)), gain)
-        factors: Any = np.array(self.strength_factors or 1.0)
-        values[_STRENGTH_OPTION] = strength_e * factors if self.strength_factors else strength_e
-        return Method(label, Settings(TotalVariation(**values)), gain)
+        estimator: Estimator
+        if name == TV:
+            strength_e = strength / (1.0 if self.unit == ELECTRONS else counts_per_e(configuration))
+            factors: Any = np.array(self.strength_factors) if self.strength_factors else 1.0
+            estimator = TotalVariation(**{**values, _STRENGTH_OPTION: strength_e * factors})
+        else:
+            estimator = BrightestPixels(**values)
+        # At a telescope all strengths share the command matrix; centroid gains are not measured for each.
+        return Method(label, Settings(estimator), gain, (UNCORRECTED,) if choice is None else ())
+
+
+def counts_per_e(configuration: LoopConfiguration) -> float:
+    """Return the counts of the camera for one photo-electron."""
+    return configuration.camera.em_gain / configuration.camera.gain_e_per_adu
 
 
 def kind_of(name: str) -> Method:
@@ -175,11 +198,13 @@ def kind_of(name: str) -> Method:
     return Method.named(BrightestPixels.name if name == NONE else name)
 
 
-def label_of(name: str, strength_e: float) -> str:
+def label_of(name: str, strength: float, unit: str = ELECTRONS) -> str:
     """Return the label of a method."""
     if name == NONE:
         return "no TV"
-    return f"TV {strength_e:.3g} e-" if name == TV else kind_of(name).label
+    return f"TV {strength:.3g} {unit}" if name == TV else kind_of(name).label
 
 
-QUICK_PLAN = NightPlan(block_frames=260, settle_in_block=60, strengths=(4, 6, 4, 6), repeats=(2, 1, 2, 1))
+QUICK_PLAN = NightPlan(
+    block_frames=190, settle_in_block=60, gap_frames=4460, strengths=(4, 6, 4, 6), repeats=(2, 2, 2, 2)
+)

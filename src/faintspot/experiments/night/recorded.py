@@ -189,7 +189,7 @@ def _night(
         reference=methods.reference,
         set_names=tuple(names[number] for number in conditions),
         set_number=numbers,
-        strength_e=np.array(methods.strength_e)[arrays["method"]],
+        strength=np.array(methods.strength_e)[arrays["method"]],
         true_r0_m=unknown,
         paired_strehl=unknown,
         overhead_s=together * float(np.mean(settle)) / loop.frame_rate_hz,

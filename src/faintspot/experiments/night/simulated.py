@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from faintspot.experiments.closed_loop.search import QUICK, Search, stored, tune, tuning_frames
 from faintspot.experiments.methods import Choice
 from faintspot.experiments.night.blocks import NIGHT_STORE, Night
-from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan, kind_of
+from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan, counts_per_e, kind_of
 from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
 from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
@@ -189,7 +189,7 @@ def observe(
         whole,
         methods[:1] if alone else methods,
         np.zeros_like(schedule) if alone else schedule,
-        first_frame=plan.first_frame(number),
+        first_frame=plan.frame_numbers(number),
         progress=lambda done, total: advance(done),
     )
     most = max(plan.blocks(each) for each in range(plan.sets))
@@ -233,19 +233,21 @@ def _night(
     sets = []
     for number in range(plan.sets):
         entries, count = plan.entries(number), plan.blocks(number)
-        made = plan.made(plan.configuration(configuration, number), number, choices)
+        whole = plan.configuration(configuration, number)
+        made = plan.made(whole, number, choices)
         for method in made:
             methods.setdefault(method.label, method)
         numbers = np.array([list(methods).index(method.label) for method in made])
         order, observed = np.arange(count) % len(entries), results[_key(number, False)]
-        first = plan.first_frame(number) + plan.settle_in_block + plan.block_frames * np.arange(count)
+        first = plan.first_frames(number) + plan.settle_in_block
         key = _key(number, True)
         alone = results[key]["strehl"] if key in results else np.full(count, np.nan)
         sets.append(
             {
                 "set_number": np.full(count, number),
                 "method": numbers[order],
-                "strength_e": np.array([strength for _, strength in entries])[order],
+                "strength": np.array([strength for _, strength in entries])[order],
+                "counts_per_e": np.full(count, counts_per_e(whole)),
                 "start_s": first / rate,
                 "paired_strehl": alone[:count],
                 **{name: observed[name][:count] for name in _VALUES},
@@ -262,9 +264,10 @@ def _night(
         reference=0,
         set_names=tuple(plan.set_name(number) for number in range(plan.sets)),
         duration_s=np.full(len(values["start_s"]), scored / rate),
-        overhead_s=plan.settle_in_block / rate,
+        overhead_s=(plan.settle_in_block + plan.gap_frames) / rate,
         wavelength_m=configuration.science.wavelength_m,
         source="simulated",
+        strength_unit=plan.unit,
         configuration=configuration.to_text(),
         **values,
     )

@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING
 
 from faintspot.base.report.page import Section
 from faintspot.base.report.texts import Texts
+from faintspot.experiments.night.analysis import OPEN
 from faintspot.experiments.night.analysis import verdicts as night_verdicts
+from faintspot.experiments.night.page import paper_sentences
+from faintspot.experiments.night.paper import compare_with_paper
 from faintspot.experiments.paper.claims import fixed_mode, verdicts
 from faintspot.experiments.paper.tables import cases_csv
 from faintspot.experiments.study.curves import Judgement, Outcome, Verdict
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
 
 _TEXT = Texts("faintspot.experiments")
 _NIGHT = Texts("faintspot.experiments.night")
+_PROVEN = 0.05  # probability below which a difference is no chance
 HOLDS, HOLDS_IF, FAILS, NOT_MEASURED = "holds", "holds if", "does not hold", "not measured"
 
 
@@ -61,6 +65,11 @@ def paper_rows(dataset: xarray.Dataset | None, night: Night | None) -> list[Pape
             rows.append(
                 PaperRow(_TEXT["whole.night"], each.statement, "", word, "", _NIGHT("lines.number", each))
             )
+        compared, sentences = compare_with_paper(night), paper_sentences(night)
+        if compared is not None:
+            proven = min(compared.every.chance, compared.chance_of_any) < _PROVEN
+            word, statement = HOLDS if proven else OPEN, _NIGHT["statements.proof"]
+            rows.append(PaperRow(_TEXT["whole.night"], statement, "", word, "", " ".join(sentences)))
     return rows
 
 

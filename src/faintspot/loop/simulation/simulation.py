@@ -55,7 +55,7 @@ def simulate_loop(
     *,
     seed: int | None = None,
     realisation: int = 0,
-    first_frame: int = 0,
+    first_frame: ArrayLike = 0,
     progress: Callable[[int, int], None] | None = None,
     disabled_errors: DisabledErrors | None = None,
 ) -> LoopRecord:
@@ -75,8 +75,9 @@ def simulate_loop(
         Default: the configuration's.
     realisation : int
         Other realisations have other air and other noise.
-    first_frame : int
-        Number of the first frame: a run that begins where another ended sees the turbulence go on.
+    first_frame : int, or (frames,) array of int
+        Number of the first frame: a run that begins where another ended sees the turbulence go on. Or the
+        numbers of all frames, increasing: frames that are left out cost no time.
     progress : callable, optional
         Called with the number of frames done and that of all, after every frame.
     disabled_errors : DisabledErrors, optional
@@ -105,11 +106,14 @@ def simulate_loop(
     numbers = _checked_schedule(configuration, methods, schedule)
     start = configuration.run.seed if seed is None else int(number_between("seed", seed, 0, integer=True))
     number = int(number_between("realisation", realisation, 0, integer=True))
-    first = int(number_between("first_frame", first_frame, 0, integer=True))
+    first = numbers_between("first_frame", first_frame, 0, integer=True).astype(np.int64)
+    if first.ndim and (first.shape != numbers.shape or np.any(np.diff(first) < 1)):
+        raise InputError(f"first_frame: expected a number, or {len(numbers)} increasing ones")
+    of_frames = first if first.ndim else first + np.arange(len(numbers))
     switches = DisabledErrors() if disabled_errors is None else disabled_errors
     changed = switches.configuration(configuration)
     ready = [_with_control(changed, method, start) for method in map(switches.method, methods)]
-    loop = partial(_Loop, configuration, ready, numbers, start, number, first, switches)
+    loop = partial(_Loop, configuration, ready, numbers, start, number, of_frames, switches)
     gains = None
     if switches.exact_gain:
         gains = loop().run(None).gains_in_run()
@@ -145,7 +149,7 @@ class _Loop:
         schedule: NDArray[np.int64],
         seed: int,
         realisation: int,
-        first_frame: int,
+        frame_numbers: NDArray[np.int64],
         disabled_errors: DisabledErrors,
         gains: NDArray[np.float64] | None = None,
     ) -> None:
@@ -155,7 +159,7 @@ class _Loop:
         self.methods = methods = methods if self.laser is None else self.laser.methods
         self.learnt = [learnt for _, learnt in ready]
         self.schedule, self.disabled_errors = schedule, disabled_errors
-        self.seed, self.realisation, self.first_frame = seed, realisation, first_frame
+        self.seed, self.realisation, self.frame_numbers = seed, realisation, frame_numbers.tolist()
         self.telescope_model = TelescopeModel(
             configuration,
             seed,
@@ -230,7 +234,8 @@ class _Loop:
     def step(self, frame: int) -> None:
         """Simulate one frame."""
         number, commands = int(self.schedule[frame]), self.line.acting
-        time = self.disabled_errors.time_s(self.first_frame + frame, self.configuration.control.frame_rate_hz)
+        rate_hz = self.configuration.control.frame_rate_hz
+        time = self.disabled_errors.time_s(self.frame_numbers[frame], rate_hz)
         after, wavefront = self.telescope_model.wavefronts(time, commands)
         self._observe(frame, time, after)
         slopes = self._measure(frame, self.telescope_model.by_rows(time, wavefront, self.line.around))
@@ -239,7 +244,7 @@ class _Loop:
         vector, covariance = (values.astype(np.float64) for values in (slopes.vector, slopes.covariance_xy))
         vector *= per_px
         if self.laser is not None:
-            vector = self.laser.low_orders.merged(self.first_frame + frame, wavefront, vector, slopes.flags)
+            vector = self.laser.low_orders.merged(self.frame_numbers[frame], wavefront, vector, slopes.flags)
         self.controllers[number].update(vector, error.astype(np.float64) * per_px, covariance * per_px**2)
         self._note(
             frame,
@@ -268,7 +273,7 @@ class _Loop:
         prior = None
         if self.methods[number].is_predicted:
             prior = self.controllers[number].expected().mean_px
-        pixels = self.telescope_model.frame(self.first_frame + frame, wavefront)
+        pixels = self.telescope_model.frame(self.frame_numbers[frame], wavefront)
         slopes = self.pipelines[number](pixels, prior)
         if self.laser is not None and self.laser.follow(number, pixels, slopes.vector.astype(np.float64)):
             method = self.laser.methods[number]

@@ -10,7 +10,6 @@ from faintspot.loop.simulation import LoopConfiguration, load_loop, shipped_loop
 
 REGIMES = {
     "canary",
-    "canary_faint",
     "emccd",
     "camera_3e",
     "laboratory_16e",

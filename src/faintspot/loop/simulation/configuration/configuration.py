@@ -253,7 +253,7 @@ def load_loop(path: str | Path) -> LoopConfiguration:
     >>> from faintspot.loop.simulation import load_loop
     >>> canary = load_loop("canary")
     >>> canary.telescope.diameter_m, canary.control.frame_rate_hz
-    (4.2, 250.0)
+    (4.2, 150.0)
     """
     path = Path(path)
     name = path.name.removesuffix(".toml")
@@ -274,7 +274,7 @@ def shipped_loops() -> list[str]:
     --------
     >>> from faintspot.loop.simulation import shipped_loops
     >>> shipped_loops()[:4]
-    ['camera_3e', 'canary', 'canary_faint', 'diffraction_limit']
+    ['camera_3e', 'canary', 'diffraction_limit', 'eight_metre']
     """
     names = (item.name for item in _shipped().iterdir())
     return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))

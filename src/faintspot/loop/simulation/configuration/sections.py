@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -122,6 +123,13 @@ class Science(ConfigurationTable, table="science"):
     """Wavelength and field of the Strehl ratio, on axis."""
 
     wavelength_m: float = number(1.65e-6, 1e-7, 1e-4)
+    static_error_nm: float = number(0.0, 0.0, 1e4)
+    """Rms of the wavefront error that the sensor does not see: Strehl ratios are lower by exp(-phase^2)."""
+
+    @property
+    def static_strehl(self) -> float:
+        """Strehl ratio that the static error leaves (extended Marechal approximation)."""
+        return math.exp(-((2e-9 * math.pi * self.static_error_nm / self.wavelength_m) ** 2))
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ class TelescopeModel:
             configuration.control.frame_rate_hz,
         )
         self._sees_mirror = configuration.control.mode == CLOSED
-        self._science_wavelength_m = configuration.science.wavelength_m
+        self._science = configuration.science
         self._seed, self._realisation = seed, realisation
 
     def wavefronts(
@@ -152,8 +152,9 @@ class TelescopeModel:
     def truth(self, time_s: float, wavefront_nm: NDArray[np.float32]) -> Truth:
         """Return the true values of a residual wavefront."""
         pupil = self.optics.pupil
-        field = pupil.field(wavefront_nm, self._science_wavelength_m)
-        return Truth(pupil.strehl(field), pupil.rms(wavefront_nm), self.atmosphere.r0_m(time_s))
+        field = pupil.field(wavefront_nm, self._science.wavelength_m)
+        strehl = self._science.static_strehl * pupil.strehl(field)
+        return Truth(strehl, pupil.rms(wavefront_nm), self.atmosphere.r0_m(time_s))
 
     def frame(self, number: int, wavefront_nm: NDArray[np.float32]) -> NDArray[np.generic]:
         """Return the camera frame [ADU] of a wavefront; the number seeds its noise."""
