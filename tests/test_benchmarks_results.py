@@ -100,7 +100,7 @@ def test_nights_of_all_packages_are_what_the_documentation_shows(tmp_path: Path)
 def test_both_nights_stand_beside_the_papers_table(tmp_path: Path) -> None:
     (tmp_path / "paper.json").write_bytes((results.PAGES / "paper.json").read_bytes())
     nights = [night_with(seed, plan=NightPlan()) for seed in (1, 2)]
-    stored = json.loads(paper_night.publish(*nights, pages=tmp_path).read_text(encoding="utf-8"))
+    stored = json.loads(paper_night.publish(nights[0], nights[1], tmp_path).read_text(encoding="utf-8"))
     compared = [compare_with_paper(night) for night in nights]
     means, beside = stored["tables"]["night"], stored["tables"]["night_paper"]
     assert [row[1] for row in means["rows"]][:2] == ["0.184 ± 0.001 (2)", "0.203 ± 0.012 (2)"]

@@ -53,7 +53,7 @@ def test_magnitude_writes_a_page_that_report_makes_again(run: Commands) -> None:
 
 
 def test_night_says_its_verdict_and_repeats_nothing(run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
-    short = NightPlan(30, 10, (2, 2), (1.0, 0.75), (2, 2), keep_brightest=12)
+    short = NightPlan(30, 10, 0, (2, 2), (1.0, 0.75), (2, 2), keep_brightest=12)
     monkeypatch.setattr(protocol, "QUICK_PLAN", short)
     arguments = "loop", "night", "small.toml", "--quick", "--workers", 0
     result = run(*arguments, "--methods", "none,tv,smoothed", "--strengths", "0.7,1.5")
@@ -86,7 +86,7 @@ def test_options_of_a_night_are_passed_on(run: Commands, monkeypatch: pytest.Mon
     np.save("factors.npy", [1.0, 0.5, 2.0])
     given = ("--strengths", "0.4,0.8", "--strength-factors", "factors.npy", "--tuned", "--overwrite")
     run.ok("loop", "night", "small.toml", "--workers", 3, "--methods", "tv,ml", "-o", "here", *given)
-    plan = NightPlan(methods=("tv", "ml"), strengths_e=(0.4, 0.8), strength_factors=(1.0, 0.5, 2.0))
+    plan = NightPlan(methods=("tv", "ml"), listed_strengths=(0.4, 0.8), strength_factors=(1.0, 0.5, 2.0))
     assert taken == {
         "loop": load_loop("small.toml"), "folder": Path("here"), "plan": plan, "quick": False, "tuned": True,
         "overwrite": True, "workers": 3, "scheduler": None,

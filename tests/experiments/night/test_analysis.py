@@ -120,13 +120,13 @@ def test_means_of_sets_and_a_parabola_of_the_seeing_are_removed_exactly() -> Non
     night = night_with(11)
     drift = np.log(night.true_r0_m)
     of_set = np.array([0.1, 0.25, 0.3, 0.2])[night.set_number]
-    strehl = of_set + 0.2 * drift - 0.1 * drift**2 + 0.07 * (night.strength_e > 0)
+    strehl = of_set + 0.2 * drift - 0.1 * drift**2 + 0.07 * (night.strength > 0)
     known = replace(night, strehl=strehl)
     reference = known.method == known.reference
-    found = contrast(known, known.strength_e > 0, reference, drift)
+    found = contrast(known, known.strength > 0, reference, drift)
     assert found.value == pytest.approx(0.07, abs=1e-9)
     assert found.standard_error < 1e-9
-    assert abs(contrast(known, known.strength_e > 0, reference, None).value - 0.07) > 1e-4
+    assert abs(contrast(known, known.strength > 0, reference, None).value - 0.07) > 1e-4
 
 
 def test_without_paired_runs_hours_are_those_of_the_measured_effect() -> None:

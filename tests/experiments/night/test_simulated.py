@@ -37,7 +37,7 @@ def test_a_night_is_what_the_loop_does(tmp_path: Path) -> None:
     np.testing.assert_array_equal(night.set_number, [0] * 6 + [1] * 4)
     rate = LOOP.control.frame_rate_hz
     np.testing.assert_allclose(night.start_s, (60 * np.arange(10) + 20) / rate)
-    np.testing.assert_array_equal(night.strength_e, [np.nan, 0, 1, np.nan, 0, 1, np.nan, 0, 0.5, 1])
+    np.testing.assert_array_equal(night.strength, [np.nan, 0, 1, np.nan, 0, 1, np.nan, 0, 0.5, 1])
     np.testing.assert_allclose(night.duration_s, 40 / rate)
     assert night.hours == pytest.approx(600 / rate / 3600)
     assert night.paired_strehl[6] == night.strehl[6]  # the first of the second set
