@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from faintspot.engine.settings.following import DarkFollower, FluxFollower
 from faintspot.engine.settings.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
 from faintspot.engine.settings.plan import EnginePlan, SettingsPreparer
 from faintspot.engine.settings.running_settings import Change, RunningSettings
-from faintspot.engine.streams.prediction_stream import PredictionStream
 from faintspot.engine.streams.slope_streams import SlopeStreams
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.loop.control.configuration import Control
@@ -32,6 +31,9 @@ from faintspot.loop.control.recorded import packed_control
 from faintspot.slopes.pipeline.configuration import packed, to_text
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+
+if TYPE_CHECKING:
+    from faintspot.engine.streams.prediction_stream import PredictionStream
 
 _WATCH_S = 0.02  # between two checks of the watcher
 _LOOKS_FOR_DARK = 10  # ditto, between two searches for dark sub-apertures
@@ -120,11 +122,14 @@ class Engine:
         commands = 0 if control is None else control.commands
         self._streams = SlopeStreams(name, len(layout), commands)
         try:
-            self.loop, self._prediction = None, None
+            self.loop = None
+            self._prediction: PredictionStream | None = None
             if control is not None:
                 loop_prior = None if control.prediction == STREAM else prior
                 self.loop = ControlLoop(control, layout, self._streams.held_commands, loop_prior, threads)
                 if control.prediction == STREAM and prior is not None:
+                    from faintspot.engine.streams.prediction_stream import PredictionStream  # rarely needed
+
                     self._prediction = PredictionStream(name, prior)
             self._make_ready(interleaving)
             first = self.live.running.pipelines[0]

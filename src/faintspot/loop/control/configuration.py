@@ -18,7 +18,6 @@ from faintspot.base.toml_files import check_keys
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, CommandDelayLine, Controller
 from faintspot.loop.control.integrator import CompiledIntegrator
 from faintspot.loop.control.options import BEYOND_ALL, CONTROLLER, NONE, STREAM, TABLE, ControlOptions
-from faintspot.loop.control.plant import LoopPlant
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.loop.control.removed_modes import TIP_TILT_FOCUS, RemovedModes
 from faintspot.slopes.camera.calibration import Calibration
@@ -28,6 +27,7 @@ from faintspot.slopes.sensor.layout import Layout
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.model import Kalman
+    from faintspot.loop.control.plant import LoopPlant
 
 Floats = NDArray[np.float64]
 
@@ -132,6 +132,8 @@ class Control:
     @property
     def plant(self) -> LoopPlant:
         """Loop properties that learnt controllers use."""
+        from faintspot.loop.control.plant import LoopPlant  # an integrator needs no replays
+
         options = self.options
         return LoopPlant(self.controlled, self.reconstructor, options.delay_frames, options.leak)
 

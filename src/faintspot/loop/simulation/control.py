@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.integrator import Integrator
-from faintspot.loop.control.plant import LoopPlant
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED
 from faintspot.loop.simulation.methods import TRUE, WEIGHTED, Method
@@ -18,6 +17,7 @@ from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.model import Kalman
+    from faintspot.loop.control.plant import LoopPlant
 
 
 def make_controller(
@@ -61,5 +61,7 @@ def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64])
 
 def plant_of(configuration: LoopConfiguration, optics: LoopOptics) -> LoopPlant:
     """Return the loop for which controllers are learnt."""
+    from faintspot.loop.control.plant import LoopPlant  # an integrator needs no replays
+
     control = configuration.control
     return LoopPlant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
