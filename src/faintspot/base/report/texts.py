@@ -95,8 +95,6 @@ def in_sigmas(estimate: Estimate, digits: int = 1) -> str:
 
 
 _OF_NUMBERS: Mapping[str, Callable[[float, int], str]] = {
-    "plain": plain_number,
-    "signed": signed,
     "significant": significant,
     "percent": percentage,
     "hours": in_hours,

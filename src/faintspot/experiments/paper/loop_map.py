@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from faintspot.base.files import csv_text
 from faintspot.base.report.page import FigureWithData, Report, Section, Table
-from faintspot.base.report.plots import Picture
+from faintspot.base.report.plots import Labels, Picture
 from faintspot.base.report.texts import NOTHING, Texts, with_error
 from faintspot.base.statistics import Estimate, paired_mean
 from faintspot.experiments.closed_loop.magnitude import run_magnitude
@@ -24,9 +24,6 @@ from faintspot.loop.simulation.configuration.configuration import LoopConfigurat
 from faintspot.loop.simulation.record import make_folder
 from faintspot.slopes.estimators.built_in.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.slopes.estimators.built_in.window import Window
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 METHODS = NO_TV, TV, SMOOTHING, Window.name, MaximumAPosteriori.name
 R0_M = 0.071, 0.127
@@ -44,6 +41,8 @@ _SEARCH = Search(coarse_frames=200, frames=300, realisations=1, finalists=2, cli
 _RUN = {"frames": 700, "settle_frames": 100, "realisations": 10}
 _QUICK_RUN = {"frames": 400, "settle_frames": 100, "realisations": 4}
 _TEXT = Texts("faintspot.experiments")
+_IN_CELL: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 10}
+_IN_CELL |= {"bbox": {"facecolor": "white", "alpha": 0.7, "lw": 0}}
 
 
 @dataclass(frozen=True)
@@ -171,22 +170,6 @@ def _table(cells: list[LoopCell]) -> Table:
     return replace(_TEXT.table("loop_map.table", rows), csv=("loop_map.csv", csv_text(header, numbers)))
 
 
-@dataclass(frozen=True)
-class _Words:
-    """Texts in the cells of a picture, and the names of its columns and rows."""
-
-    words: Mapping[tuple[int, int], str]
-    columns: list[str]
-    rows: list[str]
-
-    def draw(self, axes: Axes) -> None:
-        """Write them."""
-        for (column, row), text in self.words.items():
-            axes.text(column, row, text, ha="center", va="center", fontsize=10)
-        axes.set_xticks(range(len(self.columns)), self.columns)
-        axes.set_yticks(range(len(self.rows)), self.rows)
-
-
 def _figure(cells: list[LoopCell]) -> FigureWithData:
     """Draw the gain of TV over flux and camera, one panel for each turbulence."""
     cameras, fluxes = list({cell.camera: 0 for cell in cells}), list({cell.photons: 0 for cell in cells})
@@ -195,12 +178,13 @@ def _figure(cells: list[LoopCell]) -> FigureWithData:
     axes = "photo-electrons of a sub-aperture in a frame", "read noise"
     pictures = []
     for r0 in R0_M:
-        gains, words = np.full((len(cameras), len(fluxes)), np.nan), {}
+        gains, words = np.full((len(cameras), len(fluxes)), np.nan), dict[tuple[int, int], str]()
         for cell in (cell for cell in cells if cell.r0_m == r0):
             column, row = fluxes.index(cell.photons), cameras.index(cell.camera)
             gains[row, column] = cell.gain.value
             words[column, row] = f"{cell.gain.value:+.3f}\n{cell.winner or NOTHING}"
         unit = "Strehl ratio with TV minus without" if r0 == R0_M[-1] else ""
-        marks = [_Words(words, [f"{flux:g}" for flux in fluxes], cameras)]
-        pictures.append(Picture(gains, unit, f"r0 {100 * r0:g} cm", *axes, style, marks))
+        marks = [Labels(list(words), list(words.values()), _IN_CELL)]
+        picture = Picture(gains, unit, f"r0 {100 * r0:g} cm", *axes, style, marks)
+        pictures.append(replace(picture, x_names=[f"{flux:g}" for flux in fluxes], y_names=cameras))
     return _TEXT.figure("loop_map", [pictures], 4.6)

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.files import write_atomically
-from faintspot.base.report.plots import Line, Picture, limits_of, plot, png, styled
+from faintspot.base.report.plots import Labels, Line, Mark, Picture, limits_of, plot, png
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.sensor.drawing import Outlines
 from faintspot.slopes.sensor.layout import Layout
 
 if TYPE_CHECKING:
     from matplotlib.colors import FuncNorm
-    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 
@@ -56,6 +55,8 @@ def layout_picture(
     InputError
         When the frame is not of the layout's shape or the file cannot be written.
     """
+    from matplotlib import patheffects
+
     array = np.asarray(frame, dtype=np.float64)
     if array.ndim == 3:
         array = array.mean(axis=0)
@@ -69,10 +70,15 @@ def layout_picture(
     }
     ring = np.array([[0, 0], [width, 0], [width, height], [0, height]])
     circle = {"ls": "", "marker": "o", "ms": 0.8 * points, "mfc": "none", "mec": _DOUBTFUL}
-    marks = (
+    marks: list[Mark] = [
         Outlines(corners[:, None] + ring, windows),
         Line.of("", np.reshape(outside, (-1, 2)), circle),
-    )
+    ]
+    if points >= 12 and len(layout) <= _MOST_NUMBERED:
+        around = [patheffects.withStroke(linewidth=1.6, foreground="black")]
+        style = {"color": _WINDOW, "fontsize": min(points / 3.0, 13.0), "va": "top", "path_effects": around}
+        places = corners + np.array([0.06 * width, 0.95 * height])
+        marks.append(Labels(places, [str(number) for number in range(len(layout))], style))
     pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
     title = (
         f"{len(layout)} sub-aperture{'' if len(layout) == 1 else 's'} of {height} x {width} px, "
@@ -86,28 +92,7 @@ def layout_picture(
     picture = Picture(array, "frame's units", title, style=style, marks=marks)
     high = min(max(0.9 * _SIDE * n_rows / n_columns, 3.0), 2 * _SIDE) + 0.9
     figure = plot([[picture]], high, width=_SIDE, legend="")
-    if points >= 12 and len(layout) <= _MOST_NUMBERED:
-        _number(figure, corners + np.array([0.06 * width, 0.95 * height]), min(points / 3.0, 13.0))
     write_atomically(path, png(figure, tight=False))
-
-
-@styled
-def _number(figure: Figure, places: Floats, size: float) -> None:
-    """Write numbers, which take long, when the layout of the figure is found: they are drawn once."""
-    from matplotlib import patheffects
-
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")
-    outline = [patheffects.withStroke(linewidth=1.6, foreground="black")]
-    for number, (x, y) in enumerate(places):
-        style: dict[str, Any] = {
-            "color": _WINDOW,
-            "fontsize": size,
-            "va": "top",
-            "clip_on": True,
-            "path_effects": outline,
-        }
-        figure.axes[0].text(x, y, str(number), **style)
 
 
 def asinh_stretch(array: Floats, inside: Floats) -> FuncNorm:
