@@ -3,7 +3,7 @@
 import numpy as np
 
 from faintspot import Calibration
-from faintspot.slopes.camera.binning import binned, binned_calibration, spread
+from faintspot.slopes.camera.binning import binned, binned_calibration, camera_calibration, spread
 
 
 def test_sums_of_blocks_without_the_rest() -> None:
@@ -49,6 +49,15 @@ def test_levels_and_variances_add_up() -> None:
         background_e=0.8,
         saturation_adu=16_000.0,
     )
+
+
+def test_there_and_back() -> None:
+    known = {"gain_e_per_adu": 0.5, "em_gain": 10.0, "read_noise_e": 3.0, "background_e": 0.2}
+    for dark in (100.0, np.repeat(np.repeat([[5.0, 6.0, 7.0]], 2, axis=0), 2, axis=1)):
+        camera = Calibration(dark=dark, **known)
+        again = camera_calibration(binned_calibration(camera, 2, (2, 6)), 2)
+        np.testing.assert_allclose(again.dark, dark)
+        assert {name: getattr(again, name) for name in known} == known
 
 
 def test_maps_are_those_of_sums_of_pixels() -> None:
