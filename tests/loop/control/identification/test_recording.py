@@ -54,6 +54,15 @@ def test_unit_does_not_matter(unit: float) -> None:
     assert two.unit == pytest.approx(unit * one.unit)
 
 
+def test_commands_that_are_held_have_no_gain() -> None:
+    """Each actuator has its own."""
+    loop = recorded()
+    held = np.broadcast_to(np.arange(loop.commands.shape[1]), loop.commands.shape)
+    ready = prepared(replace(loop, commands=held))
+    assert (ready.sign, ready.sent_after_frames, ready.loop_gain) == (1.0, 0, math.inf)
+    assert ready.recording.interaction_matrix.any()
+
+
 def test_commands_of_another_loop() -> None:
     loop = recorded()
     wrong = replace(loop, commands=np.random.default_rng(1).standard_normal(loop.commands.shape))

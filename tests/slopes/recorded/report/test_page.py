@@ -117,6 +117,7 @@ def test_warnings_say_what_to_do_next() -> None:
     assert "20.0 % of the measurements were saturated" in text
     assert "raise max_iterations" in text
     assert "1 of 5 sub-apertures were never valid (no. 0)" in text
+    assert "NO_FLUX 4 (20" in text
 
 
 def test_parts_that_do_not_fit_are_refused_in_one_line() -> None:
