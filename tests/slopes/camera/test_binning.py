@@ -1,5 +1,7 @@
 """Binned frames and their calibration."""
 
+from typing import Any
+
 import numpy as np
 
 from faintspot import Calibration
@@ -52,7 +54,9 @@ def test_levels_and_variances_add_up() -> None:
 
 
 def test_there_and_back() -> None:
-    known = {"gain_e_per_adu": 0.5, "em_gain": 10.0, "read_noise_e": 3.0, "background_e": 0.2}
+    known: dict[str, Any] = {
+        "gain_e_per_adu": 0.5, "em_gain": 10.0, "read_noise_e": 3.0, "background_e": 0.2,
+    }  # fmt: skip
     for dark in (100.0, np.repeat(np.repeat([[5.0, 6.0, 7.0]], 2, axis=0), 2, axis=1)):
         camera = Calibration(dark=dark, **known)
         again = camera_calibration(binned_calibration(camera, 2, (2, 6)), 2)
