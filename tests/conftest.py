@@ -64,11 +64,15 @@ def coarse_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def undrawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the figures of pages empty, and draw none: figures have tests of their own."""
-    from faintspot.base.report import plots
+    from matplotlib.figure import Figure
 
-    def empty(rows: object, height: float, *, width: float = plots.WIDTH, **options: object) -> Any:
-        return plots.new_figure(width, height)
+    from faintspot.base.report import page, plots
 
-    monkeypatch.setattr(plots, "plot", empty)
-    for name in ("png", "svg"):
-        monkeypatch.setattr(plots, name, lambda figure, **options: b"")
+    def empty(
+        kind: Any, /, name: str, title: str, caption: str, rows: Any, height: float, **options: Any
+    ) -> page.FigureWithData:
+        figure = plots.new_figure(options.get("width", plots.WIDTH), height)
+        return page.FigureWithData(name, title, caption, figure, plots.csv_of(rows))
+
+    monkeypatch.setattr(page.FigureWithData, "of", classmethod(empty))
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *places, **options: None)

@@ -8,7 +8,7 @@ from hypothesis import settings
 LIMIT_S = 60.0
 """How long to wait for what must come."""
 
-USUAL_EXAMPLES = 25
+USUAL_EXAMPLES = 15
 """How many examples a property is tried with; a profile may have more."""
 
 

@@ -53,7 +53,8 @@ OF_DATA = {
 def caches() -> Iterator[tuple[str, int | None]]:
     """Every function that remembers results, and how many at most."""
     for path in sorted(SOURCE.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
+        text = path.read_text()
+        for node in ast.walk(ast.parse(text if "cache" in text else "")):
             for decorator in getattr(node, "decorator_list", []):
                 name = ast.unparse(decorator).partition("(")[0].rpartition(".")[2]
                 if name in ("cache", "lru_cache"):

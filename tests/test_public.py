@@ -75,10 +75,8 @@ def test_no_assert_checks_anything() -> None:
     """They vanish under `python -O`; the tests that plug-ins inherit assert."""
     source = Path(faintspot.__file__).parent
     for path in source.rglob("*.py"):
-        if path.name != "testing.py":
-            assert not any(isinstance(node, ast.Assert) for node in ast.walk(ast.parse(path.read_text()))), (
-                path
-            )
+        if path.name != "testing.py" and "assert" in (text := path.read_text()):
+            assert not any(isinstance(node, ast.Assert) for node in ast.walk(ast.parse(text))), path
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from tests.shared_data import ROOT
 MANUAL = ROOT / "docs" / "adapters"
 STREHL = r"Strehl ratio ([\d.]+)"
 SHORTER = {
-    "hcipy": ("np.arange(100, 2250)", "np.arange(1100, 2250)"),
+    "hcipy": ("np.arange(100, 2250)", "np.arange(1450, 2250)"),
     "oopao": ("signal, 2150)", "signal, 1150)"),
     "specula": ("total_time: 8.6", "total_time: 4.6"),
 }

@@ -21,7 +21,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(autouse=True)
 def _undrawn(undrawn_pictures: None) -> None:
-    """Draw no pictures but those of layouts: figures have tests of their own."""
+    """Draw no pictures: figures have tests of their own."""
 
 
 @pytest.fixture

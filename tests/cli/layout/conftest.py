@@ -7,6 +7,11 @@ import pytest
 from faintspot import Settings
 
 
+@pytest.fixture(autouse=True)
+def _undrawn() -> None:
+    """Draw the pictures of layouts, unlike those of other commands."""
+
+
 @pytest.fixture
 def no_trials(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take the first of the settings that would be tried, which takes most of a second."""

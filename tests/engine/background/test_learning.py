@@ -81,6 +81,7 @@ def engine_of(run: Run) -> Any:
     return SimpleNamespace(loop=run.loop, learning=None, estimators=None)
 
 
+@pytest.mark.slow  # compiles kernels of filters for itself
 def test_a_new_filter_goes_on_from_the_mirror(name: str, model: Kalman) -> None:
     """No step is larger than those before; in the end commands are those of one that was always there."""
     run, other = Run(name, outdated(model)), Run(f"{name}_2", model)

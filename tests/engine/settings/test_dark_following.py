@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 import faintspot as fs
@@ -51,6 +52,7 @@ def test_faint_stars_take_thousands_of_frames() -> None:
     assert np.array_equal(follower.dark, UNLIT)
 
 
+@pytest.mark.slow  # compiles a kernel of streams for itself
 def test_dark_subapertures_have_slopes_of_0_and_others_the_same() -> None:
     frame = frames_of(100.0, 1)[0]
     cells = np.array([[1], [10**6]], np.int64)

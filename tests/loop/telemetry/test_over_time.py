@@ -31,6 +31,7 @@ def opened(frames: int) -> Recording:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn_pictures")
 def test_pieces_of_an_open_loop() -> None:
     """r0 of each piece within three errors, also of one that lost half of its frames."""
     loop = opened(1600)

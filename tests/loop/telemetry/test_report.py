@@ -165,6 +165,7 @@ def test_every_number_has_an_interval(report: LoopReport) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn_pictures")
 def test_dead_and_rarely_measured_sub_apertures() -> None:
     """They have no noise, for a reason that is given, and what the others show stays."""
     loop = recorded()
@@ -253,6 +254,7 @@ def test_constant_slopes() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn_pictures")
 def test_a_single_sub_aperture() -> None:
     """Neither delay, winds nor r0 are known; vibrations and other choices are."""
     rng = np.random.default_rng(3)

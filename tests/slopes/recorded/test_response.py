@@ -43,7 +43,7 @@ def test_response_is_the_regression_of_slopes_on_displacements() -> None:
     settings = fs.Settings("weighted", spot_fwhm_px=2.5, weight_fwhm_px=3.0)
     pipeline = fs.SlopePipeline(layout, settings, fs.Calibration(dark=0.0))
     rng = np.random.default_rng(3)
-    moved = rng.normal(0.0, 1.5, (8 * FRAMES, N, 2))
+    moved = rng.normal(0.0, 1.5, (4 * FRAMES, N, 2))
     spots = gaussian_psf(np.array([[2.5, 2.5]])).images(moved.reshape(-1, 2), (SIDE, SIDE), 25.0)
     rows = spots.reshape(-1, 2, 2, SIDE, SIDE).swapaxes(2, 3).reshape(-1, 2 * SIDE, 2 * SIDE)
     mean = np.pad(np.maximum(rows, 0), ((0, 0), (4, 4), (4, 4)))

@@ -104,6 +104,7 @@ def test_command_reads_as_many_frames_as_stated(recording: Path, run: Commands, 
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn_pictures")
 def test_command_and_report(recording: Path, run: Commands) -> None:
     """What the command has learnt is what a pipeline of the configuration then knows."""
     path = recording / "faintspot.toml"

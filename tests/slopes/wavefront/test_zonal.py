@@ -65,10 +65,10 @@ def test_standard_errors_are_those_of_the_scatter(layout: Layout) -> None:
     rng = np.random.default_rng(2)
     error = rng.uniform(0.05, 0.5, len(layout))
     noise = rng.normal(size=(300, 2, len(layout))) * error
-    known = [zonal_map(_with_errors(noise[number : number + 1], error), layout) for number in range(60)]
+    known = [zonal_map(_with_errors(noise[number : number + 1], error), layout) for number in range(40)]
     scatter = np.std([found.values for found in known], axis=0)
-    # 60 draws: 9 % of error of each, less in the mean over sub-apertures.
-    assert np.mean(known[0].standard_errors / scatter) == pytest.approx(1, abs=0.06)
+    # 40 draws: 11 % of error of each, less in the mean over sub-apertures.
+    assert np.mean(known[0].standard_errors / scatter) == pytest.approx(1, abs=0.08)
     plain = np.std([zonal_map(slopes_of(noise[number : number + 1]), layout).values for number in range(12)])
     assert np.sqrt(np.mean(scatter**2)) < plain  # weights help
     over_frames = zonal_map(_with_errors(noise, error), layout)
