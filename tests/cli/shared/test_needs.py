@@ -33,7 +33,7 @@ NEEDING = {
     "tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100 -o new.toml --picture tune.png": "report",
     "layout frames.npy -o new.toml --picture layout.png": "report",
     "wavefront slopes.npz --picture wavefront.png": "report",
-    "wavefront slopes.npz -o wavefront.fits": "io",
+    "wavefront slopes.npz --map map.fits": "io",
 }
 # In a process where nothing has imported an optional package before, and nothing can.
 _WITHOUT = """
