@@ -375,7 +375,8 @@ def doubtful(
         lack, photons = quarter - float(measured.flux[s]), quarter / 4 + float(measured.flux[s])
         saturated = int(measured.flags[s]) & int(Flag.SATURATED)
         second[s] = not saturated and 0 < brightest < measured.flux[s] / 1.25 and excess > 4 * both**0.5
-        second[s] |= not saturated and lack > 4 * max(photons, 0.0) ** 0.5  # a ghost
+        apart = 4 * quarter - float(measured.flux[s]) > brightest - 4 * quarter
+        second[s] |= not saturated and apart and lack > 4 * max(photons, 0.0) ** 0.5  # a ghost
         whole = half - np.broadcast_to(fwhm, (n, 2))[s] / 2
         if np.any((np.abs(places[s]) > whole) & (whole > half / 2)):
             flags[s] |= int(Flag.AT_SEARCH_LIMIT)

@@ -150,7 +150,8 @@ def _has_other_flux(f: Any, s: Any, flux: Any, flags: Any, expected: Any) -> Any
         return False
     if own < _GHOST * dimmest:
         lack, variance = _GHOST * dimmest - own, _GHOST * _GHOST * dimmest + max(own, 0.0)
-        return lack * lack > _SURELY * _SURELY * variance
+        stands_apart = dimmest - own > brightest - dimmest  # also where read noise makes fluxes differ
+        return stands_apart and lack * lack > _SURELY * _SURELY * variance
     excess, both = own - brightest, own + brightest
     return excess * excess > _SURELY * _SURELY * both
 
