@@ -206,5 +206,5 @@ def label_of(name: str, strength: float, unit: str = ELECTRONS) -> str:
 
 
 QUICK_PLAN = NightPlan(
-    block_frames=190, settle_in_block=60, gap_frames=4460, strengths=(4, 6, 4, 6), repeats=(2, 2, 2, 2)
+    block_frames=150, settle_in_block=60, gap_frames=4500, strengths=(4, 6, 4, 6), repeats=(2, 2, 2, 2)
 )
