@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks.measuring import Row, Table
 from faintspot.base.statistics import paired_mean
+from faintspot.loop.control.flattening import residual_phase
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import open_loop_of
@@ -30,7 +31,6 @@ from faintspot.loop.control.identification.predictive_control import (
     learn_observed,
 )
 from faintspot.loop.control.identification.recording import Recording, prepared
-from faintspot.loop.control.phase import residual_phase
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M, SPECTRUM

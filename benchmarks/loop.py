@@ -20,10 +20,9 @@ from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.telescope.atmosphere import MovingLayers, make_atmosphere
-from faintspot.loop.simulation.telescope.calibration import make_pipeline
-from faintspot.loop.simulation.telescope.camera import make_detector
+from faintspot.loop.simulation.telescope.calibration import make_detector, make_pipeline
+from faintspot.loop.simulation.telescope.mirror import pupil_grid, require_hcipy
 from faintspot.loop.simulation.telescope.model import LoopOptics, prepare
-from faintspot.loop.simulation.telescope.pupil import pupil_grid, require_hcipy
 
 TARGET_FRAMES_PER_S = 80.0
 FRAMES = 400

@@ -28,13 +28,13 @@ from faintspot.loop.control.base import (
     ExpectedSlopes,
     OpenLoopTelemetry,
 )
+from faintspot.loop.control.flattening import residual_phase
 from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.vibrations import Vibration
-from faintspot.loop.control.phase import residual_phase
-from faintspot.loop.control.plant import LoopPlant
+from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop
-from faintspot.loop.simulation.control import slope_turbulence
+from faintspot.loop.simulation.record import slope_turbulence
 from faintspot.loop.simulation.simulation import measure_gains
 from faintspot.loop.simulation.telescope.atmosphere import MovingLayers
 from faintspot.loop.simulation.telescope.calibration import make_pipeline

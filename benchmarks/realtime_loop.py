@@ -33,8 +33,8 @@ from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.kalman.predictor import SlopeModel
 from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
-from faintspot.loop.simulation.control import slope_turbulence
 from faintspot.loop.simulation.engine_files import write_engine_files
+from faintspot.loop.simulation.record import slope_turbulence
 from faintspot.loop.simulation.telescope.model import prepare
 from faintspot.slopes.pipeline import configuration as configuration_file
 

@@ -37,8 +37,7 @@ from benchmarks.realtime_processes import (
 )
 from faintspot import Settings
 from faintspot.engine.loop.control_loop import CLOSED
-from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
-from faintspot.engine.requests.requests import request
+from faintspot.engine.requests.requests import TELESCOPE, request, socket_path
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop
 from faintspot.loop.simulation.engine_files import write_engine_files
 from faintspot.slopes.pipeline import configuration as configuration_file

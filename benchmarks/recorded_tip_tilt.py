@@ -22,7 +22,7 @@ from faintspot.loop.control.identification.learning import GAINS, learn_controll
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import open_loop_of, site_of_loop
 from faintspot.loop.control.identification.recording import Recording
-from faintspot.loop.control.plant import LoopPlant
+from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.control.replay import replayed_frames
 

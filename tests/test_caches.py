@@ -43,7 +43,7 @@ OF_DATA = {
     "loop/simulation/telescope/model.py atmosphere_of": 2,
     "loop/turbulence/slope_covariance.py _structure": 4,
     "loop/turbulence/strength.py _theory": 4,
-    "slopes/spots/pixel_information.py _information_table": 64,
+    "slopes/spots/bounds.py _information_table": 64,
     "slopes/spots/psf.py spot_psf": 16,
     "slopes/spots/speckled.py _phase_modes": 8,
 }

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.foreign.base import Floats, ForeignLoop, Observed
-from faintspot.loop.control.phase import residual_phase
+from faintspot.loop.control.flattening import residual_phase
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 GRIDS: dict[str, dict[str, tuple[Any, ...]]] = {

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.slopes.spots.pixel_information import poisson_gaussian_information
+from faintspot.slopes.spots.bounds import poisson_gaussian_information
 from faintspot.slopes.spots.shapes import spots
 from faintspot.slopes.training.psf_learning import learn_psf_from_images
 

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from faintspot.slopes.camera.photon_transfer import measure_detector as measure_detector
     from faintspot.slopes.estimators.algorithms.brightest import brightest_pixels as brightest_pixels
     from faintspot.slopes.estimators.algorithms.centroid import centre_of_gravity as centre_of_gravity
-    from faintspot.slopes.estimators.algorithms.total_variation import Denoised as Denoised
-    from faintspot.slopes.estimators.algorithms.total_variation import tv_denoise as tv_denoise
+    from faintspot.slopes.estimators.algorithms.noise import Denoised as Denoised
+    from faintspot.slopes.estimators.algorithms.noise import tv_denoise as tv_denoise
     from faintspot.slopes.pipeline.following import SpotFollower as SpotFollower
-    from faintspot.slopes.pipeline.images import measure_images as measure_images
+    from faintspot.slopes.pipeline.following import measure_images as measure_images
     from faintspot.slopes.pipeline.light import MeanFlux as MeanFlux
     from faintspot.slopes.pipeline.settings import Settings as Settings
     from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline as SlopePipeline
@@ -50,7 +50,7 @@ _PACKAGES = ("adapters", "data", "engine", "experiments", "io", "loop", "slopes"
 # Where each public name lives. They are imported at first use: `import faintspot` itself stays fast.
 _HOMES = {
     "Calibration": "faintspot.slopes.camera.calibration",
-    "Denoised": "faintspot.slopes.estimators.algorithms.total_variation",
+    "Denoised": "faintspot.slopes.estimators.algorithms.noise",
     "FixedWeights": "faintspot.slopes.spots.fixed_weights",
     "InputError": "faintspot.base.errors",
     "LaserGuideStar": "faintspot.slopes.spots.laser",
@@ -73,11 +73,11 @@ _HOMES = {
     "cramer_rao_covariance": "faintspot.slopes.spots.bounds",
     "fit_wavefront": "faintspot.slopes.wavefront",
     "learn_psf": "faintspot.slopes.training",
-    "measure_images": "faintspot.slopes.pipeline.images",
+    "measure_images": "faintspot.slopes.pipeline.following",
     "measure_detector": "faintspot.slopes.camera.photon_transfer",
     "photon_efficiency": "faintspot.slopes.spots.bounds",
     "tune": "faintspot.experiments",
-    "tv_denoise": "faintspot.slopes.estimators.algorithms.total_variation",
+    "tv_denoise": "faintspot.slopes.estimators.algorithms.noise",
     **{name: f"faintspot.{name}" for name in _PACKAGES},
 }
 

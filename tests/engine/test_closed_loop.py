@@ -12,8 +12,7 @@ import pytest
 
 from faintspot.base.errors import InputError
 from faintspot.engine.request_handlers import commands_of, loop_command
-from faintspot.engine.requests.private_socket import socket_path
-from faintspot.engine.requests.requests import request
+from faintspot.engine.requests.requests import request, socket_path
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.integrator import CompiledIntegrator
 from faintspot.loop.simulation import Method, simulate_loop

@@ -11,7 +11,7 @@ import pytest
 
 import faintspot as fs
 from faintspot.engine.path.slope_prior import SlopePrior
-from faintspot.engine.streams.prediction_stream import PredictionStream
+from faintspot.engine.streams.slope_streams import PredictionStream
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.simulation import Method, simulate_loop
 from faintspot.loop.simulation.learning import learnt_control

@@ -19,7 +19,7 @@ from tests.fuzz.refused import refused_in_one_line
 from tests.slopes.estimators.test_python import BRIGHT, FAULTS, FRAME, pipeline, raising
 
 import faintspot as fs
-from faintspot.engine.page.access import Access
+from faintspot.engine.page.client_requests import Access
 from faintspot.io.frame_numbers import LARGEST_GAP, left_out
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.pipeline.settings import option_names

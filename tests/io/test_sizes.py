@@ -15,7 +15,7 @@ from tests import refusals
 from tests.io.frame_files import fits, h5py, tifffile, zarr
 from tests.io.slope_files import result, write
 
-from faintspot.base.npz import read_arrays
+from faintspot.base.files import read_arrays
 from faintspot.io import open_frames, read_array, read_slopes
 from faintspot.io.arrays.fits_units import units_of
 from faintspot.io.arrays.inflation import check_inflated

@@ -20,7 +20,7 @@ from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
+from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
 

@@ -13,7 +13,7 @@ from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.settings import Settings
-from faintspot.slopes.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
+from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, SMALLEST_WINDOW
 
 try:
     import hcipy

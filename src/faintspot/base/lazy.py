@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Mapping
+from importlib import import_module
+from pkgutil import iter_modules
 from typing import Any
 
 
@@ -34,3 +36,9 @@ def lazy_attributes(package: str, homes: Mapping[str, str]) -> Callable[[str], o
 def lazy_packages(package: str, names: str) -> Callable[[str], object]:
     """Return the `__getattr__` of a package whose sub-packages (names separated by spaces) load lazily."""
     return lazy_attributes(package, {name: f"{package}.{name}" for name in names.split()})
+
+
+def import_modules(package: str) -> list[str]:
+    """Import the modules of a package, in alphabetical order, and return their full names."""
+    found = iter_modules(import_module(package).__path__, f"{package}.")
+    return [import_module(module.name).__name__ for module in found if not module.ispkg]

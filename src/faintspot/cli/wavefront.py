@@ -22,8 +22,7 @@ from faintspot.slopes.recorded.stored_run import difference, open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.wavefront import Wavefront, ZonalMap, fit_wavefront, save_map, save_wavefront, zonal_map
 from faintspot.slopes.wavefront.files import check_map_file, check_wavefront_file
-from faintspot.slopes.wavefront.fit import total
-from faintspot.slopes.wavefront.units import UNITS
+from faintspot.slopes.wavefront.fit import UNITS, total
 from faintspot.slopes.wavefront.words import (
     mode_table,
     remarks,

@@ -33,7 +33,7 @@ from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 
 if TYPE_CHECKING:
-    from faintspot.engine.streams.prediction_stream import PredictionStream
+    from faintspot.engine.streams.slope_streams import PredictionStream
 
 _WATCH_S = 0.02  # between two checks of the watcher
 _LOOKS_FOR_DARK = 10  # ditto, between two searches for dark sub-apertures
@@ -128,7 +128,7 @@ class Engine:
                 loop_prior = None if control.prediction == STREAM else prior
                 self.loop = ControlLoop(control, layout, self._streams.held_commands, loop_prior, threads)
                 if control.prediction == STREAM and prior is not None:
-                    from faintspot.engine.streams.prediction_stream import PredictionStream  # rarely needed
+                    from faintspot.engine.streams.slope_streams import PredictionStream  # rarely needed
 
                     self._prediction = PredictionStream(name, prior)
             self._make_ready(interleaving)

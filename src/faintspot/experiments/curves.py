@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import Estimate, magnitudes
-from faintspot.experiments.crossings import crossings
+from faintspot.experiments.methods import crossings
 
 Floats = NDArray[np.float64]
 

@@ -19,7 +19,6 @@ from faintspot.io.formats.registry import slope_endings, slope_format
 from faintspot.io.formats.zarr_files import Zarr
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import has_zarr
-from faintspot.io.stored.output_lock import OutputLock
 from faintspot.io.stored.slopes_format import (
     RESERVED_ATTRIBUTES,
     UNITS,
@@ -29,7 +28,7 @@ from faintspot.io.stored.slopes_format import (
     json_values,
     pixels_in,
 )
-from faintspot.io.stored.slopes_writer import SlopeWriter
+from faintspot.io.stored.slopes_writer import OutputLock, SlopeWriter
 from faintspot.io.stored.slopes_zarr import SlopeStore, describe_store, remove_store
 
 _Result = TypeVar("_Result")

@@ -21,8 +21,7 @@ from faintspot.base.errors import InputError
 from faintspot.cli.realtime.demo import in_words, methods_table
 from faintspot.engine.page.demonstration import Shown
 from faintspot.engine.pixels.segment import FOLDER
-from faintspot.engine.requests.private_socket import socket_path
-from faintspot.engine.requests.requests import ControlServer, request
+from faintspot.engine.requests.requests import ControlServer, request, socket_path
 
 pytestmark = pytest.mark.slow
 

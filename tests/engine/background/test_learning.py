@@ -14,15 +14,14 @@ from faintspot.base.errors import InputError
 from faintspot.engine.background.background_process import BackgroundLearning, _watch, background_learning
 from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.request_handlers import commands_of
-from faintspot.engine.requests.private_socket import socket_path
-from faintspot.engine.requests.requests import ControlServer
+from faintspot.engine.requests.requests import ControlServer, socket_path
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.loop.control.base import ASSUMED, SETTLE_FRAMES, OpenLoopTelemetry
 from faintspot.loop.control.configuration import Control, save_control
 from faintspot.loop.control.identification.learning import RelearntControl, learn_controller
 from faintspot.loop.control.identification.model import Kalman
+from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.options import ControlOptions
-from faintspot.loop.control.plant import LoopPlant
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.engine.page.access import Access
-from faintspot.engine.page.client_requests import ClientRequest
+from faintspot.engine.page.client_requests import Access, ClientRequest
 from faintspot.engine.page.page_state import Batch, BatchSource, Picture
 from faintspot.engine.page.server import LiveServer
 from faintspot.engine.telemetry.ring import record_type

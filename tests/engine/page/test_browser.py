@@ -20,11 +20,9 @@ from playwright.sync_api import sync_playwright
 from tests.engine.bench import Bench, simulated
 
 from faintspot.base.checks import number_between
-from faintspot.engine.page.server import LiveServer
-from faintspot.engine.page.serving import serve
+from faintspot.engine.page.server import LiveServer, serve
 from faintspot.engine.request_handlers import LENGTHY, commands_of
-from faintspot.engine.requests.private_socket import socket_path
-from faintspot.engine.requests.requests import ControlServer
+from faintspot.engine.requests.requests import ControlServer, socket_path
 from faintspot.engine.telemetry.recorder import Recorder
 from faintspot.io.telemetry.recording import read_telemetry
 

@@ -10,9 +10,9 @@ pytest.importorskip("zarr")
 from tests.engine.page.cases import LAYOUT, N, next_batch, records
 
 from faintspot.base.errors import InputError
-from faintspot.engine.page import recording_source
+from faintspot.engine.page import engine_source as recording_source
 from faintspot.engine.page.client_requests import answered
-from faintspot.engine.page.recording_source import RecordingSource, indices_of
+from faintspot.engine.page.engine_source import RecordingSource, indices_of
 from faintspot.engine.telemetry.ring import image_type, layout_values
 from faintspot.io.telemetry.recording import StoredTelemetry
 from faintspot.io.telemetry.writing import TelemetryStore

@@ -14,7 +14,7 @@ from tornado.httpclient import AsyncHTTPClient
 
 from faintspot.base.errors import InputError
 from faintspot.engine.page import server as server_module
-from faintspot.engine.page.access import Access
+from faintspot.engine.page.client_requests import Access
 from faintspot.engine.page.server import LARGEST_REQUEST, MOST_CLIENTS, LiveServer
 from faintspot.slopes.sensor.layout import Layout
 

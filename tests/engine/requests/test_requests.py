@@ -24,8 +24,7 @@ from tests.shared_data import ROOT
 
 from faintspot.base.errors import InputError
 from faintspot.engine.requests import requests as control
-from faintspot.engine.requests.private_socket import socket_path
-from faintspot.engine.requests.requests import LARGEST_REQUEST, ControlServer, request
+from faintspot.engine.requests.requests import LARGEST_REQUEST, ControlServer, request, socket_path
 
 pytestmark = pytest.mark.slow
 

@@ -13,8 +13,7 @@ from tests.engine.estimator_files import PEAK, write
 import faintspot as fs
 from faintspot.cli.realtime.command import command
 from faintspot.engine.request_handlers import commands_of
-from faintspot.engine.requests.private_socket import socket_path
-from faintspot.engine.requests.requests import ControlServer
+from faintspot.engine.requests.requests import ControlServer, socket_path
 from faintspot.engine.settings.estimators import EstimatorTrial, load_estimators
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.estimators.registry import restore

@@ -31,8 +31,7 @@ from faintspot.cli.realtime.control import send
 from faintspot.cli.realtime.control import status as show_status
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.segment import FOLDER
-from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
-from faintspot.engine.requests.requests import ControlServer, request
+from faintspot.engine.requests.requests import TELESCOPE, ControlServer, request, socket_path
 from faintspot.engine.telescope.simulated_telescope import (
     TRUTH,
     ObservingConditions,

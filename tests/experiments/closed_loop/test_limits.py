@@ -16,7 +16,7 @@ from faintspot.experiments.closed_loop.results import (
     magnitude_gain,
     magnitude_limit,
 )
-from faintspot.experiments.crossings import crossings
+from faintspot.experiments.methods import crossings
 
 MAGNITUDES = np.linspace(8.0, 13.0, 6)
 numbers = arrays(np.float64, st.integers(1, 12), elements=st.floats(-1, 1))

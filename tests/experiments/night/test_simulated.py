@@ -11,7 +11,7 @@ from faintspot.experiments.night.protocol import NightPlan
 from faintspot.experiments.night.simulated import r0_of_slopes, run_night
 from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation import simulate_loop
-from faintspot.loop.simulation.control import slope_turbulence
+from faintspot.loop.simulation.record import slope_turbulence
 
 pytest.importorskip("hcipy")
 pytest.importorskip("zarr")

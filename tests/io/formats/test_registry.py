@@ -15,8 +15,8 @@ from tests.refusals import refused
 
 from faintspot.base.variables import VARIABLES
 from faintspot.io import open_frames
+from faintspot.io.arrays.fits_units import StreamedArray
 from faintspot.io.arrays.stored_array import StoredArray
-from faintspot.io.arrays.streams import StreamedArray
 from faintspot.io.formats import registry
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.stored.slopes_format import StoredSlopes

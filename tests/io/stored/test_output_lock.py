@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from tests.refusals import refused
 
-from faintspot.io.stored.output_lock import OutputLock
+from faintspot.io.stored.slopes_writer import OutputLock
 
 pytest.importorskip("filelock")
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 from faintspot.loop.control.base import OpenLoopTelemetry
+from faintspot.loop.control.flattening import phase_of_commands
+from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.kalman.predictor import SlopeModel
-from faintspot.loop.control.phase import phase_of_commands
-from faintspot.loop.control.plant import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 

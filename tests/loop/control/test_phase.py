@@ -4,10 +4,10 @@ import numpy as np
 from tests.loop.control.control_cases import TURBULENCE, telemetry
 
 from faintspot.loop.control.base import CommandDelayLine, Controller
+from faintspot.loop.control.flattening import residual_phase
+from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
-from faintspot.loop.control.phase import residual_phase
-from faintspot.loop.control.plant import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 CELLS = np.array([[row, column] for row in range(5) for column in range(5)])

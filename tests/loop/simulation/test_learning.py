@@ -11,10 +11,10 @@ from faintspot.loop.control.base import CONTROLS, INTEGRATOR
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import open_loop_of
 from faintspot.loop.simulation import LoopConfiguration, Method, simulate_loop
-from faintspot.loop.simulation.disabled_errors import DisabledErrors
 from faintspot.loop.simulation.engine_files import fixed_window
 from faintspot.loop.simulation.learning import learnt_control, recorded_loop
 from faintspot.loop.simulation.methods import PRIOR
+from faintspot.loop.simulation.simulation import DisabledErrors
 from faintspot.loop.simulation.telescope.model import prepare
 
 LEARNT = [kind for kind in CONTROLS if kind != INTEGRATOR]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.control.phase import residual_phase
+from faintspot.loop.control.flattening import residual_phase
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.telemetry.alternation import AlternatingLoop
 from faintspot.loop.turbulence.slope_covariance import ARCSEC

@@ -9,7 +9,7 @@ from tests.loop.telemetry.loop_cases import recorded
 from faintspot.loop.control.identification.layers import Identification
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import Measured, open_loop_of, site_of_loop
-from faintspot.loop.telemetry.slope_discrepancy import recorded_discrepancy
+from faintspot.loop.telemetry.spectra import recorded_discrepancy
 
 
 def found(change: np.ndarray, missing: float = 0.0) -> list[Measured]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from faintspot.slopes.camera.mean_frame import MeanFrame
+from faintspot.slopes.camera.frame_checks import MeanFrame
 
 
 def test_blocks_and_pixels_that_are_not_finite() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import faintspot as fs
 from faintspot.slopes.estimators.spot_tables import gaussian_psf
-from faintspot.slopes.recorded.response import response
+from faintspot.slopes.recorded.survey import response
 from faintspot.slopes.spots.speckled import speckled_images
 
 SIDE, N, FRAMES, FLUX_E = 12, 4, 1500, 40.0

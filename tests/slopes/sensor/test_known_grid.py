@@ -9,7 +9,7 @@ from tests.simulated import frames_of
 
 from faintspot import Layout
 from faintspot.base.errors import InputError
-from faintspot.slopes.sensor.known_grid import find_illuminated
+from faintspot.slopes.sensor.found_layout import find_illuminated
 from faintspot.slopes.simulate import Detector
 
 PUPIL = Layout.grid((10, 12), pixels=2, outer_radius=5.2, inner_radius=1.2)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import norm, poisson
 
-from faintspot.slopes.spots.pixel_information import poisson_gaussian_information
+from faintspot.slopes.spots.bounds import poisson_gaussian_information
 
 
 @pytest.mark.parametrize(("read_noise", "mean"), [(0.3, 0.2), (0.7, 0.5), (1.0, 0.05), (2.0, 3.0)])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from faintspot import Calibration, Layout, learn_psf
 from faintspot.base.errors import InputError
 from faintspot.slopes.simulate import Detector, sensor_frames
-from faintspot.slopes.training.usable import usable_subapertures
+from faintspot.slopes.training.psf_rounds import usable_subapertures
 
 LAYOUT = Layout.grid((6, 6), pixels=12)
 CAMERA = Calibration(read_noise_e=2.0)

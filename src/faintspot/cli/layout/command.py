@@ -36,14 +36,12 @@ from faintspot.cli.shared.output import picture_file
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.slopes.camera.binning import binned
 from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.camera.frame_checks import find_hot_pixels, misread, mosaic_contrast
-from faintspot.slopes.camera.mean_frame import MeanFrame
+from faintspot.slopes.camera.frame_checks import MeanFrame, find_hot_pixels, misread, mosaic_contrast
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, first_settings
 from faintspot.slopes.recorded.survey import UsualFrames, survey
-from faintspot.slopes.sensor.found_layout import FoundLayout, find_layout
-from faintspot.slopes.sensor.known_grid import KnownGrid
+from faintspot.slopes.sensor.found_layout import FoundLayout, KnownGrid, find_layout
 from faintspot.slopes.sensor.layout import GEOMETRIES, LARGEST_BIN, OPTICS, Layout
 
 _MOST_FRAMES = 200  # averaged to find the spots

@@ -16,8 +16,7 @@ from faintspot.slopes.camera.background import overlap, smooth_background, varie
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.dark_frames import FEWEST_FRAMES, DarkPixels
 from faintspot.slopes.camera.photon_transfer import measure_detector
-from faintspot.slopes.sensor.found_layout import FoundLayout
-from faintspot.slopes.sensor.known_grid import KnownGrid
+from faintspot.slopes.sensor.found_layout import FoundLayout, KnownGrid
 from faintspot.slopes.sensor.layout import Layout
 
 

@@ -11,7 +11,7 @@ from faintspot.base.errors import InputError
 from faintspot.cli.layout import options as layout_options
 from faintspot.cli.shared.commands import errors_of_options, flag_of
 from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.sensor.known_grid import KnownGrid, find_illuminated
+from faintspot.slopes.sensor.found_layout import KnownGrid, find_illuminated
 from faintspot.slopes.sensor.layout import Layout
 
 _QUAD_CELL = 2  # pixels on a side

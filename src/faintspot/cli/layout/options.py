@@ -16,7 +16,7 @@ from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration, read_map
 from faintspot.slopes.sensor.binning import scaled_points
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.window_size import LARGEST_WINDOW
+from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW
 
 
 def binned(options: dict[str, Any], factor: int) -> dict[str, Any]:

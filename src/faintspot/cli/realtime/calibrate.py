@@ -106,8 +106,7 @@ def calibrate(
 
 def _known_commands(former: Any, name: str) -> int:
     """Return the number of commands of the former calibration, or of a simulated telescope."""
-    from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
-    from faintspot.engine.requests.requests import request
+    from faintspot.engine.requests.requests import TELESCOPE, request, socket_path
 
     if former is not None:
         return int(former.commands)

@@ -14,8 +14,7 @@ from faintspot.base.toml_files import check_keys
 from faintspot.cli.realtime.stopping import stop_on_signal
 from faintspot.cli.shared.commands import ENGINE_NAME, RANGES, option
 from faintspot.cli.shared.engine_requests import asked, asked_at_length, loop_in_words, notes, summary
-from faintspot.engine.requests.private_socket import ENGINE, TELESCOPE
-from faintspot.engine.requests.requests import since
+from faintspot.engine.requests.requests import ENGINE, TELESCOPE, since
 
 _REFRESH_S = 0.5
 _ALONE = {"methods": ("methods", "every"), "loop": ("loop",), "gain": ("gain",), "spots": ("spots",)}

@@ -51,7 +51,7 @@ def command(recording: Path | None, name: str, bind: str, port: int, private: bo
       faintspot live night.zarr
     """
     from faintspot.cli.realtime.stopping import stop_on_signal
-    from faintspot.engine.page.serving import serve
+    from faintspot.engine.page.server import serve
 
     if recording is None:
         require_linux("live without a recording")

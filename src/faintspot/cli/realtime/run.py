@@ -15,7 +15,7 @@ from faintspot.cli.realtime.stopping import stop_on_signal
 from faintspot.cli.shared.commands import FRAMES, RANGES, configuration_option, name_option, option
 from faintspot.cli.shared.engine_requests import summary
 from faintspot.cli.shared.needs import needs
-from faintspot.engine.requests.private_socket import socket_path
+from faintspot.engine.requests.requests import socket_path
 
 if TYPE_CHECKING:
     from faintspot.engine.engine import Engine
@@ -104,7 +104,7 @@ def run(
     from faintspot.base.errors import InputError
     from faintspot.engine.engine import Engine
     from faintspot.engine.options import EngineOptions
-    from faintspot.engine.path.pipeline_maker import PipelineMaker
+    from faintspot.engine.path.workers import PipelineMaker
     from faintspot.engine.request_handlers import LENGTHY, commands_of
     from faintspot.engine.requests.requests import ControlServer
     from faintspot.engine.requests.scheduling import real_time

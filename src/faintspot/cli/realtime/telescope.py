@@ -12,7 +12,7 @@ import click
 from faintspot.base.files import output_errors
 from faintspot.cli.realtime.stopping import published, stop_on_signal
 from faintspot.cli.shared.commands import FRAMES, READOUT_FRACTION, SLOTS, name_option, option
-from faintspot.engine.requests.private_socket import TELESCOPE, socket_path
+from faintspot.engine.requests.requests import TELESCOPE, socket_path
 
 
 @click.command("telescope", short_help="Simulate a telescope whose mirror follows a command stream.")

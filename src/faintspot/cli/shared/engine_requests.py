@@ -9,8 +9,7 @@ from typing import Any
 
 import click
 
-from faintspot.engine.requests.private_socket import ENGINE, socket_path
-from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
+from faintspot.engine.requests.requests import ENGINE, LENGTHY_TIMEOUT_S, request, socket_path
 
 PATIENCE_S = 2.0
 """Delay before the reason for waiting is printed."""

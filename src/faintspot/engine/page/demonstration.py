@@ -18,8 +18,7 @@ from faintspot.base.files import derived, output_errors, write_atomically
 from faintspot.engine.loop.control_loop import CLOSED, STATES
 from faintspot.engine.pixels.readout import StopEvent
 from faintspot.engine.requests.child_processes import ONE_THREAD, ChildProcesses
-from faintspot.engine.requests.private_socket import socket_path
-from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request
+from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request, socket_path
 from faintspot.engine.settings.interleaving import short_names
 from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods

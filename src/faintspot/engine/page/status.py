@@ -7,8 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from faintspot.base.errors import InputError
-from faintspot.engine.requests.private_socket import socket_path
-from faintspot.engine.requests.requests import request
+from faintspot.engine.requests.requests import request, socket_path
 from faintspot.slopes.estimators.documentation import allowed_in_words
 from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.pipeline.settings import SharedOptions

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.engine.path.frame_path import FramePath, check_real_time
 from faintspot.slopes.estimators.base import Positions
-from faintspot.slopes.estimators.faults import one_line
 from faintspot.slopes.estimators.python import PythonPlan
+from faintspot.slopes.estimators.registry import one_line
 from faintspot.slopes.kernels.driver.groups import CALIBRATED
 from faintspot.slopes.kernels.driver.products import ProductPart
 from faintspot.slopes.pipeline.settings import Settings

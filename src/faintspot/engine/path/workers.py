@@ -6,11 +6,21 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from faintspot.base.errors import InputError
+from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.kernels.compilation.ordered import load, store
 from faintspot.slopes.kernels.driver import streaming
+from faintspot.slopes.pipeline.settings import Settings
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.fixed_weights import FixedWeights
+from faintspot.slopes.spots.psf import PSF
 
 _LINE = 16  # int64 numbers from one cell to the next: no two share a cache line
 _POSTED = 0
@@ -115,3 +125,27 @@ class Workers:
 
 _NEVER = np.zeros(1, np.int64)
 """Cell that never ends a wait: shares are completed, or abandoned for a dead worker."""
+
+
+@dataclass(frozen=True, eq=False)
+class PipelineMaker:
+    """Parts of a pipeline but its settings; other processes can be given it."""
+
+    layout: Layout
+    calibration: Calibration
+    psf: PSF | None = None
+    score: FixedWeights | None = None
+    reference: NDArray[Any] | None = None
+    """Reference slopes, as for `SlopePipeline`."""
+
+    def __post_init__(self) -> None:
+        if self.layout.bin > 1:
+            raise InputError(
+                f"layout.bin = {self.layout.bin}: expected 1, the engine measures rows as they arrive; "
+                "bin in the camera, or measure recorded frames with `faintspot slopes`"
+            )
+
+    def __call__(self, settings: Settings) -> SlopePipeline:
+        """Return the pipeline with settings."""
+        parts = self.layout, settings, self.calibration, self.reference
+        return SlopePipeline(*parts, psf=self.psf, score=self.score)

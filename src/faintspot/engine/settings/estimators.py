@@ -27,7 +27,7 @@ from faintspot.engine.settings.plan import EnginePlan, SettingsPreparer
 from faintspot.engine.settings.running_settings import Change, RunningSettings
 from faintspot.slopes.estimators import registry
 from faintspot.slopes.estimators.base import Estimator
-from faintspot.slopes.estimators.faults import faults_of, one_line
+from faintspot.slopes.estimators.registry import faults_of, one_line
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.engine.streams.publication import Publication
+from faintspot.engine.streams.image_stream import Publication
 from faintspot.engine.streams.stream import Follower, StreamCounters
 
 LARGEST_NM = 1e6

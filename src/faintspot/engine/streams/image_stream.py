@@ -9,7 +9,7 @@ import os
 import stat
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -34,10 +34,23 @@ from faintspot.engine.streams.image_layout import (
     path_of,
     places_of,
 )
-from faintspot.engine.streams.publication import LARGEST_NUMBER, Publication
 from faintspot.engine.streams.semaphores import BYTES as SEMAPHORE_BYTES
 from faintspot.engine.streams.semaphores import Semaphore
 from faintspot.slopes.kernels.compilation.ordered import fence, load, store
+
+LARGEST_NUMBER = 2**63 - 1
+"""Largest frame number."""
+
+
+class Publication(NamedTuple):
+    """Values that were published together."""
+
+    values: NDArray[Any]
+    number: int
+    """Frame number given by the producer."""
+    total: int
+    """Number of publications up to this one."""
+
 
 _NAP_S = 5e-4
 _OPEN = os.O_NONBLOCK | os.O_CLOEXEC  # never block on a named pipe

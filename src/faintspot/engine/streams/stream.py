@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.engine.streams.image_layout import ISIO, IncompatibleStreamError, path_of
-from faintspot.engine.streams.image_stream import ImageStream
-from faintspot.engine.streams.publication import LARGEST_NUMBER, Publication
+from faintspot.engine.streams.image_stream import LARGEST_NUMBER, ImageStream, Publication
 from faintspot.engine.streams.shared_streams import lock_file, pyshmem_module
 from faintspot.io.frame_numbers import left_out
 

@@ -23,7 +23,7 @@ from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, change
 from faintspot.engine.streams.command_stream import CommandStream
 from faintspot.engine.streams.shared_streams import create_stream, held
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.telescope.camera import make_detector
+from faintspot.loop.simulation.telescope.calibration import make_detector
 from faintspot.loop.simulation.telescope.model import TelescopeModel
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M

@@ -12,8 +12,8 @@ from faintspot.experiments.closed_loop.search import Search
 from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED
-from faintspot.loop.simulation.disabled_errors import DisabledErrors
 from faintspot.loop.simulation.record import BUDGET_FILE
+from faintspot.loop.simulation.simulation import DisabledErrors
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.smoothed import Smoothed
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation

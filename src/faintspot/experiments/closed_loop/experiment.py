@@ -29,10 +29,9 @@ from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, 
 from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
 from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.disabled_errors import DisabledErrors
 from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import make_folder
-from faintspot.loop.simulation.simulation import simulate_loop
+from faintspot.loop.simulation.simulation import DisabledErrors, simulate_loop
 
 _QUICK_RUN = {"frames": 300, "settle_frames": 60, "realisations": 2}
 _NO_LOSS = 0.02  # of Strehl ratio: the best one of many short runs is that much too high

@@ -19,10 +19,10 @@ from faintspot.experiments.closed_loop.search import Search
 from faintspot.experiments.closed_loop.verdict import equal_methods
 from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.disabled_errors import DisabledErrors
 from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import MAGNITUDE_FILE
-from faintspot.loop.simulation.telescope.camera import camera_calibration
+from faintspot.loop.simulation.simulation import DisabledErrors
+from faintspot.loop.simulation.telescope.calibration import camera_calibration
 from faintspot.slopes.estimators.base import Need
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.smoothed import Smoothed

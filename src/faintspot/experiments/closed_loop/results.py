@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
-from faintspot.base.npz import NpzFile
+from faintspot.base.files import NpzFile
 from faintspot.base.report.texts import with_error
 from faintspot.base.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
-from faintspot.experiments.crossings import crossings
+from faintspot.experiments.methods import crossings
 
 Floats = NDArray[np.float64]
 

@@ -18,9 +18,8 @@ from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, 
 from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED
-from faintspot.loop.simulation.control import slope_turbulence
 from faintspot.loop.simulation.methods import Method
-from faintspot.loop.simulation.record import LoopRecord, make_folder
+from faintspot.loop.simulation.record import LoopRecord, make_folder, slope_turbulence
 from faintspot.loop.simulation.simulation import simulate_loop
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 from faintspot.loop.turbulence.strength import turbulence_strength

@@ -17,12 +17,11 @@ from faintspot.base.checks import not_none
 from faintspot.base.config.options import TEXT, setting
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys, checked_table, parse_file
-from faintspot.experiments.planner.spots import Spots
-from faintspot.experiments.planner.stated import StatedCamera, StatedOptics, positive
+from faintspot.experiments.planner.stated import Spots, StatedCamera, StatedOptics, positive
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.sensor.layout import GRID_KEYS, Layout
-from faintspot.slopes.simulate.photometry import Photometry, StarLight
+from faintspot.slopes.simulate.frames import Photometry, StarLight
 from faintspot.slopes.spots.laser_spots import LaserSpots
 from faintspot.slopes.spots.psf import PSF
 

@@ -21,14 +21,14 @@ from faintspot.experiments.planner.question import (
     default_search_range_px,
 )
 from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.camera.mean_frame import are_repeated
+from faintspot.slopes.camera.frame_checks import are_repeated
 from faintspot.slopes.camera.photon_transfer import DetectorMeasurement, measure_detector
 from faintspot.slopes.estimators.algorithms.noise import pixel_noise
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
+from faintspot.slopes.training.psf_rounds import usable_subapertures
 from faintspot.slopes.training.search_range import Images, SpotRange, spot_range
-from faintspot.slopes.training.usable import usable_subapertures
 
 if TYPE_CHECKING:
     from faintspot.slopes.training.psf_learning import LearntPSF

@@ -19,15 +19,17 @@ from faintspot.base.errors import InputError
 from faintspot.base.json_text import parse_json, to_json
 from faintspot.base.sizes import check_bytes
 from faintspot.base.variables import VARIABLES
-from faintspot.io.arrays.fits_units import AOT_VERSION, HeaderDataUnit, units_of
-from faintspot.io.arrays.stored_array import StoredArray
-from faintspot.io.arrays.streams import (
+from faintspot.io.arrays.fits_units import (
+    AOT_VERSION,
     GZIP_SIGNATURE,
+    HeaderDataUnit,
     StreamedArray,
     check_present,
     is_gzip,
     open_plain_or_gzip,
+    units_of,
 )
+from faintspot.io.arrays.stored_array import StoredArray
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_fits

@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import check_regular
+from faintspot.base.files import check_regular, unpacked
 from faintspot.base.json_text import parse_json, to_json
-from faintspot.base.npz import unpacked
 from faintspot.base.variables import VARIABLES
+from faintspot.io.arrays.fits_units import StreamedArray, check_present
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
-from faintspot.io.arrays.streams import StreamedArray, check_present
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.locations import PREFERRED_NAME, choose_name
 from faintspot.io.stored.slopes_format import REQUIRED, StoredSlopes, most_slopes_bytes, with_absent

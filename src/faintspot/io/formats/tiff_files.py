@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.io.arrays.fits_units import StreamedArray, check_present
 from faintspot.io.arrays.inflation import check_inflated, is_surely_small
 from faintspot.io.arrays.stored_array import EQUAL_COLOURS, StoredArray, grey
-from faintspot.io.arrays.streams import StreamedArray, check_present
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.optional_packages import load_pillow, load_tifffile
 

@@ -27,7 +27,7 @@ from faintspot.slopes.sensor.layout import Layout
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.model import Kalman
-    from faintspot.loop.control.plant import LoopPlant
+    from faintspot.loop.control.integrator import LoopPlant
 
 Floats = NDArray[np.float64]
 
@@ -132,7 +132,7 @@ class Control:
     @property
     def plant(self) -> LoopPlant:
         """Loop properties that learnt controllers use."""
-        from faintspot.loop.control.plant import LoopPlant  # an integrator needs no replays
+        from faintspot.loop.control.integrator import LoopPlant  # an integrator needs no replays
 
         options = self.options
         return LoopPlant(self.controlled, self.reconstructor, options.delay_frames, options.leak)

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.base.files import derived, write_atomically
+from faintspot.base.files import derived, save_arrays, write_atomically
 from faintspot.base.flags import UNMEASURED, SubapertureFlag
-from faintspot.base.npz import save_arrays
 from faintspot.loop.control.configuration import INTERACTION, REFERENCE, save_control
 from faintspot.slopes.sensor.layout import Layout
 

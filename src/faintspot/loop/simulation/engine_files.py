@@ -17,8 +17,11 @@ from faintspot.loop.simulation.configuration.configuration import LoopConfigurat
 from faintspot.loop.simulation.learning import learnt_control
 from faintspot.loop.simulation.methods import PREDICTED, PRIOR, Method
 from faintspot.loop.simulation.simulation import measure_gains, simulate_loop
-from faintspot.loop.simulation.telescope.calibration import make_pipeline, reference_slopes
-from faintspot.loop.simulation.telescope.camera import camera_calibration
+from faintspot.loop.simulation.telescope.calibration import (
+    camera_calibration,
+    make_pipeline,
+    reference_slopes,
+)
 from faintspot.loop.simulation.telescope.model import prepare
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline import configuration as configuration_file

@@ -19,9 +19,8 @@ from faintspot.loop.control.identification.open_loop import measured_delay, open
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED, ControlParameters, RunLength
-from faintspot.loop.simulation.control import plant_of, slope_turbulence
 from faintspot.loop.simulation.methods import PRIOR, TRUE, Method
-from faintspot.loop.simulation.record import LoopRecord
+from faintspot.loop.simulation.record import LoopRecord, plant_of, slope_turbulence
 from faintspot.loop.simulation.telescope.model import prepare
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline.configuration import to_text

@@ -16,8 +16,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.loop.control.flattening import residual_phase
 from faintspot.loop.control.identification.open_loop import noise_variance
-from faintspot.loop.control.phase import residual_phase
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.telemetry.recorded_loop import frame_rate
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence

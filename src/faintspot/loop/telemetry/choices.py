@@ -20,14 +20,14 @@ from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import mean_by_blocks
 from faintspot.loop.control.base import SETTLE_FRAMES, OpenLoopTelemetry
+from faintspot.loop.control.flattening import residual_phase
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import Measured, OpenLoop
 from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.kalman.predictor import steady_covariance
-from faintspot.loop.control.phase import residual_phase
-from faintspot.loop.control.plant import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 

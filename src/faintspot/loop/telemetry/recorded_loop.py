@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, increasing, one_of, real_array
 from faintspot.base.errors import InputError, errors_within
-from faintspot.base.files import read_lines
+from faintspot.base.files import read_arrays, read_lines
 from faintspot.base.flags import NO_FLAG, SubapertureFlag, leave_out
-from faintspot.base.npz import read_arrays
 from faintspot.base.toml_files import check_keys, parse_file
 from faintspot.io import StoredSlopes
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES

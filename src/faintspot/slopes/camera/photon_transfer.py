@@ -14,7 +14,7 @@ from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.camera.dark_frames import DarkPixels, dark_pixels
-from faintspot.slopes.camera.mean_frame import are_repeated
+from faintspot.slopes.camera.frame_checks import are_repeated
 from faintspot.slopes.camera.transfer_curve import LineFit, TransferCurve, fit_line, photon_transfer
 from faintspot.slopes.sensor.layout import Layout
 

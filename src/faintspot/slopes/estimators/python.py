@@ -14,7 +14,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Positions
 from faintspot.slopes.estimators.built_in.gravity import keep_all
-from faintspot.slopes.estimators.faults import faults_of
+from faintspot.slopes.estimators.registry import faults_of
 from faintspot.slopes.estimators.sensor import Sensor
 from faintspot.slopes.kernels.driver import groups
 from faintspot.slopes.kernels.driver.groups import SlopeArrays

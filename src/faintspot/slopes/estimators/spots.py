@@ -2,19 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.config.options import option
 from faintspot.slopes.estimators import spot_tables
-from faintspot.slopes.estimators.base import EstimatorPlan
+from faintspot.slopes.estimators.base import Estimator, EstimatorPlan
 from faintspot.slopes.estimators.spot_tables import SpotModel
-from faintspot.slopes.estimators.stepping import Stepping
 from faintspot.slopes.kernels.driver.groups import RANGE
 from faintspot.slopes.kernels.gravity.pixel_noise import SMALLEST_VARIANCE
 from faintspot.slopes.kernels.spot_fits import fits as spot_fits
+
+_STEPS_IN_BRIGHT_FLUX = 12
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Stepping(Estimator):
+    """Estimator that makes the same number of steps for every image, so that its run time is constant."""
+
+    steps: int | None = option(None, "Number of steps.", low=1, high=100, whole=True, per_subaperture=False)
+
+    usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 3}
+    """By preset."""
+
+    @property
+    def step_count(self) -> int:
+        """Number of steps, given or default."""
+        return int(self.steps or self.usual_steps[getattr(self, "preset", "accurate")])
+
+    def for_bright_flux(self) -> Self:
+        """Make more steps: without noise, the remaining influence of the starting point is a bias."""
+        return self.replaced({"steps": max(self.step_count, _STEPS_IN_BRIGHT_FLUX)})
+
+    def in_words(self, n_subapertures: int, pixels: int) -> str:
+        """See `Estimator`."""
+        own = [name for name in self.chosen() if name not in ("steps", "preset")]
+        parts = [f"{name} {self._span(name, n_subapertures, pixels)}" for name in own]
+        return f"{self.method or self.label} ({', '.join([*parts, f'{self.step_count} steps'])})"
+
 
 Floats = NDArray[np.float64]
 

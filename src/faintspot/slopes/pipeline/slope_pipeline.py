@@ -29,10 +29,9 @@ from faintspot.slopes.kernels.driver.groups import CALIBRATED, STAGE_ROWS, Scrat
 from faintspot.slopes.kernels.parallel import most_threads, run_groups, thread_scratch
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.light import MeanFlux, MeanLight, light_test
-from faintspot.slopes.pipeline.plan import Plan, packed_calibration
+from faintspot.slopes.pipeline.plan import NO_STAGES, Plan, SmallFrames, packed_calibration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes, Stages
-from faintspot.slopes.pipeline.small_frames import NO_STAGES, SmallFrames
 from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.fixed_weights import FixedWeights

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.binning import binned, binned_calibration
 from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.estimators.algorithms.centroid import SeenSpots, like_most, seen_spots
 from faintspot.slopes.estimators.algorithms.noise import pixel_noise
-from faintspot.slopes.estimators.algorithms.spot_width import SeenSpots, like_most, seen_spots
 from faintspot.slopes.estimators.base import Need
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline

@@ -24,16 +24,14 @@ from faintspot.io.slopes import create_writer
 from faintspot.io.stored.slopes_format import UNITS, pixels_in
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.fitting_dark import with_fitting_dark
-from faintspot.slopes.camera.mean_frame import are_repeated
+from faintspot.slopes.camera.frame_checks import are_repeated
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.light import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px, with_preset, without_denoising
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes, layout_coordinates
-from faintspot.slopes.recorded.configured import configured
-from faintspot.slopes.recorded.response import response
-from faintspot.slopes.recorded.survey import Survey, frames_apart, stretches, survey
+from faintspot.slopes.recorded.survey import Survey, configured, frames_apart, response, stretches, survey
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.io.frames import FrameSource
 from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.pipeline.images import measure_images
+from faintspot.slopes.pipeline.following import measure_images
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.laser_spots import LaserSpots
@@ -21,8 +21,8 @@ from faintspot.slopes.training.known_sodium import (
     calibrated_images,
     dark_variance_e2,
 )
+from faintspot.slopes.training.psf_rounds import usable_subapertures
 from faintspot.slopes.training.sodium import MeanImages
-from faintspot.slopes.training.usable import usable_subapertures
 
 _BLOCK_FRAMES = 20
 _FITS = 2  # the first one finds the shape, with which the spots are located for the second

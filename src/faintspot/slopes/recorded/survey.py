@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import shlex
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, errors_within
+from faintspot.io.arrays.fits_units import is_aot
 from faintspot.io.frames import FrameSource
-from faintspot.slopes.camera.frame_checks import LargestValues
-from faintspot.slopes.camera.mean_frame import MeanFrame, are_repeated
+from faintspot.io.locations import split_location
+from faintspot.slopes.camera.frame_checks import LargestValues, MeanFrame, are_repeated
+from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.pipeline.configuration import Configuration
+from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.sensor.layout import Layout
 
 _LOOKS, _FRAMES = 20, 50  # stretches of frames over the whole recording
 _FRAMES_FOR_SATURATION = 200
@@ -114,3 +123,102 @@ def _level_and_spread(frames: NDArray[np.generic]) -> NDArray[np.float64]:
         level = float(np.median(pixels[:: 1 + pixels.size // _FOR_LEVEL])) if pixels.size else 0.0
         kinds.append((level, float(np.sqrt(np.mean(np.square(pixels - level)))) if pixels.size else 0.0))
     return np.array(kinds)
+
+
+def configured(
+    path: str | Path, frames: Sequence[str | Path], key: str | None
+) -> tuple[Configuration, str, NDArray[Any] | None]:
+    """Return the configuration, what of it is that of an AOT file, in words, and that file's references."""
+    described = Configuration(path) if Path(path).exists() else None
+    first = None if described is not None and "layout" in described else _aot_file(frames)
+    if first is None:
+        return described or Configuration(path), "", None
+    from faintspot.io.telemetry.aot_reading import read_aot  # only for such files
+
+    sensor = read_aot(first[0], first[1] or key)
+    where = f"{first[0]}: sensor {sensor.name!r}"
+    if sensor.layout is None:
+        raise InputError(
+            f"{where}: expected its sub-apertures (subaperture_mask, mask_offsets, subaperture_size), found "
+            f"none; give [layout] in {path}"
+        )
+    with errors_within(where):
+        layout = Layout(**sensor.layout)
+    words = ["sub-apertures", *(["reference slopes"] if sensor.reference is not None else [])]
+    parts: dict[str, Any] = {"layout": layout}
+    if described is None:
+        if not sensor.tables:
+            command = _layout_command(frames[0], layout, path)
+            raise InputError(f"{path}: no such file, and {first[0]} has no settings; `{command}` makes one")
+        words.append("settings")
+        if sensor.parts is not None:
+            stored = configuration.unpacked(sensor.parts)
+            parts |= dict(zip(("calibration", "psf", "score"), stored, strict=True))
+    tables = sensor.tables if described is None else described.tables
+    listed = " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
+    return Configuration(path, tables, **parts), f"{listed} of {first[0]}", sensor.reference
+
+
+def _aot_file(frames: Sequence[str | Path]) -> tuple[Path, str | None] | None:
+    """Return the first file of frames and the key in its name, if it is one of telemetry (AOT)."""
+    if isinstance(frames, str | Path) or not frames:
+        return None
+    try:
+        first = split_location(frames[0])
+    except InputError:  # whoever opens it says so, after what is wrong with the configuration
+        return None
+    return first if is_aot(first[0]) else None
+
+
+def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str:
+    """Return the command that writes a configuration for a layout whose cells are on a grid."""
+    rows, columns = np.ptp(layout.cells, axis=0) + 1
+    (top, left), (bottom, right) = layout.corners.min(axis=0), layout.corners.max(axis=0) + layout.window
+    is_whole = (top, left, bottom, right) == (0, 0, *layout.frame_shape)
+    roi = [] if is_whole else ["--roi", f"{left},{top},{right},{bottom}"]
+    words = ["faintspot", "layout", str(frames), "--grid", f"{rows}x{columns}", *roi, "-o", str(path)]
+    return shlex.join(words)
+
+
+Floats = NDArray[np.float64]
+
+_STEP_PX = 0.25
+
+
+def response(pipeline: SlopePipeline, mean_frame: Floats, frames: Iterable[NDArray[Any]]) -> Floats:
+    """Return the slopes shown for a displacement of 1 px, (2 n,), all x, then all y.
+
+    Slopes with fixed weights are linear in the pixels: their mean change, when all spots are displaced, is
+    the change for the displaced mean of the frames. Others are measured in single frames displaced by whole
+    pixels, which leave the noise as it is. The mean change over Gaussian displacements is the regression of
+    the slopes on them, whatever the estimator does with spots that are faint or at the edges of windows.
+
+    Parameters
+    ----------
+    pipeline : SlopePipeline
+    mean_frame : (h, w) array
+        Mean of the frames, ADU.
+    frames : iterable of (n, h, w) array, ADU
+        Blocks of frames from all over the recording, as from `frames_apart`.
+    """
+    dark = np.nan_to_num(pipeline.calibration.maps(mean_frame.shape)[0])
+    if pipeline.settings.estimator.name == "window":
+        mean = np.where(np.isnan(mean_frame), np.nanmedian(mean_frame), mean_frame)
+        changes = [_change(pipeline, mean[None], dark, _STEP_PX)]
+    else:
+        changes = [_change(pipeline, block, dark, 1.0) for block in frames]
+    return np.asarray(np.concatenate(changes, axis=1).mean(axis=1))
+
+
+def _change(pipeline: SlopePipeline, frames: NDArray[Any], dark: Floats, step_px: float) -> Floats:
+    """Return the change of slopes (2 n, frames) per px, of frames displaced along x and along y."""
+    order, light = (0 if step_px == 1 else 3), frames - dark
+    changes = []
+    for axis, direction in (("x", (0, 0, step_px)), ("y", (0, step_px, 0))):
+        ahead, behind = (
+            dark + ndimage.shift(light, sign * np.array(direction), order=order, mode="nearest")
+            for sign in (1, -1)
+        )
+        ahead, behind = (getattr(pipeline(each.astype(np.float32)), axis) for each in (ahead, behind))
+        changes.append((ahead.astype(np.float64) - behind) / (2 * step_px))
+    return np.hstack(changes).T

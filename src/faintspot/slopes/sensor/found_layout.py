@@ -9,11 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
+from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.kernels.driver.doubtful import Expected, flag_doubtful
 from faintspot.slopes.sensor.binning import magnified_layout, scaled_points
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, lines_of, neighbours_of
+from faintspot.slopes.sensor.region import PupilRegion, Rectangle
+from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, SMALLEST_WINDOW, window_size
 from faintspot.slopes.sensor.windows import Windows, find_windows
 
 _GHOST, _DARK = 0.3, 0.25  # of the median flux of the neighbours, and of all
@@ -135,3 +140,156 @@ def _dim(grid: LensletGrid) -> NDArray[np.bool_]:
     around[np.isnan(around).all(axis=1)] = 0.0
     brightest = np.maximum(_GHOST * np.nanmedian(around, axis=1), _DARK * np.median(grid.flux))
     return np.asarray(grid.flux < brightest)
+
+
+_LIT_FRACTION = 0.3
+_BRIGHT = 0.95  # quantile of the flux, relative to which cells are selected for the median
+_CLOSE, _DOUBTFUL = 1.25, 0.05
+_NOISY = 0.2  # standard deviation of the flux of the dark cells, in units of the median of the others
+# Without a dark level, dim cells are dark if the bright ones exceed them by this many of their standard
+# deviations. With fewer cells or a smaller difference, as in 5 % of vignetted grids, both may be illuminated.
+_APART, _FEWEST = 8.0, 36
+
+
+@dataclass(frozen=True)
+class KnownGrid:
+    """Illuminated sub-apertures of a grid at a known position.
+
+    Parameters
+    ----------
+    layout : Layout
+        Illuminated sub-apertures.
+    unlit : (n, ny, nx) array
+        Images of the other sub-apertures.
+    doubt : str
+        Reason why the choice may be wrong, in one line; empty if it is clear.
+    """
+
+    layout: Layout
+    unlit: NDArray[np.float64]
+    doubt: str
+
+    def magnified(self, factor: int, frame_shape: tuple[int, int]) -> KnownGrid:
+        """Return the grid of a binned frame in the pixels of the camera, of frames of `frame_shape`."""
+        layout = magnified_layout(self.layout, factor, frame_shape)
+        return replace(self, layout=layout, unlit=self.unlit / factor**2)
+
+
+def find_illuminated(
+    frame: NDArray[np.float64],
+    shape: tuple[int, int],
+    *,
+    pixels: int | tuple[int, int] | None = None,
+    has_dark: bool = False,
+    illuminated_fraction: float | None = None,
+    pupil: object = None,
+    roi: object = None,
+) -> KnownGrid:
+    """Find the illuminated sub-apertures of a grid that fills a frame, from their flux.
+
+    Parameters
+    ----------
+    frame : (h, w) array
+        Mean of the frames; NaN for bad pixels.
+    shape : (int, int)
+        Rows and columns of cells, which fill the frame or `roi`.
+    pixels : int or (int, int), optional
+        Window at the centre of each cell. Default: all its whole pixels, at most 64.
+    has_dark : bool
+        Whether the dark level is subtracted. Otherwise the flux of the dimmest cells is taken to be 0, if
+        they are clearly separated from the bright ones.
+    illuminated_fraction : float, optional
+        Smallest flux of an illuminated cell, relative to the median of the bright ones. Default: 0.3.
+    pupil : (x, y, radius) or (x, y, radius, inner radius), optional
+        Use the cells whose centres are in this disk or annulus [px], whatever their flux.
+    roi : (x0, y0, x1, y1), optional
+        Columns x0 to x1 - 1 and rows y0 to y1 - 1 that the grid fills.
+
+    Raises
+    ------
+    InputError
+        If the grid does not fit into the frame, or no cell is illuminated.
+    """
+    grid = _whole_grid(frame.shape, shape, pixels, roi)
+    images = grid.images(frame)
+    flux = np.nan_to_num(np.nanmean(images.reshape(len(grid), -1), axis=1)) * grid.pixels
+    if pupil is not None:
+        illuminated, doubt = PupilRegion.given(pupil).holds(grid.centres.view(np.complex128)[:, 0]), ""
+    else:
+        fraction = _LIT_FRACTION if illuminated_fraction is None else illuminated_fraction
+        illuminated, doubt = _illuminated(
+            flux, number_between("illuminated_fraction", fraction, 0.0, 1.0), has_dark
+        )
+    if not illuminated.any():
+        raise InputError(
+            f"grid of {shape[0]} x {shape[1]}: no cell is illuminated, or none is in the pupil; check "
+            "frame and dark"
+        )
+    return KnownGrid(grid[illuminated], images[~illuminated], doubt)
+
+
+def _whole_grid(
+    frame_shape: tuple[int, ...], shape: tuple[int, int], pixels: int | tuple[int, int] | None, roi: object
+) -> Layout:
+    """Return the layout of all cells."""
+    part = Rectangle.given(roi, frame_shape)
+    size = np.array([part.y1 - part.y0, part.x1 - part.x0])
+    pitch = size / shape
+    largest = np.minimum(np.floor(pitch), LARGEST_WINDOW).astype(int)
+    if largest.min() < SMALLEST_WINDOW:
+        raise InputError(
+            f"grid of {shape[0]} x {shape[1]} in {size[0]} x {size[1]} pixels: expected cells of at least "
+            f"{SMALLEST_WINDOW} x {SMALLEST_WINDOW} pixels, got {pitch[0]:.3g} x {pitch[1]:.3g}"
+        )
+    window = (int(largest[0]), int(largest[1])) if pixels is None else window_size("pixels", pixels)
+    if np.any(np.array(window) > pitch):
+        raise InputError(
+            f"pixels = {window[0]} x {window[1]}: expected a window within a cell of {pitch[0]:.4g} x "
+            f"{pitch[1]:.4g} pixels"
+        )
+    cells = np.argwhere(np.ones(shape, dtype=bool))
+    middles = np.array([part.y0, part.x0]) + (cells + 0.5) * pitch - 0.5
+    corners = np.floor(middles - 0.5 * np.array(window) + 1.0).astype(np.int64)
+    frame = (int(frame_shape[0]), int(frame_shape[1]))
+    return Layout(frame, window, corners, middles[:, ::-1], cells, pitch_px=float(pitch.min()))
+
+
+def _illuminated(flux: NDArray[np.float64], fraction: float, has_dark: bool) -> tuple[NDArray[np.bool_], str]:
+    """Return which cells are illuminated, and the reason why that may be wrong."""
+    background = 0.0 if has_dark else _dark_level(flux)
+    if np.isnan(background):
+        doubt = "no cell is clearly dark, all are used; give --dark or --pupil to select them"
+        return np.ones(len(flux), dtype=bool), doubt
+    above = flux - background
+    bright = float(np.quantile(above, _BRIGHT))
+    if bright <= 0:
+        return np.zeros(len(flux), dtype=bool), ""
+    relative = above / np.median(above[above >= fraction * bright])
+    illuminated = relative >= fraction
+    close = np.count_nonzero((relative > fraction / _CLOSE) & (relative < fraction * _CLOSE))
+    if not illuminated.all() and np.std(relative[~illuminated]) > _NOISY:
+        return (
+            illuminated,
+            "the flux of the dark cells scatters almost as much as that of the others; average more frames",
+        )
+    if close > max(1, _DOUBTFUL * np.count_nonzero(illuminated)):
+        return (
+            illuminated,
+            f"{close} cells have about {fraction:.2g} of the median flux, the illumination limit",
+        )
+    return illuminated, ""
+
+
+def _dark_level(flux: NDArray[np.float64]) -> float:
+    """Return the median of the dim cells (split after Otsu 1979); NaN if they may be illuminated, too."""
+    if len(flux) < _FEWEST:
+        return np.nan
+    ordered = np.sort(flux)
+    number = np.arange(1, len(flux))
+    lower = np.cumsum(ordered)[:-1]
+    between = (ordered.sum() * number / len(flux) - lower) ** 2 / (number * (len(flux) - number))
+    split = int(np.argmax(between)) + 1
+    level = float(np.median(ordered[:split]))
+    scatter = MAD_TO_STD * float(np.median(np.abs(ordered[:split] - level)))
+    apart = float(np.median(ordered[split:])) - level
+    return level if min(split, len(flux) - split) >= 4 and apart > _APART * scatter else np.nan

@@ -18,8 +18,14 @@ from faintspot.base.config.tables import ConfigurationTable
 from faintspot.base.errors import DoubtWarning, InputError, errors_within
 from faintspot.base.sizes import check_size
 from faintspot.base.toml_files import check_keys, checked_table
-from faintspot.slopes.sensor.window_checks import check_centres, check_inside, check_overlap, chosen_index
-from faintspot.slopes.sensor.window_size import pair_of_numbers, window_size
+from faintspot.slopes.sensor.window_checks import (
+    check_centres,
+    check_inside,
+    check_overlap,
+    chosen_index,
+    pair_of_numbers,
+    window_size,
+)
 
 if TYPE_CHECKING:
     from faintspot.slopes.sensor.windows import Windows

@@ -14,7 +14,7 @@ from faintspot.base.checks import real_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid, find_lenslets
 from faintspot.slopes.sensor.stated import with_stated
-from faintspot.slopes.sensor.window_size import LARGEST_WINDOW, window_size
+from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, window_size
 
 # Windows may be moved this far from their spots to be a pixel larger: no more than the rounding of their
 # corners to whole pixels.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.base.npz import NpzFile
+from faintspot.base.files import NpzFile
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
 Floats = NDArray[np.float64]

@@ -25,9 +25,9 @@ from faintspot.slopes.training.psf_rounds import (
     measured_width,
     psf_of,
     registered,
+    usable_subapertures,
 )
 from faintspot.slopes.training.registration import Registered, Stack
-from faintspot.slopes.training.usable import usable_subapertures
 
 SCOPES = ("sensor", "subaperture")
 

@@ -13,8 +13,7 @@ from faintspot.base.files import check_ending, csv_text, write_atomically
 from faintspot.base.json_text import to_json
 from faintspot.io.optional_packages import load_fits
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
-from faintspot.slopes.wavefront.units import UNITS
+from faintspot.slopes.wavefront.fit import UNITS, Floats, Wavefront, total
 from faintspot.slopes.wavefront.words import mode_records
 from faintspot.slopes.wavefront.zonal import ZonalMap
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from faintspot.base.report.texts import Texts, number_or_dash, signed
 from faintspot.base.statistics import rms
-from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
-from faintspot.slopes.wavefront.units import UNITS
+from faintspot.slopes.wavefront.fit import UNITS, Floats, Wavefront, total
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
 from faintspot.slopes.wavefront.zonal import ZonalMap, compared
 

@@ -18,8 +18,7 @@ from faintspot.base.flags import are_valid, leave_out
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import Pupil, lenslet_outlines, lenslet_pitch, lit_outlines, pupil_of
-from faintspot.slopes.wavefront.fit import FEWEST_SUBAPERTURES, Wavefront, too_few
-from faintspot.slopes.wavefront.units import POINTS, OfLength, unit_of
+from faintspot.slopes.wavefront.fit import FEWEST_SUBAPERTURES, POINTS, OfLength, Wavefront, too_few, unit_of
 from faintspot.slopes.wavefront.zernike import edge_points
 
 Floats = NDArray[np.float64]

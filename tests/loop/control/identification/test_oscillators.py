@@ -13,7 +13,7 @@ from faintspot.loop.control.identification.learning import GAINS, learn_controll
 from faintspot.loop.control.identification.loop_delay import DelayFits
 from faintspot.loop.control.identification.open_loop import site_of_loop
 from faintspot.loop.control.identification.recording import Recording
-from faintspot.loop.control.plant import LoopPlant
+from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 _RATE_HZ, _FRAMES, _NOISE = 500.0, 8000, 0.5

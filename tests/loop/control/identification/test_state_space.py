@@ -25,8 +25,7 @@ from tests.shared_data import ROOT
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
-from faintspot.loop.control.identification.model import Kalman
-from faintspot.loop.control.identification.state_space import state_space, write_matrices
+from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
 from faintspot.loop.control.kalman.local_predictor import local_filter
 
 MANUAL = ROOT / "docs" / "guide" / "predictive_filter.md"

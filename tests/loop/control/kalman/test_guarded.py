@@ -6,8 +6,8 @@ from tests.loop.control.control_cases import INTERACTION, PHASE, PLANT, telemetr
 from tests.loop.control.naive_guarded import Guarded
 
 from faintspot.loop.control.base import CommandDelayLine, Controller
+from faintspot.loop.control.integrator import Make
 from faintspot.loop.control.kalman.guarded import EXCESS, MOST_EXCESS
-from faintspot.loop.control.plant import Make
 
 FRAMES = telemetry(900, 0.2)
 

@@ -3,7 +3,11 @@
 import numpy as np
 
 from faintspot.loop.simulation import LoopConfiguration
-from faintspot.loop.simulation.telescope.camera import NoiselessDetector, camera_calibration, make_detector
+from faintspot.loop.simulation.telescope.calibration import (
+    NoiselessDetector,
+    camera_calibration,
+    make_detector,
+)
 
 
 def test_calibrated_frames_hold_the_electrons_of_the_star() -> None:

@@ -3,8 +3,7 @@ import pytest
 from tests.loop.simulation.loop_cases import quiet
 
 from faintspot.loop.simulation.telescope.atmosphere import make_atmosphere
-from faintspot.loop.simulation.telescope.mirror import BestFit, make_mirror
-from faintspot.loop.simulation.telescope.pupil import make_pupil
+from faintspot.loop.simulation.telescope.mirror import BestFit, make_mirror, make_pupil
 
 pytest.importorskip("hcipy")
 

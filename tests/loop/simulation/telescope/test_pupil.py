@@ -5,7 +5,7 @@ import pytest
 from tests.loop.simulation.loop_cases import quiet
 
 from faintspot.base.errors import MissingExtraError
-from faintspot.loop.simulation.telescope.pupil import make_pupil
+from faintspot.loop.simulation.telescope.mirror import make_pupil
 
 pytest.importorskip("hcipy")
 WAVELENGTH_M = 1.65e-6

@@ -6,7 +6,7 @@ import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.loop.simulation import load_loop
 from faintspot.loop.simulation.telescope.atmosphere import make_atmosphere
-from faintspot.loop.simulation.telescope.pupil import make_pupil
+from faintspot.loop.simulation.telescope.mirror import make_pupil
 from faintspot.loop.simulation.telescope.wavefront_sensor import ShackHartmann, make_sensor
 
 pytest.importorskip("hcipy")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.refusals import refused
 
-from faintspot.slopes.estimators.algorithms.spot_width import like_most, seen_spots
+from faintspot.slopes.estimators.algorithms.centroid import like_most, seen_spots
 from faintspot.slopes.simulate import Detector, subapertures
 
 

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import real_array
 from faintspot.base.errors import InputError
-from faintspot.base.npz import read_arrays
+from faintspot.base.files import read_arrays
 from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.model import Kalman
+from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
 from faintspot.loop.control.identification.open_loop import (
     Measured,
     OpenLoop,
@@ -30,8 +30,7 @@ from faintspot.loop.control.identification.open_loop import (
     with_axes_of,
 )
 from faintspot.loop.control.identification.recording import Prepared, Recording, prepared
-from faintspot.loop.control.identification.state_space import state_space, write_matrices
-from faintspot.loop.control.plant import LoopPlant
+from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 Floats = NDArray[np.float64]

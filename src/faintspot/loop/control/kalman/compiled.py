@@ -13,6 +13,7 @@ from faintspot.loop.control.base import (
     ExpectedSlopes,
     OpenLoopTelemetry,
 )
+from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.kalman.guarded import CHOSEN, GuardedController
 from faintspot.loop.control.kalman.kernels import FOLLOW, GO_ON, HOLD, replay
 from faintspot.loop.control.kalman.memory import (
@@ -28,7 +29,6 @@ from faintspot.loop.control.kalman.memory import (
     Recorded,
 )
 from faintspot.loop.control.kalman.predictor import SlopePredictor, shares
-from faintspot.loop.control.plant import LoopPlant
 
 Floats = NDArray[np.float64]
 

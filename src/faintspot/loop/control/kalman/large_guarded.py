@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.loop.control.base import CommandDelayLine, ExpectedSlopes, without_prior
-from faintspot.loop.control.integrator import SlopeProduct
+from faintspot.loop.control.integrator import LoopPlant, SlopeProduct
 from faintspot.loop.control.kalman.guarded import SURPRISE, GuardedController
 from faintspot.loop.control.kalman.local_model import replies
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor
-from faintspot.loop.control.plant import LoopPlant
 from faintspot.slopes.kernels.driver.products import ProductPart
 
 Floats = NDArray[np.float64]

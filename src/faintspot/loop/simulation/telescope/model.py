@@ -20,10 +20,20 @@ from faintspot.loop.simulation.configuration.sections import (
     RunLength,
 )
 from faintspot.loop.simulation.telescope.atmosphere import MovingLayers, make_atmosphere
-from faintspot.loop.simulation.telescope.calibration import interaction_matrix, true_interaction_matrix
-from faintspot.loop.simulation.telescope.camera import Exposing, NoiselessDetector, make_detector
-from faintspot.loop.simulation.telescope.mirror import BestFit, DeformableMirror, make_mirror
-from faintspot.loop.simulation.telescope.pupil import PupilAmplitude, make_pupil
+from faintspot.loop.simulation.telescope.calibration import (
+    Exposing,
+    NoiselessDetector,
+    interaction_matrix,
+    make_detector,
+    true_interaction_matrix,
+)
+from faintspot.loop.simulation.telescope.mirror import (
+    BestFit,
+    DeformableMirror,
+    PupilAmplitude,
+    make_mirror,
+    make_pupil,
+)
 from faintspot.loop.simulation.telescope.wavefront_sensor import ShackHartmann, make_sensor
 
 if TYPE_CHECKING:

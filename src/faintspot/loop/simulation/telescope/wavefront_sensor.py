@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, blur_px
-from faintspot.loop.simulation.telescope.pupil import PupilAmplitude
+from faintspot.loop.simulation.telescope.mirror import PupilAmplitude
 from faintspot.slopes.sensor.layout import Layout
 
 Floats = NDArray[np.float32]

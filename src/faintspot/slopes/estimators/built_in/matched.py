@@ -13,8 +13,7 @@ from faintspot.slopes.estimators.base import Need, Style
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.estimators.sensor import Sensor
-from faintspot.slopes.estimators.spots import BLURS, PSFPlan
-from faintspot.slopes.estimators.stepping import Stepping
+from faintspot.slopes.estimators.spots import BLURS, PSFPlan, Stepping
 from faintspot.slopes.kernels.spot_fits import fits as spot_fits
 
 

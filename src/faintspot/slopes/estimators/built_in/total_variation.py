@@ -14,8 +14,7 @@ from faintspot.base.config.options import PerSubaperture, Value, is_auto, option
 from faintspot.base.config.tables import FEW_KEPT, PRESETS, of_denoising
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.algorithms.automatic import automatic_strength
-from faintspot.slopes.estimators.algorithms.noise import suggested_strength
-from faintspot.slopes.estimators.algorithms.total_variation import ALGORITHMS, tv_denoise
+from faintspot.slopes.estimators.algorithms.noise import ALGORITHMS, suggested_strength, tv_denoise
 from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Step, Style
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.gravity import Floats, GravityPlan, KeepingBrightest

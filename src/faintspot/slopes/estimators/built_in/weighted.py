@@ -17,8 +17,7 @@ from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.estimators.sensor import Sensor
 from faintspot.slopes.estimators.spot_tables import SpotModel
-from faintspot.slopes.estimators.spots import SpotPlan
-from faintspot.slopes.estimators.stepping import Stepping
+from faintspot.slopes.estimators.spots import SpotPlan, Stepping
 from faintspot.slopes.kernels.spot_fits import fits as spot_fits
 
 _WIDTHS = (1.0, 0.6, 0.8, 1.25, 1.6, 2.2)  # multiples of the spot's width
