@@ -26,11 +26,10 @@ from faintspot.loop.control.identification.learning import learn_controller, rel
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.predictive_control import LoopOfControl, PredictiveControl
 from faintspot.loop.control.integrator import CompiledIntegrator, LoopPlant
-from faintspot.loop.control.kalman.compiled import CompiledKalman
+from faintspot.loop.control.kalman.compiled import CompiledKalman, Predictive
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_model import neighbours_within
 from faintspot.loop.control.kalman.local_predictor import local_shapes
-from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 from faintspot.loop.control.reconstructor import Reconstructor
 from faintspot.loop.simulation import load_loop

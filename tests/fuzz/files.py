@@ -17,7 +17,7 @@ import faintspot as fs
 from faintspot.experiments.planner.question import read_camera
 from faintspot.experiments.study.specification import StudySpecification
 from faintspot.io import open_frames, read_array, read_slopes
-from faintspot.io.references import read_reference
+from faintspot.io.slopes import read_reference
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.spots.psf import PSF

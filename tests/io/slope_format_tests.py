@@ -30,7 +30,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.variables import VARIABLES, Variable
 from faintspot.io import read_slopes
 from faintspot.io.arrays import zarr_store
-from faintspot.io.references import read_reference
+from faintspot.io.slopes import read_reference
 from faintspot.io.stored import slopes_writer, slopes_zarr
 
 CHANGED = {**result(), "x": result()["y"]}

@@ -14,7 +14,7 @@ from tests.io.frame_files import cube, save, zarr
 from tests.refusals import refused
 
 from faintspot.io import open_frames, read_array, read_slopes
-from faintspot.io.references import read_reference
+from faintspot.io.slopes import read_reference
 from faintspot.slopes.spots.psf import PSF
 
 

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from tests.io.slope_files import ATTRIBUTES, begin, part, result, write
 
 from faintspot.base.errors import InputError
-from faintspot.io.references import read_reference
+from faintspot.io.slopes import read_reference
 
 fits = pytest.importorskip("astropy.io.fits")
 zarr = pytest.importorskip("zarr")

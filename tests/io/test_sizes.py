@@ -19,7 +19,7 @@ from faintspot.base.files import read_arrays
 from faintspot.io import open_frames, read_array, read_slopes
 from faintspot.io.arrays.fits_units import units_of
 from faintspot.io.arrays.inflation import check_inflated
-from faintspot.io.references import read_reference
+from faintspot.io.slopes import read_reference
 from faintspot.io.stored import slopes_format
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.spots.psf import PSF

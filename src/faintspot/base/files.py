@@ -1,4 +1,4 @@
-"""Atomic writing of files: a file is never left incomplete if the program or the machine stops."""
+"""Atomic writing of files, which are never left incomplete, and checked reading of .npz files."""
 
 from __future__ import annotations
 

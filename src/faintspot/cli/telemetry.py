@@ -21,7 +21,7 @@ from faintspot.slopes.sensor.layout import OPTICS, Layout
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.recording import Recording
-    from faintspot.loop.telemetry.over_time import Piece
+    from faintspot.loop.telemetry.page import Piece
 
 _SECONDS = 20.0
 
@@ -97,8 +97,7 @@ def command(
       faintspot telemetry loop.toml -o loop.html
       faintspot telemetry loop.npz --controller controller.npz
     """
-    from faintspot.loop.telemetry.over_time import table_of_pieces
-    from faintspot.loop.telemetry.page import page_of_loop
+    from faintspot.loop.telemetry.page import page_of_loop, table_of_pieces
     from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
     from faintspot.loop.telemetry.report import report_of_loop
 
@@ -197,7 +196,7 @@ def _report_night(
 
 def _over_time(loop: Recording, every_s: float) -> list[Piece]:
     """Measure the turbulence of pieces of a recording, with a progress bar."""
-    from faintspot.loop.telemetry.over_time import turbulence_over_time
+    from faintspot.loop.telemetry.page import turbulence_over_time
 
     with progress_bar("pieces", "pieces") as advance:
         return turbulence_over_time(loop, every_s, advance)

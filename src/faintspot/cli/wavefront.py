@@ -21,15 +21,16 @@ from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.stored_run import difference, open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.wavefront import Wavefront, ZonalMap, fit_wavefront, save_map, save_wavefront, zonal_map
-from faintspot.slopes.wavefront.files import check_map_file, check_wavefront_file
-from faintspot.slopes.wavefront.fit import UNITS, total
-from faintspot.slopes.wavefront.words import (
+from faintspot.slopes.wavefront.files import (
+    check_map_file,
+    check_wavefront_file,
     mode_table,
     remarks,
     rms_table,
     zonal_remarks,
     zonal_table,
 )
+from faintspot.slopes.wavefront.fit import UNITS, total
 
 
 @click.command(cls=SectionedCommand)

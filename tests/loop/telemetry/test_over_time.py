@@ -10,9 +10,8 @@ from tests.loop.telemetry.loop_cases import AIR, RATE_HZ, recorded
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.open_loop import Measured
 from faintspot.loop.control.identification.recording import Recording
-from faintspot.loop.telemetry import over_time
-from faintspot.loop.telemetry.over_time import Piece, table_of_pieces, turbulence_over_time
-from faintspot.loop.telemetry.page import page_of_loop
+from faintspot.loop.telemetry import page as over_time
+from faintspot.loop.telemetry.page import Piece, page_of_loop, table_of_pieces, turbulence_over_time
 from faintspot.loop.telemetry.report import report_of_loop
 
 

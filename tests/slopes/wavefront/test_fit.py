@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from faintspot import InputError, Layout, Settings, SlopePipeline, Slopes, SubapertureFlag, fit_wavefront
 from faintspot.slopes.sensor.pupil import inside_pupil, lenslet_outlines, lit_outlines, pupil_of, side_m
 from faintspot.slopes.wavefront.discrepancy import slope_discrepancy
-from faintspot.slopes.wavefront.words import remarks
+from faintspot.slopes.wavefront.files import remarks
 from faintspot.slopes.wavefront.zernike import mean_gradients, zernike
 
 LAYOUT = Layout.grid((7, 7), pixels=8, outer_radius=3.5, inner_radius=0.5)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tests.slopes.wavefront.test_fit import LAYOUT, SCALED, flagged, slopes_of, slopes_of_modes
 
 from faintspot import InputError, Layout, fit_wavefront
-from faintspot.slopes.wavefront.words import zonal_remarks, zonal_table
+from faintspot.slopes.wavefront.files import zonal_remarks, zonal_table
 from faintspot.slopes.wavefront.zernike import zernike
 from faintspot.slopes.wavefront.zonal import ZonalMap, compared, zonal_map
 

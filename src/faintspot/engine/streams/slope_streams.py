@@ -1,4 +1,4 @@
-"""Slopes and commands out: pyshmem streams, read by pyRTC and, through its bridge, by ImageStreamIO."""
+"""Slopes and commands out, predictions in: pyshmem streams, also for pyRTC and, by a bridge, ImageStreamIO."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Record of a closed-loop run: telemetry and true values; folders of results."""
+"""Record of a closed-loop run: telemetry, true values and control; folders of results."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from faintspot.io import StoredSlopes
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES
 from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.frames import read_array
-from faintspot.io.references import holds_slopes
+from faintspot.io.slopes import holds_slopes
 from faintspot.io.telemetry.pyrtc_session import holds_session, read_session
 from faintspot.io.telemetry.recording import read_telemetry
 from faintspot.loop.control.configuration import load_control

@@ -19,8 +19,7 @@ from faintspot.base.variables import scaled_positions
 from faintspot.base.version import __version__
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.io.locations import split_location
-from faintspot.io.references import read_reference
-from faintspot.io.slopes import create_writer
+from faintspot.io.slopes import create_writer, read_reference
 from faintspot.io.stored.slopes_format import UNITS, pixels_in
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.fitting_dark import with_fitting_dark
@@ -131,7 +130,7 @@ class Choices(Reading, total=False):
     those unlike all neighbours ("unlike")."""
     reference: NDArray[Any] | str | Path | None
     """Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key", or
-    slopes of which they are the mean; see `faintspot.io.references.read_reference`."""
+    slopes of which they are the mean; see `faintspot.io.slopes.read_reference`."""
 
 
 def measure_recorded(

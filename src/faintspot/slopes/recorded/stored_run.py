@@ -16,7 +16,7 @@ from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.base.flags import SubapertureFlag, are_valid, kept_flags
 from faintspot.base.toml_files import parse_text
 from faintspot.io import StoredSlopes, read_slopes
-from faintspot.io.references import subtracted_reference
+from faintspot.io.slopes import subtracted_reference
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.pipeline import configuration

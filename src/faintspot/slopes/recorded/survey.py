@@ -1,4 +1,4 @@
-"""First look at recorded frames, all over the recording: their mean, and their saturation level."""
+"""First look at recorded frames: configuration, mean, saturation level, and response of the slopes."""
 
 from __future__ import annotations
 

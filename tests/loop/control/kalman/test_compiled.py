@@ -10,9 +10,8 @@ from tests.loop.control.control_cases import INTERACTION, LAYERS, MODEL, PHASE, 
 from tests.loop.control.naive_guarded import Guarded
 
 from faintspot.loop.control.base import CommandDelayLine
-from faintspot.loop.control.kalman.compiled import STEPS, CompiledKalman
+from faintspot.loop.control.kalman.compiled import STEPS, CompiledKalman, Predictive
 from faintspot.loop.control.kalman.guarded import HANDOVER_FRAMES
-from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 
 M, COMMANDS = INTERACTION.shape

@@ -18,10 +18,10 @@ from tests.loop.control.naive_guarded import Guarded
 
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CommandDelayLine
+from faintspot.loop.control.kalman.compiled import Predictive
 from faintspot.loop.control.kalman.guarded import EXCESS, MOST_EXCESS, GuardedController
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter
-from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.slopes.kernels.driver.products import add_slopes
 
 M, COMMANDS = INTERACTION.shape

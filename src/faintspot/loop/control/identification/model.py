@@ -26,12 +26,11 @@ from faintspot.loop.control.base import (
     usual_noise,
 )
 from faintspot.loop.control.integrator import LoopPlant, settled
-from faintspot.loop.control.kalman.compiled import CompiledKalman
+from faintspot.loop.control.kalman.compiled import CompiledKalman, Predictive
 from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_model import STEPS, slopes_ahead, state_of_state, state_of_surprise
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter, local_shapes
-from faintspot.loop.control.kalman.predictive import Predictive
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor, steady_covariance
 from faintspot.loop.control.replay import mean_residual
 

@@ -17,7 +17,7 @@ from faintspot.slopes.recorded.statistics import MeasuredSlopes, SlopesSummary, 
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.wavefront import fit_wavefront
 from faintspot.slopes.wavefront.figure import wavefront_figure
-from faintspot.slopes.wavefront.words import remarks, rms_table
+from faintspot.slopes.wavefront.files import remarks, rms_table
 
 _TEXT = Texts("faintspot.slopes.recorded")
 _MOST_LISTED = 20
