@@ -1,4 +1,4 @@
-"""Slopes and commands out, predictions in: pyshmem streams, also for pyRTC and, by a bridge, ImageStreamIO."""
+"""Slopes and commands out, predictions in: pyshmem streams, for pyRTC and, by a bridge, ImageStreamIO."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wavefronts from slopes: Zernike modes fitted by least squares to the valid sub-apertures, and their units."""
+"""Wavefronts from slopes: Zernike modes fitted by least squares to valid sub-apertures, and their units."""
 
 from __future__ import annotations
 
