@@ -1,13 +1,16 @@
 """Every public name has an example in its docstring, and the examples say what happens."""
 
+import ast
 import doctest
 import importlib
 import inspect
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import faintspot
 from faintspot.slopes.estimators import estimators, registry
 
 PAGES = Path(__file__).resolve().parents[1] / "docs/reference/modules"
@@ -75,3 +78,18 @@ def test_examples_give_what_they_show(name: str, tmp_path: Path, monkeypatch: py
     for each in found:
         runner.run(each, out=said.append)
     assert not runner.failures, "".join(said)
+
+
+def test_packages_name_modules_that_exist() -> None:
+    """The reading order in the docstring of a package."""
+    unknown = []
+    for path in Path(faintspot.__file__).parent.rglob("__init__.py"):
+        order = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition(
+            "Read in this order"
+        )
+        unknown += [
+            f"{path.parent.name}: {name}"
+            for name in re.findall(r"`([a-z_]+)`", order[2])
+            if not (path.with_name(f"{name}.py").exists() or path.with_name(name).is_dir())
+        ]
+    assert unknown == []

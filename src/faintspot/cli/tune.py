@@ -275,7 +275,7 @@ def _say_what_is_next(answer: Answer, target: Path, picture: Path | None, frames
     """Write the picture, and say what comes next."""
     click.echo(f"{target}: written")
     if picture is not None:
-        from faintspot.experiments.planner.text import tune_figure
+        from faintspot.experiments.planner.figures import tune_figure
 
         write_picture(tune_figure(answer), picture)
     if answer.question.layout is None:

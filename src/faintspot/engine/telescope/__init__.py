@@ -1,1 +1,1 @@
-"""Simulated telescope that publishes frames and reads commands, and its changing conditions (`orders`)."""
+"""Simulated telescope that publishes frames and reads commands, and its changing conditions."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
@@ -266,7 +267,8 @@ class StoredTelemetry:
 
     def size(self, *, images: bool) -> int:
         """Return the bytes of all arrays in memory."""
-        with self._damage():
+        with self._damage(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of files that a recorder has not finished
             arrays = list(self._group.arrays())
         left_out = () if images else ("raw", "denoised")
         return sum(array.nbytes for name, array in arrays if name not in left_out)

@@ -1,12 +1,12 @@
 """Controllers that turn slopes into mirror commands, independent of any simulation. Read in this order.
 
 `base` (delay line to the mirror, what every controller offers, open-loop slopes), `reconstructor` (slopes
-to commands), `integrator`, `replay` and `plant` (the loop for which controllers are made), `kalman`
+to commands), `integrator` (and the loop for which controllers are made), `replay`, `kalman`
 (prediction), `identification` (controllers learnt from telemetry), `options` and `configuration` (table
 [control]). Beside them: `mirror_calibration`, from pokes, and `flattening`, the command that flattens a
 measured wavefront.
 
-For the loops of other systems: `Recording`, `learn` and `PredictiveControl`.
+For the loops of other systems: `Recording`, learning and `PredictiveControl`.
 """
 
 from typing import TYPE_CHECKING

@@ -1,5 +1,5 @@
 """Camera: `calibration`, `detector`, and their measurement.
 
-`dark_frames` and `photon_transfer` measure the detector; `hot_pixels`, `background` and `colour_mosaic`
-look at frames of spots.
+`dark_frames`, `photon_transfer` and `transfer_curve` measure the detector; `frame_checks`, `background` and
+`fitting_dark` look at frames of spots.
 """

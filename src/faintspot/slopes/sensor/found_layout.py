@@ -22,6 +22,7 @@ from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, SMALLEST_WINDO
 from faintspot.slopes.sensor.windows import Windows, find_windows
 
 _GHOST, _DARK = 0.3, 0.25  # of the median flux of the neighbours, and of all
+_EDGE_GHOST = 0.2  # of that of the neighbours at the edge of the pupil, where lenslets may be partly lit
 
 
 @dataclass(frozen=True)
@@ -137,9 +138,11 @@ def _unlike(grid: LensletGrid) -> NDArray[np.bool_]:
 def _dim(grid: LensletGrid) -> NDArray[np.bool_]:
     """Return which spots amid others are so dim that they may be ghosts in a dark lenslet."""
     around = np.append(grid.flux, np.nan)[neighbours_of(grid.cells, grid.geometry)]
+    is_edge = np.isnan(around).any(axis=1)
     around[np.isnan(around).all(axis=1)] = 0.0
-    brightest = np.maximum(_GHOST * np.nanmedian(around, axis=1), _DARK * np.median(grid.flux))
-    return np.asarray(grid.flux < brightest)
+    near = np.nanmedian(around, axis=1)
+    brightest = np.maximum(_GHOST * near, _DARK * np.median(grid.flux))
+    return np.asarray(grid.flux < np.where(is_edge, _EDGE_GHOST * near, brightest))
 
 
 _LIT_FRACTION = 0.3

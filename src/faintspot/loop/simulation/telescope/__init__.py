@@ -1,5 +1,5 @@
 """The simulated telescope. Read in this order.
 
-`pupil`, `atmosphere`, `mirror` and `wavefront_sensor` (wavefronts and spots), `camera`, `model` (one frame of
-all of them), `calibration` (interaction matrix and gains). With a laser: `laser`, `sodium`, `natural_star`.
+`atmosphere`, `mirror` (and pupil) and `wavefront_sensor` (wavefronts and spots), `model` (one frame of all of
+them), `calibration` (camera, interaction matrix and gains). With a laser guide star: `laser`.
 """
