@@ -83,7 +83,7 @@ class Method(Options, table="method"):
     >>> method.name, method.control, method.gain
     ('window', 'integrator', 0.4)
     >>> Method.named("ml+weighted+kalman").label
-    'maximum likelihood, weighted reconstructor, Kalman filter'
+    'maximum likelihood, weighted reconstructor, predictive Kalman filter'
     """
 
     label: str = setting(REQUIRED, kind=TEXT)
