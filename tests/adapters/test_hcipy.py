@@ -92,6 +92,7 @@ def test_lenslets_that_are_not_a_whole_number_of_pixels_wide() -> None:
         np.testing.assert_allclose(slopes[axis], expected, rtol=0, atol=1e-5 * PIXEL_M)
 
 
+@pytest.mark.slow
 def test_fits_into_hcipys_sensor_and_takes_what_it_takes(optics: Any) -> None:
     first = SlopeEstimator(optics.mla_grid, optics.mla_index, settings=FAINT)
     assert isinstance(first, hcipy.WavefrontSensorEstimator)

@@ -41,6 +41,7 @@ def noisy(frame: int) -> Slopes:
     return Slopes(**{**values, "x": noise[0], "y": noise[1]})
 
 
+@pytest.mark.slow
 def test_running_engine(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(telemetry_cases, "slopes_of", noisy)
     name = f"faintspot-test-{secrets.token_hex(6)}"

@@ -65,7 +65,7 @@ class SlopeFile:
 class SlopeFormatTests(SlopeFile):
     """Tests of a format of slopes."""
 
-    memory_limit_bytes = 14_000_000
+    memory_limit_bytes = 18_000_000
     """Blocks, chunks and buffers, of which a busy machine keeps some longer; 24 MB of slopes are written."""
     texts = (".csv", ".plain")
     """Endings of texts, for which measuring the memory takes too long."""

@@ -54,6 +54,7 @@ def test_colour_mosaic(folder: Path, run: Commands) -> None:
     assert layout.pitch_px == pytest.approx(20.3, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_trials", "undrawn_pictures")
 def test_windows_over_64_px(folder: Path, run: Commands) -> None:
     frames = frames_of(480, 3, 150.0, 6.0, 20_000.0, 5.0)

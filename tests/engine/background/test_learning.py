@@ -110,6 +110,7 @@ def test_a_process_that_ends_before_the_engine_is_a_fault(engine_ends: bool) -> 
     assert faults == ([] if engine_ends else ["learn: killed"])
 
 
+@pytest.mark.slow
 def test_a_learnt_centroid_gain(name: str, model: Kalman) -> None:
     """Slopes are half as large: a filter that knows it sends the same commands, also after it took over."""
     knowing = replace(model, centroid_gain=0.5)

@@ -154,6 +154,7 @@ def test_site_of_a_layout() -> None:
         site_of(layouts[0], [(12.0, 18.0, 0.0)])
 
 
+@pytest.mark.slow
 def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "faintspot.toml"
     configuration_file.save(path, Layout.grid((3, 3), pixels=8, subaperture_m=0.6))

@@ -35,6 +35,7 @@ def test_pixel_noise_does_not_see_an_offset_or_a_few_hot_pixels() -> None:
     assert pixel_noise(images + 100.0) == pytest.approx(plain, rel=0.02)
 
 
+@pytest.mark.slow
 def test_suggested_strength_gains_and_the_full_noise_gains_less() -> None:
     """At 0.1 e- and 50 e-, k = 12, the suggested strength lowers R by more than five paired standard errors.
 

@@ -68,6 +68,7 @@ class TestAgainstOracle:
                 assert result.converged[i] == expected.converged
                 assert np.isclose(result.multiplier[i], expected.multiplier, rtol=100 * tolerance_of(dtype))
 
+    @pytest.mark.slow
     @every_dtype
     @every_algorithm
     @given(images(), st.floats(0.05, 0.98), st.sampled_from([1e-3, 1e-2, 0.3]))
