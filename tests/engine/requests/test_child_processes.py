@@ -73,6 +73,7 @@ def test_one_that_has_done_its_work_may_be_absent(tmp_path: Path) -> None:
         processes.start("wrong", ["estimators", "nothing"])
         with pytest.raises(InputError, match="wrong: the process has ended"):
             wait_for(lambda: processes.finished("wrong"))
+        processes.check()
 
 
 def test_one_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

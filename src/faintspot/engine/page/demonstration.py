@@ -204,6 +204,7 @@ class LiveDemonstration:
             self._asked("learnt", found=found, taken=True)
         except InputError as error:
             say(f"no filter takes turns: {error}")
+            self._asked("learnt", found=f"no filter, {error}")
 
     def _interleave(self, methods: list[str], shown: Shown) -> None:
         """Let methods take turns from now on."""

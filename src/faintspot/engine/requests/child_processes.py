@@ -93,16 +93,20 @@ class ChildProcesses(Closing):
                 raise InputError(f"{name}: the process has ended: {words.removeprefix(_ERROR)}")
 
     def finished(self, name: str) -> bool:
-        """Return whether a command has done its work; from then on it may be absent.
+        """Return whether a command has done its work; from its end on it may be absent.
 
         Raises
         ------
         InputError
             When a process has failed; the message holds its last line.
         """
-        if name in self._started and self._started[name].poll() == 0:
-            del self._started[name]
-        self.check()
+        process = self._started.get(name)
+        try:
+            if process is None or process.poll() != 0:
+                self.check()
+        finally:
+            if process is not None and process.returncode is not None:
+                del self._started[name]
         return name not in self._started
 
     def wait_until(self, condition: Callable[[], bool], awaited: str, timeout_s: float) -> None:
