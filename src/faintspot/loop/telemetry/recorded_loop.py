@@ -24,7 +24,7 @@ from faintspot.io.slopes import holds_slopes
 from faintspot.io.telemetry.pyrtc_session import holds_session, read_session
 from faintspot.io.telemetry.recording import read_telemetry
 from faintspot.loop.control.configuration import load_control
-from faintspot.loop.control.identification.recording import NUMBERS, Recording
+from faintspot.loop.control.identification.recording import NUMBERS, Recording, cells_of
 from faintspot.loop.control.recorded import RecordedControl, unpacked_control
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
@@ -295,7 +295,7 @@ def _loop(name: str, values: dict[str, Any]) -> Recording:
         slopes,
         values.get("commands"),
         interaction,
-        values.get("cells"),
+        cells_of(values.get("cells"), math.prod(slopes.shape[1:]) // 2),
         **known,
         frame=frame,
         is_closed=one_of("loop", values.get("loop", "closed"), ("closed", "open")) == "closed",

@@ -126,8 +126,10 @@ def report_of_loop(
     Raises
     ------
     InputError
-        When the slopes do not vary, or commands and slopes are not of one loop.
+        When the slopes do not vary, commands and slopes are not of one loop, or there are no cells.
     """
+    if loop.cells is None:
+        raise InputError("cells: expected row and column of each sub-aperture for a report, got none")
     ready = prepared(loop)
     parts = {name: Part(_TEXT[f"{name}.title"]) for name in _PARTS}
     report = LoopReport(ready.recording, parts)

@@ -164,3 +164,16 @@ def test_a_gain_that_cannot_be_known() -> None:
         _, used, unknown = known_delay(replace(short, delay_frames=3.0))
         assert (used.delay_frames, used.gain) == (3.0, 1.0)
         assert reason in unknown
+
+
+def test_slopes_without_sub_apertures() -> None:
+    """Any number of them; constant ones are named, and no order of cells is checked."""
+    loop = recorded()
+    slopes, matrix = loop.slopes[:, :49].copy(), loop.interaction_matrix[:49]
+    slopes[:, 4] = 0.5
+    ready = prepared(Recording(slopes, -loop.commands, matrix, None, loop.frame_rate_hz))
+    assert ready.sign == -1.0
+    assert np.flatnonzero(np.isnan(ready.recording.slopes).all(axis=0)).tolist() == [4]
+    assert any("slope 4" in remark for remark in ready.recording.remarks)
+    with refused("covariance_xy"):
+        replace(loop, cells=None, covariance_xy=np.zeros((len(loop.slopes), 25)))

@@ -315,6 +315,8 @@ def learn(recording: Recording, start: Identified | None = None) -> PredictiveCo
     >>> control(slopes[0]).shape
     (16,)
     """
+    if recording.cells is None:
+        raise InputError("cells: expected row and column of each sub-aperture, got none")
     if recording.commands is None or recording.interaction_matrix is None:
         absent = "commands" if recording.commands is None else "interaction_matrix"
         raise InputError(f"{absent}: expected an array, got none")

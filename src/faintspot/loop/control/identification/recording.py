@@ -66,9 +66,10 @@ NUMBERS = {
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Slopes and commands of consecutive frames of a loop with n sub-apertures; None if unknown.
+    """Slopes and commands of consecutive frames of a loop; None if unknown.
 
-    Commands may add to the slopes of the turbulence or be subtracted from them.
+    Commands may add to the slopes of the turbulence or be subtracted from them. With `cells`, the slopes are
+    those of n sub-apertures; without, any measurements of the wavefront, such as those of a pyramid.
 
     Raises
     ------
@@ -77,13 +78,15 @@ class Recording:
     """
 
     slopes: Any
-    """(frames, 2 n): residual slopes in any unit, all x, then all y; NaN (or infinite) where not measured."""
+    """(frames, 2 n): residual slopes in any unit, all x, then all y; NaN (or infinite) where not measured.
+    Without `cells`, (frames, m) in any order."""
     commands: Any
     """(frames, commands): one row for each frame; see `sent_after_frames`."""
     interaction_matrix: Any
     """(2 n, commands): slopes for a unit of each command, in the unit of `slopes`."""
     cells: Any
-    """(n, 2): row and column of each sub-aperture in the lenslet array; or a mask of the array."""
+    """(n, 2): row and column of each sub-aperture in the lenslet array; or a mask of the array. None: a
+    sensor without sub-apertures (tip-tilt, pyramid, modes), or of unknown geometry."""
     frame_rate_hz: float
     _: KW_ONLY
     subaperture_m: float | None = None
@@ -120,9 +123,10 @@ class Recording:
         slopes[np.isinf(slopes)] = np.nan
         if slopes.ndim == 3:  # (frames, n, 2) or (frames, 2, n)
             slopes = (slopes if slopes.shape[1] == 2 else slopes.swapaxes(1, 2)).reshape(len(slopes), -1)
-        if slopes.ndim != 2 or slopes.shape[1] % 2:
-            raise InputError(f"slopes: expected shape (frames, 2 n), got {slopes.shape}")
-        cells = cells_of(self.cells, slopes.shape[1] // 2)
+        if slopes.ndim != 2 or (slopes.shape[1] % 2 and self.cells is not None):
+            expected = "(frames, 2 n)" if self.cells is not None else "(frames, m)"
+            raise InputError(f"slopes: expected shape {expected}, got {slopes.shape}")
+        cells = None if self.cells is None else cells_of(self.cells, slopes.shape[1] // 2)
         frame = np.arange(len(slopes))
         if self.frame is not None:
             frame = increasing("frame", self.frame, len(slopes), integer=True)
@@ -160,6 +164,9 @@ class Recording:
                 f"commands: expected {len(self.slopes)} frames, as of the slopes, got {len(self.commands)}"
             )
         frames, slopes = self.slopes.shape
+        for name in ("covariance_xy", "prior_std") if self.cells is None else ():
+            if getattr(self, name) is not None:
+                raise InputError(f"{name}: expected none without cells, got an array; give cells")
         shapes = {"standard_errors": (frames, slopes), "covariance_xy": (frames, slopes // 2)}
         for name, shape in {**shapes, "prior_std": (slopes,)}.items():
             if getattr(self, name) is not None and getattr(self, name).shape != shape:
@@ -222,7 +229,7 @@ def prepared(recording: Recording) -> Prepared:
     _check_alike(recording)
     scaled = _without_unmeasured(recording).scaled(spread)
     if not recording.is_closed:
-        modes = modes_of_turbulence(scaled.slopes)
+        modes = np.zeros((0, 0)) if scaled.cells is None else modes_of_turbulence(scaled.slopes)
         remark = order_remark(modes, scaled.cells, of_turbulence=True) if modes.shape[1] else ""
         remarks = (*scaled.remarks, *([remark] if remark else []))
         return Prepared(replace(scaled, remarks=remarks), 1.0, 0, math.inf)
@@ -255,6 +262,8 @@ def _without_unmeasured(recording: Recording) -> Recording:
     InputError
         When none are left.
     """
+    if recording.cells is None:
+        return _without_constant(recording)
     n, stuck, matrix = len(recording.cells), stuck_slopes(recording.slopes), recording.interaction_matrix
     slopes = np.where(np.tile(stuck, 2), np.nan, recording.slopes)
     measured = np.isfinite(slopes)
@@ -277,6 +286,19 @@ def _without_unmeasured(recording: Recording) -> Recording:
     if not np.isfinite(slopes).any():
         raise InputError(f"{recording.name}: expected slopes that measure something; {'; '.join(remarks)}")
     return replace(recording, slopes=slopes, remarks=(*recording.remarks, *remarks)) if remarks else recording
+
+
+def _without_constant(recording: Recording) -> Recording:
+    """Return a recording without cells whose constant slopes are NaN, and named in a remark."""
+    low, high = (extreme(recording.slopes, axis=0) for extreme in (np.fmin.reduce, np.fmax.reduce))
+    constant = np.flatnonzero(~(low < high))
+    if not len(constant):
+        return recording
+    slopes = recording.slopes.copy()
+    slopes[:, constant] = np.nan
+    more = f" and {len(constant) - _NAMED} more" if len(constant) > _NAMED else ""
+    remark = f"slope {', '.join(map(str, constant[:_NAMED]))}{more}: constant, or never measured"
+    return replace(recording, slopes=slopes, remarks=(*recording.remarks, remark))
 
 
 def _without_still_actuators(loop: Recording) -> Recording:
@@ -305,7 +327,7 @@ def _with_convention(loop: Recording) -> Prepared:
     """Return a closed loop whose commands add, in the rows of the frames that they were computed from."""
     if not np.ptp(loop.commands, axis=0).any():
         return Prepared(loop, 1.0, 0, math.inf)
-    wrong_order = order_remark(loop.interaction_matrix, loop.cells)
+    wrong_order = "" if loop.cells is None else order_remark(loop.interaction_matrix, loop.cells)
     stated, remarks = loop.sent_after_frames, [*loop.remarks, *([wrong_order] if wrong_order else [])]
     correlations, gains = _steps_on_slopes(loop)
     clearest = int(np.argmax(np.abs(correlations)))
