@@ -20,7 +20,7 @@ NOT_TRIED = ("oopao", "specula", "soapy", "pyrtc")
 """Extras that bring another tool, with pins of its own."""
 FRAME = "import numpy as np; from faintspot.data import mmt_frame; np.save('frame.npy', mmt_frame())"
 COMMANDS = (
-    "doctor",
+    "--version",
     "demo --frames 20",
     "layout frame.npy -o found.toml --mask-hot-pixels",
     "slopes frame.npy --config found.toml -o slopes.npz",

@@ -33,7 +33,6 @@ WITHOUT_EXAMPLE = {
     "faintspot.slopes.training.SodiumFit": "in that of fit_sodium_profile",
     "faintspot.slopes.training.LearntPSF": "in that of learn_psf_from_images",
     "faintspot.slopes.wavefront.Discrepancy": "in that of slope_discrepancy",
-    "faintspot.slopes.wavefront.ZonalMap": "in that of zonal_map",
     "faintspot.slopes.estimators.Sensor": "made by a pipeline, in that of Estimator",
 }
 NEEDED = {"simulate_loop": ("hcipy",), "run": ("xarray",), "open_study": ("xarray", "zarr")}

@@ -22,7 +22,7 @@ from faintspot.data import mmt_frame
 
 BLOCK = re.compile(r"^```(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 IN_TEXT = re.compile(r"`(faintspot [a-z][^`|]*)`")
-RUN = {"doctor", "estimators", "layout", "report", "slopes", "wavefront"}
+RUN = {"estimators", "layout", "report", "slopes", "wavefront"}
 """What runs in a second; others take minutes, end never or need another program: their own tests run them."""
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
+import platform
 import sys
 import warnings
 from importlib import import_module
+from pathlib import Path
 
 import click
 
@@ -15,7 +17,6 @@ from faintspot.base.version import __version__
 
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
-    "doctor": "Show versions, extras and processor, and how to add what is missing.",
     "estimators": "List the estimators, or the options of one.",
     "export": "Write telemetry as FITS (AOT) for other software.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
@@ -78,13 +79,37 @@ class _LazyGroup(click.Group):
             formatter.write_dl([(name, listed.short_help or "") for name, listed in self.commands.items()])
 
 
+def _print_versions(context: click.Context, _: click.Parameter, asked: bool) -> None:
+    """Print versions, and the processor that kernels are compiled for."""
+    if not asked or context.resilient_parsing:
+        return
+    from importlib.metadata import version
+
+    from faintspot.slopes.kernels.compilation.host import lanes_for
+    from faintspot.slopes.kernels.compilation.target import compile_target
+
+    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy", "numba", "llvmlite"))
+    click.echo(f"faintspot, version {__version__}, in {Path(__file__).parents[1]}")
+    click.echo(f"Python {platform.python_version()} ({platform.platform()}), {packages}")
+    target = compile_target()
+    click.echo(f"kernels for {target.cpu} ({target.triple}), {lanes_for('float32').width} lanes of float32")
+    context.exit()
+
+
 @click.group(
     cls=_LazyGroup,
     commands={name: click.Command(name, short_help=text) for name, text in _COMMANDS.items()},
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-@click.version_option(__version__, prog_name="faintspot")
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_versions,
+    help="Show versions and the processor, and exit.",
+)
 @click.pass_context
 def group(context: click.Context) -> None:
     """Measure wavefront slopes from faint Shack-Hartmann spots.

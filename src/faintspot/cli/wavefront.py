@@ -10,7 +10,6 @@ import click
 import numpy as np
 
 from faintspot.base.errors import InputError
-from faintspot.base.extras import require
 from faintspot.base.files import derived
 from faintspot.cli.shared.commands import SectionedCommand, declared, errors_of_options, option
 from faintspot.cli.shared.needs import can_make
@@ -20,28 +19,14 @@ from faintspot.loop.control.flattening import Flattening, check_command_file, fl
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.stored_run import difference, open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
-from faintspot.slopes.wavefront import Wavefront, ZonalMap, fit_wavefront, save_map, save_wavefront, zonal_map
-from faintspot.slopes.wavefront.files import (
-    check_map_file,
-    check_wavefront_file,
-    mode_table,
-    remarks,
-    rms_table,
-    zonal_remarks,
-    zonal_table,
-)
+from faintspot.slopes.wavefront import Wavefront, fit_wavefront, save_wavefront
+from faintspot.slopes.wavefront.files import check_wavefront_file, mode_table, remarks, rms_table
 from faintspot.slopes.wavefront.fit import UNITS, total
 
 
 @click.command(cls=SectionedCommand)
 @click.argument("slopes", metavar="SLOPES")
-@option(
-    "--output",
-    "-o",
-    metavar="FILE",
-    multiple=True,
-    help="File to write, .csv or .json; may be repeated.",
-)
+@option("--output", "-o", metavar="FILE", help="File to write, .json.")
 @option("--picture", metavar="PNG", help="Picture to write.", show_default="beside the slopes")
 @option(
     "--modes",
@@ -50,15 +35,7 @@ from faintspot.slopes.wavefront.fit import UNITS, total
     help="Number of modes, from tip and tilt on.",
     show_default="by the sensor",
 )
-@option("--zonal", is_flag=True, help="Also reconstruct the wavefront without modes, for any pupil.")
 @option("--minus", metavar="SLOPES", help="Slopes of a recording whose mean wavefront is subtracted.")
-@option(
-    "--map",
-    "maps",
-    metavar="FILE",
-    multiple=True,
-    help="Map of the mean wavefront to write, .fits; may be repeated.",
-)
 @option("--unit", type=click.Choice(UNITS), help="Unit of the wavefront.", show_default="nm, if known")
 @option("--wavelength-nm", type=float, metavar="NM", help="Wavelength, for waves.")
 @option(
@@ -79,12 +56,10 @@ from faintspot.slopes.wavefront.fit import UNITS, total
 @declared(Layout, *OPTICS, sections="Telescope")
 def command(
     slopes: str,
-    output: tuple[str, ...],
+    output: str | None,
     picture: str | None,
     modes: int | None,
-    zonal: bool,
     minus: str | None,
-    maps: tuple[str, ...],
     unit: str | None,
     wavelength_nm: float | None,
     actuators: str | None,
@@ -102,17 +77,12 @@ def command(
     Examples:
       faintspot wavefront slopes.zarr
       faintspot wavefront slopes.zarr --pixel-scale-arcsec 0.38 --diameter-m 4.2 -o wavefront.json
-      faintspot wavefront slopes.zarr --zonal --map map.fits
       faintspot wavefront warm.zarr --minus cold.zarr
       faintspot wavefront slopes.zarr --actuators interaction.npy --stroke 300
       faintspot wavefront slopes.zarr --actuators faintspot.control.npz:interaction_matrix
     """
-    for name in output:
-        check_wavefront_file(Path(name))
-    for name in maps:
-        check_map_file(Path(name))
-    if maps:
-        require("io", "astropy", purpose="Writing a FITS file")
+    if output is not None:
+        check_wavefront_file(Path(output))
     target = Path(command_file) if command_file else derived(slopes, "_command.npy")
     check_command_file(target)
     if actuators is None and (stroke is not None or command_file is not None):
@@ -129,48 +99,33 @@ def command(
         measured, other = difference(run, open_run(Path(minus)))
     with errors_of_options(slopes):
         wavefront = fit_wavefront(measured, layout, modes=modes)
-        surface = zonal_map(measured, layout) if zonal else None
     if other is not None:
         with errors_of_options(minus):
-            wavefront, surface = _with_error_of(other, layout, wavefront, surface)
+            wavefront = _with_error_of(other, layout, wavefront)
     with errors_of_options(slopes):
         if unit or wavelength_nm is not None:
-            asked = unit or "nm", wavelength_nm
-            wavefront = wavefront.in_unit(*asked)
-            surface = None if surface is None else surface.in_unit(*asked)
+            wavefront = wavefront.in_unit(unit or "nm", wavelength_nm)
     with errors_of_options(actuators):
         flat = None if interaction is None else flattening(measured, interaction, stroke)
     # A difference of positions in the frame lacks nothing.
     notes = [note for note in run.notes if minus is None or note != run.about_reference]
-    _print(wavefront, surface, notes)
-    for name in output:
-        save_wavefront(name, wavefront)
-        click.echo(name)
-    for name in maps:
-        save_map(name, wavefront, layout, surface)
-        click.echo(name)
+    _print(wavefront, notes)
+    if output is not None:
+        save_wavefront(output, wavefront)
+        click.echo(output)
     if drawing is not None:
-        from faintspot.slopes.wavefront.figure import wavefront_figure, zonal_figure
+        from faintspot.slopes.wavefront.figure import wavefront_figure
 
         title = Path(slopes).name + ("" if minus is None else f" minus {Path(minus).name}")
         write_picture(wavefront_figure(wavefront, layout, title).figure, drawing)
-        if surface is not None:
-            target_picture = drawing.with_stem(f"{drawing.stem}_zonal")
-            write_picture(zonal_figure(surface, wavefront, layout, title), target_picture)
     if flat is not None:
         _write_flattening(flat, target, measured, wavefront, layout)
 
 
-def _with_error_of(
-    other: Slopes, layout: Layout, wavefront: Wavefront, surface: ZonalMap | None
-) -> tuple[Wavefront, ZonalMap | None]:
-    """Return wavefronts from which others were subtracted, with the errors of both."""
+def _with_error_of(other: Slopes, layout: Layout, wavefront: Wavefront) -> Wavefront:
+    """Return a wavefront from which another was subtracted, with the errors of both."""
     fitted = fit_wavefront(other, layout, modes=len(wavefront.modes))
-    wavefront = replace(wavefront, other_standard_error=fitted.mean_standard_error)
-    if surface is not None:
-        errors = np.hypot(surface.standard_errors, zonal_map(other, layout).standard_errors)
-        surface = replace(surface, standard_errors=errors)
-    return wavefront, surface
+    return replace(wavefront, other_standard_error=fitted.mean_standard_error)
 
 
 def _write_flattening(
@@ -197,16 +152,12 @@ def _write_flattening(
         write_picture(flattening_figure(flat, wavefront, after, layout), target.with_suffix(".png"))
 
 
-def _print(wavefront: Wavefront, surface: ZonalMap | None, notes: list[str]) -> None:
+def _print(wavefront: Wavefront, notes: list[str]) -> None:
     from rich.console import Console
     from rich.table import Table
 
     console = Console()
-    tables, lines = [mode_table(wavefront), rms_table(wavefront)], remarks(wavefront)
-    if surface is not None:
-        tables.append(zonal_table(surface, wavefront))
-        lines += zonal_remarks(surface, wavefront)
-    for header, rows in tables:
+    for header, rows in (mode_table(wavefront), rms_table(wavefront)):
         table = Table(box=None, pad_edge=False)
         words = 2 if header[0] == "Noll" else 1
         for place, title in enumerate(header):
@@ -217,5 +168,5 @@ def _print(wavefront: Wavefront, surface: ZonalMap | None, notes: list[str]) -> 
             table.add_row(*row)
         console.print(table)
         console.print()
-    for line in (*lines, *notes):
+    for line in (*remarks(wavefront), *notes):
         click.echo(line)

@@ -1,4 +1,4 @@
-"""Wavefronts from slopes: Zernike modes, zonal maps, figures and files."""
+"""Wavefronts from slopes: Zernike modes, figures and files."""
 
 from __future__ import annotations
 
@@ -9,24 +9,18 @@ from faintspot.base.lazy import lazy_attributes
 if TYPE_CHECKING:
     from faintspot.slopes.wavefront.discrepancy import Discrepancy as Discrepancy
     from faintspot.slopes.wavefront.discrepancy import slope_discrepancy as slope_discrepancy
-    from faintspot.slopes.wavefront.files import save_map as save_map
     from faintspot.slopes.wavefront.files import save_wavefront as save_wavefront
     from faintspot.slopes.wavefront.fit import Wavefront as Wavefront
     from faintspot.slopes.wavefront.fit import fit_wavefront as fit_wavefront
     from faintspot.slopes.wavefront.zernike import zernike as zernike
-    from faintspot.slopes.wavefront.zonal import ZonalMap as ZonalMap
-    from faintspot.slopes.wavefront.zonal import zonal_map as zonal_map
 
 _HOMES = {
     "Discrepancy": "faintspot.slopes.wavefront.discrepancy",
     "Wavefront": "faintspot.slopes.wavefront.fit",
-    "ZonalMap": "faintspot.slopes.wavefront.zonal",
     "fit_wavefront": "faintspot.slopes.wavefront.fit",
     "save_wavefront": "faintspot.slopes.wavefront.files",
     "slope_discrepancy": "faintspot.slopes.wavefront.discrepancy",
-    "save_map": "faintspot.slopes.wavefront.files",
     "zernike": "faintspot.slopes.wavefront.zernike",
-    "zonal_map": "faintspot.slopes.wavefront.zonal",
 }
 
 __all__ = sorted(_HOMES)

@@ -1,23 +1,18 @@
-"""Figures of a wavefront: maps with and without tip and tilt, its coefficients, and a zonal map."""
+"""Figures of a wavefront: maps with and without tip and tilt, and its coefficients."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from faintspot.base.report.page import FigureWithData
-from faintspot.base.report.plots import GREY, METHOD_COLOURS, Drawing, Line, Panel, Picture, plot
-from faintspot.base.statistics import rms
-from faintspot.slopes.sensor.drawing import Map, Outlines
+from faintspot.base.report.plots import GREY, METHOD_COLOURS, Drawing, Line, Panel, Picture
+from faintspot.slopes.sensor.drawing import Outlines
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.pupil import Pupil, lenslet_outlines
-from faintspot.slopes.wavefront.fit import Floats, Wavefront, total
+from faintspot.slopes.sensor.pupil import lenslet_outlines
+from faintspot.slopes.wavefront.fit import Wavefront, total
 from faintspot.slopes.wavefront.zernike import mode_name, osa_index
-from faintspot.slopes.wavefront.zonal import ZonalMap, compared
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _MOST_OUTLINED = 1500
 _MOST_NAMED = 45  # modes of a panel
@@ -56,46 +51,11 @@ def wavefront_map(
 
     Its rms follows the title. Colours go to `largest` on both sides; 0: to the largest value.
     """
-    size = float(total(wavefront.mean, tilt=tilt))
-    title = f"{title}: {size:.3g} {wavefront.unit} rms"
-    return _map(wavefront.sheet(tilt=tilt), wavefront.pupil, layout, wavefront.unit, title, largest)
-
-
-def zonal_figure(zonal: ZonalMap, wavefront: Wavefront, layout: Layout, name: str) -> Figure:
-    """Draw a zonal map, the wavefront of the modes, their difference, and standard errors."""
-    sheets = compared(zonal, wavefront)
-    largest = max(float(np.nanmax(np.abs(sheet))) for sheet in list(sheets.values())[:2])
-    drawn: list[Drawing] = [
-        _map(
-            sheet,
-            zonal.pupil,
-            layout,
-            zonal.unit,
-            f"{title}: {rms(sheet):.3g} {zonal.unit} rms",
-            limit,
-            zonal.reach,
-        )
-        for (title, sheet), limit in zip(sheets.items(), (largest, largest, 0.0), strict=True)
-    ]
-    error, most = rms(zonal.standard_errors), float(np.nan_to_num(zonal.standard_errors).max())
-    title = f"standard error: {error:.3g} {zonal.unit} rms" if error > 0 else "standard error: unknown"
-    drawn.append(Map(layout, zonal.standard_errors, zonal.unit, title, (0.0, most or 1.0)))
-    return plot([drawn[:2], drawn[2:]], 10.4, heading=name)
-
-
-def _map(
-    sheet: Floats,
-    pupil: Pupil,
-    layout: Layout,
-    unit: str,
-    title: str,
-    largest: float = 0.0,
-    reach: float = 1.0,
-) -> Picture:
-    """Return a map whose outermost points are `reach` radii of the pupil from its centre."""
+    title = f"{title}: {total(wavefront.mean, tilt=tilt):.3g} {wavefront.unit} rms"
+    sheet, pupil, unit = wavefront.sheet(tilt=tilt), wavefront.pupil, wavefront.unit
     (x, y), radius = pupil.centre_px, pupil.radius_px
     largest = largest or float(np.nanmax(np.abs(sheet))) or 1.0
-    half = reach * radius * len(sheet) / (len(sheet) - 1)  # the outermost points are within the image
+    half = radius * len(sheet) / (len(sheet) - 1)  # the outermost points are within the image
     style = {
         "cmap": "RdBu_r",
         "vmin": -largest,
@@ -104,7 +64,7 @@ def _map(
     }
     outline = {"edgecolors": "#00000030", "linewidths": 0.6}
     lenslets = lenslet_outlines(layout) if len(layout) <= _MOST_OUTLINED else np.zeros((0, 4, 2))
-    angle, margin = np.linspace(0, 2 * np.pi, 200), 1.12 * reach * radius
+    angle, margin = np.linspace(0, 2 * np.pi, 200), 1.12 * radius
     circle = Line(
         "", x + radius * np.cos(angle), y + radius * np.sin(angle), style={"color": "black", "lw": 0.8}
     )

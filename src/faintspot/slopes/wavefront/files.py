@@ -1,23 +1,17 @@
-"""Wavefronts in words and in files: CSV or JSON by the ending of the name, maps as FITS."""
+"""Wavefronts in words and in JSON files."""
 
 from __future__ import annotations
 
-import io
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from faintspot.base.files import check_ending, csv_text, write_atomically
+from faintspot.base.files import check_ending, write_atomically
 from faintspot.base.json_text import to_json
 from faintspot.base.report.texts import Texts, number_or_dash, signed
-from faintspot.base.statistics import rms
-from faintspot.io.optional_packages import load_fits
-from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.wavefront.fit import UNITS, Floats, Wavefront, total
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
-from faintspot.slopes.wavefront.zonal import ZonalMap, compared
 
 _TEXT = Texts("faintspot.slopes.wavefront")
 _TILTS = (True, False)
@@ -98,40 +92,10 @@ def remarks(wavefront: Wavefront) -> list[str]:
     )
 
 
-def zonal_table(zonal: ZonalMap, wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows: rms over the sub-apertures of a zonal map, the modes and their difference."""
-    whole, still = compared(zonal, wavefront), compared(zonal, wavefront, tilt=False)
-    values = np.array([[rms(whole[name]), rms(still[name])] for name in whole])
-    digits = _decimals(values)
-    rows = [
-        [name, *(f"{value:.{digits}f}" for value in pair), ""]
-        for name, pair in zip(whole, values, strict=True)
-    ]
-    rows[0][-1] = number_or_dash(rms(zonal.standard_errors), digits)
-    header = f"rms over the sub-apertures ({zonal.unit})"
-    return [header, "with tip, tilt", "no tip, tilt", "standard error"], rows
-
-
-def zonal_remarks(zonal: ZonalMap, wavefront: Wavefront) -> list[str]:
-    """Return remarks for the reader: method, errors, parts without a common piston, what was left out."""
-    sizes = np.bincount(zonal.parts[zonal.parts >= 0])
-    return _TEXT.lines(
-        "zonal",
-        zonal,
-        errors=_TEXT[f"errors.{zonal.errors_from}"],
-        parts=len(sizes) if len(sizes) > 1 else None,
-        listed=", ".join(map(str, sizes[:6])) + (", ..." if len(sizes) > 6 else ""),
-        without=zonal.left_out if zonal.left_out not in ("", wavefront.left_out) else None,
-    )
-
-
 def _decimals(values: Floats) -> int:
     """Return the number of decimals that shows the largest value with four digits."""
     largest = float(np.abs(values).max())
     return 3 if largest == 0 else int(np.clip(3 - np.floor(np.log10(largest)), 0, 6))
-
-
-_WAVEFRONT_ENDINGS, _MAP_ENDING = (".csv", ".json"), ".fits"
 
 
 def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
@@ -140,8 +104,8 @@ def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
     Parameters
     ----------
     path : path
-        .csv: a row for the mean and one for each frame, with rms, coefficients and standard errors. .json:
-        the same by name, and the modes. A frame that could not be fitted is empty or null.
+        .json: unit, pupil, modes, and rms, coefficients and standard errors of the mean and of each frame;
+        null for a frame that could not be fitted.
     wavefront : Wavefront
 
     Raises
@@ -159,76 +123,16 @@ def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
     ...     positions=np.tile([0.3, 0.0], (len(layout), 1)), rng=np.random.default_rng(1),
     ... )
     >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frames)
-    >>> save_wavefront("wavefront.csv", fs.fit_wavefront(slopes, layout, modes=5))
+    >>> save_wavefront("wavefront.json", fs.fit_wavefront(slopes, layout, modes=5))
     """
     path = Path(path)
     check_wavefront_file(path)
-    is_csv = path.suffix.lower() == ".csv"
-    write_atomically(path, _csv(wavefront) if is_csv else to_json(_values(wavefront), indent=1))
-
-
-def save_map(path: str | Path, wavefront: Wavefront, layout: Layout, zonal: ZonalMap | None = None) -> None:
-    """Write the map of the mean wavefront to a FITS file, replacing an existing one.
-
-    Parameters
-    ----------
-    path : path
-        An image for each quantity, in the frame's coordinates; with a zonal map also the table SUBAPERTURES.
-    wavefront : Wavefront
-        Values of the fitted modes, within their disk.
-    layout : Layout
-    zonal : ZonalMap, optional
-        Adds its values, their standard errors (those of the sub-aperture around the point) and the number of
-        the connected part.
-
-    Raises
-    ------
-    InputError
-        When the ending is unknown or the file cannot be written.
-    MissingExtraError
-        When astropy is not installed.
-
-    Examples
-    --------
-    >>> import numpy as np, faintspot as fs
-    >>> from faintspot.slopes.wavefront import save_map
-    >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5)
-    >>> frame = np.random.default_rng(1).poisson(5.0, layout.frame_shape)
-    >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frame)
-    >>> save_map("map.fits", fs.fit_wavefront(slopes, layout, modes=5), layout)
-    """
-    path = Path(path)
-    check_map_file(path)
-    write_atomically(path, _map_fits(wavefront, layout, zonal))
+    write_atomically(path, to_json(_values(wavefront), indent=1))
 
 
 def check_wavefront_file(path: Path) -> None:
     """Refuse an unknown ending before the work."""
-    check_ending(path, *_WAVEFRONT_ENDINGS)
-
-
-def check_map_file(path: Path) -> None:
-    """Refuse an unknown ending before the work."""
-    check_ending(path, _MAP_ENDING)
-
-
-def _csv(wavefront: Wavefront) -> str:
-    names = [
-        f"noll{mode['noll']}_osa{mode['osa']}_"
-        + "_".join(re.findall(r"\w+", mode["name"].replace("°", "deg")))
-        for mode in mode_records(wavefront)
-    ]
-    quantities = ["rms", "rms_without_tilt", *names, *(f"{name}_standard_error" for name in names)]
-    coefficients = np.concatenate([wavefront.mean[None], wavefront.coefficients])
-    errors = np.concatenate([wavefront.mean_standard_error[None], wavefront.standard_errors])
-    columns = [total(coefficients), total(coefficients, tilt=False), *coefficients.T, *errors.T]
-    unit = wavefront.unit if wavefront.unit in UNITS else "px_subaperture"
-    frames, values = ["mean", *range(len(wavefront.coefficients))], np.stack(columns, axis=1).tolist()
-    rows = [
-        [frame, *(f"{value:.7g}" if np.isfinite(value) else "" for value in row)]
-        for frame, row in zip(frames, values, strict=True)
-    ]
-    return csv_text(["frame", *(f"{name}_{unit}" for name in quantities)], rows)
+    check_ending(path, ".json")
 
 
 def _values(wavefront: Wavefront) -> dict[str, Any]:
@@ -262,50 +166,3 @@ def _values(wavefront: Wavefront) -> dict[str, Any]:
         unknown["standard_errors"] = "no standard errors of the slopes, and no residuals to replace them"
     wave = {} if wavefront.wavelength_nm is None else {"wavelength_nm": wavefront.wavelength_nm}
     return {**values, **wave, "unknown": unknown}
-
-
-def _sheets(wavefront: Wavefront, zonal: ZonalMap | None) -> tuple[dict[str, Floats], Floats]:
-    """Return the maps by name, and the points' distances from the centre of the pupil along an axis [px]."""
-    reach = 1.0 if zonal is None else zonal.reach
-    sheets = {"modes": wavefront.sheet(reach=reach)}
-    if zonal is not None:
-        known = zonal.nearest >= 0
-        sheets["zonal"] = zonal.sheet
-        sheets["standard_error"] = np.where(known, zonal.standard_errors[zonal.nearest], np.nan)
-        sheets["part"] = np.where(known, zonal.parts[zonal.nearest], np.nan)
-    return sheets, np.linspace(-reach, reach, len(sheets["modes"])) * wavefront.pupil.radius_px
-
-
-def _map_fits(wavefront: Wavefront, layout: Layout, zonal: ZonalMap | None) -> bytes:
-    sheets, line = _sheets(wavefront, zonal)
-    units: list[Any] = [load_fits().PrimaryHDU()]
-    for name, sheet in sheets.items():
-        image = load_fits().ImageHDU(sheet.astype(np.float32), name=name.upper())
-        for axis, centre in enumerate(wavefront.pupil.centre_px, start=1):
-            image.header[f"CRPIX{axis}"] = 1.0
-            image.header[f"CRVAL{axis}"] = (centre + line[0], "pixel of the frame, from 0")
-            image.header[f"CDELT{axis}"] = line[1] - line[0]
-        units.append(image)
-    unit = wavefront.unit if wavefront.unit in UNITS else "pixel"
-    for image in units[1:]:
-        if image.name != "PART":
-            image.header["BUNIT"] = (unit, "times sub-apertures" if unit == "pixel" else "")
-    if zonal is not None:
-        (row, column), (x, y) = layout.cells.T, layout.centres.T
-        table = {
-            "ROW": ("J", None, row),
-            "COLUMN": ("J", None, column),
-            "PART": ("J", None, zonal.parts),
-            "X": ("D", "pixel", x),
-            "Y": ("D", "pixel", y),
-            "ZONAL": ("D", unit, zonal.values),
-            "STANDARD_ERROR": ("D", unit, zonal.standard_errors),
-        }
-        columns = [load_fits().Column(name, *form, array=array) for name, (*form, array) in table.items()]
-        units.append(load_fits().BinTableHDU.from_columns(columns, name="SUBAPERTURES"))
-    units[0].header["CREATOR"] = "faintspot"
-    if wavefront.wavelength_nm is not None:
-        units[0].header["WAVELEN"] = (wavefront.wavelength_nm, "length of a wave, nm")
-    stream = io.BytesIO()
-    load_fits().HDUList(units).writeto(stream, checksum=True)
-    return stream.getvalue()

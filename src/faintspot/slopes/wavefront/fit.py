@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,97 +15,22 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, lit_outlines, pupil_of
 from faintspot.slopes.wavefront.zernike import mean_gradients, zernike
 
-UNITS = "nm", "um", "waves"
-"""Units of length for wavefronts."""
-POINTS = 201
-"""Points of a map along the diameter of the pupil."""
-_NM_PER_ARCSEC_M = 1e9 * np.pi / (180 * 3600)
-
-
-@dataclass(frozen=True, kw_only=True)
-class OfLength:
-    """Base of fits whose values are lengths along the light's path."""
-
-    unit: str
-    """Unit: one of `UNITS`, or "px × sub-aperture" (slopes in pixels, lengths in sub-apertures)."""
-    pupil: Pupil
-    errors_from: str
-    """Source of the standard errors: "frames" (the scatter over them), "slopes" (their standard errors) or
-    "residuals" (the slopes' scatter about the fit, which counts as noise what is not fitted)."""
-    left_out: str = ""
-    """Line about the slopes that were left out; empty if there are none."""
-    wavelength_nm: float | None = None
-    """Length of a wave, for the unit "waves"."""
-
-    _amounts: ClassVar[tuple[str, ...]] = ()
-    """Names of the fields in the unit."""
-
-    def in_unit(self, unit: str, wavelength_nm: float | None = None) -> Self:
-        """Return the wavefront in another unit.
-
-        Parameters
-        ----------
-        unit : {"nm", "um", "waves"}
-        wavelength_nm : float, optional
-            Required for waves, and only for them.
-
-        Raises
-        ------
-        InputError
-            If the wavefront is in pixels, or wavelength and unit do not fit.
-        """
-        one_of("unit", unit, UNITS)
-        if (unit == "waves") != (wavelength_nm is not None):
-            raise InputError("wavelength_nm: expected a wavelength for the unit waves, and for no other")
-        if wavelength_nm is not None:
-            wavelength_nm = number_between("wavelength_nm", wavelength_nm, 0, low_open=True)
-        itself: Any = self  # a dataclass
-        converted = replace(itself, unit=unit, wavelength_nm=wavelength_nm)
-        factor = self.nm_per_unit / converted.nm_per_unit
-        amounts = {name: getattr(self, name) for name in self._amounts}
-        scaled = {name: factor * value for name, value in amounts.items() if value is not None}
-        changed: Self = replace(converted, **scaled)
-        return changed
-
-    @property
-    def nm_per_unit(self) -> float:
-        """Length of the unit [nm].
-
-        Raises
-        ------
-        InputError
-            If the wavefront is in pixels.
-        """
-        lengths = {"nm": 1.0, "um": 1e3, "waves": self.wavelength_nm}
-        length = lengths.get(self.unit)
-        if length is None:
-            raise InputError(
-                "layout: expected pixel_scale_arcsec, and subaperture_m or diameter_m, for a wavefront in a "
-                "unit of length"
-            )
-        return length
-
-
-def unit_of(layout: Layout, pupil: Pupil) -> tuple[str, float]:
-    """Return the unit of coefficients, and its value for one pixel times the disk's radius."""
-    if layout.pixel_scale_arcsec is None or pupil.radius_m is None:
-        return "px × sub-aperture", pupil.radius_subapertures
-    return "nm", layout.pixel_scale_arcsec * pupil.radius_m * _NM_PER_ARCSEC_M
-
-
 Floats = NDArray[np.float64]
 
+UNITS = "nm", "um", "waves"
+"""Units of length for wavefronts."""
+_POINTS = 201  # of a map along the diameter of the pupil
+_NM_PER_ARCSEC_M = 1e9 * np.pi / (180 * 3600)
 LARGEST_CONDITION = 100.0
 """Largest condition number of the modes' gradients, each scaled to 1: the noise amplification allowed."""
 _HIGHEST_ORDER, _USUAL_CONDITION = 8, 20.0  # defaults; higher orders are rarely needed
 _TILTS = 2
-FEWEST_SUBAPERTURES = 3
-"""Fewest valid sub-apertures of a wavefront: two show no surface."""
+_FEWEST_SUBAPERTURES = 3  # two show no surface
 _LEAST_SHARE = 0.1  # of a sub-aperture's area in the pupil, below which its slope tells too little
 
 
-@dataclass(frozen=True)
-class Wavefront(OfLength):
+@dataclass(frozen=True, kw_only=True)
+class Wavefront:
     """Zernike coefficients of the wavefront in one frame or several.
 
     The wavefront is the optical path difference minus its mean; it increases in the direction of the spots'
@@ -126,8 +50,63 @@ class Wavefront(OfLength):
     """Condition number of the fit with every sub-aperture that is ever valid."""
     other_standard_error: Floats | None = None
     """Standard error of a mean wavefront that was subtracted, (k,)."""
+    unit: str
+    """Unit: one of `UNITS`, or "px × sub-aperture" (slopes in pixels, lengths in sub-apertures)."""
+    pupil: Pupil
+    errors_from: str
+    """Source of the standard errors: those of the slopes ("slopes"), or the slopes' scatter about the fit
+    ("residuals"), which counts as noise what is not fitted."""
+    left_out: str = ""
+    """Line about the slopes that were left out; empty if there are none."""
+    wavelength_nm: float | None = None
+    """Length of a wave, for the unit "waves"."""
 
-    _amounts: ClassVar[tuple[str, ...]] = "coefficients", "standard_errors", "other_standard_error"
+    def in_unit(self, unit: str, wavelength_nm: float | None = None) -> Wavefront:
+        """Return the wavefront in another unit.
+
+        Parameters
+        ----------
+        unit : {"nm", "um", "waves"}
+        wavelength_nm : float, optional
+            Required for waves, and only for them.
+
+        Raises
+        ------
+        InputError
+            If the wavefront is in pixels, or wavelength and unit do not fit.
+        """
+        one_of("unit", unit, UNITS)
+        if (unit == "waves") != (wavelength_nm is not None):
+            raise InputError("wavelength_nm: expected a wavelength for the unit waves, and for no other")
+        if wavelength_nm is not None:
+            wavelength_nm = number_between("wavelength_nm", wavelength_nm, 0, low_open=True)
+        converted = replace(self, unit=unit, wavelength_nm=wavelength_nm)
+        factor = self.nm_per_unit / converted.nm_per_unit
+        other = self.other_standard_error
+        return replace(
+            converted,
+            coefficients=factor * self.coefficients,
+            standard_errors=factor * self.standard_errors,
+            other_standard_error=None if other is None else factor * other,
+        )
+
+    @property
+    def nm_per_unit(self) -> float:
+        """Length of the unit [nm].
+
+        Raises
+        ------
+        InputError
+            If the wavefront is in pixels.
+        """
+        lengths = {"nm": 1.0, "um": 1e3, "waves": self.wavelength_nm}
+        length = lengths.get(self.unit)
+        if length is None:
+            raise InputError(
+                "layout: expected pixel_scale_arcsec, and subaperture_m or diameter_m, for a wavefront in a "
+                "unit of length"
+            )
+        return length
 
     @property
     def fitted(self) -> NDArray[np.bool_]:
@@ -160,7 +139,7 @@ class Wavefront(OfLength):
         """Return the rms of each frame's wavefront over the disk, (n_frames,)."""
         return total(self.coefficients, tilt=tilt)
 
-    def sheet(self, *, points: int = POINTS, tilt: bool = True, reach: float = 1.0) -> Floats:
+    def sheet(self, *, points: int = _POINTS, tilt: bool = True) -> Floats:
         """Return the mean wavefront as a map over the disk, (points, points), NaN outside.
 
         Parameters
@@ -169,10 +148,8 @@ class Wavefront(OfLength):
             Points along the map; rows go along y, columns along x.
         tilt : bool
             Whether to include tip and tilt.
-        reach : float
-            Distance of the outermost points from the centre, in radii of the disk.
         """
-        line = np.linspace(-reach, reach, points)
+        line = np.linspace(-1.0, 1.0, points)
         y, x = np.meshgrid(line, line, indexing="ij")
         inside = np.hypot(x, y) <= 1
         sheet = np.full((points, points), np.nan)
@@ -238,10 +215,10 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     outlines, share = _in_pupil(layout, pupil)
     valid, left_out = leave_out(flags, slopes.keep, {"outside the pupil": share < _LEAST_SHARE})
     illuminated = np.asarray(valid.any(axis=0))
-    if np.count_nonzero(illuminated) < FEWEST_SUBAPERTURES:
-        raise too_few(illuminated, left_out)
+    if np.count_nonzero(illuminated) < _FEWEST_SUBAPERTURES:
+        raise _too_few(illuminated, left_out)
     gradients, condition = _chosen_gradients(modes, outlines, illuminated)
-    unit, scale = unit_of(layout, pupil)
+    unit, scale = _unit_of(layout, pupil)
     errors = np.concatenate(
         [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
     )
@@ -253,11 +230,11 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
         measured, used, gradients, share, noise if has_errors else None
     )
     return Wavefront(
-        np.arange(2, 2 + gradients.shape[1]),
-        scale * coefficients,
-        scale * standard_errors,
-        residual,
-        condition,
+        modes=np.arange(2, 2 + gradients.shape[1]),
+        coefficients=scale * coefficients,
+        standard_errors=scale * standard_errors,
+        residual_px=residual,
+        condition=condition,
         unit=unit,
         pupil=pupil,
         errors_from="slopes" if has_errors else "residuals",
@@ -265,10 +242,17 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     )
 
 
-def too_few(valid: NDArray[np.bool_], left_out: str) -> InputError:
+def _unit_of(layout: Layout, pupil: Pupil) -> tuple[str, float]:
+    """Return the unit of coefficients, and its value for one pixel times the disk's radius."""
+    if layout.pixel_scale_arcsec is None or pupil.radius_m is None:
+        return "px × sub-aperture", pupil.radius_subapertures
+    return "nm", layout.pixel_scale_arcsec * pupil.radius_m * _NM_PER_ARCSEC_M
+
+
+def _too_few(valid: NDArray[np.bool_], left_out: str) -> InputError:
     """Return the error of slopes with too few valid sub-apertures for a wavefront."""
     return InputError(
-        f"slopes: expected at least {FEWEST_SUBAPERTURES} valid sub-apertures for a wavefront, got "
+        f"slopes: expected at least {_FEWEST_SUBAPERTURES} valid sub-apertures for a wavefront, got "
         f"{np.count_nonzero(valid)} of {len(valid)}{f' ({left_out})' if left_out else ''}"
     )
 
@@ -352,7 +336,7 @@ def _weighted_fit(
     for number in range(len(patterns)):
         rows = np.flatnonzero(of_frame.ravel() == number)
         used = valid[rows[0]]
-        few = np.count_nonzero(used) < 2 * FEWEST_SUBAPERTURES
+        few = np.count_nonzero(used) < 2 * _FEWEST_SUBAPERTURES
         if few or not _condition(gradients[used]) <= LARGEST_CONDITION:
             continue
         root = np.sqrt(weights[used] / weights[used].mean())
