@@ -45,7 +45,6 @@ def pipelines(layout: fs.Layout, calibration: fs.Calibration) -> dict[str, fs.Sl
         "thresholded": pipeline("thresholded", threshold_e=0.5),
         "smoothed": pipeline("smoothed", smoothing_px=0.7),
         "weighted": pipeline("weighted", **near),
-        "matched": pipeline("matched", **near),
         "ml": pipeline("ml", **near),
         "ml, whole window": pipeline("ml"),
         "ml, rotated elongated PSF": pipeline("ml", rotated, **near),

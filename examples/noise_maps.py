@@ -29,7 +29,7 @@ STEP = 0.1  # of the logarithm of the noise: the exact bound needs a table for e
 OFFSET_ADU = 100.0
 TRAINING = 4000  # spots of the best linear weights
 PARTS = 20  # of the frames, for standard errors
-METHODS = ("weighted", "window", "best linear", "matched", "ml", "map")
+METHODS = ("weighted", "window", "best linear", "ml", "map")
 
 Floats = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import faintspot as fs
 from faintspot.slopes.spots.psf import PSF
 
-NEED_PSF = ("matched", "ml", "map")
+NEED_PSF = ("ml", "map")
 FIELDS = (
     *("x", "y", "flux", "flags", "iterations", "bad_pixels"),
     *("standard_error_x", "standard_error_y", "covariance_xy"),

@@ -116,7 +116,7 @@ def spot_tasks(case: Case) -> list[Task]:
     reach = start_reach(width.max(), (ny, nx))
     counts = case.calibration.em_gain == 1 and case.calibration.background_e == 0
     background = case.settings.local_background == "on"
-    counts = counts and case.settings.estimator.name != "matched" and not background
+    counts = counts and not background
     made = []
     for task, kind, noise in zip(tasks(case), index, pixel_noises(case), strict=True):
         task = replace(task, background=background)
@@ -255,7 +255,6 @@ METHODS: dict[str, tuple[Callable[[Case], list[Task]], Method]] = {
     "smoothed": (tasks, by_gravity),
     "window": (tasks, by_window),
     "weighted": (tasks, by_weight),
-    "matched": (spot_tasks, by_fit),
     "ml": (spot_tasks, by_fit),
     "map": (spot_tasks, by_posterior),
 }

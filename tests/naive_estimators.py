@@ -16,7 +16,7 @@ from tests.naive_spots import Floats, Spot, phase_margins, pixel_centres, window
 
 FWHM_PER_STD = 2 * math.sqrt(2 * math.log(2))
 START_STD_PER_FWHM = 0.73
-STEPS = {"ml": 4, "matched": 4, "map": 4, "weighted": 8}
+STEPS = {"ml": 4, "map": 4, "weighted": 8}
 LEAST_VARIANCE, LEAST_FLUX = 1e-4, 1e-2
 MOST_MODEL_ERROR_E = 300.0
 LEAST_FRACTION = 0.05
@@ -182,14 +182,8 @@ def largest_move(fwhm_x: float, fwhm_y: float) -> float:
     return max(1.0, 0.25 * min(fwhm_x, fwhm_y))
 
 
-def weights(m: Floats, task: Task, first_flux: float, name: str) -> Floats:
+def weights(m: Floats, task: Task, first_flux: float) -> Floats:
     """Inverse of the variance that the likelihood ascribes to every pixel."""
-    if name == "matched" and not np.ndim(task.variance):
-        return np.ones_like(m)
-    if name == "matched":
-        assert task.spot is not None
-        photons = task.excess * first_flux * np.sum(task.spot.images(0.0, 0.0, m.shape)[0] ** 2)
-        return np.asarray(1.0 / np.maximum(task.variance + photons, LEAST_VARIANCE))
     flux = np.maximum(m, 0.0)  # a spline may dip below zero
     floor: Any = np.maximum(task.variance + task.weight_floor * first_flux, LEAST_VARIANCE)
     model_error_squared = min(task.model_error**2, MOST_MODEL_ERROR_E / first_flux)
@@ -225,7 +219,7 @@ def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = 
     for _ in range(STEPS[name] if task.steps is None else task.steps):
         f, fx, fy = task.spot.images(x, y, g.shape)
         m, dm = flux * f, [flux * fx, flux * fy, f] + [np.ones_like(f)] * task.background
-        w = weights(m, task, begin.flux, name)
+        w = weights(m, task, begin.flux)
         score = np.array([np.sum((g - m - level) * w * d) for d in dm])
         if name == "map":
             score[:2] += (np.array(task.prior) - (x, y)) / task.prior_std**2

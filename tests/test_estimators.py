@@ -51,11 +51,10 @@ class TestAgainstOracle:
         assert_equals_oracle(case, case.measure())
 
     @pytest.mark.slow  # compiled for noise maps, as the next one
-    @pytest.mark.parametrize("estimator", ["matched", "ml"])
     @given(seed=SEEDS)
     @examples(3)
-    def test_noise_map_on_an_unknown_background(self, estimator: str, seed: int) -> None:
-        case = on_unknown_background(with_noise_map(random_case(seed, estimator), seed), seed)
+    def test_noise_map_on_an_unknown_background(self, seed: int) -> None:
+        case = on_unknown_background(with_noise_map(random_case(seed, "ml"), seed), seed)
         assert_equals_oracle(case, case.measure())
 
     @pytest.mark.slow
@@ -73,11 +72,10 @@ class TestAgainstOracle:
         case = random_case(seed, "map", n=2)
         assert_equals_oracle(case, case.measure())
 
-    @pytest.mark.parametrize("estimator", ["matched", "ml"])
     @given(seed=SEEDS)
     @examples(5)
-    def test_random_spots_on_an_unknown_background(self, estimator: str, seed: int) -> None:
-        case = on_unknown_background(random_case(seed, estimator), seed)
+    def test_random_spots_on_an_unknown_background(self, seed: int) -> None:
+        case = on_unknown_background(random_case(seed, "ml"), seed)
         assert_equals_oracle(case, case.measure())
 
     @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -191,9 +189,7 @@ class TestNoiseMap:
     @pytest.mark.slow
     @EVERY
     def test_constant_map_is_the_number(self, estimator: str) -> None:
-        """Of one variance, so that only the order of roundings may differ; the matched filter's weights are
-        another constant, which its flux and errors do not depend on.
-        """
+        """Of one variance, so that only the order of roundings may differ."""
         case = random_case(21, estimator, n=9)
         number = case.calibration.read_noise_e
         shape = case.layout.frame_shape
@@ -247,7 +243,7 @@ class TestNoiseMap:
 class TestLocalBackground:
     """When a constant is fitted along with the spot."""
 
-    @pytest.mark.parametrize("estimator", ["matched", "ml", "map"])
+    @pytest.mark.parametrize("estimator", ["ml", "map"])
     def test_automatic_without_a_dark(self, estimator: str) -> None:
         case = random_case(12, estimator, n=5, window=(10, 10))
         case = replace(case, images=np.float32(2.0) + case.images)
@@ -344,7 +340,7 @@ class TestPhysics:
 
 
 def test_unknown_read_noise_gives_infinite_errors() -> None:
-    for estimator in ("brightest", "tv", "centroid", "thresholded", "smoothed", "weighted", "matched"):
+    for estimator in ("brightest", "tv", "centroid", "thresholded", "smoothed", "weighted"):
         case: Case = random_case(14, estimator, n=6)
         calibration = replace(case.calibration, read_noise_e=None)
         slopes = replace(case, calibration=calibration).measure()

@@ -32,7 +32,7 @@ from faintspot.slopes.spots.psf import PSF
 Flag = fs.SubapertureFlag
 SEEDS = st.integers(0, 2**32 - 1)
 EVERY = pytest.mark.parametrize("estimator", list(estimators()))
-FITTED = ("matched", "ml", "map")
+FITTED = ("ml", "map")
 
 
 def hostile_images(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -116,7 +116,6 @@ class TestImages:
     @pytest.mark.parametrize(
         ("estimator", "known", "most"),
         [
-            ("matched", {}, 0.04),
             ("ml", {}, 0.04),
             ("weighted", {}, 0.04),
             ("map", {"flux_e": 400.0, "prior_std_px": 1.0}, 0.1),

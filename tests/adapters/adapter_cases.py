@@ -43,7 +43,6 @@ ESTIMATORS = {
     "thresholded": Settings("thresholded", threshold_e=2.0),
     "window": Settings("window", flux_e=FAINT_E),
     "weighted": Settings("weighted"),
-    "matched": Settings("matched"),
     "ml": Settings("ml", model_error=0.3),
     "map": Settings("map", flux_e=FAINT_E, prior_std_px=0.5),
 }

@@ -184,7 +184,6 @@ def test_axes_that_run_backwards(optics: Any) -> None:
         ({"pixels": 14}, "49 lenslets|leave it|overlap"),
         ({"pixels": 1}, "pixels = 1"),
         ({"settings": Settings(estimator="ml")}, "calibration.read_noise_e"),
-        ({"settings": Settings(estimator="matched")}, "psf"),
     ],
 )
 def test_refused_in_one_line(optics: Any, change: dict[str, Any], message: str) -> None:

@@ -38,7 +38,6 @@ def test_every_estimator_is_made_for_a_scene(name: str) -> None:
 def test_knowledge_follows_from_the_needs() -> None:
     found = {name: Knowledge.of(kind) for name, kind in estimators().items()}
     assert [name for name, knowledge in found.items() if knowledge is Knowledge.SPOT] == [
-        "matched",
         "ml",
         "map",
     ]

@@ -94,11 +94,11 @@ def test_scatter_between_frames_that_one_method_alone_has_is_its_error() -> None
             }
         )
 
-    still = checked({"window": 0.11, "smoothed": 0.115, "matched": 0.3})
+    still = checked({"window": 0.11, "smoothed": 0.115, "ml": 0.3})
     assert still["window"].factor == still["smoothed"].factor == 1.0
-    assert still["matched"].expected_px == pytest.approx(0.07 * 0.296 / 0.1, rel=0.01)
-    moving = checked({"window": 0.5, "matched": 0.6})  # gains that differ would look the same
-    assert moving["matched"].factor == 1.0
+    assert still["ml"].expected_px == pytest.approx(0.07 * 0.296 / 0.1, rel=0.01)
+    moving = checked({"window": 0.5, "ml": 0.6})  # gains that differ would look the same
+    assert moving["ml"].factor == 1.0
     assert checked({"window": math.nan})["window"].factor == 1.0
 
 

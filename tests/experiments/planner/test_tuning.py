@@ -31,7 +31,7 @@ def test_errors_are_near_the_bound_where_the_spot_is_known() -> None:
     """The bound is for unbiased estimators; 512 spots tell R to 3 %."""
     answer = answered()
     assert answer["ml"].statistics.error.value == pytest.approx(answer.bound_px[1], rel=0.15)
-    assert answer.best.method.name in ("ml", "weighted", "matched", "smoothed", "map")
+    assert answer.best.method.name in ("ml", "weighted", "smoothed", "map")
     assert answer.best.over_brightest.value > 0.1
 
 

@@ -124,7 +124,7 @@ def test_candidates_in_a_cell() -> None:
     specification = StudySpecification(
         "x",
         [Sweep("a", pixels=16, d_over_r0=[0, 2])],
-        estimators=["brightest", "tv", "ml", "matched", "weighted"],
+        estimators=["brightest", "tv", "ml", "weighted"],
         options={"noise_std": [0.5, 1.0], "blur_px": [0.0, 1.0], "model_error": [0.2]},
     )
     still, speckled = (CellMethods(cell, specification) for cell in specification.cells())
@@ -132,7 +132,6 @@ def test_candidates_in_a_cell() -> None:
     assert still.candidates("tv") == [(("noise_std", 0.5),), (("noise_std", 1.0),)]
     assert still.estimator("tv", (("noise_std", 0.5),)).noise_std == 0.5 * still.cell.pixel_noise_e  # type: ignore[attr-defined]
     assert still.candidates("ml") == [(("blur_px", 0.0), ("model_error", 0.0))]
-    assert speckled.candidates("matched") == [(("blur_px", 0.0),), (("blur_px", 1.0),)]
     assert speckled.candidates("ml") == [(("blur_px", blur), ("model_error", 0.2)) for blur in (0.0, 1.0)]
     assert len(still.candidates("weighted")) > 1
 

@@ -11,7 +11,7 @@ from faintspot.experiments import StudySpecification, Sweep, measure_cell
 from faintspot.experiments.study.cell import realisations
 from faintspot.experiments.study.cell_methods import CellMethods
 
-ESTIMATOR_METHODS = ("window", "weighted", "matched", "ml", "map")
+ESTIMATOR_METHODS = ("window", "weighted", "ml", "map")
 METHODS = ("brightest", *ESTIMATOR_METHODS)
 COUNT = 2000
 

@@ -39,7 +39,7 @@ def distances(slopes: fs.Slopes, truth: Any) -> Any:
 
 
 @pytest.mark.parametrize("flux", [120.0, 1000.0])
-@pytest.mark.parametrize("name", ["ml", "map", "matched", "filter", "shape"])
+@pytest.mark.parametrize("name", ["ml", "map", "filter", "shape"])
 def test_ellipses_hold_95_percent(name: str, flux: float) -> None:
     """Within 2 %: the scatter of 3600 spots is 0.4 %; the rest is what a normal distribution neglects."""
     frames, truth = fs.slopes.simulate.sensor_frames(
@@ -50,7 +50,6 @@ def test_ellipses_hold_95_percent(name: str, flux: float) -> None:
     window = fs.Settings("window", flux_e=flux)
     settings, score = {
         "ml": (fs.Settings("ml", search_range_px=2.0), None),
-        "matched": (fs.Settings("matched", search_range_px=2.0), None),
         "map": (fs.Settings("map", flux_e=flux, prior_std_px=MOTION_PX), None),
         "filter": (window, fs.FixedWeights.matched(PSF, SIDE, flux_e=flux, read_noise_e=1.0)),
         "shape": (window, fs.FixedWeights.shaped(PSF, SIDE)),

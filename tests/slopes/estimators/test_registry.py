@@ -26,7 +26,6 @@ BUILT_IN = [
     "thresholded",
     "window",
     "weighted",
-    "matched",
     "ml",
     "map",
 ]

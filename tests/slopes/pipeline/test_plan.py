@@ -31,7 +31,7 @@ class TestWhatIsMissing:
     @pytest.mark.parametrize(
         ("settings", "parts", "message"),
         [
-            (fs.Settings("matched"), {}, r"psf: expected a PSF .*learn_psf"),
+            (fs.Settings("ml"), {}, r"psf: expected a PSF .*learn_psf"),
             (
                 fs.Settings("ml"),
                 {"calibration": None, "psf": fs.PSF.analytic()},

@@ -127,7 +127,7 @@ class TestEstimators:
     @pytest.mark.parametrize(
         ("words", "estimator", "options"),
         [
-            ("model_error: an option of 'ml' and 'map', not of 'matched'", "matched", {"model_error": 0.1}),
+            ("model_error: an option of 'ml' and 'map', not of 'weighted'", "weighted", {"model_error": 0.1}),
             ("modle_error: unknown option of 'ml'; did you mean model_error?", "ml", {"modle_error": 0.1}),
         ],
     )

@@ -86,7 +86,6 @@ _MODULES = {
     "thresholded": "thresholded",
     "window": "window",
     "weighted": "weighted",
-    "matched": "matched",
     "ml": "maximum_likelihood",
     "map": "maximum_a_posteriori",
 }

@@ -51,9 +51,6 @@ Floats = NDArray[np.float64]
 _LEVEL = 0.05  # step of the logarithm of variances for which the flux of likely outliers is computed
 _LARGEST_MOVE = 0.25  # in a step, in units of the FWHM; 1 px for narrow spots
 
-BLURS = (0.4, 0.0, 0.8, 1.2)
-"""Blurs of the PSF of a speckled spot, in units of lambda / d."""
-
 
 class SpotPlan(EstimatorPlan):
     """Settings and tables of an estimator that uses profiles of spots, or of weights centred on them."""
@@ -145,15 +142,3 @@ class SpotPlan(EstimatorPlan):
         """PSF of the sensor, blurred if the estimator requires it."""
         psf, blur = self.sensor.psf, float(getattr(self.estimator, "blur_px", 0.0))
         return psf.blurred(blur) if psf is not None and blur > 0 else psf
-
-
-class PSFPlan(SpotPlan):
-    """Settings and tables of a fit of the PSF itself."""
-
-    kernel = staticmethod(spot_fits.fitted_of_groups)
-
-    @cached_property
-    def model(self) -> SpotModel:
-        """Profiles of the spots."""
-        sensor = self.sensor
-        return spot_tables.model_of_psf(self.psf, sensor.n, sensor.window, sensor.width, self.fits_background)

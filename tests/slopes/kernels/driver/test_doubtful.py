@@ -102,7 +102,7 @@ def test_spots_between_wrong_ones_stay_valid() -> None:
     assert np.flatnonzero(arrays.flags[0]).tolist() == sorted(wrong)
 
 
-@pytest.mark.parametrize("estimator", ["brightest", "tv", "smoothed", "ml", "matched", "weighted"])
+@pytest.mark.parametrize("estimator", ["brightest", "tv", "smoothed", "ml", "weighted"])
 def test_planted_spots_are_flagged_and_others_are_not(estimator: str) -> None:
     """A spot outside its window, a spot cut by it, an unlit window that has its neighbour's flux."""
     far, cut, unlit, beside = (number_of(*cell) for cell in ((5, 3), (3, 8), (0, 6), (1, 6)))

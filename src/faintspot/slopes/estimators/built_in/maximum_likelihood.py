@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -12,21 +13,37 @@ from numpy.typing import NDArray
 
 from faintspot.base.config.options import Value, option
 from faintspot.slopes.estimators.base import Estimator, Need, Style
-from faintspot.slopes.estimators.built_in.matched import Fitted
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.estimators.sensor import Sensor
-from faintspot.slopes.estimators.spots import PSFPlan
+from faintspot.slopes.estimators.spot_tables import SpotModel, model_of_psf
+from faintspot.slopes.estimators.spots import SpotPlan, Stepping
 from faintspot.slopes.kernels.spot_fits import fits as spot_fits
 
+_BLURS = (0.4, 0.0, 0.8, 1.2)  # of the PSF of a speckled spot, in units of lambda / d
 _MODEL_ERRORS = (0.3, 0.0, 1.0)  # for speckled spots
 _LEARNT_WEIGHT_FLOOR = 1e-3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Likelihood(Fitted):
-    """Fit whose weights follow from the noise."""
+class Likelihood(Stepping):
+    """Fit of the PSF to the image, whose weights follow from the noise."""
 
+    blur_px: Value = option(
+        0.0,
+        "Standard deviation of the Gaussian blur applied to the PSF, for broadening by turbulence.",
+        unit="px",
+        low=0.0,
+        high=16.0,
+        per_subaperture=False,
+    )
+    local_background: str = option(
+        "auto",
+        "Fit a constant background in every sub-aperture along with the spot, for an unknown dark level or "
+        'sky. "auto": fit it if the calibration gives no dark, or only a rough one.',
+        choices=("auto", "on", "off"),
+        per_subaperture=False,
+    )
     model_error: Value = option(
         0.0,
         "Deviation of the spots from the PSF, as a fraction of each pixel's flux; it limits the weight of "
@@ -53,9 +70,11 @@ class Likelihood(Fitted):
         return self
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[object]]:
-        """Return the options of the fit and, for speckled spots, also model errors."""
-        errors = {"model_error": list(_MODEL_ERRORS)} if scene.d_over_r0 else {}
-        return {**super().tuned(scene), **errors}
+        """Return blurs of the PSF and model errors to try for speckled spots."""
+        if not scene.d_over_r0:
+            return {}
+        blurs = [factor * scene.lambda_over_d_px for factor in _BLURS]
+        return {"blur_px": blurs, "model_error": list(_MODEL_ERRORS)}
 
 
 @register
@@ -74,8 +93,10 @@ class MaximumLikelihood(Likelihood):
         return LikelihoodPlan(self, sensor)
 
 
-class LikelihoodPlan(PSFPlan):
+class LikelihoodPlan(SpotPlan):
     """Tables of a weighted fit; pixels with low read noise are rounded to whole electrons."""
+
+    kernel = staticmethod(spot_fits.fitted_of_groups)
 
     def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
@@ -83,6 +104,12 @@ class LikelihoodPlan(PSFPlan):
             noise = sensor.pixel_noise_e
             rounded = noise < spot_fits.WHOLE_ELECTRONS_BELOW
             self.pixel_variance = np.where(rounded, _rounding_variance(noise), self.pixel_variance)
+
+    @cached_property
+    def model(self) -> SpotModel:
+        """Profiles of the spots."""
+        sensor = self.sensor
+        return model_of_psf(self.psf, sensor.n, sensor.window, sensor.width, self.fits_background)
 
     @property
     def rounds_electrons(self) -> bool:
