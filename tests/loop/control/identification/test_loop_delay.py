@@ -37,7 +37,7 @@ def test_the_delay_is_found_within_its_error(delay: int) -> None:
 def test_gain_for_a_known_delay(gain: float) -> None:
     seen = found(2, gain, given=2.0)
     assert seen.delay_frames == 2.0
-    assert seen.gain_error < 0.06
+    assert seen.gain_error < 0.1
     assert abs(seen.gain - gain) < 3 * seen.gain_error
 
 
@@ -52,16 +52,19 @@ def test_errors_of_gains_are_those_of_least_squares() -> None:
     gains = np.repeat([0.9, 0.45], 4)
     context = sent, np.zeros(frames, np.int64), site, RATE_HZ
     slopes = gains * delayed + 0.8 * rng.standard_normal((frames, 8))
-    gain, error = DelayFits(slopes, *context, axis=0).gain_of(2.0)
-    least = 0.8 / 0.5 / np.sqrt(3 * frames)  # three modes without tip
-    assert error == pytest.approx(least / np.sqrt(0.55), rel=0.1)
+    gain, error, _ = DelayFits(slopes, *context, axis=0).gains_of(2.0)[3]
+    least = (
+        0.8 / 0.5 / np.sqrt(3 * frames)
+    )  # three modes without tip; strengths of turbulence are fitted, too
+    assert error == pytest.approx(least / np.sqrt(0.55), rel=0.15)
     assert abs(gain - 0.9) < 3 * error
     seen = with_axes(LoopDelay(2.0, 0.1, 0.6, 0.05), slopes, *context)
     assert seen.x_to_y == pytest.approx(2.0, rel=0.25)
     of_axes = error / 0.9, error / 0.45
     assert seen.x_to_y_error == pytest.approx(seen.x_to_y * np.linalg.norm([0.09, *of_axes]), rel=0.05)
     np.testing.assert_allclose(seen.gains(4), gains, rtol=0.15)
-    assert seen.gain_error == pytest.approx(np.hypot(0.03 * np.hypot(1, seen.gain), error), rel=0.1)
+    least = np.hypot(0.04 * np.hypot(1, seen.gain), error)  # plus the change from one averaging to the next
+    assert 0.9 * least < seen.gain_error < 1.5 * least
 
 
 def test_too_few_frames() -> None:

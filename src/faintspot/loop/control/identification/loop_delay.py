@@ -2,8 +2,9 @@
 
 With the right delay and gain, slopes without the mirror's part are turbulence and white noise. With wrong
 ones the noise that the loop has sent to the mirror is left in them. So delay, gain, strengths of von Karman
-turbulence carried by winds of several speeds from anywhere, and noise are those for which the cross-spectra
-of the slopes are the most likely (Whittle). The gain of given spectra is generalised least squares.
+turbulence carried by winds of several speeds from anywhere, its spatial averaging, and noise are those for
+which the cross-spectra of the slopes are the most likely (Whittle). The gain of given spectra is generalised
+least squares. Its error grows with the deviation of the measured spectra from the fitted ones.
 """
 
 from __future__ import annotations
@@ -22,20 +23,24 @@ Floats = NDArray[np.float64]
 
 _WINDOW, _WINDOW_S = 128, 0.52  # frames; a longer window if the frame rate is so high that these last longer
 _FEWEST_PIECES, _FEWEST_LONG_PIECES = 8, 12
-_MOST_DELAY = 5
+_MOST_DELAY, _USUAL_DELAY = 5, 3
+_UNLIKE = 3.0  # misfit above which longer delays than the usual ones explain only what is not turbulence
 _STEP = 0.1  # of fractional delays
 GAINS = 0.1, 1.6
 """Limits of the search for the centroid gain."""
 _START_GAIN = 0.6
 _MODEL_ERROR = 0.05  # frames: spectra of real slopes differ from the theory
-_GAIN_ERROR = 0.03  # absolute and relative, likewise
-_AXES_ERROR = 0.09  # of the gain of x relative to y, likewise: rms in loops of three packages, of equal gains
+_GAIN_ERROR = 0.04  # absolute and relative, likewise
+_AVERAGED = 0.4, 0.55, 0.7, 1.0, 1.4, 2.0
+"""Values of `SlopeTurbulence.averaged` of which the likeliest is used: sharper or smoother slopes."""
+_AXES_ERROR = 0.09  # of the gain of x relative to y, likewise: in loops of three packages, of equal gains
 _SURE = 3.0  # standard errors
 _SPEEDS_M_PER_S = (1.0, 3.0, 6.0, 10.0, 15.0, 22.0, 32.0)
 _DIRECTIONS = 4  # of half a turn: opposite winds have the same spectrum
 _MOST_SUBAPERTURES, _MOST_MODES = 160, 36
 """Side by side: in sparse ones structure between them is taken for large modes."""
 _UPDATES, _FEW_UPDATES, _POWER = 60, 15, 0.9
+_LEAST_STRENGTH = 1e-6  # of the largest: weaker turbulence is none
 _BATCH = 64  # pieces at a time
 _INDEPENDENT = 0.55  # part of half-overlapping pieces
 FEWEST_SUBAPERTURES = 3
@@ -56,6 +61,15 @@ class LoopDelay:
     """Gain of x relative to y that is used; `gain` is their geometric mean."""
     measured_x_to_y: float = math.nan
     x_to_y_error: float = math.nan
+    misfit: float = 1.0
+    """Rms deviation of spectra from the fitted ones, in units of that of chance; 1 or more."""
+
+    def for_control(self) -> LoopDelay:
+        """Return the same with a gain that a controller may assume: larger where the spectra do not fit.
+
+        A gain assumed too small makes the loop unstable; one too large by as much only makes it slower.
+        """
+        return replace(self, gain=self.gain + self.gain_error * (1 - 1 / self.misfit))
 
     @property
     def gain_summary(self) -> str:
@@ -122,58 +136,90 @@ class DelayFits:
         window /= np.linalg.norm(window)
         basis = _modes(site, axis)
         slopes, sent = ((values - values.mean(axis=0))[:, columns] @ basis for values in (slopes_px, sent_px))
-        self._products, pieces = _products(slopes, sent, run, window)
-        self._parts = _turbulence(site, rate_hz, window, basis)
-        self._flat = self._parts.reshape(len(self._parts), -1)
-        self._independent = _INDEPENDENT * pieces
-        self._begin()
+        products, pieces = _products(slopes, sent, run, window)
+        self._fits = [
+            _Fit(
+                products, _turbulence(replace(site, averaged=averaged), rate_hz, window, basis, axis), pieces
+            )
+            for averaged in _AVERAGED
+        ]
 
-    def _begin(self) -> None:
+    def of(self, delay_frames: float) -> LoopDelay:
+        """Return the gain for a delay that is known."""
+        found = self._fitted(delay_frames)
+        misfit = self._fits[found].misfit(delay_frames)
+        gain, error = self._fits[found].of(delay_frames, 0)[0], self._fits[found].gain_error(delay_frames)
+        near = [fit.of(delay_frames, 0)[0] for fit in self._fits[max(found - 1, 0) : found + 2]]
+        error = math.hypot(error, np.ptp(near) / 2, _model_error(gain, misfit))
+        return LoopDelay(delay_frames, 0.0, gain, error, misfit=misfit)
+
+    def gains_of(self, delay_frames: float) -> Floats:
+        """Return the gain for a known delay, its error as far as frames and noise cause it, and minus the
+        logarithm of the likelihood, for each averaging of turbulence, (averagings, 3).
+        """
+        self._fitted(delay_frames)
+        rows = []
+        for fit in self._fits:
+            gain, unlikely = fit.of(delay_frames, 0)
+            rows.append([gain, fit.gain_error(delay_frames), unlikely])
+        return np.array(rows)
+
+    def best(self) -> LoopDelay:
+        """Return delay and gain, averaged over the delays that are likely."""
+        for fit in self._fits:
+            fit.begin()
+            fit.of(2.0)
+        tried = {
+            (fit, delay): fit.of(delay, _FEW_UPDATES)[-1]
+            for delay in range(1, _MOST_DELAY + 1)
+            for fit in self._fits
+        }
+        for most in _MOST_DELAY, _USUAL_DELAY:
+            fit, whole = min((key for key in tried if key[1] <= most), key=tried.__getitem__)
+            fit.begin()
+            fit.of(whole)
+            misfit = fit.misfit(whole)
+            if misfit < _UNLIKE:
+                break
+        delays = np.arange(max(whole - 1.0, 1.0), min(whole + 1.0, _MOST_DELAY) + 0.5 * _STEP, _STEP)
+        values = np.array([fit.of(delay, _FEW_UPDATES) for delay in delays])
+        weight = np.exp((values[:, 1].min() - values[:, 1]) / misfit**2)
+        weight /= weight.sum()
+        delay = float(weight @ delays)
+        of_frames = math.sqrt(float(weight @ (delays - delay) ** 2))
+        delay_error = math.hypot(of_frames, _STEP / math.sqrt(12), _MODEL_ERROR * misfit)
+        known = self.of(delay)
+        of_delay = math.sqrt(float(weight @ (values[:, 0] - weight @ values[:, 0]) ** 2))
+        return replace(known, delay_error=delay_error, gain_error=math.hypot(known.gain_error, of_delay))
+
+    def _fitted(self, delay_frames: float) -> int:
+        """Return the number of the likeliest averaging for a known delay, whose fits are made."""
+        for fit in self._fits:
+            fit.begin()
+        return int(np.argmin([fit.of(delay_frames)[-1] for fit in self._fits]))
+
+
+class _Fit:
+    """Gain, and strengths of turbulence of given spectra, fitted to the cross-spectra of a loop."""
+
+    def __init__(self, products: Floats, parts: Floats, pieces: int) -> None:
+        self._products, self._parts = products, parts
+        self._flat = parts.reshape(len(parts), -1)
+        self._independent = _INDEPENDENT * pieces
+        self.begin()
+
+    def begin(self) -> None:
         """Start from equal strengths."""
         level = np.trace(self._products[:, 0, 0], axis1=1, axis2=2).sum()
         self._strength = level / np.trace(self._parts, axis1=2, axis2=3).sum(axis=1) / len(self._parts)
         self._gain = _START_GAIN
 
-    def of(self, delay_frames: float) -> LoopDelay:
-        """Return the gain for a delay that is known."""
-        self._begin()
-        gain, gain_error, _ = self._fit(delay_frames, _UPDATES)
-        return LoopDelay(delay_frames, 0.0, gain, math.hypot(gain_error, _model_error(gain)))
-
-    def gain_of(self, delay_frames: float) -> tuple[float, float]:
-        """Return the gain for a known delay, and its error as far as frames and noise cause it."""
-        self._begin()
-        return self._fit(delay_frames, _UPDATES)[:2]
-
-    def best(self) -> LoopDelay:
-        """Return delay and gain, averaged over the delays that are likely."""
-        self._begin()
-        self._fit(2.0, _UPDATES)
-        whole = min(range(1, _MOST_DELAY + 1), key=lambda delay: self._fit(delay, _FEW_UPDATES)[-1])
-        delays = np.arange(max(whole - 1.0, 1.0), min(whole + 1.0, _MOST_DELAY) + 0.5 * _STEP, _STEP)
-        values = np.array([self._fit(delay, _FEW_UPDATES) for delay in delays])
-        weight = np.exp(values[:, 2].min() - values[:, 2])
-        weight /= weight.sum()
-        delay, gain = float(weight @ delays), float(weight @ values[:, 0])
-        delay_error = math.hypot(
-            math.sqrt(float(weight @ (delays - delay) ** 2)), _STEP / math.sqrt(12), _MODEL_ERROR
-        )
-        of_delay = math.sqrt(float(weight @ (values[:, 0] - gain) ** 2))
-        gain_error = math.hypot(of_delay, float(weight @ values[:, 1]), _model_error(gain))
-        return LoopDelay(delay, delay_error, gain, gain_error)
-
-    def _fit(self, delay: float, updates: int) -> tuple[float, float, float]:
-        """Return gain, its standard error, and the misfit: minus the logarithm of the likelihood.
+    def of(self, delay: float, updates: int = _UPDATES) -> tuple[float, float]:
+        """Return gain and minus the logarithm of the likelihood after more updates.
 
         Strengths are kept from one delay to the next.
         """
-        first, part = min(int(delay), _MOST_DELAY), delay - min(int(delay), _MOST_DELAY)
-        share = {first: 1 - part, first + 1: part}
-        lags, weights = list(share), np.array(list(share.values()))
-        crossed = np.tensordot(self._products[:, 0, lags], weights, (1, 0))
-        within = self._products[:, lags][:, :, lags]
-        squared = np.tensordot(within, np.outer(weights, weights), ((1, 2), (0, 1)))
-        crossed = crossed + crossed.swapaxes(1, 2)
+        crossed, squared = self._of_delay(delay)
         strength, gain = self._strength, self._gain
         for _ in range(updates):
             inverse = np.linalg.inv(self._model(strength))
@@ -183,10 +229,42 @@ class DelayFits:
             curvature, slope = (float((inverse * matrix).sum()) for matrix in (squared, crossed))
             gain = float(np.clip(0.5 * slope / max(curvature, 1e-300), *GAINS))
         self._strength, self._gain = np.maximum(strength, 1e-12 * strength.max()), gain
-        model, measured = self._model(strength), self._measured(gain, crossed, squared)
-        misfit = float(np.linalg.slogdet(model)[1].sum() + (np.linalg.inv(model) * measured).sum())
-        error = 1 / math.sqrt(2 * self._independent * max(curvature, 1e-300))
-        return gain, error, self._independent * misfit
+        model, measured = self._model(self._strength), self._measured(gain, crossed, squared)
+        unlikely = float(np.linalg.slogdet(model)[1].sum() + (np.linalg.inv(model) * measured).sum())
+        return gain, self._independent * unlikely
+
+    def gain_error(self, delay: float) -> float:
+        """Return the standard error of the latest fit's gain, with the strengths unknown (Fisher)."""
+        crossed, squared = self._of_delay(delay)
+        used = self._strength > _LEAST_STRENGTH * self._strength.max()
+        inverse = np.linalg.inv(self._model(self._strength))
+        parts = inverse @ (self._parts[used] * self._strength[used, None, None, None])
+        change = inverse @ (2 * self._gain * squared - crossed)
+        flat, turned = (values.reshape(len(parts), -1) for values in (parts, parts.swapaxes(-1, -2)))
+        both = flat @ change.swapaxes(-1, -2).ravel()
+        information = 2 * float((inverse * squared).sum()) - both @ np.linalg.pinv(flat @ turned.T) @ both
+        return 1 / math.sqrt(self._independent * max(information, 1e-300))
+
+    def misfit(self, delay: float) -> float:
+        """Return the rms deviation of the latest fit's whitened power, in that of chance; 1 or more.
+
+        Of the mean over all modes, frequency by frequency.
+        """
+        measured = self._measured(self._gain, *self._of_delay(delay))
+        whitened = (np.linalg.inv(self._model(self._strength)) * measured).sum(axis=(1, 2))
+        modes = self._parts.shape[-1]
+        deviation = float(np.square(whitened / modes - 1).mean())
+        return max(1.0, math.sqrt(self._independent * modes * deviation))
+
+    def _of_delay(self, delay: float) -> tuple[Floats, Floats]:
+        """Return products of slopes with the commands of a delay, and of these with themselves."""
+        first, part = min(int(delay), _MOST_DELAY), delay - min(int(delay), _MOST_DELAY)
+        share = {first: 1 - part, first + 1: part}
+        lags, weights = list(share), np.array(list(share.values()))
+        crossed = np.tensordot(self._products[:, 0, lags], weights, (1, 0))
+        within = self._products[:, lags][:, :, lags]
+        squared = np.tensordot(within, np.outer(weights, weights), ((1, 2), (0, 1)))
+        return crossed + crossed.swapaxes(1, 2), np.asarray(squared)
 
     def _model(self, strength: Floats) -> Floats:
         return np.asarray((strength @ self._flat).reshape(self._parts.shape[1:]))
@@ -208,23 +286,23 @@ def with_axes(
     Parameters as for `DelayFits`, which has found `delay`.
     """
     loop = sent_px, run, site, rate_hz
-    gains, errors = np.transpose(
-        [DelayFits(slopes_px, *loop, axis).gain_of(delay.delay_frames) for axis in (0, 1)]
-    )
+    of_axes = np.array([DelayFits(slopes_px, *loop, axis).gains_of(delay.delay_frames) for axis in (0, 1)])
+    alike = int(np.argmin(of_axes[..., 2].sum(axis=0)))  # turbulence is averaged alike along both axes
+    gains, errors = of_axes[:, alike, :2].T
     ratio = float(gains[0] / gains[1])
-    error = ratio * math.hypot(*(errors / gains), _AXES_ERROR)
+    error = ratio * math.hypot(*(errors / gains), _AXES_ERROR * delay.misfit)
     found = replace(delay, measured_x_to_y=ratio, x_to_y_error=error)
     if abs(math.log(ratio)) < _SURE * error / ratio:
         return found
     # Both axes together tell the gain better than each alone.
-    alike = slopes_px / replace(found, gain=1.0, x_to_y=ratio).gains(len(site.positions_m))
-    fit = DelayFits(alike, *loop).of(delay.delay_frames)
-    return replace(found, gain=fit.gain, gain_error=fit.gain_error, x_to_y=ratio)
+    equal = slopes_px / replace(found, gain=1.0, x_to_y=ratio).gains(len(site.positions_m))
+    fit = DelayFits(equal, *loop).of(delay.delay_frames).for_control()
+    return replace(found, gain=fit.gain, gain_error=fit.gain_error, x_to_y=ratio, misfit=fit.misfit)
 
 
-def _model_error(gain: float) -> float:
+def _model_error(gain: float, misfit: float) -> float:
     """Return the error of a gain as spectra of real slopes differ from the theory."""
-    return _GAIN_ERROR * math.hypot(1, gain)
+    return _GAIN_ERROR * math.hypot(1, gain) * misfit
 
 
 def _modes(site: SlopeTurbulence, axis: int | None) -> Floats:
@@ -286,8 +364,14 @@ def _bins(length: int) -> NDArray[np.int64]:
     return np.arange(1, length // 2, 2)
 
 
-def _turbulence(site: SlopeTurbulence, rate_hz: float, window: Floats, basis: Floats) -> Floats:
-    """Return cross-spectra (speeds + 1, frequencies, m, m) of turbulence from anywhere and of white noise."""
+def _turbulence(
+    site: SlopeTurbulence, rate_hz: float, window: Floats, basis: Floats, axis: int | None
+) -> Floats:
+    """Return cross-spectra (parts + 1, frequencies, m, m) of turbulence and of white noise.
+
+    The turbulence is from anywhere; of one axis, it comes from each direction, as winds along x change slopes
+    along x more than those along y.
+    """
     bins = _bins(len(window))
     spectra = SlopeSpectra(site, 1 / rate_hz, window, bins, max(_SPEEDS_M_PER_S) * len(window) / rate_hz)
     tables, _ = spectra.tables(site.outer_scale_m)
@@ -295,7 +379,8 @@ def _turbulence(site: SlopeTurbulence, rate_hz: float, window: Floats, basis: Fl
     parts = []
     for speed in _SPEEDS_M_PER_S:
         winds = speed * np.column_stack([np.cos(angles), np.sin(angles)])
-        full = spectra.matrices(np.mean([spectra.of_wind(wind, tables) for wind in winds], axis=0))
-        parts.append(basis.T @ full.real @ basis)
+        full = [spectra.of_wind(wind, tables) for wind in winds]
+        for distinct in full if axis is not None else [np.mean(full, axis=0)]:
+            parts.append(basis.T @ spectra.matrices(distinct).real @ basis)
     noise = np.broadcast_to(np.eye(basis.shape[1]), parts[0].shape)
     return np.array([*parts, noise])

@@ -98,7 +98,7 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
             "keep the integrator, and record more frames, or check that slopes, commands and matrix are of "
             "one loop"
         )
-    return fit, used
+    return fit, used.for_control()
 
 
 def with_axes_of(loop: Recording, delay: LoopDelay) -> LoopDelay:
