@@ -29,7 +29,7 @@ from faintspot.experiments.closed_loop.methods import with_choice
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.learning import learnt_control
-from faintspot.loop.simulation.simulation import DisabledErrors, _Loop
+from faintspot.loop.simulation.simulation import _Loop
 from faintspot.loop.simulation.telescope.model import LoopOptics, TelescopeModel, prepare
 from faintspot.loop.turbulence.slope_covariance import phase_covariance_rad2
 
@@ -240,7 +240,7 @@ class PixelLoop(_Loop):
     def step(self, frame: int) -> None:
         """Simulate one frame."""
         model, commands = self.model, self.line.acting
-        time = self.disabled_errors.time_s(frame, self.configuration.control.frame_rate_hz)
+        time = (frame + 0.5) / self.configuration.control.frame_rate_hz
         after, seen = self.telescope_model.wavefronts(time, commands)
         self._observe(frame, time, after)
         mean = self.from_slopes @ self.predictor.mean_px
@@ -264,8 +264,8 @@ def closed_loop(configuration: LoopConfiguration, realisations: int) -> None:
     print(f"{configuration.name}, {configuration.photons:g} photo-electrons, filter: {learnt.description}")
     found = []
     for realisation in range(realisations):
-        which = np.zeros(configuration.run.frames, np.int64)
-        what = configuration, [(method, learnt)], which, configuration.run.seed, realisation, DisabledErrors()
+        which, numbers = np.zeros(configuration.run.frames, np.int64), np.arange(configuration.run.frames)
+        what = configuration, [(method, learnt)], which, configuration.run.seed, realisation, numbers
         by_slopes, by_pixels = _Loop(*what), PixelLoop(*what)
         by_pixels.begin(model, learnt.predictor())
         found.append([each.run(None).rows["strehl"][settle:].mean() for each in (by_slopes, by_pixels)])

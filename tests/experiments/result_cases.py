@@ -3,7 +3,7 @@
 import numpy as np
 
 import faintspot as fs
-from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
+from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.loop.simulation import LoopConfiguration
 from faintspot.slopes.pipeline.configuration import to_text
 
@@ -14,7 +14,6 @@ LABELS = (
     "maximum likelihood",
     "maximum likelihood, weighted reconstructor",
 )
-TERMS = ("nothing", "photon and read noise", "slope error")
 
 
 def made_up_magnitude(gain_mag: float = 0.3, realisations: int = 6) -> MagnitudeResult:
@@ -44,9 +43,3 @@ def made_up_magnitude(gain_mag: float = 0.3, realisations: int = 6) -> Magnitude
         np.full(shape, '{"loop_gain": 0.5}'),
         LoopConfiguration().to_text(),
     )
-
-
-def made_up_budget() -> BudgetResult:
-    """Two methods, three terms, five realisations."""
-    strehl = np.array([0.4, 0.5, 0.6])[None, :, None] + np.random.default_rng(1).normal(0, 0.01, (2, 3, 5))
-    return BudgetResult(NAMES[:2], TERMS, LABELS[:2], strehl, 100 / strehl)

@@ -13,7 +13,7 @@ from faintspot.cli.shared.needs import needs
 from faintspot.experiments.store import kind_of_store
 from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.locations import split_location
-from faintspot.loop.simulation.record import holds_loop_results
+from faintspot.loop.simulation.record import MAGNITUDE_FILE, holds_loop_results
 
 
 @needs("report", "matplotlib", "jinja2")
@@ -56,9 +56,9 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
     target = Path(output) if output is not None else derived(paths[0], ".html")
     if len(paths) == 1 and holds_loop_results(paths[0]):
         from faintspot.experiments.closed_loop.page import loop_page
-        from faintspot.experiments.closed_loop.verdict import LoopResults
+        from faintspot.experiments.closed_loop.results import MagnitudeResult
 
-        report = loop_page(LoopResults.load(paths[0]))
+        report = loop_page(MagnitudeResult.load(paths[0] / MAGNITUDE_FILE))
         target = target if output is not None else paths[0] / "report.html"
     elif len(paths) == 1 and kind_of_store(paths[0]) == "study":
         from faintspot.experiments.report.page import report_of_study

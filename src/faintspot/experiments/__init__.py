@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from faintspot.base.lazy import lazy_attributes
 
 if TYPE_CHECKING:
-    from faintspot.experiments.closed_loop.budget import run_budget as run_budget
     from faintspot.experiments.closed_loop.magnitude import run_magnitude as run_magnitude
     from faintspot.experiments.planner.answer import Answer as Answer
     from faintspot.experiments.planner.figures import tune_figure as tune_figure
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 _NAMES = {
     "planner.answer": "Answer",
     "planner.figures": "tune_figure",
-    "closed_loop.budget": "run_budget",
     "study.cell": "measure_cell",
     "closed_loop.magnitude": "run_magnitude",
     "planner.promise": "Promise check_promises",

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from tests.cli.cli_cases import Commands
 from tests.experiments.experiment_cases import SEARCH, small
+from tests.experiments.result_cases import made_up_magnitude
 
 from faintspot.cli.loop import command
-from faintspot.experiments.closed_loop import budget, experiment, magnitude
+from faintspot.experiments.closed_loop import experiment, magnitude
+from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.night import page, protocol
 from faintspot.experiments.night.blocks import load_night
 from faintspot.experiments.night.protocol import NightPlan
@@ -25,8 +27,6 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(autouse=True)
 def _small_experiments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(experiment, "QUICK", SEARCH)
-    terms = {name: budget.TERMS[name] for name in ("nothing", "slope error")}
-    monkeypatch.setattr(budget, "TERMS", terms)
     monkeypatch.chdir(tmp_path)
     faint = small().replace("camera", em_gain=100.0).replace("run", photons_per_subaperture=(40.0, 400.0))
     Path("small.toml").write_text(faint.to_text(), encoding="utf-8")
@@ -98,23 +98,19 @@ def test_what_magnitude_recommends_is_for_the_configuration(
 ) -> None:
     measured: list[Any] = []
     saved: list[Any] = []
-    monkeypatch.setattr(command, "_measure", lambda *what, **options: measured.append((what, options)))
-    monkeypatch.setattr(magnitude, "save_recommended", lambda *what: saved.append(what))
+
+    def measure(*what: Any, pool: Any, **options: Any) -> MagnitudeResult:
+        measured.append((what, options))
+        return made_up_magnitude()
+
+    monkeypatch.setattr(magnitude, "run_magnitude", measure)
+    monkeypatch.setattr(magnitude, "save_recommended", lambda *what: saved.append(what[1:]))
+    Path("here").mkdir()
     given = ("--methods", "tv,ml", "--flux-e", "20,50", "--write-config", "best.toml", "--workers", 2)
-    run.ok("loop", "magnitude", "small.toml", "--quick", *given)
-    [(what, options)] = measured
-    assert what == ("small.toml", "magnitude", magnitude.run_magnitude, ("tv", "ml"), (20.0, 50.0))
-    assert options == {"output": None, "quick": True, "overwrite": False, "workers": 2, "scheduler": None}
-    assert saved == [(None, load_loop("small.toml"), "best.toml")]
-
-
-def test_budget(run: Commands) -> None:
-    result = run("loop", "budget", "small.toml", "--quick", "--workers", 0, "--methods", "centroid")
-    assert result.code == 0, result.err
-    lines = result.out.splitlines()
-    assert lines[1].startswith("centre of gravity")
-    assert "slope error" in lines[2]
-    assert lines[-1] == "small-quick/report.html: open it in a browser"
+    run.ok("loop", "magnitude", "small.toml", "-o", "here", *given)
+    loop = load_loop("small.toml")
+    assert measured == [((loop, "here", ("tv", "ml"), (20.0, 50.0)), {"quick": False, "overwrite": False})]
+    assert saved == [(loop, "best.toml")]
 
 
 def test_engine_files_close_the_loop(run: Commands) -> None:
@@ -139,8 +135,7 @@ def test_engine_files_close_the_loop(run: Commands) -> None:
         (["engine", "small.toml", "--frame-rate-hz", "0"], "frame_rate_hz"),
         (["magnitude", "small.toml", "--flux-e", "1,x"], "--flux-e 1,x: expected numbers with commas"),
         (["magnitude", "small.toml", "--flux-e", "-1"], "photons"),
-        (["budget", "small.toml", "-o", "no/where"], "the folder no does not exist"),
-        (["budget", "open_loop"], "expected 'closed' for an error budget"),
+        (["magnitude", "small.toml", "-o", "no/where"], "the folder no does not exist"),
     ],
 )
 def test_errors_are_one_line(run: Commands, arguments: list[str], message: str) -> None:

@@ -23,7 +23,6 @@ NEEDING = {
     "study paper --quick": "loop",
     "study estimators --quick": "loop",
     "loop magnitude --quick": "loop",
-    "loop budget --quick": "loop",
     "realtime run": "realtime",
     "realtime bridge stream": "realtime",
     "realtime record night.zarr": "realtime",
@@ -33,7 +32,6 @@ NEEDING = {
     "tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100 -o new.toml --picture tune.png": "report",
     "layout frames.npy -o new.toml --picture layout.png": "report",
     "wavefront slopes.npz --picture wavefront.png": "report",
-    "wavefront slopes.npz --map map.fits": "io",
 }
 # In a process where nothing has imported an optional package before, and nothing can.
 _WITHOUT = """

@@ -2,18 +2,18 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.experiments.result_cases import made_up_budget, made_up_magnitude
+from tests.experiments.result_cases import made_up_magnitude
 
 from faintspot.base.report.page import FigureWithData
 from faintspot.experiments.closed_loop.page import loop_page, loop_warnings
-from faintspot.experiments.closed_loop.verdict import NOWHERE, LoopResults
+from faintspot.experiments.closed_loop.verdict import NOWHERE
 
 pytest.importorskip("hcipy")
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
 def test_the_page_holds_everything() -> None:
-    page = loop_page(LoopResults(made_up_magnitude(), made_up_budget()))
+    page = loop_page(made_up_magnitude())
     text = page.html()
     assert "limiting magnitude" in text
     for bad in ("nan", "None", "{{"):
@@ -25,15 +25,8 @@ def test_the_page_holds_everything() -> None:
 
 @pytest.mark.usefixtures("undrawn_pictures")
 def test_the_page_says_when_tv_gains_nothing() -> None:
-    page = loop_page(LoopResults(made_up_magnitude(-0.3))).html()
+    page = loop_page(made_up_magnitude(-0.3)).html()
     assert NOWHERE in page
-
-
-@pytest.mark.usefixtures("undrawn_pictures")
-def test_what_was_not_run_is_said() -> None:
-    page = loop_page(LoopResults(budget=made_up_budget())).html()
-    assert "Not run: “faintspot loop magnitude” does that." in page
-    assert "Nothing to compare yet." in page
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
@@ -42,19 +35,19 @@ def test_unfinished_results_make_a_page() -> None:
     strehl = whole.strehl.copy()
     strehl[1, 2:] = np.nan
     strehl[3] = np.nan
-    results = LoopResults(magnitude=dataclasses.replace(whole, strehl=strehl))
+    results = dataclasses.replace(whole, strehl=strehl)
     assert "runs are still missing" in loop_warnings(results)[0]
     page = loop_page(results).html()
     assert ">nan" not in page
-    nothing = LoopResults(magnitude=dataclasses.replace(whole, strehl=np.full_like(strehl, np.nan)))
+    nothing = dataclasses.replace(whole, strehl=np.full_like(strehl, np.nan))
     assert ">nan" not in loop_page(nothing).html()
 
 
 def test_few_realisations_are_warned_of() -> None:
-    lines = loop_warnings(LoopResults(made_up_magnitude(realisations=2)))
+    lines = loop_warnings(made_up_magnitude(realisations=2))
     assert any("fewer than 5" in line for line in lines)
 
 
 def test_sections_have_different_names() -> None:
-    names = [section.name for section in loop_page(LoopResults(made_up_magnitude())).sections]
+    names = [section.name for section in loop_page(made_up_magnitude()).sections]
     assert len(set(names)) == len(names)

@@ -3,12 +3,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.experiments.result_cases import made_up_budget, made_up_magnitude
+from tests.experiments.result_cases import made_up_magnitude
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError
-from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
-from faintspot.loop.simulation.record import BUDGET_FILE, MAGNITUDE_FILE, holds_loop_results, make_folder
+from faintspot.experiments.closed_loop.results import MagnitudeResult
+from faintspot.loop.simulation.record import MAGNITUDE_FILE, holds_loop_results, make_folder
 
 
 def assert_equal(one: Any, other: Any) -> None:
@@ -31,12 +31,6 @@ def test_magnitude_is_read_as_written(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == [MAGNITUDE_FILE]
 
 
-def test_budget_is_read_as_written(tmp_path: Path) -> None:
-    result = made_up_budget()
-    result.save(tmp_path / BUDGET_FILE)
-    assert_equal(BudgetResult.load(tmp_path / BUDGET_FILE), result)
-
-
 def test_other_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
     with pytest.raises(InputError, match="no such file"):
@@ -44,9 +38,6 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     path.write_bytes(b"nothing")
     with refused("expected a magnitude experiment"):
         MagnitudeResult.load(path)
-    made_up_magnitude().save(path)
-    with pytest.raises(InputError, match="expected an error budget of format 2"):
-        BudgetResult.load(path)
 
 
 def test_folders_that_cannot_be(tmp_path: Path) -> None:

@@ -4,15 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.experiments.result_cases import LABELS, made_up_budget, made_up_magnitude
-from tests.refusals import refused
+from tests.experiments.result_cases import LABELS, made_up_magnitude
 
-from faintspot.experiments.closed_loop.budget import TERMS
 from faintspot.experiments.closed_loop.magnitude import save_recommended
-from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult
+from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.closed_loop.verdict import (
     NOWHERE,
-    LoopResults,
     better_and_worse,
     equal_methods,
     loop_summary,
@@ -22,20 +19,19 @@ from faintspot.experiments.closed_loop.verdict import (
     tv_method,
 )
 from faintspot.loop.simulation.configuration.configuration import load_loop
-from faintspot.loop.simulation.record import BUDGET_FILE, MAGNITUDE_FILE
 from faintspot.slopes.pipeline.settings import Settings
 
 pytest.importorskip("hcipy")
 
 
 def test_no_gain_anywhere_is_said_exactly() -> None:
-    lines = loop_verdict(LoopResults(made_up_magnitude(-0.3)))
+    lines = loop_verdict(made_up_magnitude(-0.3))
     assert lines[0].startswith(NOWHERE)
     assert "lowers it beyond its error" in lines[0]
 
 
 def test_a_gain_is_said() -> None:
-    lines = loop_verdict(LoopResults(made_up_magnitude(0.3)))
+    lines = loop_verdict(made_up_magnitude(0.3))
     assert NOWHERE not in " ".join(lines)
     assert "beyond its error in" in lines[0]
 
@@ -52,20 +48,10 @@ def test_methods_are_found_by_their_names() -> None:
     assert not below
 
 
-def test_results_are_read_from_a_folder(tmp_path: Path) -> None:
-    with refused("no results of a loop"):
-        LoopResults.load(tmp_path)
-    made_up_magnitude().save(tmp_path / MAGNITUDE_FILE)
-    made_up_budget().save(tmp_path / BUDGET_FILE)
-    found = LoopResults.load(tmp_path)
-    assert found.magnitude is not None
-    assert found.budget is not None
-
-
 def test_gains_are_said_against_the_strongest_baseline_first() -> None:
     result = dataclasses.replace(made_up_magnitude(), names=("brightest", "tv", "window", "ml"))
     assert reference_methods(result) == [2, 0]
-    lines = [line for line in loop_verdict(LoopResults(magnitude=result)) if line.startswith("Magnitudes")]
+    lines = [line for line in loop_verdict(result) if line.startswith("Magnitudes")]
     against = [line.split(" against ")[1].split(":")[0] for line in lines]
     window, brightest = result.labels[2], result.labels[0]
     assert against == [window, window, window, brightest, brightest]
@@ -92,7 +78,7 @@ def result() -> MagnitudeResult:
 
 def summary(result: MagnitudeResult, realisations: int = 5) -> str:
     few = {name: getattr(result, name)[:, :, :realisations] for name in ("strehl", "centroid_gain")}
-    return loop_summary(LoopResults(magnitude=replace(result, **few)))
+    return loop_summary(replace(result, **few))
 
 
 def test_the_summary_of_magnitudes_has_errors_and_a_verdict(result: MagnitudeResult) -> None:
@@ -109,16 +95,6 @@ def test_few_realisations_have_no_error_and_name_no_gain(result: MagnitudeResult
     assert "nan" not in single
     assert "0.100 ±" not in single
     assert "limiting magnitude" not in summary(result, 2)  # not a figure of a gain whose error is not known
-
-
-def test_the_summary_of_a_budget_has_every_term() -> None:
-    shape = (1, len(TERMS), 3)
-    strehl = np.broadcast_to(np.linspace(0.3, 0.9, len(TERMS))[:, None], shape)
-    residual = np.full(shape, 150.0)
-    result = BudgetResult(("brightest",), tuple(TERMS), ("brightest pixels",), strehl, residual)
-    lines = loop_summary(LoopResults(budget=result)).splitlines()
-    assert len(lines) == 1 + len(TERMS)
-    assert lines[1].split() == ["brightest", "pixels", "–", "0.300", "±", "0.000", "150", "±", "0"]
 
 
 def test_the_simplest_of_equal_methods_is_recommended() -> None:
@@ -140,7 +116,7 @@ def test_the_simplest_of_equal_methods_is_recommended() -> None:
     assert equal_methods(made, 0) == [3]
     level = replace(made, strehl=np.concatenate([strehl[:3], strehl[1:2] + steps / 10]))
     assert equal_methods(level, 0) == [1, 2, 3]
-    text = " ".join(loop_verdict(LoopResults(made)))
+    text = " ".join(loop_verdict(made))
     assert "Recommended at magnitude 10.00 (50 e-): map+kalman (loop_gain 0.3)." in text
     nothing = replace(made, strehl=np.full(strehl.shape, np.nan))
     assert equal_methods(nothing, 0) == []

@@ -14,7 +14,6 @@ from faintspot.loop.simulation import LoopConfiguration, Method, simulate_loop
 from faintspot.loop.simulation.engine_files import fixed_window
 from faintspot.loop.simulation.learning import learnt_control, recorded_loop
 from faintspot.loop.simulation.methods import PRIOR
-from faintspot.loop.simulation.simulation import DisabledErrors
 from faintspot.loop.simulation.telescope.model import prepare
 
 LEARNT = [kind for kind in CONTROLS if kind != INTEGRATOR]
@@ -97,7 +96,7 @@ def test_control_needs_a_closed_loop_and_the_whole_run() -> None:
 
 def test_true_slopes_have_no_prior() -> None:
     short = FAINT.replace("run", frames=60, settle_frames=20)
-    record = simulate_loop(short, [_method("kalman")], disabled_errors=DisabledErrors(true_slopes=True))
+    record = simulate_loop(short, [replace(_method("kalman"), variants=("true",))])
     assert np.isfinite(record.commands).all()
     assert record.mean_strehl() > 0.5
 

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from tests.loop.simulation.best_fit import BestFit
 from tests.loop.simulation.loop_cases import PLAIN, faint, plain, quiet
 
 import faintspot as fs
@@ -8,7 +9,6 @@ from faintspot.loop.simulation import LoopRecord, Method, load_loop, simulate_lo
 from faintspot.loop.simulation.simulation import measure_gains
 from faintspot.loop.simulation.telescope.atmosphere import make_atmosphere
 from faintspot.loop.simulation.telescope.calibration import make_pipeline
-from faintspot.loop.simulation.telescope.mirror import BestFit
 from faintspot.loop.simulation.telescope.model import prepare
 
 pytest.importorskip("hcipy")

@@ -96,7 +96,10 @@ def magnitude(
     methods: Names | None,
     flux_e: tuple[float, ...] | None,
     write_config: str | None,
-    **options: Any,
+    output: str | None,
+    quick: bool,
+    overwrite: bool,
+    **processes: Any,
 ) -> None:
     """Measure the Strehl ratio of any list of methods against the star's magnitude.
 
@@ -115,38 +118,21 @@ def magnitude(
       faintspot loop magnitude camera_3e --methods brightest,smoothed,tv,ml --flux-e 60,200,640
     """
     from faintspot.experiments.closed_loop.magnitude import run_magnitude, save_recommended
+    from faintspot.experiments.closed_loop.page import loop_page
+    from faintspot.experiments.closed_loop.verdict import loop_summary
     from faintspot.loop.simulation.configuration.configuration import load_loop
 
-    result = _measure(configuration, "magnitude", run_magnitude, _methods(methods), flux_e, **options)
+    loop = load_loop(configuration)
+    folder, methods = output or (f"{loop.name}-quick" if quick else loop.name), _methods(methods)
+    with worker_pool("loop", **processes) as pool:
+        result = run_magnitude(loop, folder, methods, flux_e, quick=quick, pool=pool, overwrite=overwrite)
+    click.echo(loop_summary(result))
+    page = Path(folder) / "report.html"
+    loop_page(result).write(page)
+    click.echo(f"{shlex.quote(str(page))}: open it in a browser")
     if write_config is not None:
-        loop = save_recommended(result, load_loop(configuration), write_config)
-        click.echo(f"{write_config}: written, and {loop}, the loop with this star and gain")
-
-
-@_needs_loop
-@command.command(short_help="Measure what limits the Strehl ratio.")
-@_compared
-@option(
-    "--methods",
-    type=NAMES,
-    metavar="NAMES",
-    help="Methods, with commas.",
-    show_default="brightest,smoothed,tv",
-)
-def budget(configuration: str, methods: Names | None, **options: Any) -> None:
-    """Measure what limits the Strehl ratio, by switching off one term of the error after another.
-
-    At the configuration's own flux, each method is tuned and then runs without photon and read noise, without
-    delay of the loop, without what the mirror cannot correct, with its actual centroid gain, and with the
-    wavefront's true slopes.
-
-    \b
-    Examples:
-      faintspot loop budget camera_3e --quick
-    """
-    from faintspot.experiments.closed_loop.budget import run_budget
-
-    _measure(configuration, "budget", run_budget, _methods(methods), **options)
+        beside = save_recommended(result, loop, write_config)
+        click.echo(f"{write_config}: written, and {beside}, the loop with this star and gain")
 
 
 @_needs_loop
@@ -257,32 +243,6 @@ def engine(configuration: str, output: str, control: str, frame_rate_hz: float |
         loop = loop.replace("control", frame_rate_hz=frame_rate_hz)
     path = write_engine_files(loop, output, control)
     click.echo(f"{path} written; next: faintspot realtime run --config {shlex.quote(str(path))} --close-loop")
-
-
-def _measure(
-    configuration: str,
-    name: str,
-    run: Callable[..., Any],
-    *what: object,
-    output: str | None,
-    quick: bool,
-    overwrite: bool,
-    **processes: Any,
-) -> Any:
-    """Run an experiment with a progress bar, print its summary, write its page, and return the result."""
-    from faintspot.experiments.closed_loop.page import loop_page
-    from faintspot.experiments.closed_loop.verdict import LoopResults, loop_summary
-    from faintspot.loop.simulation.configuration.configuration import load_loop
-
-    loop = load_loop(configuration)
-    folder = output or (f"{loop.name}-quick" if quick else loop.name)
-    with worker_pool("loop", **processes) as pool:
-        result = run(loop, folder, *what, quick=quick, pool=pool, overwrite=overwrite)
-    click.echo(loop_summary(LoopResults(**{name: result})))
-    page = Path(folder) / "report.html"
-    loop_page(LoopResults.load(folder)).write(page)
-    click.echo(f"{shlex.quote(str(page))}: open it in a browser")
-    return result
 
 
 def _methods(names: Names | None) -> Names | None:

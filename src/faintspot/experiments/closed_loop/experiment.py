@@ -31,7 +31,7 @@ from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import make_folder
-from faintspot.loop.simulation.simulation import DisabledErrors, simulate_loop
+from faintspot.loop.simulation.simulation import simulate_loop
 
 _QUICK_RUN = {"frames": 300, "settle_frames": 60, "realisations": 2}
 _NO_LOSS = 0.02  # of Strehl ratio: the best one of many short runs is that much too high
@@ -68,10 +68,8 @@ class Experiment:
         self._search = search or (QUICK if quick else Search())
         self._pool = pool or WorkerPool()
 
-    def measured(
-        self, kinds: Sequence[Method], columns: Mapping[str, tuple[float, DisabledErrors]]
-    ) -> dict[str, NDArray[Any]]:
-        """Tune every method at every flux, then score it in every column.
+    def measured(self, kinds: Sequence[Method], fluxes: Sequence[float]) -> dict[str, NDArray[Any]]:
+        """Tune every method at every flux, then score it.
 
         Slopes are tuned first, with the integrator, also of methods whose control learns: all their options
         at each flux alone, then the loop gain with smoothed options, which are kept where they lose nothing.
@@ -80,16 +78,16 @@ class Experiment:
         Parameters
         ----------
         kinds : sequence of Method
-        columns : mapping
-            Flux and errors that are switched off, by name.
+        fluxes : sequence of float
+            Photo-electrons of a fully lit sub-aperture in a frame.
 
         Returns
         -------
         dict
-            What `scored_runs` returns, (methods, columns, realisations), and "choices", (methods, columns):
+            What `scored_runs` returns, (methods, fluxes, realisations), and "choices", (methods, fluxes):
             JSON text of the tuned values.
         """
-        stars = {flux: with_flux(self.configuration, flux) for flux, _ in columns.values()}
+        stars = {flux: with_flux(self.configuration, flux) for flux in fluxes}
         plain = list({kind.name: kind for kind in map(with_integrator, kinds)}.values())
         learning = [kind for kind in kinds if kind.control != INTEGRATOR]
         guess: Choices = {
@@ -101,21 +99,21 @@ class Experiment:
             self._tuning(plain, stars, {}),
             self._tuning(plain, stars, guess),
             self._tuning(learning, stars, guess),
-            self._scoring(kinds, columns, stars, {}),
+            self._scoring(kinds, stars, {}),
         )
         sizes = [sum(unit.size for unit in units.values()) for units in expected]
         alone, again, control, scoring = in_stages(self._pool, sizes)
         choices = self._choices(plain, stars, alone, again)
         of_control = self._tuned("tuning of control", learning, stars, choices, control)
         choices |= {key: tuned.choice for key, tuned in of_control.items()}
-        units = self._scoring(kinds, columns, stars, choices)
+        units = self._scoring(kinds, stars, choices)
         results = self._run("scoring", scored_runs, units, scoring)
-        scored = [[results[units[kind.name, name].key] for name in columns] for kind in kinds]
+        scored = [[results[units[kind.name, name].key] for name in stars] for kind in kinds]
         arrays = {
             name: np.array([[each[name] for each in row] for row in scored])
-            for name in ("strehl", "residual_nm", "centroid_gain", "settings")
+            for name in ("strehl", "centroid_gain", "settings")
         }
-        texts = [[to_json(choices[kind.name, flux]) for flux, _ in columns.values()] for kind in kinds]
+        texts = [[to_json(choices[kind.name, flux]) for flux in stars] for kind in kinds]
         return {**arrays, "choices": np.array(texts)}
 
     def _choices(
@@ -159,17 +157,16 @@ class Experiment:
     def _scoring(
         self,
         kinds: Sequence[Method],
-        columns: Mapping[str, tuple[float, DisabledErrors]],
         stars: Stars,
         choices: Choices,
-    ) -> dict[tuple[str, str], Unit]:
+    ) -> dict[tuple[str, float], Unit]:
         run, units = self.configuration.run, {}
         for kind in kinds:
             size = run.realisations * run.frames + learning_frames(kind, self.configuration)
-            for name, (flux, off) in columns.items():
-                arguments = stars[flux], choices.get((kind.name, flux)), off
-                key = f"{kind.name}-{name}-{_digest(arguments)}"
-                units[kind.name, name] = Unit(key, (kind, *arguments), size)
+            for flux, star in stars.items():
+                arguments = star, choices.get((kind.name, flux))
+                key = f"{kind.name}-{flux:g}-{_digest(arguments)}"
+                units[kind.name, flux] = Unit(key, (kind, *arguments), size)
         return units
 
     def _run(
@@ -194,14 +191,14 @@ def _digest(value: object) -> str:
 
 
 def scored_runs(
-    kind: Method, star: LoopConfiguration, choice: Choice, off: DisabledErrors, advance: Advance
+    kind: Method, star: LoopConfiguration, choice: Choice, advance: Advance
 ) -> dict[str, NDArray[np.generic]]:
     """Run a tuned method in all realisations of the turbulence, in one process: control learns only once.
 
     Returns
     -------
     dict
-        Long-exposure Strehl ratio, rms of the wavefront, centroid gain and settings as TOML, (realisations,).
+        Long-exposure Strehl ratio, centroid gain and settings as TOML, (realisations,).
     """
     method, frames, results = with_choice(kind, star, choice), star.run.frames, []
     for run in range(star.run.realisations):
@@ -209,12 +206,10 @@ def scored_runs(
         def progress(done: int, total: int, before: int = run * frames) -> None:
             advance(before + done)
 
-        record = simulate_loop(star, [method], realisation=run, progress=progress, disabled_errors=off)
-        scored = record.scored & off.settled(record.frames)
-        residual_nm = np.sqrt(np.mean(record.residual_nm[scored] ** 2))
-        gain, settings = record.centroid_gain[0], record.method_settings[0]
-        results.append((record.strehl[scored].mean(), residual_nm, gain, settings))
-    names = "strehl", "residual_nm", "centroid_gain", "settings"
+        record = simulate_loop(star, [method], realisation=run, progress=progress)
+        strehl = record.strehl[record.scored].mean()
+        results.append((strehl, record.centroid_gain[0], record.method_settings[0]))
+    names = "strehl", "centroid_gain", "settings"
     return {name: np.array(values) for name, values in zip(names, zip(*results, strict=True), strict=True)}
 
 

@@ -21,7 +21,6 @@ from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import MAGNITUDE_FILE
-from faintspot.loop.simulation.simulation import DisabledErrors
 from faintspot.loop.simulation.telescope.calibration import camera_calibration
 from faintspot.slopes.estimators.base import Need
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
@@ -88,7 +87,7 @@ def run_magnitude(
     photons = photons if photons is not None else configuration.run.photons_per_subaperture
     fluxes = _checked_fluxes(photons, quick)
     experiment = Experiment(configuration, folder, KIND, quick, search, pool, overwrite)
-    found = experiment.measured(kinds, {f"{flux:g}": (flux, DisabledErrors()) for flux in fluxes})
+    found = experiment.measured(kinds, fluxes)
     result = MagnitudeResult(
         tuple(kind.name for kind in kinds),
         tuple(kind.label for kind in kinds),

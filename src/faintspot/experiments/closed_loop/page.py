@@ -11,8 +11,8 @@ from faintspot.base.report.plots import Line, Panel
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import paired_mean
 from faintspot.experiments.closed_loop.results import MagnitudeResult, differences_by_flux
-from faintspot.experiments.closed_loop.tables import budget_table, gain_table, settings_table, strehl_table
-from faintspot.experiments.closed_loop.verdict import LoopResults, loop_verdict, reference_methods
+from faintspot.experiments.closed_loop.tables import gain_table, settings_table, strehl_table
+from faintspot.experiments.closed_loop.verdict import loop_verdict, reference_methods
 from faintspot.loop.control.base import split_control
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.slopes.estimators.base import Style
@@ -24,43 +24,34 @@ _DODGE = 0.008  # of the axis, between methods at the same magnitude
 _LEARNING_LINE = (0, (6, 1.5, 1, 1.5))
 
 
-def loop_page(results: LoopResults) -> Report:
+def loop_page(result: MagnitudeResult) -> Report:
     """Return the report page of closed-loop results."""
-    text = "" if results.magnitude is None else results.magnitude.configuration
-    configuration = _configuration(text)
+    configuration = _configuration(result.configuration)
     wavelength_um = 1.65 if configuration is None else configuration.science.wavelength_m * 1e6
     name = "" if configuration is None else f": “{configuration.name}”"
     sections = [
-        _TEXT.section("verdict", *loop_verdict(results)),
-        *_of_magnitudes(results.magnitude, f"Strehl ratio at {wavelength_um:.3g} µm"),
-        _TEXT.section("budget", None if results.budget is None else budget_table(results.budget)),
-        configuration_section(text),
+        _TEXT.section("verdict", *loop_verdict(result)),
+        *_of_magnitudes(result, f"Strehl ratio at {wavelength_um:.3g} µm"),
+        configuration_section(result.configuration),
     ]
     facts = {} if configuration is None else _facts(configuration)
-    return Report(f"Closed loop{name}", facts, sections, loop_warnings(results), remark=POSITIONS)
+    return Report(f"Closed loop{name}", facts, sections, loop_warnings(result), remark=POSITIONS)
 
 
-def loop_warnings(results: LoopResults) -> list[str]:
+def loop_warnings(result: MagnitudeResult) -> list[str]:
     """Return what a reader should know before the results: what is unfinished or too little."""
-    lines = []
-    for name, result in (("magnitude", results.magnitude), ("budget", results.budget)):
-        if result is not None:
-            missing, count = int(np.isnan(result.strehl).sum()), result.strehl.shape[-1]
-            lines += _TEXT.lines(
-                "loop.warnings",
-                name=_TEXT[f"{name}.title"],
-                missing=missing or None,
-                runs=result.strehl.size,
-                few=count if count < _FEW_REALISATIONS else None,
-                fewest=_FEW_REALISATIONS,
-            )
-    return lines
+    missing, count = int(np.isnan(result.strehl).sum()), result.strehl.shape[-1]
+    return _TEXT.lines(
+        "loop.warnings",
+        missing=missing or None,
+        runs=result.strehl.size,
+        few=count if count < _FEW_REALISATIONS else None,
+        fewest=_FEW_REALISATIONS,
+    )
 
 
-def _of_magnitudes(result: MagnitudeResult | None, strehl: str) -> list[Section]:
+def _of_magnitudes(result: MagnitudeResult, strehl: str) -> list[Section]:
     """Return the sections of Strehl against magnitude; `strehl` is the label of an axis."""
-    if result is None:
-        return [_TEXT.section("magnitude")]
     references = reference_methods(result)
     gains = [
         gain_table(result, [n for n in range(len(result.labels)) if n not in references[: rank + 1]], method)

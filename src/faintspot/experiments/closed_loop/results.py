@@ -175,25 +175,6 @@ class MagnitudeResult(NpzFile):
     """TOML text."""
 
 
-@dataclass(frozen=True, eq=False)
-class BudgetResult(NpzFile):
-    """Error budget: A methods with T terms switched off, R realisations of the air."""
-
-    WHAT: ClassVar[str] = "an error budget"
-    FORMAT: ClassVar[int] = 2
-
-    names: tuple[str, ...]
-    """(A,): of the methods, see `faintspot.loop.simulation.Method.named`."""
-    terms: tuple[str, ...]
-    """(T,): what is switched off; the first is nothing."""
-    labels: tuple[str, ...]
-    """(A,)"""
-    strehl: Floats
-    """(A, T, R): long exposure; NaN where not measured yet."""
-    residual_nm: Floats
-    """(A, T, R): rms of the wavefront after the mirror, root of the mean square over the frames."""
-
-
 def differences_by_flux(result: MagnitudeResult, method: int, reference: int) -> list[Estimate]:
     """Return a method's Strehl less the reference's at each flux, over realisations.
 

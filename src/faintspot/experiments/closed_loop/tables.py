@@ -9,9 +9,8 @@ from faintspot.base.json_text import parse_json
 from faintspot.base.report.page import Table
 from faintspot.base.report.texts import Texts, with_error, with_interval
 from faintspot.base.statistics import paired_mean
-from faintspot.experiments.closed_loop.budget import TERMS
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN
-from faintspot.experiments.closed_loop.results import BudgetResult, MagnitudeResult, gains_in_magnitude
+from faintspot.experiments.closed_loop.results import MagnitudeResult, gains_in_magnitude
 
 _TEXT = Texts("faintspot.experiments")
 
@@ -44,28 +43,9 @@ def settings_table(result: MagnitudeResult) -> Table:
     return _TEXT.table("tables.settings", rows, _stars(result))
 
 
-def budget_table(result: BudgetResult) -> Table:
-    """Return the Strehl ratio and the rms wavefront of every method without each term."""
-    first = result.strehl[0]
-    records = [
-        {
-            "method": name,
-            "term": term if number else "–",
-            "strehl": paired_mean(strehl[number]),
-            "residual": paired_mean(residual[number]),
-            "change": paired_mean(strehl[number] - strehl[0]) if number else None,
-            "less": None if name == result.labels[0] else paired_mean(strehl[number] - first[number]),
-        }
-        for name, strehl, residual in zip(result.labels, result.strehl, result.residual_nm, strict=True)
-        for number, term in enumerate(result.terms)
-    ]
-    meanings = "; ".join(f"{term}: {_TEXT[f'terms.{term}']}" for term in result.terms[1:] if term in TERMS)
-    return _TEXT.table("tables.budget", records, meanings=meanings, first=result.labels[0])
-
-
-def in_columns(table: Table, most: int | None = None) -> str:
-    """Return a table of texts as lines for a terminal, with its first columns alone if there are too many."""
-    rows = [[str(cell) for cell in row[:most]] for row in (table.header, *table.rows)]
+def in_columns(table: Table) -> str:
+    """Return a table of texts as lines for a terminal."""
+    rows = [[str(cell) for cell in row] for row in (table.header, *table.rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ("  ".join(map(str.rjust, row[1:], widths[1:])) for row in rows)
     return "\n".join(f"{row[0]:{widths[0]}}  {line}" for row, line in zip(rows, lines, strict=True))

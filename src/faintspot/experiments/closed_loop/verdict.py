@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from faintspot.base.errors import InputError
 from faintspot.base.json_text import parse_json
 from faintspot.base.report.texts import plain_number, with_interval
 from faintspot.base.statistics import Estimate, paired_mean
 from faintspot.experiments.closed_loop.results import (
-    BudgetResult,
     MagnitudeResult,
     differences_by_flux,
     gains_in_magnitude,
     magnitude_limit,
 )
-from faintspot.experiments.closed_loop.tables import budget_table, in_columns, strehl_table
+from faintspot.experiments.closed_loop.tables import in_columns, strehl_table
 from faintspot.experiments.methods import Knowledge
 from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.methods import VARIANTS, Method
-from faintspot.loop.simulation.record import BUDGET_FILE, MAGNITUDE_FILE
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.estimators.built_in.window import Window
@@ -33,42 +28,14 @@ REFERENCES = Window.name, BrightestPixels.name
 NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
 
 
-@dataclass(frozen=True, eq=False)
-class LoopResults:
-    """Results in a folder; None: not run."""
-
-    magnitude: MagnitudeResult | None = None
-    budget: BudgetResult | None = None
-
-    @classmethod
-    def load(cls, folder: str | Path) -> LoopResults:
-        """Read the results in a folder.
-
-        Raises
-        ------
-        InputError
-            When there are none, or one cannot be read.
-        """
-        folder = Path(folder)
-        results = cls(
-            MagnitudeResult.load(folder / MAGNITUDE_FILE) if (folder / MAGNITUDE_FILE).exists() else None,
-            BudgetResult.load(folder / BUDGET_FILE) if (folder / BUDGET_FILE).exists() else None,
-        )
-        if results.magnitude is None and results.budget is None:
-            raise InputError(f"{folder}: no results of a loop: expected {MAGNITUDE_FILE} or {BUDGET_FILE}")
-        return results
-
-
-def loop_verdict(results: LoopResults) -> list[str]:
+def loop_verdict(result: MagnitudeResult) -> list[str]:
     """Return what the results say about TV, and then about the other ways to measure slopes."""
-    if results.magnitude is None:
-        return []
-    lines = [*_recommendations(results.magnitude), *_magnitude_lines(results.magnitude)]
+    lines = [*_recommendations(result), *_magnitude_lines(result)]
     # What the denoising itself does: against the same without it.
-    tv, reference = tv_method(results.magnitude), reference_methods(results.magnitude)[-1]
+    tv, reference = tv_method(result), reference_methods(result)[-1]
     if tv is None or tv == reference:
         return lines
-    return [_headline(differences_by_flux(results.magnitude, tv, reference)), *lines]
+    return [_headline(differences_by_flux(result, tv, reference)), *lines]
 
 
 def equal_methods(result: MagnitudeResult, flux: int) -> list[int]:
@@ -212,12 +179,7 @@ def _gain_in_magnitude(result: MagnitudeResult, method: int, reference: int) -> 
 _WIDTH = 100
 
 
-def loop_summary(results: LoopResults) -> str:
-    """Return the main tables of results and the verdict as text."""
-    tables = []
-    if results.magnitude is not None:
-        tables.append(in_columns(strehl_table(results.magnitude)))
-    if results.budget is not None:
-        tables.append(in_columns(budget_table(results.budget), 4))
-    verdict = [textwrap.fill(line, _WIDTH, subsequent_indent="  ") for line in loop_verdict(results)]
-    return "\n\n".join([*tables, *(["\n".join(verdict)] if verdict else [])])
+def loop_summary(result: MagnitudeResult) -> str:
+    """Return the main table of a result and the verdict as text."""
+    verdict = [textwrap.fill(line, _WIDTH, subsequent_indent="  ") for line in loop_verdict(result)]
+    return "\n\n".join([in_columns(strehl_table(result)), "\n".join(verdict)])

@@ -102,13 +102,12 @@ class LoopRecord(NpzFile):
 
 
 MAGNITUDE_FILE = "magnitude.npz"
-BUDGET_FILE = "budget.npz"
-"""Names of the files in a folder of results."""
+"""Name of the file in a folder of results."""
 
 
 def holds_loop_results(path: Path) -> bool:
     """Return whether a folder holds results of `faintspot loop`."""
-    return any((path / name).is_file() for name in (MAGNITUDE_FILE, BUDGET_FILE))
+    return (path / MAGNITUDE_FILE).is_file()
 
 
 def make_folder(folder: str | Path) -> Path:

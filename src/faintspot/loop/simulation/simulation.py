@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +18,6 @@ from faintspot.loop.simulation.configuration.sections import RunLength
 from faintspot.loop.simulation.methods import TRUE, Method
 from faintspot.loop.simulation.record import LoopRecord, make_controller
 from faintspot.loop.simulation.telescope.calibration import (
-    Exposing,
     centroid_gain,
     make_detector,
     make_pipeline,
@@ -43,48 +42,6 @@ if TYPE_CHECKING:
     from faintspot.slopes.training.known_sodium import KnownSodium
 
 
-@dataclass(frozen=True)
-class DisabledErrors:
-    """Error sources that a run switches off, for error budgets; none by default."""
-
-    noiseless: bool = False
-    """Every pixel holds its mean flux."""
-    true_slopes: bool = False
-    """Whether slopes are the true mean gradients of the wavefront, for every method."""
-    correctable: bool = False
-    """Whether the turbulence is limited to what the mirror can correct."""
-    faster: float = 1.0
-    """Factor on the frame rate, with the same flux in each frame and the same duration."""
-    exact_gain: bool = False
-    """Whether slopes are divided by the centroid gain of a first run, for one method."""
-
-    stretch_frames: ClassVar[int] = 100
-    """Frames in each stretch of a faster loop."""
-    stretch_settle_frames: ClassVar[int] = 40
-
-    def configuration(self, configuration: LoopConfiguration) -> LoopConfiguration:
-        """Return the configuration with a changed frame rate and the same flux per frame."""
-        if self.faster == 1.0:
-            return configuration
-        rate = configuration.control.frame_rate_hz * self.faster
-        camera = {"photons_per_subaperture": configuration.photons, "magnitude": None}
-        return configuration.replace("camera", **camera).replace("control", frame_rate_hz=rate)
-
-    def method(self, method: Method) -> Method:
-        """Return the method as used in such a run."""
-        return replace(method, variants=(*method.variants, TRUE)) if self.true_slopes else method
-
-    def time_s(self, frame: int, frame_rate_hz: float) -> float:
-        """Return the middle of a frame."""
-        first = 0 if self.faster == 1.0 else frame - frame % self.stretch_frames
-        return first * self.faster / frame_rate_hz + (frame - first + 0.5) / frame_rate_hz
-
-    def settled(self, frames: int) -> NDArray[np.bool_]:
-        """Return which frames directly follow the frame before, (frames,)."""
-        position = np.arange(frames) % self.stretch_frames
-        return (position >= self.stretch_settle_frames) | (self.faster == 1.0)
-
-
 _MOST_METHODS = 127
 _FLUX_FRAMES = 20
 """Frames after which pipelines follow the mean flux, which changes over a thousand."""
@@ -99,7 +56,6 @@ def simulate_loop(
     realisation: int = 0,
     first_frame: ArrayLike = 0,
     progress: Callable[[int, int], None] | None = None,
-    disabled_errors: DisabledErrors | None = None,
 ) -> LoopRecord:
     """Run the loop once.
 
@@ -122,8 +78,6 @@ def simulate_loop(
         numbers of all frames, increasing: frames that are left out cost no time.
     progress : callable, optional
         Called with the number of frames done and that of all, after every frame.
-    disabled_errors : DisabledErrors, optional
-        What is left out of what spoils the Strehl ratio.
 
     Returns
     -------
@@ -152,14 +106,8 @@ def simulate_loop(
     if first.ndim and (first.shape != numbers.shape or np.any(np.diff(first) < 1)):
         raise InputError(f"first_frame: expected a number, or {len(numbers)} increasing ones")
     of_frames = first if first.ndim else first + np.arange(len(numbers))
-    switches = DisabledErrors() if disabled_errors is None else disabled_errors
-    changed = switches.configuration(configuration)
-    ready = [_with_control(changed, method, start) for method in map(switches.method, methods)]
-    loop = partial(_Loop, configuration, ready, numbers, start, number, of_frames, switches)
-    gains = None
-    if switches.exact_gain:
-        gains = loop().run(None).gains_in_run()
-    return loop(gains).run(progress).record()
+    ready = [_with_control(configuration, method, start) for method in methods]
+    return _Loop(configuration, ready, numbers, start, number, of_frames).run(progress).record()
 
 
 def measure_gains(
@@ -168,10 +116,9 @@ def measure_gains(
     *,
     seed: int,
     realisation: int = 0,
-    detector: Exposing | None = None,
 ) -> NDArray[np.float64]:
     """Return the centroid gain of each pipeline at the configuration's flux, by `centroid_gain`."""
-    optics, detector = prepare(configuration), detector or make_detector(configuration)
+    optics, detector = prepare(configuration), make_detector(configuration)
     spots = _typical_spots(without_flux(configuration), seed, realisation)
     return np.array(
         [
@@ -192,29 +139,21 @@ class _Loop:
         seed: int,
         realisation: int,
         frame_numbers: NDArray[np.int64],
-        disabled_errors: DisabledErrors,
-        gains: NDArray[np.float64] | None = None,
     ) -> None:
-        self.configuration = configuration = disabled_errors.configuration(configuration)
+        self.configuration = configuration
         methods = [method for method, _ in ready]
         self.laser = _laser_run(configuration, methods, seed, realisation)
         self.methods = methods = methods if self.laser is None else self.laser.methods
         self.learnt = [learnt for _, learnt in ready]
-        self.schedule, self.disabled_errors = schedule, disabled_errors
-        self.seed, self.realisation, self.frame_numbers = seed, realisation, frame_numbers.tolist()
-        self.telescope_model = TelescopeModel(
-            configuration,
-            seed,
-            realisation,
-            correctable=disabled_errors.correctable,
-            noiseless=disabled_errors.noiseless,
-        )
+        self.schedule, self.seed, self.realisation = schedule, seed, realisation
+        self.frame_numbers = frame_numbers.tolist()
+        self.telescope_model = TelescopeModel(configuration, seed, realisation)
         self.optics = optics = self.telescope_model.optics
         self.pipelines = [make_pipeline(configuration, optics.sensor, method) for method in methods]
         self.fluxes = [self._first_flux(pipeline) for pipeline in self.pipelines]
         for number in range(len(methods)):
             self._follow_flux(number)
-        self.gains, self.divisors = self._gains_and_divisors(gains)
+        self.gains, self.divisors = self._gains_and_divisors()
         self.line = CommandDelayLine(optics.mirror.commands, configuration.control.delay_frames)
         self.controllers = [make_controller(configuration, optics, *pair, self.line) for pair in ready]
         frames, n = len(schedule), len(optics.sensor.layout)
@@ -228,7 +167,6 @@ class _Loop:
             **{name: np.zeros(frames) for name in ("strehl", "residual_nm", "r0_m")},
         }
         """Values of each frame, by their names in `LoopRecord`."""
-        self.regression = np.zeros((2, len(methods)))
 
     def _first_flux(self, pipeline: SlopePipeline) -> MeanFlux | None:
         """Return the mean flux of every sub-aperture for an estimator that uses it, as before a run."""
@@ -244,18 +182,10 @@ class _Loop:
         if flux is not None:
             self.pipelines[number] = self.pipelines[number].with_flux(flux)
 
-    def _gains_and_divisors(
-        self, in_run: NDArray[np.float64] | None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _gains_and_divisors(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return each method's centroid gain and the divisor of its slopes."""
-        if in_run is not None:
-            return in_run, in_run
         gains = measure_gains(
-            self.configuration,
-            self.pipelines,
-            seed=self.seed,
-            realisation=self.realisation,
-            detector=self.telescope_model.detector,
+            self.configuration, self.pipelines, seed=self.seed, realisation=self.realisation
         )
         gains = np.where([TRUE in method.variants for method in self.methods], 1.0, gains)
         divisors = np.where([method.corrects_gain for method in self.methods], gains, 1.0)
@@ -276,8 +206,7 @@ class _Loop:
     def step(self, frame: int) -> None:
         """Simulate one frame."""
         number, commands = int(self.schedule[frame]), self.line.acting
-        rate_hz = self.configuration.control.frame_rate_hz
-        time = self.disabled_errors.time_s(self.frame_numbers[frame], rate_hz)
+        time = (self.frame_numbers[frame] + 0.5) / self.configuration.control.frame_rate_hz
         after, wavefront = self.telescope_model.wavefronts(time, commands)
         self._observe(frame, time, after)
         slopes = self._measure(frame, self.telescope_model.by_rows(time, wavefront, self.line.around))
@@ -326,14 +255,7 @@ class _Loop:
             self.fluxes[number] = flux.updated(slopes.flux)
             if frame % _FLUX_FRAMES == 0:
                 self._follow_flux(number)
-        if self.disabled_errors.exact_gain and frame >= self.configuration.run.settle_frames:
-            true = sensor.mean_slopes_px(wavefront)
-            self.regression[:, number] += slopes.vector.astype(np.float64) @ true, true @ true
         return slopes
-
-    def gains_in_run(self) -> NDArray[np.float64]:
-        """Return the regression of each method's measured slopes on the true ones."""
-        return np.asarray(self.regression[0] / self.regression[1])
 
     def record(self) -> LoopRecord:
         """Return the record of the run."""

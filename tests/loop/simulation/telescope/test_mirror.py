@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
+from tests.loop.simulation.best_fit import BestFit
 from tests.loop.simulation.loop_cases import quiet
 
 from faintspot.loop.simulation.telescope.atmosphere import make_atmosphere
-from faintspot.loop.simulation.telescope.mirror import BestFit, make_mirror, make_pupil
+from faintspot.loop.simulation.telescope.mirror import make_mirror, make_pupil
 
 pytest.importorskip("hcipy")
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,27 +22,6 @@ from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF, spot_psf
-
-
-class Exposing(Protocol):
-    """A camera."""
-
-    def expose(self, mean_e: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.generic]:
-        """Return a frame with this flux in each pixel."""
-
-
-@dataclass(frozen=True, eq=False)
-class NoiselessDetector:
-    """A camera without photon noise, read noise and quantisation."""
-
-    detector: Detector
-
-    def expose(self, mean_e: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float32]:
-        """Return the mean frame, ADU."""
-        camera = self.detector
-        flux = mean_e + camera.background_e + camera.dark_e
-        adu = camera.offset_adu + flux * camera.em_gain / camera.gain_e_per_adu
-        return adu.astype(np.float32)
 
 
 def make_detector(configuration: LoopConfiguration) -> Detector:
@@ -214,7 +192,7 @@ def typical_spots(
 def mean_flux(
     pipeline: SlopePipeline,
     sensor: ShackHartmann,
-    detector: Exposing,
+    detector: Detector,
     photons: float,
     spots: tuple[NDArray[np.float32], NDArray[np.float32]],
     seed: int,
@@ -230,7 +208,7 @@ def mean_flux(
 def centroid_gain(
     pipeline: SlopePipeline,
     sensor: ShackHartmann,
-    detector: Exposing,
+    detector: Detector,
     photons: float,
     spots: tuple[NDArray[np.float32], NDArray[np.float32]],
     seed: int,

@@ -21,14 +21,11 @@ from faintspot.loop.simulation.configuration.sections import (
 )
 from faintspot.loop.simulation.telescope.atmosphere import MovingLayers, make_atmosphere
 from faintspot.loop.simulation.telescope.calibration import (
-    Exposing,
-    NoiselessDetector,
     interaction_matrix,
     make_detector,
     true_interaction_matrix,
 )
 from faintspot.loop.simulation.telescope.mirror import (
-    BestFit,
     DeformableMirror,
     PupilAmplitude,
     make_mirror,
@@ -78,10 +75,6 @@ class TelescopeModel:
     ----------
     configuration : LoopConfiguration
     seed, realisation : int
-    correctable : bool
-        Whether the air is only what the mirror can make.
-    noiseless : bool
-        Whether every pixel holds its mean flux.
 
     Attributes
     ----------
@@ -90,24 +83,14 @@ class TelescopeModel:
         May be changed between two frames, as may
     photons : float
         photo-electrons of a fully lit sub-aperture in a frame.
-    detector : Exposing
+    detector : Detector
     """
 
-    def __init__(
-        self,
-        configuration: LoopConfiguration,
-        seed: int,
-        realisation: int = 0,
-        *,
-        correctable: bool = False,
-        noiseless: bool = False,
-    ) -> None:
-        self.optics = optics = prepare(configuration)
+    def __init__(self, configuration: LoopConfiguration, seed: int, realisation: int = 0) -> None:
+        self.optics = prepare(configuration)
         self.atmosphere = atmosphere_of(without_flux(configuration), seed, realisation)
         self.photons = configuration.photons
-        camera = make_detector(configuration)
-        self.detector: Exposing = NoiselessDetector(camera) if noiseless else camera
-        self._best_fit = BestFit.of(optics.mirror, optics.pupil, piston=False) if correctable else None
+        self.detector = make_detector(configuration)
         self._laser = laser_source(configuration)
         self._rolling, self._rate_hz = (
             configuration.camera.rolling_shutter,
@@ -122,8 +105,6 @@ class TelescopeModel:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the wavefront after the mirror, and the one that the sensor sees, nm, (points, points)."""
         atmosphere = self.atmosphere.wavefront_nm(time_s)
-        if self._best_fit is not None:
-            atmosphere = self._best_fit.fitted(atmosphere)
         after = atmosphere + self.optics.mirror.wavefront_nm(commands)
         return after, after if self._sees_mirror else atmosphere
 
