@@ -17,6 +17,7 @@ import faintspot as fs
 from faintspot.experiments.planner.question import read_camera
 from faintspot.experiments.study.specification import StudySpecification
 from faintspot.io import open_frames, read_array, read_slopes
+from faintspot.io.formats.registry import frame_format
 from faintspot.io.slopes import read_reference
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
 from faintspot.slopes.pipeline import configuration
@@ -97,6 +98,12 @@ def _read_aot(path: Path) -> None:
     _read_frames(path)
 
 
+def _read_arrays(path: Path) -> None:
+    """Read all arrays of a file whose format lists them, or the only one."""
+    for name in frame_format(path).names(path) or [""]:
+        read_array(f"{path}:{name}" if name else path)
+
+
 _IMAGES = ("png", "bmp", "jpg", "lzw.tif")
 
 
@@ -114,6 +121,10 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "reference.npz": read_reference,
     "telemetry.zarr": _read_telemetry,
     "aot.fits": _read_aot,
+    "trs.sav": _read_arrays,
+    "packed.sav": _read_arrays,
+    "table.fits": _read_arrays,
+    "poke.txt": _read_arrays,
     "psf.npz": PSF.load,
     "weights.npz": fs.FixedWeights.load,
     "faintspot.toml": _read_configuration,
@@ -127,7 +138,8 @@ READERS: dict[str, Callable[[Path], Any]] = {
 @cache
 def _originals() -> Path:
     """Return a folder with a sound file of each, which stays as long as the process."""
-    from tests.io import frame_files, slope_files, telemetry_files
+    from tests.io import frame_files, idl_file, slope_files, telemetry_files
+    from tests.io.formats.test_fits_files import table
 
     from faintspot.io import read_telemetry, write_aot
     from faintspot.io.telemetry.writing import TelemetryStore
@@ -151,6 +163,11 @@ def _originals() -> Path:
     some = telemetry_files.records_of(10, 5), telemetry_files.images_of(10)
     store.append(*some, {"changes": telemetry_files.CHANGES})
     write_aot(folder / "aot.fits", read_telemetry(store.path))
+    saved = {"rx": np.eye(5), "A": {"DMCOMMAND": np.ones((30, 4), np.float32), "COUNTS": np.arange(9)}}
+    for name in ("trs.sav", "packed.sav"):
+        idl_file.write(folder / name, saved, compressed=name == "packed.sav")
+    table(folder / "table.fits")
+    np.savetxt(folder / "poke.txt", np.eye(9), header="poke")
     psf = PSF.analytic(radius_px=5)
     weights = fs.FixedWeights(*np.random.default_rng(0).uniform(0.1, 1.0, (3, 8, 8)))
     psf.save(folder / "psf.npz")

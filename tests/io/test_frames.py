@@ -63,7 +63,7 @@ class TestSequence:
         ("missing.fits", "no such file"),
         ("missing.npz:frames", "no such file"),
         ("empty.fits", "empty"),
-        ("text.txt", "MATLAB"),
+        ("text.log", "MATLAB"),
         ("folder", "expected a Zarr store"),
         ("short.npy", "expected a whole .npy file"),
         ("cut.npy", "truncated"),
@@ -72,7 +72,7 @@ class TestSequence:
 )
 def test_refused_paths(tmp_path: Path, name: str, part: str) -> None:
     (tmp_path / "empty.fits").touch()
-    (tmp_path / "text.txt").write_text("some text")
+    (tmp_path / "text.log").write_text("some text")
     (tmp_path / "folder").mkdir()
     (tmp_path / "short.npy").write_bytes(b"\x93NUMPY")
     cut = save(tmp_path / "cut.npy", cube())

@@ -147,3 +147,67 @@ def test_image_larger_than_memory_allows(tmp_path: Path) -> None:
             assert tracemalloc.get_traced_memory()[1] < 8_000_000
         finally:
             tracemalloc.stop()
+
+
+ROWS = 500
+
+
+def table(path: Path) -> dict[str, np.ndarray]:
+    """Write a table with columns of numbers among others; return the numbers."""
+    rng = np.random.default_rng(4)
+    numbers = {
+        "FrameCounter": np.arange(ROWS, dtype=np.uint32) + np.uint32(2**31 + 5),
+        "Gradients": rng.standard_normal((ROWS, 34)).astype(np.float32),
+        "Pair": rng.standard_normal((ROWS, 3, 2)),
+        "Level": np.arange(ROWS, dtype=np.int16),
+    }
+    columns = [
+        fits.Column("Text", "5A", array=["ab"] * ROWS),
+        fits.Column("FrameCounter", "J", bzero=2**31, array=numbers["FrameCounter"]),
+        fits.Column("Bits", "11X", array=np.ones((ROWS, 11), bool)),
+        fits.Column("Gradients", "34E", array=numbers["Gradients"]),
+        fits.Column("True", "L", array=np.ones(ROWS, bool)),
+        fits.Column("Pair", "6D", dim="(2,3)", array=numbers["Pair"]),
+        fits.Column("Level", "I", array=numbers["Level"]),
+    ]
+    units = [fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns, name="LoopFrame")]
+    fits.HDUList(units).writeto(path)
+    return numbers
+
+
+@pytest.mark.parametrize("ending", ["fits", "fits.gz"])
+def test_columns_of_a_table(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"loop.{ending}"
+    for name, values in table(path).items():
+        stored = read_array(f"{path}:{name.upper()}")
+        np.testing.assert_array_equal(stored, values)
+        assert stored.dtype == values.dtype
+    named = "FrameCounter, Gradients, Pair, Level"
+    for key in ("", ":LoopFrame", ":1", ":Text"):
+        with refused("a binary table; name a column", named):
+            read_array(f"{path}{key}")
+
+
+@pytest.mark.parametrize(
+    ("card", "value"),
+    [
+        ("TFORM4", "340000000E"),
+        ("TFORM4", "5Y"),
+        ("TFORM4", "33E"),
+        ("NAXIS1", 2**40),
+        ("NAXIS1", 7),
+        ("NAXIS2", 2**40),
+        ("TFIELDS", 3),
+        ("TSCAL4", "two"),
+    ],
+)
+def test_damaged_table(tmp_path: Path, card: str, value: object) -> None:
+    table(tmp_path / "loop.fits")
+    content = (tmp_path / "loop.fits").read_bytes()
+    header = fits.Header.fromstring(content[2880 : 2880 * 3].split(b" END ")[0])
+    header[card] = value
+    text = header.tostring().encode()
+    size = len(fits.getheader(tmp_path / "loop.fits", 1).tostring())
+    (tmp_path / "loop.fits").write_bytes(content[:2880] + text + content[2880 + size :])
+    with refused("loop.fits"):
+        read_array(f"{tmp_path / 'loop.fits'}:Gradients")

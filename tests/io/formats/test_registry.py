@@ -82,7 +82,7 @@ class TestSlopes(SlopeFormatTests):
 
 
 def test_it_is_listed(tmp_path: Path) -> None:
-    (tmp_path / "a.txt").write_text("text")
+    (tmp_path / "a.unknown").write_text("text")
     assert_refused(tmp_path / "b.txt", ".csv", ".plain")
     with refused("MATLAB", "plain"):
-        open_frames([tmp_path / "a.txt"])
+        open_frames([tmp_path / "a.unknown"])

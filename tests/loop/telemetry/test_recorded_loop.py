@@ -226,8 +226,8 @@ def test_frame_rate_of_frames_that_were_buffered() -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("", "the file is empty"),
-        ("a,b\n", "the file is empty"),
+        ("\n", "it has none"),
+        ("a,b\n", "it has none"),
         ("1,2\n1\n", "number of columns"),
         ("a,b\nc,d\n", "string 'c'"),
         ("1,2\nx,3\n", "string 'x'"),

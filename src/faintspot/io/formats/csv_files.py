@@ -1,4 +1,4 @@
-"""Slopes in .csv files: one line per frame and sub-aperture, without coordinates and attributes."""
+"""Text files: slopes in .csv, a line for each frame and sub-aperture; arrays in .csv, .txt and .dat."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
+from numpy.typing import NDArray
 
-from faintspot.base.files import check_file_size
+from faintspot.base.errors import InputError
+from faintspot.base.files import check_file_size, read_lines
 from faintspot.base.variables import VARIABLES
+from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
 from faintspot.io.formats.file_format import FileFormat
+from faintspot.io.locations import one_line
 from faintspot.io.stored.slopes_format import (
     UNITS,
     ExistingOutput,
@@ -20,13 +24,35 @@ from faintspot.io.stored.slopes_format import (
 
 _LINES = 1 << 14
 _INDEX = ("frame", "subaperture")
+TEXTS = (".csv", ".txt", ".dat")
+"""Endings of arrays in text files."""
 
 
 class Csv(FileFormat):
-    """A table with the quantities of `VARIABLES` as columns."""
+    """Slopes as a table with the quantities of `VARIABLES`; other arrays as rows of numbers."""
 
     name = "CSV"
     endings = (".csv",)
+
+    def has_frames(self, path: Path, start: bytes) -> bool:
+        """Return whether the name of a file ends as that of a text."""
+        return bool(start) and path.suffix.lower() in TEXTS
+
+    def find(self, path: Path, key: str | None) -> StoredArray:
+        """Return the numbers of a text; fields are apart by commas, semicolons or blanks.
+
+        A first line of names and comments after # are left out. Empty fields between commas are NaN.
+        """
+        if key is not None:
+            raise InputError(f"{path}: expected no name of an array, as a text has one, got {key!r}")
+        try:
+            # A number takes at least two characters.
+            values = _numbers(read_lines(path, "rows of numbers", MOST_WHOLE_BYTES // 4))
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(f"{path}: expected rows of numbers ({one_line(error)})") from None
+        return StoredArray.whole(f"{path}", values.shape, values.dtype, lambda: values)
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
         """Write floats with the fewest digits that reproduce them."""
@@ -46,6 +72,12 @@ class Csv(FileFormat):
                 columns.append(piece.view(np.uint8) if piece.dtype == np.bool_ else piece)
             lines = zip(*(column.astype(str).tolist() for column in columns), strict=True)
             stream.write("".join(",".join(line) + "\n" for line in lines).encode())
+
+    def has_slopes(self, path: Path) -> bool:
+        """Return whether the first line names the columns of slopes."""
+        check_file_size(path, "slopes", most_slopes_bytes() // 4)
+        with path.open("rb") as stream:
+            return stream.readline(1 << 12).startswith(",".join(_INDEX).encode())
 
     def finished(self, path: Path) -> ExistingOutput | None:
         """Return an output without a fingerprint: a table does not identify its run."""
@@ -74,3 +106,29 @@ def column_name(name: str, unit: str) -> str:
     """Return the heading of a variable's column."""
     variable = VARIABLES[name]
     return variable.csv_name.replace("_px", f"_{unit}") if "px" in variable.units else variable.csv_name
+
+
+def _numbers(lines: list[str]) -> NDArray[np.float64]:
+    """Return the rows of a text, (rows, columns)."""
+    lines = [line.lstrip("\ufeff") for line in lines if line.split("#")[0].strip("\ufeff \t")]
+    separator = next((sign for sign in ",;" if lines and sign in lines[0]), None)
+    if lines and not any(map(_is_number, lines[0].split(separator))):
+        del lines[0]  # a line of names
+    if not lines:
+        raise ValueError("it has none")
+    try:
+        return np.loadtxt(lines, delimiter=separator, ndmin=2)
+    except ValueError:  # empty fields
+        return np.loadtxt(lines, delimiter=separator, ndmin=2, converters=_number)
+
+
+def _number(field: str) -> float:
+    return float(field.strip() or "nan")
+
+
+def _is_number(field: str) -> bool:
+    try:
+        _number(field)
+    except ValueError:
+        return False
+    return True

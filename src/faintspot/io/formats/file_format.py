@@ -34,6 +34,10 @@ class FileFormat:
         """
         raise NotImplementedError
 
+    def names(self, path: Path) -> list[str]:
+        """Return the names of the arrays of a file, by which layouts of telemetry are recognised."""
+        return []
+
     def require(self) -> None:
         """Raise MissingExtraError when a package for slopes is missing; called before the work."""
 

@@ -1,4 +1,4 @@
-"""FITS files: frames, plain, gzip-compressed (.gz) or tile-compressed (.fz); slopes, plain or .gz.
+"""FITS files: frames and columns of tables, plain, gzip- (.gz) or tile-compressed (.fz); slopes.
 
 Values follow the FITS standard 4.0, section 4.4.2: physical = BZERO + BSCALE * stored, and BLANK marks
 integers without a value, which become NaN.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import warnings
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any, cast
@@ -19,6 +20,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.json_text import parse_json, to_json
 from faintspot.base.sizes import check_bytes
 from faintspot.base.variables import VARIABLES
+from faintspot.io.arrays.fits_tables import Column, ColumnValues, columns_of, is_table
 from faintspot.io.arrays.fits_units import (
     AOT_VERSION,
     GZIP_SIGNATURE,
@@ -56,7 +58,8 @@ class Fits(FileFormat):
     def find(self, path: Path, key: str | None) -> StoredArray:
         """Return an image of a file: the first, or the one whose EXTNAME or number is `key`.
 
-        For a file of the AOT standard, return the frames of the sensor `key`, by default of the only one.
+        `key` may also name a column of a binary table, (rows, ...). For a file of the AOT standard, return
+        the frames of the sensor `key`, by default of the only one.
         """
         if AOT_VERSION in next(units_of(path)).header:
             from faintspot.io.telemetry.aot_reading import frames_of_aot
@@ -65,7 +68,12 @@ class Fits(FileFormat):
             if key is None or key.strip().upper() not in names:
                 key = frames_of_aot(path, key)
         name = f"{path}:{key}" if key is not None else str(path)
-        return _image(name, path, _find_unit(path, key))
+        unit, column = _find_unit(path, key)
+        return _image(name, path, unit) if column is None else _column(name, path, unit, column)
+
+    def names(self, path: Path) -> list[str]:
+        """Return the names of images and of columns of numbers."""
+        return [name for unit in units_of(path) for name in (_columns(path, unit) or _name(unit))]
 
     def require(self) -> None:
         """Raise MissingExtraError when astropy is not installed."""
@@ -132,19 +140,55 @@ class FitsGz(Fits):
             super().write(cast(IO[bytes], compressed), slopes)
 
 
-def _find_unit(path: Path, key: str | None) -> HeaderDataUnit:
-    """Return the first image, or the unit named `key`."""
-    names = []
+def _name(unit: HeaderDataUnit) -> list[str]:
+    return [unit.name] if unit.shape else []
+
+
+def _columns(path: Path, unit: HeaderDataUnit) -> dict[str, Column]:
+    """Return the columns of a binary table; of another unit none."""
+    if not is_table(unit):
+        return {}
+    try:
+        return columns_of(unit)
+    except Exception as error:  # cards are parsed on access and may be broken
+        raise InputError(f"{path}: table {unit.name} is damaged ({one_line(error)})") from None
+
+
+def _find_unit(path: Path, key: str | None) -> tuple[HeaderDataUnit, Column | None]:
+    """Return the first image, or the image, or table and column, named `key`."""
+    names, wanted = [], "" if key is None else key.strip().upper()
     for unit in units_of(path):
-        names.append(unit.name)
+        columns = _columns(path, unit)
+        listed = f" (a binary table; name a column, as {path.name}:COLUMN: {', '.join(columns)})"
+        names.append(unit.name + (listed if columns else ""))
         if key is None and unit.shape:
-            return unit
-        if key is not None and (unit.name.upper() == key.strip().upper() or str(unit.index) == key):
+            return unit, None
+        if wanted in (unit.name.upper(), str(unit.index)):
             if not unit.shape:
-                raise InputError(f"{path}: expected an image in extension {key!r}, found none there")
-            return unit
-    wanted = "an image" if key is None else f"an extension {key!r}"
-    raise InputError(f"{path}: expected {wanted}, the file has only: {', '.join(names)}")
+                found = names[-1] if columns else "none there"
+                raise InputError(f"{path}: expected an image in extension {key!r}, found {found}")
+            return unit, None
+        column = next((column for name, column in columns.items() if name.upper() == wanted), None)
+        if column is not None:
+            return unit, column
+    sought = "an image" if key is None else f"an extension or a column {key!r}"
+    raise InputError(f"{path}: expected {sought}, the file has only: {', '.join(names)}")
+
+
+def _column(name: str, path: Path, unit: HeaderDataUnit, column: Column) -> StoredArray:
+    """Return a column of a binary table."""
+    compressed = is_gzip(path)
+    if not compressed:
+        check_present(name, path, unit.data_start + unit.header.data_size)
+    values = _Image(name, column.cards, column.stored_type)
+
+    def open_array(files: ExitStack) -> Any:
+        stream = files.enter_context(open_plain_or_gzip(path))
+        rows = StreamedArray(stream, unit.data_start, column.rows, (column.length,))
+        values.stored = ColumnValues(rows, column.rows.itemsize)
+        return values
+
+    return StoredArray(name, column.shape, values[:].dtype, open_array)
 
 
 def _image(name: str, path: Path, unit: HeaderDataUnit) -> StoredArray:
@@ -174,12 +218,12 @@ def _image(name: str, path: Path, unit: HeaderDataUnit) -> StoredArray:
 
 
 class _Image:
-    """Physical values of an image, from stored numbers and the cards of its header.
+    """Physical values of an image or a column, from stored numbers and the cards of its header.
 
     astropy leaves BLANK aside in unsigned integers, and so cannot scale.
     """
 
-    def __init__(self, name: str, header: Any, stored_type: np.dtype[np.generic]) -> None:
+    def __init__(self, name: str, header: Mapping[str, Any], stored_type: np.dtype[np.generic]) -> None:
         self.stored: Any = np.zeros(1, stored_type)
         try:
             self._scale, self._zero = float(header.get("BSCALE", 1.0)), float(header.get("BZERO", 0.0))

@@ -46,7 +46,10 @@ def frame_format(path: Path) -> FileFormat:
         if item.has_frames(path, start):
             return item
     names = list(dict.fromkeys(item.name for item in FORMATS if item.signatures))
-    raise InputError(f"{path}: expected a {_listed(names)} file or a Zarr store, it is none of them")
+    raise InputError(
+        f"{path}: expected a {_listed(names)} file, a text (.csv, .txt, .dat) or a Zarr store, it is none of "
+        "them"
+    )
 
 
 def slope_format(path: Path) -> FileFormat:

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, increasing, one_of, real_array
 from faintspot.base.errors import InputError, errors_within
-from faintspot.base.files import read_arrays, read_lines
+from faintspot.base.files import read_arrays
 from faintspot.base.flags import NO_FLAG, SubapertureFlag, leave_out
 from faintspot.base.toml_files import check_keys, parse_file
 from faintspot.io import StoredSlopes
-from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES
 from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.frames import read_array
 from faintspot.io.slopes import holds_slopes
@@ -85,7 +84,7 @@ def read_recorded_loop(
         values = read_session(path)
     elif path.is_dir() and holds_telemetry(path):
         values = _of_store(path, configuration)
-    elif path.suffix != ".csv" and holds_slopes(path):
+    elif holds_slopes(path):
         values = _of_slopes(path)
     elif path.suffix in _TABLES:
         values = _of_table(path)
@@ -110,7 +109,7 @@ def _system_values(path: Path) -> dict[str, Any]:
     check_keys(f"{path}: ", values, [*_ARRAYS, *NUMBERS, *_WORDS])
     for name in _ARRAYS:
         if name in values and isinstance(values[name], str):
-            values[name] = _array(str(path.parent / values[name]))
+            values[name] = read_array(path.parent / values[name])
     return values
 
 
@@ -129,39 +128,9 @@ def _numbers(values: Mapping[str, object]) -> dict[str, float]:
     return {key: option.checked(key, values[key]) for key, option in NUMBERS.items() if key in values}
 
 
-def _array(location: str) -> NDArray[Any]:
-    if not location.endswith((".csv", ".txt")):
-        return read_array(location)
-    try:
-        lines = read_lines(location, "rows of numbers", MOST_WHOLE_BYTES // 4)
-        lines = [line for line in lines if line.split("#")[0].strip()]
-        if lines and not any(map(_is_number, lines[0].split(","))):
-            del lines[0]  # a line of names
-        if not lines:
-            raise ValueError("the file is empty")
-        return np.loadtxt(lines, delimiter=",", ndmin=2, converters=_number)
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{location}: expected rows of numbers with commas ({reason})") from None
-
-
-def _number(field: str) -> float:
-    return float(field.strip() or "nan")
-
-
-def _is_number(field: str) -> bool:
-    try:
-        _number(field)
-    except ValueError:
-        return False
-    return True
-
-
 def _of_table(path: Path) -> dict[str, Any]:
     if path.suffix != ".npz":
-        return {"slopes": _array(str(path))}
+        return {"slopes": read_array(path)}
     stored = read_arrays(path, "slopes of a loop")
     check_keys(f"{path}: ", stored, [*_ARRAYS, *NUMBERS, *_WORDS])
     return {name: array.item() if array.ndim == 0 else array for name, array in stored.items()}
