@@ -1,4 +1,5 @@
 import functools
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -8,7 +9,7 @@ import pytest
 from tests.cli.cli_cases import LAYOUT, Commands, simulated
 
 from faintspot import Calibration, Layout, Settings, SlopePipeline
-from faintspot.cli.tune import _binned, _save_in_camera_pixels
+from faintspot.cli.tune import _binned, _save_in_camera_pixels, _sensor
 from faintspot.experiments.planner import tuning
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.sensor.binning import binned_layout
@@ -24,7 +25,8 @@ def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_answer_configuration_and_picture(run: Commands) -> None:
-    result = run.ok("tune", *KNOWN, "--grid", "4x4", "--budget", "0.1")
+    LAYOUT.save("layout.toml")
+    result = run.ok("tune", *KNOWN, "--config", "layout.toml", "--budget", "0.1")
     for text in ("brightest pixels", "Cramer-Rao", "Recommended: ", "limiting flux", "This rests on"):
         assert text in result.out
     assert max(len(line) for line in result.out.splitlines()) <= 80
@@ -35,17 +37,15 @@ def test_answer_configuration_and_picture(run: Commands) -> None:
     assert "faintspot slopes" in result.out
 
 
-@pytest.mark.slow
-def test_camera_file_and_options_that_count_more(run: Commands) -> None:
-    Path("camera.toml").write_text(
-        "[camera]\nread_noise_e = 2.0\npixels = 8\n[spot]\nfwhm_px = 1.8\nsubaperture_m = 0.5\n"
-        "[star]\nmagnitude = 9.0\nframe_rate_hz = 500\n[tune]\nbudget = 0.2\n"
-        "[layout.grid]\nshape = [4, 4]\npixels = 8\n"
-    )
-    result = run.ok("tune", "--camera", "camera.toml", "--magnitude", "9.5", "-o", "out.toml")
-    assert "R = 9.50" in result.out
-    assert "limiting magnitude" in result.out
-    assert len(SlopePipeline.from_file("out.toml").layout) == 16
+def test_laser_guide_star_of_the_configuration(tmp_path: Path) -> None:
+    path = tmp_path / "laser.toml"
+    replace(LAYOUT, pixel_scale_arcsec=0.5, subaperture_m=0.8).save(path)
+    with path.open("a") as stream:
+        stream.write("[laser]\nlaunch_m = [-5.0, 0.0]\nat_m = [1.6, 0.0]\nspot_fwhm_arcsec = 1.2\n")
+    found = _sensor(str(path), path, simulated=True)
+    assert (found["pixel_scale_arcsec"], found["subaperture_m"]) == (0.5, 0.8)
+    assert found["laser"].at_m == pytest.approx([1.6, 0.0])
+    assert "laser" not in _sensor(str(path), path, simulated=False)
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ def test_from_frames(run: Commands) -> None:
 @pytest.mark.parametrize(
     ("arguments", "naming"),
     [
-        (("tune",), ("read_noise_e", "--read-noise-e", "[camera]")),
+        (("tune",), ("read_noise_e", "--read-noise-e")),
         (("tune", "--read-noise-e", "abc"), ("--read-noise-e",)),
         (("tune", "--read-noise-e", -3, *KNOWN[2:]), ("read_noise_e = -3",)),
         (("tune", *KNOWN[:-2]), ("magnitude", "flux_e")),
@@ -139,25 +139,14 @@ def test_from_frames(run: Commands) -> None:
         (("tune", *KNOWN, "--budget", "3furlongs"), ("budget", "0.05arcsec")),
         (("tune", *KNOWN[:-2], "--flux-e", "nan"), ("--flux-e", "finite")),
         (("tune", *KNOWN[:-2], "--flux-e", "-3"), ("--flux-e", "above 0")),
-        (("tune", *KNOWN, "--grid", "7-7"), ("--grid", "7x7")),
-        (("tune", *KNOWN, "--grid", "7x7", "--config", "a.toml"), ("--grid", "--config")),
         (("tune", *KNOWN, "--config", "nothere.toml"), ("nothere.toml",)),
         (("tune", *KNOWN, "--dark", "dark.fits"), ("--recording",)),
         (("tune", *KNOWN, "-o", "nofolder/faintspot.toml"), ("nofolder",)),
-        (("tune", "--camera", "nothere.toml"), ("nothere.toml",)),
-        (("tune", "--camera", "broken.toml"), ("broken.toml", "TOML")),
-        (("tune", "--camera", "typo.toml"), ("read_noise", "did you mean read_noise_e")),
-        (("tune", "--camera", "table.toml"), ("cameras", "did you mean camera")),
-        (("tune", "--camera", "layout.toml"), ("layout.grid.shape",)),
         (("tune", "--recording", "nothere.fits"), ("nothere.fits",)),
     ],
 )
 def test_mistakes_are_named_in_one_line(
     run: Commands, arguments: tuple[object, ...], naming: tuple[str, ...]
 ) -> None:
-    Path("broken.toml").write_text("read_noise = [\n")
-    Path("typo.toml").write_text("[camera]\nread_noise = 3\n")
-    Path("table.toml").write_text("[cameras]\nread_noise = 3\n")
-    Path("layout.toml").write_text("[layout.grid]\npixels = 8\n")
     run.refused(*arguments, naming=naming)  # type: ignore[arg-type]
     assert not Path("faintspot.toml").exists()

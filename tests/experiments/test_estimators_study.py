@@ -10,9 +10,7 @@ from tests.experiments.study_cases import cells, dataset, power_law
 from tests.shared_data import shared_file
 
 from faintspot.base.report import plots
-from faintspot.base.report.page import Table
 from faintspot.experiments.report.estimators import (
-    calibration_sections,
     compares_estimators,
     enough_photons,
     estimator_figures,
@@ -106,16 +104,6 @@ def test_findings_count_cells() -> None:
     assert "d/r0 up to 1, 4 cells" in " ".join(found)
     assert "ml 4 (worst 0 %)" in " ".join(found)
     assert findings(study(unfinished=range(21))) == []
-
-
-def test_calibration_of_stated_errors() -> None:
-    (section,) = calibration_sections(study())
-    (table,) = section.parts
-    assert isinstance(table, Table)
-    assert len(table.rows) == 15
-    assert table.header[1:] == ["ml", "map", "weighted"]
-    assert set(table.rows[0][1:]) == {"1.00 (1.10)"}
-    assert calibration_sections(study(unfinished=range(21))) == []
 
 
 def test_other_studies_do_not_compare_estimators() -> None:

@@ -14,7 +14,6 @@ from PIL import Image
 from tests.fuzz.refused import refused_in_one_line
 
 import faintspot as fs
-from faintspot.experiments.planner.question import read_camera
 from faintspot.experiments.study.specification import StudySpecification
 from faintspot.io import open_frames, read_array, read_slopes
 from faintspot.io.formats.registry import frame_format
@@ -32,17 +31,6 @@ methods = ["tv", "brightest"]
 fixed_k = [5]
 [sweeps.light]
 flux_e = { from = 10, to = 100, points = 3, spacing = "log" }
-pixels = 8
-"""
-_CAMERA = """[camera]
-read_noise_e = 1.0
-pixels = 8
-[spot]
-fwhm_px = 2.0
-[star]
-flux_e = 100.0
-[layout.grid]
-shape = [3, 3]
 pixels = 8
 """
 
@@ -131,7 +119,6 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "faintspot.calibration.npz": lambda path: _read_configuration(path.with_name("faintspot.toml")),
     "study.toml": StudySpecification.from_file,
     "loop.toml": load_loop,
-    "camera.toml": read_camera,
 }
 
 
@@ -183,7 +170,6 @@ def _originals() -> Path:
     for item in (layout, camera, chosen, psf, weights):
         configuration.save(path, item)
     (folder / "study.toml").write_text(_STUDY)
-    (folder / "camera.toml").write_text(_CAMERA)
     (folder / "loop.toml").write_text(LoopConfiguration().to_text())
     return folder
 

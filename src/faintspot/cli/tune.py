@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -15,18 +15,18 @@ from rich.console import Console
 
 from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
-from faintspot.cli.layout.options import grid_shape
 from faintspot.cli.shared.commands import SectionedCommand, declared, flag_of, option, which_frames
 from faintspot.cli.shared.needs import suggested_slopes
 from faintspot.cli.shared.output import check_target, picture_file, results_table, wrapped, write_picture
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.experiments.planner import text as answer_text
-from faintspot.experiments.planner.question import Question, read_camera
+from faintspot.experiments.planner.question import Question
 from faintspot.slopes.camera.binning import binned, binned_calibration, camera_calibration
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.sensor.pupil import side_m
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,7 +42,6 @@ _SECTIONS = {"camera": "Camera", "spot": "Spots", "star": "Guide star", "tune": 
 
 
 @click.command(cls=SectionedCommand)
-@option("--camera", metavar="TOML", help="File of the values below; options take precedence.", section=_GIVEN)
 @option(
     "--recording", multiple=True, metavar="FILE", help="Recorded frames, to measure the rest.", section=_GIVEN
 )
@@ -52,14 +51,8 @@ _SECTIONS = {"camera": "Camera", "spot": "Spots", "star": "Guide star", "tune": 
     "--config",
     "-c",
     metavar="TOML",
-    help="Configuration with layout and calibration.",
+    help="Configuration with layout, calibration and laser guide star.",
     show_default="that of --output, if there is one",
-    section=_GIVEN,
-)
-@option(
-    "--grid",
-    metavar="ROWSxCOLUMNS",
-    help="Rows and columns of lenslets instead of a layout, such as 7x7.",
     section=_GIVEN,
 )
 @declared(Question, sections=_SECTIONS)
@@ -68,12 +61,10 @@ _SECTIONS = {"camera": "Camera", "spot": "Spots", "star": "Guide star", "tune": 
 @option("--seed", type=click.IntRange(0), default=1, help="Seed of the simulation.")
 @option("--overwrite", is_flag=True, help="Replace the settings of an existing configuration.")
 def command(
-    camera: str | None,
     recording: tuple[str, ...],
     dark: tuple[str, ...],
     key: str | None,
     time_axis: int | None,
-    grid: str | None,
     config: str | None,
     output: str,
     picture: str | None,
@@ -93,16 +84,16 @@ def command(
 
     \b
     Examples:
-      faintspot tune --camera camera.toml --budget 0.1
-      faintspot tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100
+      faintspot tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100 --budget 0.1
       faintspot tune --recording cube.fits --dark dark.fits --flux-e 60
     """
     target = Path(output)
     check_target(target, overwrite)
     drawing = picture_file(target, picture, "-tune.png")
-    given = _given(camera, options)
-    known = _sensor(grid, config, target, given)
-    given = {**known, **given, **({"layout": known["layout"]} if grid or config else {})}
+    given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
+    if "magnitude" in given and "flux_e" in given:
+        raise InputError("--magnitude, --flux-e: expected one of them, got both")
+    given = {**_sensor(config, target, simulated=not recording), **given}
     camera_layout: Layout | None = given.get("layout")
     factor = 1 if camera_layout is None else camera_layout.bin
     if camera_layout is not None and factor > 1:
@@ -161,17 +152,6 @@ def answer_table(answer: Answer) -> Table:
     return table
 
 
-def _given(camera: str | None, options: Mapping[str, object]) -> dict[str, Any]:
-    """Return what is known: the options, and the file where they say nothing."""
-    chosen = {name: value for name, value in options.items() if value is not None}
-    if "magnitude" in chosen and "flux_e" in chosen:
-        raise InputError("--magnitude, --flux-e: expected one of them, got both")
-    known = {} if camera is None else read_camera(camera)
-    if "magnitude" in chosen or "flux_e" in chosen:
-        known = {name: value for name, value in known.items() if name not in ("magnitude", "flux_e")}
-    return {**known, **chosen}
-
-
 def _binned(given: dict[str, Any], layout: Layout) -> dict[str, Any]:
     """Return the values of binned frames for those stated of the camera."""
     factor = layout.bin
@@ -193,35 +173,29 @@ def _binned(given: dict[str, Any], layout: Layout) -> dict[str, Any]:
     return {**scaled, "layout": binned_layout(layout)}
 
 
-def _sensor(grid: str | None, config: str | None, target: Path, given: dict[str, Any]) -> dict[str, Any]:
-    """Return the layout that was asked for or that the configuration has already, and its calibration."""
-    if grid is not None and config is not None:
-        raise InputError("--grid, --config: expected one of them, got both")
+def _sensor(config: str | None, target: Path, *, simulated: bool) -> dict[str, Any]:
+    """Return what a configuration states of the sensor, or the target where it exists."""
     found: dict[str, Any] = {}
     source = config or (str(target) if target.exists() else None)
-    if source is not None:
-        described = configuration.Configuration(source)
-        calibration = described.calibration
-        # The target may have no layout yet; a file that was named for its layout must.
-        if config is not None or "layout" in described:
-            found["layout"] = described.layout
-        found["calibration"] = calibration
-        default = Calibration()
-        if calibration.read_noise_e is not None and "read_noise_e" not in calibration.estimated:
-            found["read_noise_e"] = calibration.typical_read_noise_e
-        for name in ("gain_e_per_adu", "em_gain", "background_e"):
-            if getattr(calibration, name) != getattr(default, name):
-                found[name] = getattr(calibration, name)
-    if grid is not None:
-        found["layout"] = _grid(grid, given)
+    if source is None:
+        return found
+    described = configuration.Configuration(source)
+    calibration = described.calibration
+    # The target may have no layout yet; a file that was named for its layout must.
+    if config is not None or "layout" in described:
+        found["layout"] = described.layout
+    found["calibration"] = calibration
+    default = Calibration()
+    if calibration.read_noise_e is not None and "read_noise_e" not in calibration.estimated:
+        found["read_noise_e"] = calibration.typical_read_noise_e
+    for name in ("gain_e_per_adu", "em_gain", "background_e"):
+        if getattr(calibration, name) != getattr(default, name):
+            found[name] = getattr(calibration, name)
+    laser, layout = described.laser, found.get("layout")
+    if simulated and layout is not None and laser is not None and laser.at_m is not None:
+        side = side_m(layout.cells, layout.subaperture_m, layout.diameter_m)
+        found |= {"laser": laser, "pixel_scale_arcsec": layout.pixel_scale_arcsec, "subaperture_m": side}
     return found
-
-
-def _grid(grid: str, given: dict[str, Any]) -> Layout:
-    shape = grid_shape(grid)
-    if given.get("pixels") is None:
-        raise InputError("--grid: with it, expected --pixels, the side of a sub-aperture's window")
-    return Layout.grid(shape, pixels=given["pixels"])
 
 
 def _question(
@@ -243,10 +217,11 @@ def _question(
         darks = read(dark, None) if dark else None
         return question_from_frames(read(frames, key), darks, **given)
     except InputError as error:
-        if (what := Question.declared().get(error.name)) is None:
+        if error.name not in Question.declared():
             raise
-        hint = f"({flag_of(error.name)}, or {error.name} in [{what.group}] of the --camera file)"
-        raise InputError(f"{error.expected} {hint}", name=error.name, value=error.value) from None
+        raise InputError(
+            f"{error.expected} ({flag_of(error.name)})", name=error.name, value=error.value
+        ) from None
 
 
 def _read(paths: tuple[str, ...], key: str | None, *, time_axis: int | None, factor: int) -> NDArray[Any]:

@@ -2,7 +2,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from tests.cli.cli_cases import Commands
 from tests.experiments.experiment_cases import SEARCH, small
@@ -83,12 +82,11 @@ def test_options_of_a_night_are_passed_on(run: Commands, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(command, "simulate_night", simulate)
     monkeypatch.setattr(page, "night_summary_text", lambda night: "")
-    np.save("factors.npy", [1.0, 0.5, 2.0])
-    given = ("--strengths", "0.4,0.8", "--strength-factors", "factors.npy", "--tuned", "--overwrite")
+    given = ("--strengths", "0.4,0.8", "--overwrite")
     run.ok("loop", "night", "small.toml", "--workers", 3, "--methods", "tv,ml", "-o", "here", *given)
-    plan = NightPlan(methods=("tv", "ml"), listed_strengths=(0.4, 0.8), strength_factors=(1.0, 0.5, 2.0))
+    plan = NightPlan(methods=("tv", "ml"), listed_strengths=(0.4, 0.8))
     assert taken == {
-        "loop": load_loop("small.toml"), "folder": Path("here"), "plan": plan, "quick": False, "tuned": True,
+        "loop": load_loop("small.toml"), "folder": Path("here"), "plan": plan, "quick": False,
         "overwrite": True, "workers": 3, "scheduler": None,
     }  # fmt: skip
 

@@ -88,7 +88,7 @@ def test_the_rest_is_done_and_what_is_left_out_is_said(tmp_path: Path) -> None:
         "demo --frames 20",
         "layout faintspot-demo/frames.npy -o found.toml",
         "slopes faintspot-demo/frames.npy --config found.toml -o slopes.npz",
-        "wavefront slopes.npz -o wavefront.csv",
+        "wavefront slopes.npz -o wavefront.json",
         "tune --read-noise-e 3 --pixels 8 --fwhm-px 2 --flux-e 1000 -o tuned.toml",
         "loop show",
         "estimators",
@@ -109,7 +109,7 @@ def test_the_rest_is_done_and_what_is_left_out_is_said(tmp_path: Path) -> None:
     assert "slopes.zarr" not in done.stdout  # what is suggested can be done
     made = {path.name for path in (tmp_path / "faintspot-demo").iterdir()}
     assert made == {"frames.npy", "truth.npy", "tv.toml", "tv.npz", "no-tv.toml", "no-tv.npz"}
-    for name in ("found.toml", "slopes.npz", "wavefront.csv", "tuned.toml"):
+    for name in ("found.toml", "slopes.npz", "wavefront.json", "tuned.toml"):
         assert (tmp_path / name).exists()
 
 

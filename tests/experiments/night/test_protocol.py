@@ -5,7 +5,7 @@ import pytest
 from tests.experiments.experiment_cases import small
 from tests.refusals import refused
 
-from faintspot.experiments.night.protocol import COUNTS, NONE, QUICK_PLAN, TV, NightPlan, counts_per_e
+from faintspot.experiments.night.protocol import COUNTS, NONE, QUICK_PLAN, NightPlan, counts_per_e
 from faintspot.loop.simulation import load_loop
 from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
@@ -52,7 +52,7 @@ def test_strengths_in_counts_follow_the_multiplication_gain() -> None:
     for number, counts in ((0, 30.0), (2, 22.5)):  # 300 / 10, and three quarters of it
         whole = plan.configuration(loop, number)
         assert counts_per_e(whole) == counts
-        _, *tv = plan.made(whole, number, {})
+        _, *tv = plan.made(whole, number)
         noise = [method.estimator.noise_std for method in tv]  # type: ignore[attr-defined]
         np.testing.assert_allclose(noise, [0.6 / counts, 1.5 / counts])
         assert [method.label for method in tv] == ["TV 0.6 counts", "TV 1.5 counts"]
@@ -73,8 +73,8 @@ def test_multiplication_gain_is_full_and_then_three_quarters() -> None:
     assert plain.camera.em_gain == 1  # without multiplication there is nothing to lower
 
 
-def test_methods_share_pixels_and_loop_gain_when_nothing_is_tuned() -> None:
-    none, *tv = NightPlan(keep_brightest=30).made(small(), 0, {})
+def test_methods_share_pixels_and_loop_gain() -> None:
+    none, *tv = NightPlan(keep_brightest=30).made(small(), 0)
     assert isinstance(none.estimator, BrightestPixels)
     assert none.label == "no TV"
     assert {method.estimator.keep_brightest for method in (none, *tv)} == {30}  # type: ignore[attr-defined]
@@ -83,26 +83,10 @@ def test_methods_share_pixels_and_loop_gain_when_nothing_is_tuned() -> None:
     assert [method.estimator.noise_std for method in tv][-1] == 2  # type: ignore[attr-defined]
 
 
-def test_tuned_values_are_used_except_for_the_strength() -> None:
-    choices = {
-        NONE: {"loop_gain": 0.3, "keep_brightest": 12},
-        TV: {"loop_gain": 0.2, "keep_brightest": 20, "noise_std": 9.0},
-    }
-    none, *tv = NightPlan(listed_strengths=(0.5, 1.5)).made(small(), 0, choices)
-    assert (none.gain, none.estimator.keep_brightest) == (0.3, 12)  # type: ignore[attr-defined]
-    assert [(method.gain, method.estimator.noise_std) for method in tv] == [(0.2, 0.5), (0.2, 1.5)]  # type: ignore[attr-defined]
-
-
-def test_each_subaperture_may_have_its_own_strength() -> None:
-    factors = tuple(np.linspace(0.5, 1, 12))
-    method = NightPlan(listed_strengths=(2.0,), strength_factors=factors).made(small(), 0, {})[1]
-    np.testing.assert_allclose(method.estimator.values("noise_std", 12, 64), 2 * np.array(factors))
-
-
 def test_other_methods_are_one_block_of_a_cycle() -> None:
     plan = NightPlan(methods=("window", "none", "tv"), listed_strengths=(0.4, 0.8))
     assert [name for name, _ in plan.entries(0)] == ["window", "none", "tv", "tv"]
-    labels = [method.label for method in plan.made(small(), 0, {})]
+    labels = [method.label for method in plan.made(small(), 0)]
     assert labels == ["fixed window", "no TV", "TV 0.4 e-", "TV 0.8 e-"]
 
 

@@ -45,7 +45,7 @@ def test_a_night_is_what_the_loop_does(tmp_path: Path) -> None:
     # The first block of the reference has seen nothing else, so that it is the reference's own run.
     assert night.paired_strehl[0] == night.strehl[0]
     first = PLAN.configuration(LOOP, 0).replace("run", frames=60)
-    alone = simulate_loop(first, PLAN.made(first, 0, {})[:1])
+    alone = simulate_loop(first, PLAN.made(first, 0)[:1])
     assert night.strehl[0] == pytest.approx(alone.strehl[20:].mean())
     assert night.true_r0_m[0] == pytest.approx(np.mean(alone.r0_m[20:] ** (-5 / 3)) ** (-3 / 5))
     phase = (2e-9 * np.pi / night.wavelength_m) ** 2 * np.square(alone.residual_nm[20:])
@@ -55,14 +55,14 @@ def test_a_night_is_what_the_loop_does(tmp_path: Path) -> None:
     pieces = (2e-9 * np.pi / night.wavelength_m) ** 2 * np.square(alone.residual_nm[20:].reshape(10, 4))
     assert night.phase_error_rad2[0] == pytest.approx(pieces.mean(axis=1).std(ddof=1) / np.sqrt(10))
     # The same turbulence without the mirror: 40 frames and other noise, 0.5 % apart; 25 % if added to it.
-    seen = simulate_loop(first.replace("control", mode="open"), PLAN.made(first, 0, {})[:1])
+    seen = simulate_loop(first.replace("control", mode="open"), PLAN.made(first, 0)[:1])
     site = slope_turbulence(first, seen.cells)
     slopes = seen.slopes_px[20:] / seen.centroid_gain[0]
     r0_m, _ = r0_of_slopes(slopes, slopes, site, first.atmosphere.outer_scale_m)
     assert night.r0_m[0] == pytest.approx(r0_m, rel=0.05)
     # The second set goes on where the first ended.
     second = PLAN.configuration(LOOP, 1).replace("run", frames=60)
-    later = simulate_loop(second, PLAN.made(second, 1, {})[:1], first_frame=360)
+    later = simulate_loop(second, PLAN.made(second, 1)[:1], first_frame=360)
     assert night.strehl[6] == pytest.approx(later.strehl[20:].mean())
     assert np.isfinite(night.r0_m).sum() >= 8
     assert ((night.r0_m > 0.3 * night.true_r0_m) & (night.r0_m < 3 * night.true_r0_m))[
@@ -84,17 +84,7 @@ def test_an_interrupted_night_goes_on(tmp_path: Path) -> None:
         run_night(LOOP, interrupted, plan=replace(PLAN, keep_brightest=9), pool=HERE)
 
 
-def test_without_paired_runs_and_in_open_loop(tmp_path: Path) -> None:
+def test_in_open_loop(tmp_path: Path) -> None:
     loop = LOOP.replace("control", mode="open")
-    night = run_night(loop, tmp_path, plan=replace(PLAN, repeats=(1, 1)), pool=HERE, paired=False)
-    assert not night.is_paired
+    night = run_night(loop, tmp_path, plan=replace(PLAN, repeats=(1, 1)), pool=HERE)
     assert np.isfinite(night.strehl).all()
-
-
-@pytest.mark.slow
-def test_tuned(tmp_path: Path) -> None:
-    plan = replace(PLAN, methods=("none", "tv", "window"), repeats=(1, 1))
-    night = run_night(LOOP, tmp_path, plan=plan, pool=HERE, quick=True, tuned=True)
-    assert "fixed window" in night.labels
-    assert len(night.settings) == len(night.labels)
-    assert (tmp_path / "units" / "tuning.zarr").is_dir()

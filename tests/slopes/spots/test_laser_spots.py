@@ -1,4 +1,4 @@
-"""Laser guide stars in the planner: [laser] of the camera file, spots that are tuned on, what is written."""
+"""Laser guide stars in the planner: spots that are tuned on, what is written, what is refused."""
 
 from pathlib import Path
 from typing import Any
@@ -10,37 +10,24 @@ from tests.refusals import refused
 import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.experiments import Question
-from faintspot.experiments.planner.question import read_camera
 from faintspot.experiments.planner.text import foundations
 from faintspot.slopes.spots.laser_spots import LaserSpots
 
-FILE = """
-[camera]
-read_noise_e = 1.0
-pixels = 10
-[spot]
-pixel_scale_arcsec = 0.5
-subaperture_m = 0.8
-[star]
-flux_e = 300
-[tune]
-search_range_px = 1.0
-[layout.grid]
-shape = [4, 4]
-pixels = 10
-[laser]
-launch_m = [-5.0, 0.0]
-at_m = [3.6, 0.0]
-spot_fwhm_arcsec = 1.2
-"""
+LASER = {"launch_m": [-5.0, 0.0], "at_m": [3.6, 0.0], "spot_fwhm_arcsec": 1.2}
+SCALE = {"pixel_scale_arcsec": 0.5, "subaperture_m": 0.8}
+
+
+def question(laser: LaserSpots, **changes: Any) -> Question:
+    layout = fs.Layout.grid((4, 4), pixels=10)
+    known = {"read_noise_e": 1.0, "flux_e": 300.0, "search_range_px": 1.0, "layout": layout, **SCALE}
+    return Question(**{**known, **changes}, laser=laser)
 
 
 @pytest.mark.slow
 def test_tuned_on_spots_of_the_sub_aperture(tmp_path: Path) -> None:
     """The layer's width at 90 km seen from 8.6 m: 2.2 arcsec, 4.4 px."""
-    path = tmp_path / "camera.toml"
-    path.write_text(FILE, encoding="utf-8")
-    answer = fs.tune(Question(**read_camera(path)), rng=np.random.default_rng(1), realisations=300)
+    asked = question(LaserSpots.from_table(LASER))
+    answer = fs.tune(asked, rng=np.random.default_rng(1), realisations=300)
     assert answer["ml"].method.psf is not None
     assert "elongated by 4.4 px along 0 deg" in " ".join(foundations(answer))
     answer.save(tmp_path / "faintspot.toml")
@@ -54,33 +41,30 @@ def test_tuned_on_spots_of_the_sub_aperture(tmp_path: Path) -> None:
 
 def test_a_profile_from_a_file(tmp_path: Path) -> None:
     fs.SodiumProfile.gaussian(fwhm_m=5e3).save(tmp_path / "sodium.npz")
-    path = tmp_path / "camera.toml"
-    path.write_text(f'{FILE}profile = "sodium.npz"\n', encoding="utf-8")
-    spots = read_camera(path)["laser"]
+    spots = LaserSpots.from_table({**LASER, "profile": "sodium.npz"}, tmp_path / "faintspot.toml")
     assert "elongated by 2.2 px" in spots.in_words(0.5, (10, 10))
 
 
 @pytest.mark.parametrize(
-    ("old", "new"),
+    ("changes", "known"),
     [
-        ("at_m = [3.6, 0.0]", ""),
-        ("at_m = [3.6, 0.0]", "at_m = [3.6]"),
-        ("launch_m = [-5.0, 0.0]", "launch_m = [nan, 0.0]"),
-        ("spot_fwhm_arcsec = 1.2", "spot_fwhm_arcsec = 0"),
-        ("spot_fwhm_arcsec = 1.2", "spot_fwhm_arcsec = 1.2\nprofile = 3"),
-        ("spot_fwhm_arcsec = 1.2", 'spot_fwhm_arcsec = 1.2\nprofile = "none.npz"'),
-        ("spot_fwhm_arcsec = 1.2", "spot_fwhm_arcsec = 1.2\nzenith = 3"),
-        ("spot_fwhm_arcsec = 1.2", "spot_fwhm_arcsec = 1.2\nzenith_distance_deg = 90"),
-        ("spot_fwhm_arcsec = 1.2", "spot_fwhm_arcsec = 30"),
-        ("pixel_scale_arcsec = 0.5", ""),
+        ({"at_m": None}, {}),
+        ({"at_m": [3.6]}, {}),
+        ({"launch_m": [np.nan, 0.0]}, {}),
+        ({"spot_fwhm_arcsec": 0}, {}),
+        ({"profile": 3}, {}),
+        ({"profile": "none.npz"}, {}),
+        ({"zenith": 3}, {}),
+        ({"zenith_distance_deg": 90}, {}),
+        ({"spot_fwhm_arcsec": 30}, {}),
+        ({}, {"pixel_scale_arcsec": None}),
     ],
 )
-def test_what_is_refused(tmp_path: Path, old: str, new: str) -> None:
+def test_what_is_refused(changes: dict[str, Any], known: dict[str, Any]) -> None:
     """Also a window shorter than the spot."""
-    path = tmp_path / "camera.toml"
-    path.write_text(FILE.replace(old, new), encoding="utf-8")
+    values = {name: value for name, value in {**LASER, **changes}.items() if value is not None}
     with refused():
-        Question(**read_camera(path))
+        question(LaserSpots.from_table(values), **known)
 
 
 def test_not_with_other_spots() -> None:

@@ -159,23 +159,11 @@ def magnitude(
     default="e-",
     help="Unit of strengths, which the paper does not state: photo-electrons, or counts of the camera.",
 )
-@option(
-    "--strength-factors",
-    metavar="FILE",
-    help="Factor on the strength in each sub-aperture (.npy or .fits).",
-    show_default="1",
-)
-@option(
-    "--tuned",
-    is_flag=True,
-    help="Tune pixels kept, loop gain and options of each method on other turbulence.",
-)
 def night(
     configuration: str,
     methods: Names,
     strengths: tuple[float, ...],
     unit: str,
-    strength_factors: str | None,
     output: str | None,
     quick: bool,
     **options: Any,
@@ -193,18 +181,14 @@ def night(
     Examples:
       faintspot loop night
       faintspot loop night canary --unit counts
-      faintspot loop night canary --tuned -o tuned
       faintspot loop night emccd --methods none,tv,smoothed,window --strengths 0.4,0.8
     """
     from faintspot.experiments.night.page import PAGE_FILE, night_summary_text
     from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan
-    from faintspot.io.frames import read_array
     from faintspot.loop.simulation.configuration.configuration import load_loop
 
-    factors = () if strength_factors is None else tuple(read_array(strength_factors).ravel().tolist())
     plan = QUICK_PLAN if quick else NightPlan()
-    listed = strengths or ()
-    plan = replace(plan, methods=methods, listed_strengths=listed, strength_factors=factors, unit=unit)
+    plan = replace(plan, methods=methods, listed_strengths=strengths or (), unit=unit)
     loop = load_loop(configuration)
     kind = ("-counts" if unit == "counts" else "") + ("-quick" if quick else "")
     folder = Path(output or f"{loop.name}-night{kind}")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +11,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.config.options import LIST, TEXTS, Options, number, setting
 from faintspot.base.errors import InputError
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, with_choice
-from faintspot.experiments.methods import Choice
+from faintspot.experiments.closed_loop.methods import with_choice
 from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import UNCORRECTED, Method
@@ -30,8 +27,6 @@ BEST_STRENGTHS = 0.6, 1.1
 """Strengths of which the paper's Table 1 has a column of its own, ends included."""
 ELECTRONS, COUNTS = "e-", "counts"
 """Units of the strength, which the paper does not state: photo-electrons, and counts of the camera."""
-
-_KEPT_OPTION, _STRENGTH_OPTION = "keep_brightest", "noise_std"
 
 
 @dataclass(frozen=True)
@@ -65,10 +60,8 @@ class NightPlan(Options, table="plan"):
         as in `Method.named`, with the integrator.
     listed_strengths : tuple of float
         Strengths of all sets instead of evenly spaced ones.
-    strength_factors : tuple of float
-        Factor on the strength in each sub-aperture; empty: 1.
     keep_brightest : int
-        Pixels kept where nothing is tuned: those of the paper's simulations.
+        Pixels kept without and with TV: those of the paper's simulations.
 
     Raises
     ------
@@ -86,7 +79,6 @@ class NightPlan(Options, table="plan"):
     unit: str = setting(ELECTRONS, choices=(ELECTRONS, COUNTS))
     methods: tuple[str, ...] = setting(PAPER_METHODS, kind=TEXTS)
     listed_strengths: tuple[float, ...] = number((), 0, 1e6, kind=LIST)
-    strength_factors: tuple[float, ...] = number((), 0, 1e6, kind=LIST)
     keep_brightest: int = number(40, 1, 10**6, whole=True)
 
     def __post_init__(self) -> None:
@@ -151,41 +143,20 @@ class NightPlan(Options, table="plan"):
         run = {"frames": self.frames(number), "settle_frames": self.settle_in_block}
         return configuration.replace("camera", em_gain=gain).replace("run", **run)
 
-    def made(
-        self, configuration: LoopConfiguration, number: int, choices: Mapping[str, Choice]
-    ) -> list[Method]:
-        """Return the methods of a set's cycle, in order.
+    def made(self, configuration: LoopConfiguration, number: int) -> list[Method]:
+        """Return the methods of a set's cycle, in order; sets are counted from 0."""
+        return [self._method(configuration, name, strength) for name, strength in self.entries(number)]
 
-        Parameters
-        ----------
-        configuration : LoopConfiguration
-        number : int
-            Set, counted from 0.
-        choices : mapping
-            Tuned values by the method's name; empty where nothing is tuned.
-        """
-        return [
-            self._method(configuration, name, strength, choices.get(name))
-            for name, strength in self.entries(number)
-        ]
-
-    def _method(
-        self, configuration: LoopConfiguration, name: str, strength: float, choice: Choice | None
-    ) -> Method:
+    def _method(self, configuration: LoopConfiguration, name: str, strength: float) -> Method:
         label = label_of(name, strength, self.unit)
         if name not in PAPER_METHODS:
-            return replace(with_choice(kind_of(name), configuration, choice), label=label)
-        values = dict(choice or {_KEPT_OPTION: self.keep_brightest})
-        gain = values.pop(LOOP_GAIN, None)
-        estimator: Estimator
+            return replace(with_choice(kind_of(name), configuration, None), label=label)
+        estimator: Estimator = BrightestPixels(keep_brightest=self.keep_brightest)
         if name == TV:
-            strength_e = strength / (1.0 if self.unit == ELECTRONS else counts_per_e(configuration))
-            factors: Any = np.array(self.strength_factors) if self.strength_factors else 1.0
-            estimator = TotalVariation(**{**values, _STRENGTH_OPTION: strength_e * factors})
-        else:
-            estimator = BrightestPixels(**values)
+            noise_std = strength / (1.0 if self.unit == ELECTRONS else counts_per_e(configuration))
+            estimator = TotalVariation(keep_brightest=self.keep_brightest, noise_std=noise_std)
         # At a telescope all strengths share the command matrix; centroid gains are not measured for each.
-        return Method(label, Settings(estimator), gain, (UNCORRECTED,) if choice is None else ())
+        return Method(label, Settings(estimator), variants=(UNCORRECTED,))
 
 
 def counts_per_e(configuration: LoopConfiguration) -> float:

@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.experiments.closed_loop.search import QUICK, Search, stored, tune, tuning_frames
-from faintspot.experiments.methods import Choice
 from faintspot.experiments.night.blocks import NIGHT_STORE, Night
-from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan, counts_per_e, kind_of
-from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
+from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan, counts_per_e
+from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
 from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED
@@ -72,15 +70,14 @@ def run_night(
     *,
     plan: NightPlan | None = None,
     quick: bool = False,
-    tuned: bool = False,
-    paired: bool = True,
     pool: WorkerPool | None = None,
     overwrite: bool = False,
 ) -> Night:
     """Observe a night in simulation, or what is left of it; the result is also written to the folder.
 
-    The sets follow one another in one continuous atmosphere, in which r0 drifts as configured. Each unit of
-    work is a set; where it is finished, it is not done again.
+    The sets follow one another in one continuous atmosphere, in which r0 drifts as configured; the reference
+    also runs alone in the same turbulence. Each unit of work is a set; where it is finished, it is not done
+    again.
 
     Parameters
     ----------
@@ -90,11 +87,7 @@ def run_night(
     plan : NightPlan, optional
         Default: the paper's, or with `quick` a short one.
     quick : bool
-        Short blocks, few strengths and a coarse search.
-    tuned : bool
-        Whether number of pixels, loop gain and options are tuned for each method in other turbulence.
-    paired : bool
-        Whether the reference also runs alone in the same turbulence.
+        Short blocks and few strengths.
     pool : WorkerPool, optional
         Where the work is done. Default: processes on this machine.
     overwrite : bool
@@ -115,43 +108,26 @@ def run_night(
     """
     plan = plan or (QUICK_PLAN if quick else NightPlan())
     pool, folder = pool or WorkerPool(), make_folder(folder)
-    identity = fingerprint_of(configuration.to_text(), str(asdict(plan)), f"tuned: {tuned}, quick: {quick}")
+    identity = fingerprint_of(configuration.to_text(), str(asdict(plan)), f"quick: {quick}")
 
-    def results_of(name: str, function: Any, units: list[Unit], stage: WorkerPool) -> UnitStore:
-        path = make_folder(folder / "units") / f"{name}.zarr"
-        keys, attributes = [unit.key for unit in units], {"name": configuration.name}
-        store = ZarrStore(path, KIND, identity, keys, attributes=attributes, overwrite=overwrite)
-        return run_units(function, units, store, stage)
-
-    plan.made(plan.configuration(configuration, 0), 0, {})  # refuses what does not fit before any work
-    search = QUICK if quick else Search()
-    trials = [
-        Unit(name, (kind, configuration, search, None), tuning_frames(kind, configuration, search))
-        for name, kind in ({name: kind_of(name) for name in plan.methods} if tuned else {}).items()
-    ]
-    units = _units(configuration, plan, {}, paired)
-    stages = in_stages(pool, [sum(unit.size for unit in each) for each in (trials, units)])
-    choices: dict[str, Choice] = {}
-    if trials:
-        pool.say("tuning")
-        found = results_of("tuning", tune, trials, stages[0])
-        choices = {unit.key: stored(found[unit.key]).choice for unit in trials}
+    plan.made(plan.configuration(configuration, 0), 0)  # refuses what does not fit before any work
     pool.say("observing")
-    units = _units(configuration, plan, choices, paired)
-    night = _night(configuration, plan, choices, results_of("night", observe, units, stages[1]))
-    night.save(folder / NIGHT_STORE)
-    return night
-
-
-def _units(
-    configuration: LoopConfiguration, plan: NightPlan, choices: dict[str, Choice], paired: bool
-) -> list[Unit]:
-    """Return the sets with alternating methods, and those of the reference alone."""
-    return [
-        Unit(_key(number, alone), (configuration, plan, number, choices, alone), plan.frames(number))
-        for alone in ([False, True] if paired else [False])
+    units = [
+        Unit(_key(number, alone), (configuration, plan, number, alone), plan.frames(number))
+        for alone in (False, True)
         for number in range(plan.sets)
     ]
+    store = ZarrStore(
+        make_folder(folder / "units") / "night.zarr",
+        KIND,
+        identity,
+        [unit.key for unit in units],
+        attributes={"name": configuration.name},
+        overwrite=overwrite,
+    )
+    night = _night(configuration, plan, run_units(observe, units, store, pool))
+    night.save(folder / NIGHT_STORE)
+    return night
 
 
 def _key(number: int, alone: bool) -> str:
@@ -162,7 +138,6 @@ def observe(
     configuration: LoopConfiguration,
     plan: NightPlan,
     number: int,
-    choices: dict[str, Choice],
     alone: bool,
     advance: Advance,
 ) -> dict[str, NDArray[np.generic]]:
@@ -174,8 +149,6 @@ def observe(
     plan : NightPlan
     number : int
         Set, counted from 0.
-    choices : dict
-        Tuned values by the method's name.
     alone : bool
         Whether the reference measures all blocks.
     advance : callable
@@ -183,7 +156,7 @@ def observe(
     """
     whole = plan.configuration(configuration, number)
     schedule = plan.schedule(number)
-    methods = plan.made(whole, number, choices)
+    methods = plan.made(whole, number)
     record = simulate_loop(
         whole,
         methods[:1] if alone else methods,
@@ -223,9 +196,7 @@ def _mean(values: Floats) -> tuple[float, float]:
     return float(values.mean()), float(np.std(pieces, ddof=1)) / math.sqrt(_PIECES)
 
 
-def _night(
-    configuration: LoopConfiguration, plan: NightPlan, choices: dict[str, Choice], results: UnitStore
-) -> Night:
+def _night(configuration: LoopConfiguration, plan: NightPlan, results: UnitStore) -> Night:
     """Put the sets together."""
     rate = configuration.control.frame_rate_hz
     methods: dict[str, Method] = {}
@@ -233,14 +204,12 @@ def _night(
     for number in range(plan.sets):
         entries, count = plan.entries(number), plan.blocks(number)
         whole = plan.configuration(configuration, number)
-        made = plan.made(whole, number, choices)
+        made = plan.made(whole, number)
         for method in made:
             methods.setdefault(method.label, method)
         numbers = np.array([list(methods).index(method.label) for method in made])
         order, observed = np.arange(count) % len(entries), results[_key(number, False)]
         first = plan.first_frames(number) + plan.settle_in_block
-        key = _key(number, True)
-        alone = results[key]["strehl"] if key in results else np.full(count, np.nan)
         sets.append(
             {
                 "set_number": np.full(count, number),
@@ -248,7 +217,7 @@ def _night(
                 "strength": np.array([strength for _, strength in entries])[order],
                 "counts_per_e": np.full(count, counts_per_e(whole)),
                 "start_s": first / rate,
-                "paired_strehl": alone[:count],
+                "paired_strehl": results[_key(number, True)]["strehl"][:count],
                 **{name: observed[name][:count] for name in _VALUES},
             }
         )
@@ -256,10 +225,7 @@ def _night(
     scored = plan.block_frames - plan.settle_in_block
     return Night(
         labels=tuple(methods),
-        settings=tuple(
-            _in_words(configuration, method, max(1, len(plan.strength_factors)))
-            for method in methods.values()
-        ),
+        settings=tuple(_in_words(configuration, method) for method in methods.values()),
         reference=0,
         set_names=tuple(plan.set_name(number) for number in range(plan.sets)),
         duration_s=np.full(len(values["start_s"]), scored / rate),
@@ -272,8 +238,8 @@ def _night(
     )
 
 
-def _in_words(configuration: LoopConfiguration, method: Method, subapertures: int) -> str:
+def _in_words(configuration: LoopConfiguration, method: Method) -> str:
     """Return settings and loop gain of a method in words."""
     gain = configuration.control.gain if method.gain is None else method.gain
-    words = method.estimator.in_words(subapertures, configuration.sensor.pixels**2)
+    words = method.estimator.in_words(1, configuration.sensor.pixels**2)
     return f"{words}; loop gain {gain:.3g}"

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.base.files import csv_text
 from faintspot.base.report.page import FigureWithData, Report, Section, Table
 from faintspot.base.report.plots import Labels, Picture
 from faintspot.base.report.texts import NOTHING, Texts, with_error
@@ -160,14 +159,7 @@ def _table(cells: list[LoopCell]) -> Table:
         + [with_error(cell.gain, sign=True), label_of(cell.winner) if cell.winner else NOTHING]
         for cell in cells
     ]
-    numbers = [
-        [cell.r0_m, cell.camera, cell.photons, cell.gain.value, cell.gain.standard_error, cell.winner]
-        + [value for name in METHODS for value in (cell.strehl[name].value, cell.strehl[name].standard_error)]
-        for cell in cells
-    ]
-    of_methods = [f"{name}{ending}" for name in METHODS for ending in ("", "_se")]
-    header = ["r0_m", "camera", "photons", "gain", "gain_se", "winner", *of_methods]
-    return replace(_TEXT.table("loop_map.table", rows), csv=("loop_map.csv", csv_text(header, numbers)))
+    return _TEXT.table("loop_map.table", rows)
 
 
 def _figure(cells: list[LoopCell]) -> FigureWithData:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -67,23 +66,6 @@ def grouped(
     return dict(sorted(groups.items()))
 
 
-def table_of_cells(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[str], list[list[Any]]]:
-    """Return a table of all methods and modes of cells."""
-    columns = ("chosen_k", "chosen_candidate", "invalid_fraction", *_STATISTICS)
-    arrays = [
-        dataset[name].transpose("cell", "mode", "estimator").values
-        for name in ("error", "error_se", *columns)
-    ]
-    rows = []
-    for cell, parameters in zip(cells, parameters_of(dataset, cells), strict=True):
-        for m, mode in enumerate(dataset["mode"].values):
-            for a, method in enumerate(dataset["estimator"].values):
-                values = [float(array[cell, m, a]) for array in arrays]
-                if np.isfinite(values[0]):
-                    rows.append([*parameters.values(), str(mode), str(method), *(f"{v:.6g}" for v in values)])
-    return [*PARAMETERS, "mode", "method", "R_px", "R_se_px", *columns], rows
-
-
 def cases_csv(judged: Sequence[Verdict]) -> tuple[str, str]:
     """Return name and text of the file with all cases that the verdicts rest on."""
     data = [
@@ -108,11 +90,7 @@ def baselines_section(dataset: xarray.Dataset) -> Section:
         if mode in dataset["mode"].values
         for row in against_tv(dataset, mode)
     ]
-    done = np.flatnonzero(dataset["done"].values).tolist()
-    table = replace(
-        _TEXT.table("baselines", records), csv=("cells.csv", csv_text(*table_of_cells(dataset, done)))
-    )
-    return _TEXT.section("baselines", table)
+    return _TEXT.section("baselines", _TEXT.table("baselines", records))
 
 
 def gains_section(dataset: xarray.Dataset) -> Section:

@@ -1,13 +1,11 @@
-"""The camera, spot and star that a user asks about, checked, and the file that describes them."""
+"""The camera, spot and star that a user asks about, checked."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,11 +14,10 @@ from numpy.typing import NDArray
 from faintspot.base.checks import not_none
 from faintspot.base.config.options import TEXT, setting
 from faintspot.base.errors import InputError
-from faintspot.base.toml_files import check_keys, checked_table, parse_file
 from faintspot.experiments.planner.stated import Spots, StatedCamera, StatedOptics, positive
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.scene import Scene
-from faintspot.slopes.sensor.layout import GRID_KEYS, Layout
+from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.simulate.frames import Photometry, StarLight
 from faintspot.slopes.spots.laser_spots import LaserSpots
 from faintspot.slopes.spots.psf import PSF
@@ -302,40 +299,3 @@ class Question(StarLight, StatedOptics, StatedCamera):
                 f"got {flux:.3g}; check "
                 + ("flux_e" if self.magnitude is None else "magnitude, subaperture_m and frame_rate_hz")
             )
-
-
-_LAYOUT, _LASER = "layout", "laser"
-
-
-def read_camera(path: str | Path) -> dict[str, Any]:
-    """Return the values of a camera file by the names of `faintspot.experiments.Question`.
-
-    A table [layout.grid], as in a configuration, gives `layout`; [laser] gives `laser`.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read or is not TOML, or has an unknown table or key.
-    """
-    document = parse_file(path)
-    groups = {name: declared.group for name, declared in Question.declared().items()}
-    check_keys(f"{path}: ", document, [*groups.values(), _LAYOUT, _LASER], what="table")
-    values: dict[str, Any] = {}
-    for table, content in document.items():
-        entries = checked_table(f"{path}: {table}", content)
-        if table == _LAYOUT:
-            values[_LAYOUT] = _layout(path, entries)
-            continue
-        if table == _LASER:
-            values[_LASER] = LaserSpots.from_table(entries, Path(path))
-            continue
-        check_keys(f"{path}: {table}.", entries, [name for name in groups if groups[name] == table])
-        values |= entries
-    return values
-
-
-def _layout(path: str | Path, content: Mapping[str, object]) -> Layout:
-    check_keys(f"{path}: layout.", content, ["grid"], required=["grid"])
-    grid = checked_table(f"{path}: layout.grid", content["grid"])
-    check_keys(f"{path}: layout.grid.", grid, GRID_KEYS, required=("shape", "pixels"))
-    return Layout.grid(**grid)

@@ -1,4 +1,4 @@
-"""Camera and optics that a user states, as options and as tables of a camera file."""
+"""Camera and optics that a user states, as options."""
 
 from __future__ import annotations
 

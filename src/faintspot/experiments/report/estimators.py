@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.report.page import FigureWithData, Section
+from faintspot.base.report.page import FigureWithData
 from faintspot.base.report.plots import Line, Panel
-from faintspot.base.report.texts import Texts, number_or_dash
+from faintspot.base.report.texts import Texts
 from faintspot.experiments.methods import knows_the_spot, label_of, style_of
 from faintspot.experiments.paper.figures import axis_of_study
 from faintspot.experiments.paper.tables import grouped, in_words, parameter_in_words
@@ -154,21 +154,6 @@ def findings(dataset: xarray.Dataset) -> list[str]:
         *_efficient(_finished(dataset, speckled=False)),
         *_near_the_best(_finished(dataset, speckled=True)),
     ]
-
-
-def calibration_sections(dataset: xarray.Dataset) -> list[Section]:
-    """Return the table of stated over actual errors of estimators that know the spot; none without cells."""
-    cells = _finished(dataset, speckled=False)
-    cells = cells.isel(cell=np.lexsort([cells[name].values for name in reversed(PARAMETERS)]))
-    if not cells.sizes["cell"]:
-        return []
-    knowing = [method for method in _methods(dataset) if knows_the_spot(method)]
-    stated = [cells[f"stated_over_actual{part}"].sel(estimator=knowing).values for part in ("", "_all")]
-    rows = [
-        [words, *(f"{number_or_dash(one)} ({number_or_dash(all_)})" for one, all_ in zip(*pair, strict=True))]
-        for words, *pair in zip(_cells_in_words(cells), *stated, strict=True)
-    ]
-    return [_TEXT.section("calibration-table", _TEXT.table("calibration-table", rows, knowing))]
 
 
 def _finished(dataset: xarray.Dataset, *, speckled: bool) -> xarray.Dataset:

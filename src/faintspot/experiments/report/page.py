@@ -22,7 +22,6 @@ from faintspot.experiments.paper.figures import (
 from faintspot.experiments.paper.tables import baselines_section, gains_section
 from faintspot.experiments.paper.whole import paper_rows, paper_section
 from faintspot.experiments.report.estimators import (
-    calibration_sections,
     compares_estimators,
     estimator_figures,
     findings,
@@ -157,7 +156,6 @@ def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
     return [
         _TEXT.section("sections.findings", findings(dataset)),
         *_figure_sections(dataset),
-        *calibration_sections(dataset),
         baselines_section(dataset),
     ]
 

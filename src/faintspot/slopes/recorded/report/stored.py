@@ -1,4 +1,4 @@
-"""The report page of slopes that lie in files, with its section on sodium profiles."""
+"""The report page of slopes that lie in files, and the figure of a sodium profile."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.flags import leave_out
-from faintspot.base.report.page import FigureWithData, Report, Section
+from faintspot.base.report.page import FigureWithData, Report
 from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, Line, Panel
 from faintspot.base.report.texts import Texts
 from faintspot.io import open_frames
@@ -21,7 +21,6 @@ from faintspot.slopes.pipeline.slopes import Slopes, Stages
 from faintspot.slopes.recorded.report.page import slopes_report
 from faintspot.slopes.recorded.report.pictures import Followed, farthest_frame
 from faintspot.slopes.recorded.report.run import SlopesRun
-from faintspot.slopes.recorded.sodium import sodium_of_frames
 from faintspot.slopes.recorded.statistics import MeasuredSlopes
 from faintspot.slopes.recorded.stored_run import StoredRun, open_run
 from faintspot.slopes.spots.sodium import SodiumProfile
@@ -47,7 +46,6 @@ def profile_figure(profiles: Mapping[str, SodiumProfile]) -> FigureWithData:
 _SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
 _SAME_POSITION_PX = 0.02
 """Recomputed positions differ by less, whatever processor computed the stored ones."""
-_FRAMES_OF_PROFILE = 500
 
 
 def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path] | None = None) -> Report:
@@ -95,24 +93,7 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
         facts=_facts(stores, methods),
         configurations=_configurations(stores, methods),
         warnings=list(dict.fromkeys([*_labelled_notes(stores, methods), *notes])),
-        sections=_sodium(first, frames),
     )
-
-
-def _sodium(store: StoredRun, frames: Sequence[str | Path] | None) -> list[Section]:
-    """Return the section of the sodium profile, for a laser guide star whose frames are there."""
-    if store.laser is None or store.layout is None or store.calibration is None:
-        return []
-    try:
-        with _source(store, frames) as source:
-            parts = store.layout, store.calibration, store.laser
-            found = sodium_of_frames(source, *parts, most_frames=_FRAMES_OF_PROFILE)
-    except InputError as error:
-        return [_TEXT.section("sodium", missing=f"Not fitted: {error}.")]
-    sodium, doubt = found.sodium, found.left_out.capitalize() or None
-    profiles = {"configured": sodium.star.focused(store.laser.profile), "these frames": sodium.fit.profile}
-    figure = profile_figure(profiles)
-    return [_TEXT.section("sodium", figure, width=sodium.spot_fwhm_arcsec, left_out=doubt)]
 
 
 def _configurations(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> dict[str, str]:
