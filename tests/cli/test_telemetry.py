@@ -84,7 +84,7 @@ def test_controllers_that_cannot_be_learnt(folder: Path, run: Commands) -> None:
     np.savez("loop.npz", **values, **known)
     told = run("telemetry", "loop.npz", "--controller", "controller.npz")
     assert told.code == 2
-    reason = "keep the integrator: recording: expected 576 consecutive frames, got 300"
+    reason = "keep the integrator: recording: expected 326 consecutive frames, got 300"
     assert f"controller.npz: not written, {reason}" in told.err
     assert Path("loop.html").exists()
     assert not Path("controller.npz").exists()

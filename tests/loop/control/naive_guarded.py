@@ -49,6 +49,10 @@ class Guarded(GuardedController):
         self._phase, makers = phase, (learnt, plain)
         self._controllers = [make(own_line) for make, own_line in zip(makers, self._lines, strict=True)]
 
+    def set_plain_gain(self, gain: float) -> None:
+        """See `GuardedController`."""
+        self._controllers[1].gain = gain
+
     def expected(self) -> ExpectedSlopes:
         """See `Controller`."""
         mean, std = self._controllers[self.chosen].expected()

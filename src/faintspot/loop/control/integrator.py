@@ -63,7 +63,8 @@ class Integrator(Controller):
         sees_mirror: bool = True,
     ) -> None:
         super().__init__(line, interaction)
-        self._reconstructor, self._gain, self._leak = reconstructor, gain, leak
+        self._reconstructor, self._leak = reconstructor, leak
+        self.gain: float = gain
         self._weighted, self._sees_mirror = weighted, sees_mirror
 
     def expected(self) -> ExpectedSlopes:
@@ -84,8 +85,8 @@ class Integrator(Controller):
 
     def follow(self, wavefront: Floats) -> None:
         """Update with this frame's wavefront, given as the commands that cause it."""
-        forgotten = self._leak if self._sees_mirror else self._gain
-        self.line.put((1 - forgotten) * self.line.latest - self._gain * wavefront)
+        forgotten = self._leak if self._sees_mirror else self.gain
+        self.line.put((1 - forgotten) * self.line.latest - self.gain * wavefront)
 
 
 _LEAST_BYTES = 500_000

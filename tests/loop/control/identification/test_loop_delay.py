@@ -68,7 +68,7 @@ def test_errors_of_gains_are_those_of_least_squares() -> None:
 
 
 def test_too_few_frames() -> None:
-    with pytest.raises(InputError, match="expected 576 consecutive frames, got 300"):
+    with pytest.raises(InputError, match="expected 326 consecutive frames, got 300"):
         found(2, 1.0, frames=300)
 
 

@@ -28,8 +28,8 @@ def test_winds_have_the_unit_of_length_per_second() -> None:
 def test_frames_without_slopes_are_gaps() -> None:
     loop = recorded()
     slopes = loop.slopes.copy()
-    slopes[300:2300] = np.nan
-    with pytest.raises(InputError, match="expected 576 consecutive frames, got 550 with 1 gaps"):
+    slopes[150:2400] = np.nan
+    with pytest.raises(InputError, match="expected 326 consecutive frames, got 300 with 1 gaps"):
         measured_delay(replace(loop, slopes=slopes))
     slopes[:] = np.nan
     with pytest.raises(InputError, match="expected frames with most slopes measured"):

@@ -145,16 +145,34 @@ def test_learn_again_continues(control: PredictiveControl, recording: Recording)
     np.testing.assert_allclose(control(recording.slopes[50]), sent, atol=0.5 * np.abs(sent).max())
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_learning_again_keeps_the_command(monkeypatch: pytest.MonkeyPatch, sign: float) -> None:
-    """Slopes of 0 change it by the integrator's leak alone; `sign` is that of the user's commands."""
+def made(sign: float = 1.0, **options: Any) -> PredictiveControl:
+    """Return a controller of 9 sub-apertures with a gain of 0.4; `sign` is that of the user's commands."""
     residual, variance = 1.0, np.ones(18)
     arrays = {"first": 0.9 * LAYERS.first, "second": LAYERS.second, "driving_px2": LAYERS.driving}
     arrays |= {"variance_px2": variance, "covariance_xy_px2": np.zeros(9)}
     model = Kalman(arrays, 0.4, 1.0, (residual, residual), PHASE_OF_COMMANDS)
     gains = np.array([2.0, 0.0, 1.0, 0.0, 1.0, 0.0])
-    loop = LoopOfControl(INTERACTION, np.ones(18), np.ones(18), sign, gains, np.zeros((0, 6)), 10.0, 0.4, 1)
-    control, again = PredictiveControl(loop, model), PredictiveControl(loop, model)
+    numbers = gains, np.zeros((0, 6)), 10.0, 0.4, 1
+    return PredictiveControl(
+        LoopOfControl(INTERACTION, np.ones(18), np.ones(18), sign, *numbers, **options), model
+    )
+
+
+def test_another_gain_than_the_recorded_one_comes_in_100_frames() -> None:
+    """Steps of the integrator, which drives for 60 frames, are in proportion to its gain."""
+    eased, plain = made(recorded_gain=0.1), made()
+    slopes = np.linspace(0.1, 0.2, 18)
+    steps = np.array([[control(slopes) for control in (eased, plain)] for _ in range(3)])
+    first, second = steps[1] - 0.99 * steps[0]
+    ratios = 0.25 ** (1 - np.array([0.01, 0.02]))
+    np.testing.assert_allclose(steps[0, 0], ratios[0] * steps[0, 1], rtol=1e-5)
+    np.testing.assert_allclose(first, ratios[1] * second, rtol=1e-4)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_learning_again_keeps_the_command(monkeypatch: pytest.MonkeyPatch, sign: float) -> None:
+    """Slopes of 0 change it by the integrator's leak alone."""
+    control, again = made(sign), made(sign)
     monkeypatch.setattr(predictive_control, "learn", lambda recording, start: again)
     held = np.linspace(-1.0, 2.0, 12)
     control.reset(held)

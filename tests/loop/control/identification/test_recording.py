@@ -158,7 +158,7 @@ def test_a_gain_that_cannot_be_known() -> None:
     """Of few frames, and of an estimator with a prior."""
     loop = recorded()
     for short, reason in (
-        (loop.part(slice(0, 300)), "expected 576 consecutive frames, got 300"),
+        (loop.part(slice(0, 300)), "expected 326 consecutive frames, got 300"),
         (replace(loop, prior_std=np.full(50, 0.3)), "the estimator had a prior"),
     ):
         _, used, unknown = known_delay(replace(short, delay_frames=3.0))

@@ -22,7 +22,7 @@ from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 Floats = NDArray[np.float64]
 
 _WINDOW, _WINDOW_S = 128, 0.52  # frames; a longer window if the frame rate is so high that these last longer
-_FEWEST_PIECES, _FEWEST_LONG_PIECES = 8, 12
+_FEWEST_PIECES, _FEWEST_LONG_PIECES = 4, 12
 _MOST_DELAY, _USUAL_DELAY = 5, 3
 _UNLIKE = 3.0  # misfit above which longer delays than the usual ones explain only what is not turbulence
 _STEP = 0.1  # of fractional delays
@@ -41,6 +41,8 @@ _MOST_SUBAPERTURES, _MOST_MODES = 160, 36
 """Side by side: in sparse ones structure between them is taken for large modes."""
 _UPDATES, _FEW_UPDATES, _POWER = 60, 15, 0.9
 _LEAST_STRENGTH = 1e-6  # of the largest: weaker turbulence is none
+_LEAST_INFORMATION, _MOST_ERROR = 0.01, 1.0
+"""Part of the information on the gain that unknown strengths leave at least; largest error of a gain."""
 _BATCH = 64  # pieces at a time
 _INDEPENDENT = 0.55  # part of half-overlapping pieces
 FEWEST_SUBAPERTURES = 3
@@ -69,7 +71,7 @@ class LoopDelay:
 
         A gain assumed too small makes the loop unstable; one too large by as much only makes it slower.
         """
-        return replace(self, gain=self.gain + self.gain_error * (1 - 1 / self.misfit))
+        return replace(self, gain=min(self.gain + self.gain_error * (1 - 1 / self.misfit), max(GAINS)))
 
     @property
     def gain_summary(self) -> str:
@@ -109,7 +111,7 @@ class DelayFits:
     Raises
     ------
     InputError
-        When there are fewer than 3 sub-apertures, because vibrations change tip and tilt, or fewer than 8
+        When there are fewer than 3 sub-apertures, because vibrations change tip and tilt, or fewer than 4
         pieces of 128 consecutive frames, half overlapping.
     """
 
@@ -242,8 +244,9 @@ class _Fit:
         change = inverse @ (2 * self._gain * squared - crossed)
         flat, turned = (values.reshape(len(parts), -1) for values in (parts, parts.swapaxes(-1, -2)))
         both = flat @ change.swapaxes(-1, -2).ravel()
-        information = 2 * float((inverse * squared).sum()) - both @ np.linalg.pinv(flat @ turned.T) @ both
-        return 1 / math.sqrt(self._independent * max(information, 1e-300))
+        alone = 2 * float((inverse * squared).sum())  # with the strengths known
+        information = max(alone - both @ np.linalg.pinv(flat @ turned.T) @ both, _LEAST_INFORMATION * alone)
+        return min(1 / math.sqrt(max(self._independent * information, 1e-300)), _MOST_ERROR)
 
     def misfit(self, delay: float) -> float:
         """Return the rms deviation of the latest fit's whitened power, in that of chance; 1 or more.
@@ -338,10 +341,8 @@ def _products(slopes: Floats, sent: Floats, run: NDArray[np.int64], window: Floa
     ]
     if len(starts) < _FEWEST_PIECES:
         gaps = f" with {len(np.unique(run)) - 1} gaps" if run[0] != run[-1] else ""
-        raise InputError(
-            f"recording: expected {length * (_FEWEST_PIECES + 1) // 2} consecutive frames, got {len(slopes)}"
-            f"{gaps}"
-        )
+        needed = length * (_FEWEST_PIECES + 1) // 2 + lags
+        raise InputError(f"recording: expected {needed} consecutive frames, got {len(slopes)}{gaps}")
     total: Floats | float = 0.0
     for first in range(0, len(starts), _BATCH):
         pieces = []

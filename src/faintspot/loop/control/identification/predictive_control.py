@@ -38,6 +38,9 @@ Floats = NDArray[np.float64]
 _LEAK = 0.01
 _MEASURED_FRAMES = 60  # that the integrator drives the mirror first, so that its residual is measured
 _MOST_SIGMAS = 5.0  # of the commands that the turbulence asks for
+_MOST_OFF = 1.5  # ratio of the recorded gain and the advised one, above which the fallback has the latter
+_EASED_FRAMES = 100  # in which it gets there
+_MARGIN = 0.55  # of the largest stable loop gain, for the largest centroid gain that is likely
 _ABSURD = 1e3  # of the rms of recorded slopes: no such slope is measured
 _CONTENTS = "a predictive controller"
 
@@ -61,6 +64,8 @@ class LoopOfControl:
     largest_command: float
     integrator_gain: float
     sent_after_frames: int
+    recorded_gain: float = math.nan
+    """Gain of the recorded integrator on the controller's slopes, if the fallback has another one."""
     length_unit: str = "m"
     """Unit of length of the winds."""
 
@@ -111,7 +116,7 @@ class PredictiveControl:
 
     @property
     def integrator_gain(self) -> float:
-        """Best loop gain of an integrator on slopes as measured, by replay of the recording."""
+        """Best stable loop gain of an integrator on slopes as measured, by replay of the recording."""
         return self._loop.integrator_gain
 
     @property
@@ -136,6 +141,7 @@ class PredictiveControl:
         plant, limit = self._plant, self._loop.largest_command
         self._line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames, limit)
         self._controller = self.model.guarded(plant, self._line, plain_frames=_MEASURED_FRAMES)
+        self._eased = 0 if self._loop.recorded_gain > 0 else _EASED_FRAMES
         if command is not None:
             self._line.hold(self._loop.sign * np.asarray(command, np.float64))
             self._controller.begin()
@@ -171,6 +177,10 @@ class PredictiveControl:
         measured = np.abs(scaled) < _ABSURD
         if not measured.all():  # NaN among them
             scaled, errors = np.where(measured, scaled, 0.0), np.where(measured, errors, np.inf)
+        if self._eased < _EASED_FRAMES:
+            self._eased += 1
+            part, plain = self._eased / _EASED_FRAMES, self.model.plain_gain
+            self._controller.set_plain_gain(loop.recorded_gain ** (1 - part) * plain**part)
         self._controller.update(scaled, errors)
         return loop.sign * self._line.latest
 
@@ -353,7 +363,7 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> P
         math.inf,
         math.nan,
         ready.sent_after_frames,
-        site.length_unit,
+        length_unit=site.length_unit,
     )
     plant = described.plant()
     learnt = learn_controller(
@@ -364,18 +374,37 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> P
         start=start,
         identification=observed.identification,
     )
-    # The fallback is the integrator that has run, whatever the gain found.
-    plain = ready.loop_gain * gain if math.isfinite(ready.loop_gain) else learnt.plain_gain
+    advised = _advised_gain(learnt.plain_gain, delay, plant.delay_frames)
+    recorded, remarks = ready.loop_gain, list(loop.remarks)
+    plain = recorded if math.isfinite(recorded) else advised
+    if abs(math.log(max(plain, 1e-9) / advised)) > math.log(_MOST_OFF):
+        plain = advised
+        described = replace(described, recorded_gain=max(recorded, 1e-9) * gain)
+        remarks.append(f"fallback integrator: gain {advised:.2g}, as the recorded {recorded:.2g} leaves more")
     described = replace(
-        described,
-        largest_command=_largest_command(loop, seen, plant),
-        integrator_gain=learnt.plain_gain / gain,
+        described, largest_command=_largest_command(loop, seen, plant), integrator_gain=advised
     )
     identified = learnt.identified
     if identified is not None and identified.is_layered:
         described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
-    description = "; ".join([learnt.description, *loop.remarks])
-    return PredictiveControl(described, replace(learnt, plain_gain=plain, description=description))
+    description = "; ".join([learnt.description, *remarks])
+    return PredictiveControl(described, replace(learnt, plain_gain=plain * gain, description=description))
+
+
+def _advised_gain(best: float, delay: LoopDelay, delay_frames: int) -> float:
+    """Return the loop gain on slopes as measured: the best by replay, or less, as it must be stable.
+
+    Parameters
+    ----------
+    best : float
+        Of slopes divided by the centroid gain.
+    delay : LoopDelay
+    delay_frames : int
+        Whole frames; an integrator is stable up to 2 sin(pi / (4 delay - 2)).
+    """
+    most = _MARGIN * 2 * math.sin(math.pi / (4 * delay_frames - 2))
+    error = delay.gain_error if math.isfinite(delay.gain_error) else 0.0
+    return min(best / delay.gain, most / (delay.gain + error))
 
 
 def _largest_command(loop: Recording, seen: OpenLoop, plant: LoopPlant) -> float:

@@ -104,6 +104,10 @@ class CompiledKalman(GuardedController):
         self._held_at = -1
         """Position of the delay line at which the acting command was turned into slopes."""
 
+    def set_plain_gain(self, gain: float) -> None:
+        """See `GuardedController`."""
+        self._numbers = gain, *self._numbers[1:]
+
     def expected(self) -> ExpectedSlopes:
         """See `Controller`."""
         self.complete()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from functools import partial
 from typing import Any
 
@@ -193,6 +194,10 @@ class GuardedController(Controller):
     def _chosen(self) -> int:
         """The same, while a frame is not complete."""
         return int(self._guard[CHOSEN])
+
+    @abstractmethod
+    def set_plain_gain(self, gain: float) -> None:
+        """Change the gain of the integrator from the next frame on."""
 
     def fall_back(self) -> None:
         """See `Controller`."""

@@ -99,6 +99,10 @@ class LargeGuarded(GuardedController):
         """The previous frame, while it is not complete."""
         self._restarted = True
 
+    def set_plain_gain(self, gain: float) -> None:
+        """See `GuardedController`."""
+        self._integrator.gain = gain
+
     def expected(self) -> ExpectedSlopes:
         """See `Controller`."""
         self.complete()
