@@ -8,7 +8,7 @@ from tests.loop.control.control_cases import FRAME_S, LAYERS, PLANT, TURBULENCE,
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import ASSUMED
-from faintspot.loop.control.identification.learning import _error_of_mean, learn_controller, relearn
+from faintspot.loop.control.identification.learning import error_of_mean, learn_controller, relearn
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import Kalman
 
@@ -49,7 +49,7 @@ def test_too_few_frames_are_refused(now: Kalman) -> None:
 def test_error_of_a_mean_of_correlated_values() -> None:
     """Every 5 values are the same: 80 blocks of 5 values each know the error to 8 %; three times that."""
     values = np.repeat(np.random.default_rng(3).normal(size=400), 5)
-    assert _error_of_mean(values) == pytest.approx(1 / np.sqrt(400), rel=0.25)
+    assert error_of_mean(values) == pytest.approx(1 / np.sqrt(400), rel=0.25)
 
 
 @pytest.mark.slow

@@ -183,11 +183,11 @@ def relearn(
     means = float(by_new.mean()), float(by_running.mean()), float(by_integrator.mean())
     # By the residuals the engine chooses what begins.
     learnt = replace(new, left=(means[0], means[2]), centroid_gain=gain, identified=identified)
-    error = _error_of_mean(by_running - by_new)
+    error = error_of_mean(by_running - by_new)
     return RelearntControl(learnt, *means, error, delay, changed)
 
 
-def _error_of_mean(values: Floats) -> float:
+def error_of_mean(values: Floats) -> float:
     """Return the standard error of the mean of correlated values, from the scatter of blocks."""
     blocks = len(values) // _BLOCK_FRAMES
     means = values[: blocks * _BLOCK_FRAMES].reshape(blocks, _BLOCK_FRAMES).mean(axis=1)

@@ -5,18 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import real_array
+from faintspot.base.checks import one_of, real_array
 from faintspot.base.errors import InputError
-from faintspot.base.files import read_arrays
-from faintspot.loop.control.base import CommandDelayLine
+from faintspot.base.files import read_arrays, save_arrays
+from faintspot.loop.control.base import SETTLE_FRAMES, CommandDelayLine
 from faintspot.loop.control.identification.layers import Identification, Identified
-from faintspot.loop.control.identification.learning import learn_controller
+from faintspot.loop.control.identification.learning import (
+    JUDGED_PART,
+    STANDARD_ERRORS,
+    error_of_mean,
+    learn_controller,
+)
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
 from faintspot.loop.control.identification.open_loop import (
@@ -30,10 +36,20 @@ from faintspot.loop.control.identification.open_loop import (
     with_axes_of,
 )
 from faintspot.loop.control.identification.recording import Prepared, Recording, prepared
+from faintspot.loop.control.identification.relearning import (
+    FRAMES,
+    STORED,
+    BesideTheLoop,
+    RecentFrames,
+    replayed_slopes,
+    restored,
+    stored,
+)
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
 _LEAK = 0.01
 _MEASURED_FRAMES = 60  # that the integrator drives the mirror first, so that its residual is measured
@@ -43,6 +59,14 @@ _EASED_FRAMES = 100  # in which it gets there
 _MARGIN = 0.55  # of the largest stable loop gain, for the largest centroid gain that is likely
 _ABSURD = 1e3  # of the rms of recorded slopes: no such slope is measured
 _CONTENTS = "a predictive controller"
+_RELEARNT_FROM = 750  # frames since the integrator took over, from which is learnt in the background
+_PLAIN_AT_FIRST = 200  # frames in which it may drive because the filter has just begun
+_RELEARNT_EVERY = 5000  # frames, while the filter drives
+_LEARN_BESIDE = (
+    "import sys; from faintspot.loop.control.identification.predictive_control import learn_beside; "
+    "learn_beside(sys.argv[1])"
+)
+_CONTROL, _TASK, _BETTER, _RESULT = "control.npz", "frames.npz", "better.npz", "result.txt"
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +92,22 @@ class LoopOfControl:
     """Gain of the recorded integrator on the controller's slopes, if the fallback has another one."""
     length_unit: str = "m"
     """Unit of length of the winds."""
+    recorded: Recording | None = None
+    """A frame of the recorded loop, in the user's units: what learning again must know."""
+
+    @property
+    def slopes_of_commands(self) -> Floats:
+        """(m, commands): the user's matrix in such slopes.
+
+        Raises
+        ------
+        InputError
+            When the file of the controller has no recorded loop.
+        """
+        if self.recorded is None:
+            raise InputError("controller: expected the recorded loop in its file; learn from a recording")
+        scale = float(np.exp(np.log(np.abs(self.scale)).mean())) * float(self.delay[2])
+        return np.asarray(scale * self.recorded.interaction_matrix)
 
     def plant(self) -> LoopPlant:
         """Return the loop for which controllers are made."""
@@ -90,6 +130,11 @@ class PredictiveControl:
         self._loop, self._plant = loop, loop.plant()
         self.model = model
         """Model of the filter and of its fallback."""
+        self._relearn = ""
+        self.relearnt = ""
+        """Result of the latest learning from the running loop, in one line."""
+        self._recent = RecentFrames(len(loop.scale), loop.interaction.shape[1])
+        self._beside: BesideTheLoop[tuple[PredictiveControl | None, str]] | None = None
         self.reset()
 
     @property
@@ -120,6 +165,16 @@ class PredictiveControl:
         return self._loop.integrator_gain
 
     @property
+    def relearn(self) -> str:
+        """When to learn again: "background", from the running loop in a process beside it; or "", never."""
+        return self._relearn
+
+    @relearn.setter
+    def relearn(self, when: str) -> None:
+        self._relearn = one_of("relearn", when, ["", "background"])
+        _ = self._loop.slopes_of_commands  # refused here rather than in the loop
+
+    @property
     def is_predicting(self) -> bool:
         """Whether the filter drives the mirror; else the integrator does."""
         return self._controller.chosen == 0
@@ -145,6 +200,8 @@ class PredictiveControl:
         if command is not None:
             self._line.hold(self._loop.sign * np.asarray(command, np.float64))
             self._controller.begin()
+        self._recent.clear()
+        self._waited = self._since_loss = 0
 
     def prepare(self) -> None:
         """Compute what does not need the next slopes, so that the next call is shorter.
@@ -169,6 +226,8 @@ class PredictiveControl:
         InputError
             When an array has another shape.
         """
+        if self._relearn:
+            self._learn_beside()
         loop = self._loop
         scaled, errors = self._row("slopes", slopes), loop.standard_error
         if standard_errors is not None:
@@ -182,7 +241,86 @@ class PredictiveControl:
             part, plain = self._eased / _EASED_FRAMES, self.model.plain_gain
             self._controller.set_plain_gain(loop.recorded_gain ** (1 - part) * plain**part)
         self._controller.update(scaled, errors)
-        return loop.sign * self._line.latest
+        command = loop.sign * self._line.latest
+        self._recent.add(np.where(np.isfinite(errors), scaled, np.nan) / loop.scale, command)
+        return command
+
+    def _learn_beside(self) -> None:
+        """Begin to learn in another process when it is time to, and take what was learnt when it ends."""
+        self._waited += 1
+        has_lost = not self.is_predicting and self._waited > _PLAIN_AT_FIRST
+        self._since_loss += has_lost or self._since_loss > 0
+        if self._beside is not None:
+            if self._beside.is_running:
+                return
+            better, self.relearnt = self._beside.result() or (None, "learning again: the process failed")
+            self._beside, self._waited, self._since_loss = None, 0, 0
+            if better is not None:
+                self._take(better)
+            return
+        frames = self._since_loss or self._waited
+        if self._since_loss >= _RELEARNT_FROM or self._waited >= _RELEARNT_EVERY:
+            task = partial(_write_task, self._loop, self.model, *self._recent.latest(frames))
+            self._beside = BesideTheLoop(_LEARN_BESIDE, task, _read_result)
+
+    def recording_of(self, slopes: ArrayLike, commands: ArrayLike) -> Recording:
+        """Return frames of this controller's loop, (frames, m) and (frames, commands), as a recording.
+
+        Raises
+        ------
+        InputError
+            When the controller comes from a file without the recorded loop.
+        """
+        if self._loop.recorded is None:
+            raise InputError("controller: expected the recorded loop in its file; learn from a recording")
+        delay = float(self._plant.delay_frames)
+        frames = replace(self._loop.recorded, slopes=slopes, commands=commands, frame=None)
+        return replace(frames, delay_frames=delay, sent_after_frames=0)
+
+    def better_of(self, recording: Recording) -> tuple[PredictiveControl | None, str]:
+        """Learn from the first part of a recording, and compare with this controller on the rest, by replay.
+
+        Returns
+        -------
+        PredictiveControl or None
+            The new controller if it leaves less by two standard errors.
+        str
+            Result in one line.
+
+        Raises
+        ------
+        InputError
+            When nothing can be learnt from the recording.
+        """
+        frames = len(recording.slopes)
+        first = frames - round(JUDGED_PART * frames)
+        new = learn(recording.part(slice(0, first)))
+        loop, begin = new._loop, max(0, first - SETTLE_FRAMES)
+        rest, delay = recording.part(slice(begin, None)), new._plant.delay_frames
+        matrix = loop.slopes_of_commands
+        corrected = {"slopes": rest.slopes * loop.scale, "commands": loop.sign * rest.commands}
+        rest = replace(rest, **corrected, interaction_matrix=matrix)
+        seen = open_loop_of(rest, LoopDelay(float(delay), 0.0, 1.0, 0.0)).telemetry
+        in_loop = seen, loop.sign * matrix, loop.scale, delay
+        left = [
+            replayed_slopes(control, *in_loop)[first - begin :]
+            for control in (new, PredictiveControl(self._loop, self.model))
+        ]
+        ratio, error = left[0].mean() / left[1].mean(), error_of_mean(left[1] - left[0]) / left[1].mean()
+        new.reset()
+        text = f"{new.model.description}; residual {ratio:.2f} +- {error:.2f} of the running filter's"
+        is_better = 1 - ratio > STANDARD_ERRORS * error
+        return (new if is_better else None), f"{text}, {'taken' if is_better else 'not taken'}"
+
+    def _take(self, better: PredictiveControl) -> None:
+        """Continue with another controller from the mirror's command."""
+        latest = self._loop.sign * self._line.latest
+        self._loop, self._plant, self.model = better._loop, better._plant, better.model
+        self._line, self._controller, self._eased = better._line, better._controller, _EASED_FRAMES
+        self._line.hold(self._loop.sign * latest)
+        self._controller.begin()
+        self._recent.clear()
+        self._waited = self._since_loss = 0
 
     def _row(self, name: str, values: ArrayLike) -> Floats:
         """Return values of all slopes, scaled.
@@ -202,16 +340,27 @@ class PredictiveControl:
         with np.errstate(over="ignore"):
             return row * scale
 
-    def learn_again(self, recording: Recording) -> PredictiveControl:
+    def learn_again(self, recording: Recording | None = None) -> PredictiveControl:
         """Learn from another recording of the same loop, from the turbulence known so far; return itself.
 
         The recording may be of any controller. The mirror's command continues from the latest.
+
+        Parameters
+        ----------
+        recording : Recording, optional
+            Default: the latest frames of the running loop, up to 2000, of which a part is kept back: what
+            is learnt is only taken if it leaves less there.
 
         Raises
         ------
         InputError
             As `learn`; then nothing changes.
         """
+        if recording is None:
+            better, self.relearnt = self.better_of(self.recording_of(*self._recent.latest(FRAMES)))
+            if better is not None:
+                self._take(better)
+            return self
         if recording.sent_after_frames is None:
             recording = replace(recording, sent_after_frames=self._loop.sent_after_frames)
         again = learn(recording, self.model.identified)
@@ -228,7 +377,7 @@ class PredictiveControl:
         InputError
             When it cannot be written.
         """
-        self.model.save(path, {f"loop_{name}": np.asarray(value) for name, value in vars(self._loop).items()})
+        _save(path, self._loop, self.model)
 
     @classmethod
     def load(cls, path: str | Path) -> PredictiveControl:
@@ -239,12 +388,13 @@ class PredictiveControl:
         InputError
             When the file cannot be read, or has numbers out of range.
         """
-        names = LoopOfControl.__dataclass_fields__
-        arrays = read_arrays(path, _CONTENTS, [f"loop_{name}" for name in names])
+        names = [name for name in LoopOfControl.__dataclass_fields__ if name != "recorded"]
+        wanted = *(f"loop_{name}" for name in names), *STORED
+        arrays = read_arrays(path, _CONTENTS, wanted, optional=STORED)
         values: Mapping[str, Any] = {name: arrays[f"loop_{name}"] for name in names}
         try:
             plain = {name: array.item() if array.ndim == 0 else array for name, array in values.items()}
-            loop = LoopOfControl(**plain)
+            loop = LoopOfControl(**plain, recorded=restored(arrays))
             return cls(loop, Kalman.load(path, loop.plant()))
         except (ValueError, TypeError, IndexError):
             raise InputError(f"{path}: expected {_CONTENTS}, got arrays of another shape") from None
@@ -284,6 +434,35 @@ class PredictiveControl:
             f"sub-apertures {', '.join(map(str, self.left_out))} left out" if len(self.left_out) else "",
         ]
         return "; ".join(part for part in parts if part)
+
+
+def _save(path: str | Path, loop: LoopOfControl, model: Kalman) -> None:
+    known = {f"loop_{name}": np.asarray(value) for name, value in vars(loop).items() if name != "recorded"}
+    model.save(path, known | ({} if loop.recorded is None else stored(loop.recorded)))
+
+
+def _write_task(loop: LoopOfControl, model: Kalman, slopes: Singles, commands: Singles, folder: Path) -> None:
+    _save(folder / _CONTROL, loop, model)
+    save_arrays(folder / _TASK, {"slopes": slopes, "commands": commands})
+
+
+def learn_beside(folder: str) -> None:
+    """Learn again from the frames in a folder, and write the controller to it if it is better."""
+    path = Path(folder)
+    control = PredictiveControl.load(path / _CONTROL)
+    frames = read_arrays(path / _TASK, "frames of a loop", ("slopes", "commands"))
+    try:
+        better, text = control.better_of(control.recording_of(**frames))
+    except InputError as error:
+        better, text = None, f"not learnt again: {error}"
+    if better is not None:
+        better.save(path / _BETTER)
+    (path / _RESULT).write_text(text, encoding="utf-8")
+
+
+def _read_result(folder: Path) -> tuple[PredictiveControl | None, str]:
+    better = PredictiveControl.load(folder / _BETTER) if (folder / _BETTER).exists() else None
+    return better, (folder / _RESULT).read_text(encoding="utf-8")
 
 
 def learn(recording: Recording, start: Identified | None = None) -> PredictiveControl:
@@ -364,6 +543,7 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> P
         math.nan,
         ready.sent_after_frames,
         length_unit=site.length_unit,
+        recorded=loop.part(slice(0, 1)).scaled(1 / loop.unit),
     )
     plant = described.plant()
     learnt = learn_controller(
