@@ -38,7 +38,7 @@ from faintspot.engine.engine import Engine
 from faintspot.engine.options import EngineOptions
 from faintspot.engine.path.timing import Latencies
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.requests.scheduling import real_time
+from faintspot.engine.requests.child_processes import real_time
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control

@@ -26,7 +26,7 @@ from faintspot.base.statistics import slope_statistics
 from faintspot.experiments.study.cell_methods import position_table
 from faintspot.experiments.study.sweep import Cell
 from faintspot.slopes.estimators.algorithms.automatic import automatic_kept_pixels, automatic_strength
-from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 from faintspot.slopes.simulate import Detector, subapertures
 
 SIDE = 16

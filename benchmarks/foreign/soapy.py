@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from benchmarks.foreign.base import IMAGING_M, Floats, SteppedLoop
-from faintspot.adapters.spots import Spots
+from faintspot.adapters.oopao import Spots
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 
 _READ_NOISE_E = 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.lazy import lazy_attributes
+from faintspot.base.extras import lazy_attributes
 from faintspot.base.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from faintspot.loop import control as control
     from faintspot.slopes.camera.calibration import Calibration as Calibration
     from faintspot.slopes.camera.photon_transfer import measure_detector as measure_detector
-    from faintspot.slopes.estimators.algorithms.brightest import brightest_pixels as brightest_pixels
+    from faintspot.slopes.estimators.algorithms.centroid import brightest_pixels as brightest_pixels
     from faintspot.slopes.estimators.algorithms.centroid import centre_of_gravity as centre_of_gravity
     from faintspot.slopes.estimators.algorithms.noise import Denoised as Denoised
     from faintspot.slopes.estimators.algorithms.noise import tv_denoise as tv_denoise
@@ -66,7 +66,7 @@ _HOMES = {
     "Stages": "faintspot.slopes.pipeline.slopes",
     "SubapertureFlag": "faintspot.base.flags",
     "Wavefront": "faintspot.slopes.wavefront",
-    "brightest_pixels": "faintspot.slopes.estimators.algorithms.brightest",
+    "brightest_pixels": "faintspot.slopes.estimators.algorithms.centroid",
     "centre_of_gravity": "faintspot.slopes.estimators.algorithms.centroid",
     "control": "faintspot.loop",
     "cramer_rao": "faintspot.slopes.spots.bounds",

@@ -105,7 +105,7 @@ def test_large_grids_are_quick_enough_to_make() -> None:
 
 def test_flux_beyond_the_memory_uses_the_nearest_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     """Faint and bright frames in turn: with room for few levels, all are measured, the first ones alike."""
-    from faintspot.slopes.estimators.built_in import maximum_a_posteriori
+    from faintspot.slopes.estimators.built_in import maximum_likelihood
 
     rng = np.random.default_rng(1)
     roomy, narrow = map_of(8, 0.8), map_of(8, 0.8)
@@ -114,7 +114,7 @@ def test_flux_beyond_the_memory_uses_the_nearest_tables(monkeypatch: pytest.Monk
     frames = rng.poisson(np.multiply.outer([30, 300, 330, 3000], bright)) + rng.normal(0, 1, (4, 32, 32))
     room: Any = narrow.plan.prepared
     expected = [roomy(frame) for frame in frames]
-    monkeypatch.setattr(maximum_a_posteriori, "MOST_NUMBERS", 2 * np.prod(room.table_shape))
+    monkeypatch.setattr(maximum_likelihood, "MOST_NUMBERS", 2 * np.prod(room.table_shape))
     full = [narrow(frame) for frame in frames]
     assert len(room.tables.logarithms) == 2
     for place_in_turn in range(2):

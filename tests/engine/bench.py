@@ -11,7 +11,7 @@ from tests.patience import LIMIT_S, wait_for
 from tests.simulated import frames_of
 
 import faintspot as fs
-from faintspot.base.closing import Closing
+from faintspot.base.files import Closing
 from faintspot.engine.engine import Engine
 from faintspot.engine.options import EngineOptions
 from faintspot.engine.pixels.pixel_ring import PixelRing

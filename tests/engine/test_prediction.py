@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot.engine.path.slope_prior import SlopePrior
+from faintspot.engine.path.workers import SlopePrior
 from faintspot.engine.streams.slope_streams import PredictionStream
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.simulation import Method, simulate_loop

@@ -10,13 +10,13 @@ from tests.experiments.study_cases import cells, dataset, power_law
 from tests.shared_data import shared_file
 
 from faintspot.base.report import plots
-from faintspot.experiments.report.estimators import (
+from faintspot.experiments.report.page import (
     compares_estimators,
     enough_photons,
     estimator_figures,
     findings,
+    study_report,
 )
-from faintspot.experiments.report.page import study_report
 from faintspot.experiments.study.specification import estimators_study
 from faintspot.experiments.study.sweep import Cell
 

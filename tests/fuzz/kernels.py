@@ -32,7 +32,7 @@ from faintspot.base.config.tables import PRESETS
 from faintspot.engine.path import frame_path
 from faintspot.engine.path.frame_path import FramePath, Progress
 from faintspot.slopes.estimators import estimators
-from faintspot.slopes.estimators.algorithms.brightest import brightest_pixels
+from faintspot.slopes.estimators.algorithms.centroid import brightest_pixels
 from faintspot.slopes.kernels import parallel
 from faintspot.slopes.kernels.compilation.host import WIDTHS
 from faintspot.slopes.kernels.driver.groups import STAGE_ROWS, SlopeArrays, new_scratch

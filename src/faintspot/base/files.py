@@ -1,4 +1,4 @@
-"""Atomic writing of files, which are never left incomplete, and checked reading of .npz files."""
+"""Files: written atomically, never left incomplete; .npz files read with checks; objects that are closed."""
 
 from __future__ import annotations
 
@@ -296,3 +296,17 @@ def _restored(value: Any) -> object:
     if value.ndim == 0:
         return value.item()
     return tuple(value.tolist()) if value.dtype.kind == "U" and value.ndim == 1 else value
+
+
+class Closing:
+    """Mixin for objects with `close`, which a `with` block calls at its end."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release all resources of the object."""
+        raise NotImplementedError

@@ -85,8 +85,8 @@ def _print_versions(context: click.Context, _: click.Parameter, asked: bool) -> 
         return
     from importlib.metadata import version
 
+    from faintspot.slopes.kernels.compilation.compiling import compile_target
     from faintspot.slopes.kernels.compilation.host import lanes_for
-    from faintspot.slopes.kernels.compilation.target import compile_target
 
     packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy", "numba", "llvmlite"))
     click.echo(f"faintspot, version {__version__}, in {Path(__file__).parents[1]}")
@@ -147,7 +147,7 @@ def main(arguments: list[str] | None = None) -> object:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     warnings.formatwarning = lambda message, *_: f"faintspot: warning: {' '.join(str(message).split())}\n"
     if sys.stderr.isatty():
-        compiling = logging.getLogger("faintspot.slopes.kernels.compilation.cached")
+        compiling = logging.getLogger("faintspot.slopes.kernels.compilation.compiling")
         compiling.addHandler(_Terminal())
         compiling.setLevel(logging.INFO)
     try:

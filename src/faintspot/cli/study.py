@@ -11,9 +11,8 @@ from faintspot.base.errors import InputError
 from faintspot.base.extras import require
 from faintspot.base.files import derived, write_atomically
 from faintspot.cli.shared.commands import option
-from faintspot.cli.shared.experiments import QUICK, experiment_options, simulate_night, worker_pool
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.progress import progress_bar
+from faintspot.cli.shared.progress import QUICK, experiment_options, progress_bar, simulate_night, worker_pool
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,9 +14,8 @@ from faintspot.base.errors import InputError
 from faintspot.engine.loop.control_loop import CLOSED, OPEN, STATES, ControlLoop
 from faintspot.engine.options import EngineOptions, FrameInput
 from faintspot.engine.path.frame_path import FramePath
-from faintspot.engine.path.slope_prior import SlopePrior
 from faintspot.engine.path.timing import INCOMPLETE, WORKER, FrameAccount
-from faintspot.engine.path.workers import Workers
+from faintspot.engine.path.workers import SlopePrior, Workers
 from faintspot.engine.pixels.pixel_ring import PixelRing, living_ring
 from faintspot.engine.settings.estimators import EngineEstimators
 from faintspot.engine.settings.following import DarkFollower, FluxFollower

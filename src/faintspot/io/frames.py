@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.files import Closing
 from faintspot.base.sizes import check_bytes, check_size
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray, arranged
 from faintspot.io.formats.registry import frame_format

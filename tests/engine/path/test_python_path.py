@@ -16,7 +16,7 @@ import faintspot as fs
 from faintspot.base.flags import INVALID
 from faintspot.engine.path.frame_path import Progress
 from faintspot.engine.path.python_path import PythonPath, call_within, tried
-from faintspot.engine.path.slope_prior import SlopePrior
+from faintspot.engine.path.workers import SlopePrior
 from faintspot.slopes.estimators import Estimator, Positions
 
 pytestmark = pytest.mark.slow

@@ -1,6 +1,6 @@
 import numpy as np
 
-from faintspot.engine.path.slope_prior import SlopePrior
+from faintspot.engine.path.workers import SlopePrior
 
 
 def test_what_is_expected_and_how_surely() -> None:

@@ -20,7 +20,7 @@ from faintspot.engine.pixels import replay as replay_module
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.replay import Replay, ring_type
 from faintspot.engine.pixels.segment import FOLDER
-from faintspot.engine.requests.scheduling import quick_switching
+from faintspot.engine.requests.child_processes import quick_switching
 from faintspot.io import FrameSource, open_frames
 
 pytestmark = [

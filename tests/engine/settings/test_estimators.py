@@ -108,7 +108,7 @@ def test_a_compiled_estimator(camera: Camera, tmp_path: Path) -> None:
     path = tmp_path / "compiled.py"
     path.write_text(
         "from dataclasses import dataclass\nfrom faintspot.slopes.estimators import register\n"
-        "from faintspot.slopes.estimators.built_in.centroid import CentreOfGravity\n"
+        "from faintspot.slopes.estimators.built_in.gravity import CentreOfGravity\n"
         "@register\n@dataclass(frozen=True, eq=False, kw_only=True)\n"
         "class Mine(CentreOfGravity):\n    name = 'mine'\n"
     )

@@ -17,10 +17,10 @@ from faintspot.base.errors import InputError
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.streams.bridge import StreamBridge
+from faintspot.engine.streams.command_stream import StreamOut
 from faintspot.engine.streams.image_layout import IncompatibleStreamError
 from faintspot.engine.streams.image_stream import ImageStream, ImageStreamWriter
 from faintspot.engine.streams.stream import Follower, open_stream
-from faintspot.engine.streams.stream_out import StreamOut
 
 pyshmem = pytest.importorskip("pyshmem")
 pytestmark = [

@@ -25,8 +25,8 @@ from tests.refusals import assert_each_refused, refused
 
 import faintspot
 import faintspot as fs
-from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
+from faintspot.base.files import Closing
 from faintspot.cli.realtime.control import send
 from faintspot.cli.realtime.control import status as show_status
 from faintspot.engine.pixels.pixel_ring import PixelRing

@@ -7,7 +7,7 @@ from tests.refusals import refused
 
 from faintspot.experiments.night.protocol import COUNTS, NONE, QUICK_PLAN, NightPlan, counts_per_e
 from faintspot.loop.simulation import load_loop
-from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 
 

@@ -15,7 +15,7 @@ from faintspot.experiments.methods import keeps_every_k, knows_the_spot, label_o
 from faintspot.experiments.study.cell import realisations
 from faintspot.experiments.study.cell_methods import CellMethods, position_table
 from faintspot.slopes.estimators import Estimator
-from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.estimators.registry import estimator_named
 

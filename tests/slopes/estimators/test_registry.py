@@ -16,7 +16,7 @@ from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.slopes.estimators import Estimator, estimator_named, estimators, register, registry
-from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 
 BUILT_IN = [
     "brightest",
@@ -155,7 +155,7 @@ class TestInstalledPackages:
         assert loads == ["middle"]
 
     def test_a_real_entry_point(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        place = "faintspot.slopes.estimators.built_in.brightest:BrightestPixels"
+        place = "faintspot.slopes.estimators.built_in.gravity:BrightestPixels"
         installed(monkeypatch, EntryPoint("brightest", place, registry.ENTRY_POINTS))
         assert estimators()["brightest"] is BrightestPixels
 

@@ -16,9 +16,15 @@ from numpy.typing import NDArray
 
 from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import DoubtWarning, InputError
-from faintspot.cli.layout import grid as layout_grid
 from faintspot.cli.layout import options as layout_options
-from faintspot.cli.layout.completing import clearer_frame, completed, measured_darks, with_measured_pixels
+from faintspot.cli.layout.completing import (
+    clearer_frame,
+    completed,
+    describe_grid,
+    illuminated,
+    measured_darks,
+    with_measured_pixels,
+)
 from faintspot.cli.layout.describing import describe, describe_settings, doubts_of
 from faintspot.cli.layout.options import plain
 from faintspot.cli.shared.commands import (
@@ -220,7 +226,7 @@ def command(
             shown, options = binned(shown, factor).astype(np.float64), layout_options.binned(options, factor)
         found: FoundLayout | KnownGrid
         if grid is not None:
-            found = layout_grid.illuminated(source.description, shown, grid, calibration, options)
+            found = illuminated(source.description, shown, grid, calibration, options)
         else:
             found = _found(source.description, shown, options)
         if factor > 1:
@@ -278,7 +284,7 @@ def command(
     for item in (settings, calibration, layout):
         configuration.save(target, item)
     if isinstance(found, KnownGrid):
-        lines = layout_grid.describe(output, found, layout, calibration)
+        lines = describe_grid(output, found, layout, calibration)
     else:
         lines = describe(output, found, layout)
     for line in [*lines, *describe_settings(settings, layout, seen, unit), *stated, *notes]:

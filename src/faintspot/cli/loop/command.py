@@ -11,14 +11,14 @@ from typing import Any
 import click
 
 from faintspot.cli.shared.commands import NAMES, NUMBERS, option
-from faintspot.cli.shared.experiments import (
+from faintspot.cli.shared.needs import needs
+from faintspot.cli.shared.progress import (
     CONFIGURATION,
     QUICK,
     experiment_options,
     simulate_night,
     worker_pool,
 )
-from faintspot.cli.shared.needs import needs
 
 Names = tuple[str, ...]
 

@@ -106,8 +106,8 @@ def run(
     from faintspot.engine.options import EngineOptions
     from faintspot.engine.path.workers import PipelineMaker
     from faintspot.engine.request_handlers import LENGTHY, commands_of
+    from faintspot.engine.requests.child_processes import real_time
     from faintspot.engine.requests.requests import ControlServer
-    from faintspot.engine.requests.scheduling import real_time
     from faintspot.engine.settings.interleaving import Interleaving
     from faintspot.loop.control.configuration import load_control
     from faintspot.slopes.pipeline.configuration import Configuration

@@ -17,7 +17,7 @@ from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.progress import progress_bar
 
 if TYPE_CHECKING:
-    from faintspot.engine.streams.stream_out import StreamOut
+    from faintspot.engine.streams.command_stream import StreamOut
 
 _HEAD_START_S = 0.5
 _DEFAULT_RATE_HZ = 500.0
@@ -71,7 +71,7 @@ def replay(
     """
     from faintspot.engine.pixels.pixel_ring import PixelRing
     from faintspot.engine.pixels.replay import Replay, ring_type
-    from faintspot.engine.requests.scheduling import quick_switching
+    from faintspot.engine.requests.child_processes import quick_switching
     from faintspot.io import open_frames
 
     repeat = options["repeat"]
@@ -137,9 +137,9 @@ def bridge(
         raise InputError("bridge: expected a stream of frames, --to or --commands-to, got none")
     if frames is not None and not stream:
         raise InputError("--frames: expected a stream of frames, got none")
-    from faintspot.engine.requests.scheduling import quick_switching
+    from faintspot.engine.requests.child_processes import quick_switching
     from faintspot.engine.streams.bridge import StreamBridge
-    from faintspot.engine.streams.stream_out import StreamOut
+    from faintspot.engine.streams.command_stream import StreamOut
 
     def say(line: str) -> None:
         click.echo(f"{name}: {line}")

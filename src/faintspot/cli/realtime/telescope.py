@@ -81,8 +81,8 @@ def telescope(
       faintspot realtime run --config bench/faintspot.toml
       faintspot realtime send --telescope photons=50 seeing_arcsec=1.2
     """
+    from faintspot.engine.requests.child_processes import real_time
     from faintspot.engine.requests.requests import ControlServer
-    from faintspot.engine.requests.scheduling import real_time
     from faintspot.engine.telescope.simulated_telescope import LENGTHY, SimulatedTelescope, commands_of
     from faintspot.loop.simulation.configuration.configuration import load_loop
     from faintspot.loop.simulation.engine_files import write_engine_files

@@ -1,10 +1,13 @@
-"""The progress bar of long commands."""
+"""The progress bar of long commands, and experiments in several processes with their options."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import click
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -18,6 +21,13 @@ from rich.progress import (
 from rich.text import Text
 
 from faintspot.base.extras import present
+from faintspot.cli.shared.commands import option
+
+if TYPE_CHECKING:
+    from faintspot.experiments.night.blocks import Night
+    from faintspot.experiments.running import WorkerPool
+    from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+
 
 _SPEED_OVER_S = 120.0  # work of several kinds is done in turns
 
@@ -70,3 +80,46 @@ def progress_bar(what: str, unit: str = "frames") -> Iterator[Callable[[int, int
         if progress.live.is_started:
             progress.refresh()  # a notebook's bar would stay where it was when last drawn
             progress.stop()
+
+
+CONFIGURATION = click.argument("configuration", metavar="[CONFIG]", default="canary")
+QUICK = option("--quick", is_flag=True, help="Fewer and shorter runs: a few minutes.")
+_OPTIONS = (
+    option("--overwrite", is_flag=True, help="Replace another experiment that is there."),
+    option("--scheduler", metavar="ADDRESS", help="Dask scheduler to use instead: tls://host:8786."),
+    option(
+        "--workers",
+        type=click.IntRange(0),
+        help="Processes on this machine; 0 or 1: this process alone.",
+        show_default="all processors",
+    ),
+)
+
+
+def experiment_options(command: Callable[..., object]) -> Callable[..., object]:
+    """Add the options that say where and how an experiment runs."""
+    for each in _OPTIONS:
+        command = each(command)
+    return command
+
+
+@contextmanager
+def worker_pool(what: str, workers: int | None, scheduler: str | None) -> Iterator[WorkerPool]:
+    """Yield the processes of an experiment, which show their progress."""
+    from faintspot.experiments.running import WorkerPool
+
+    with progress_bar(what) as advance:
+        yield WorkerPool(workers, advance, lambda text: click.echo(text, err=True), scheduler)
+
+
+def simulate_night(
+    loop: LoopConfiguration, folder: Path, workers: int | None, scheduler: str | None, **options: Any
+) -> Night:
+    """Simulate alternating observations with a progress bar, and write their page."""
+    from faintspot.experiments.night.page import write_night
+    from faintspot.experiments.night.simulated import run_night
+
+    with worker_pool("night", workers, scheduler) as pool:
+        night = run_night(loop, folder, pool=pool, **options)
+    write_night(night, folder)
+    return night

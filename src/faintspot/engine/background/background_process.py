@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.engine.engine import Engine
-from faintspot.engine.requests.child_processes import ONE_THREAD, ChildProcesses
+from faintspot.engine.requests.child_processes import ONE_THREAD, ChildProcesses, lowest_priority
 from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request, socket_path
-from faintspot.engine.requests.scheduling import lowest_priority
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io.telemetry.recording import Telemetry, stored_names
 from faintspot.loop.control.base import KALMAN

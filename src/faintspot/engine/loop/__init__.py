@@ -1,1 +1,1 @@
-"""From slopes to commands: `control_loop`, its `guard`, new controllers (`successor`), and `poking`."""
+"""From slopes to commands: `control_loop`, its `guard`, with new controllers, and `poking`."""

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.engine.loop.guard import Guard
-from faintspot.engine.loop.successor import ControllerSuccessor, PreparedController
-from faintspot.engine.path.slope_prior import SlopePrior
+from faintspot.engine.loop.guard import ControllerSuccessor, Guard, PreparedController
 from faintspot.engine.path.timing import Latencies
+from faintspot.engine.path.workers import SlopePrior
 from faintspot.loop.control.base import KALMAN, CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.integrator import MEAN_SQUARE, true_slopes

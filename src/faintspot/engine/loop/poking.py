@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
-from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
+from faintspot.base.files import Closing
 from faintspot.engine.streams.shared_streams import create_stream
 from faintspot.engine.telemetry.ring import TelemetryRing
 

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
-from faintspot.base.files import derived, output_errors, write_atomically
+from faintspot.base.files import Closing, derived, output_errors, write_atomically
 from faintspot.engine.loop.control_loop import CLOSED, STATES
 from faintspot.engine.pixels.readout import StopEvent
 from faintspot.engine.requests.child_processes import ONE_THREAD, ChildProcesses

@@ -1,5 +1,5 @@
 """Path of one frame from rows of pixels to slopes. Read in this order.
 
-`frame_path` (compiled estimators), `workers` (its threads), `slope_prior` (predicted slopes), `python_path`
+`frame_path` (compiled estimators), `workers` (its threads, and predicted slopes), `python_path`
 (estimators in NumPy) and `timing` (statistics).
 """

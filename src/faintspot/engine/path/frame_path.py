@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.engine.path.slope_prior import SlopePrior
-from faintspot.engine.path.workers import Workers
+from faintspot.engine.path.workers import SlopePrior, Workers
 from faintspot.loop.control.configuration import prior_std_px
 from faintspot.slopes.kernels.compilation.compiling import Direct
 from faintspot.slopes.kernels.compilation.host import WIDTHS, lanes_for

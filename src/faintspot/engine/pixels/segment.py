@@ -32,8 +32,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
+from faintspot.base.files import Closing
 from faintspot.base.json_text import parse_json, to_json
 from faintspot.slopes.kernels.compilation.ordered import load, store
 

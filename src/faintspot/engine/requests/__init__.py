@@ -1,1 +1,1 @@
-"""Requests to a running engine (`requests`), its priority (`scheduling`) and its child processes."""
+"""Requests to a running engine (`requests`), its child processes and priority (`child_processes`)."""

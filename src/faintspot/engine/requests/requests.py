@@ -21,8 +21,8 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
+from faintspot.base.files import Closing
 from faintspot.base.json_text import parse_json, to_json
 
 _BACKLOG = 64

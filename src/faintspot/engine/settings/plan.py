@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.engine.path.frame_path import FramePath, Progress, check_real_time
 from faintspot.engine.path.python_path import PythonPath, call_within, tried
-from faintspot.engine.path.slope_prior import SlopePrior
-from faintspot.engine.path.workers import Workers
+from faintspot.engine.path.workers import SlopePrior, Workers
 from faintspot.engine.pixels.pixel_ring import ARRIVALS, ROWS, PixelRing
 from faintspot.engine.settings.interleaving import Interleaving
 from faintspot.slopes.estimators.base import Estimator

@@ -23,6 +23,7 @@ from faintspot.engine.streams.image_layout import (
     MATH_DATA,
     METADATA,
     MOST_POSTED,
+    SEMAPHORE_BYTES,
     SEMAPHORES,
     TRACES,
     TYPES,
@@ -30,12 +31,11 @@ from faintspot.engine.streams.image_layout import (
     WRITING,
     IncompatibleStreamError,
     Places,
+    Semaphore,
     checked,
     path_of,
     places_of,
 )
-from faintspot.engine.streams.semaphores import BYTES as SEMAPHORE_BYTES
-from faintspot.engine.streams.semaphores import Semaphore
 from faintspot.slopes.kernels.compilation.ordered import fence, load, store
 
 LARGEST_NUMBER = 2**63 - 1

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.engine.path.slope_prior import SlopePrior
+from faintspot.engine.path.workers import SlopePrior
 from faintspot.engine.streams.shared_streams import (
     LOCK_LIMIT_S,
     create_stream,
@@ -23,7 +23,7 @@ from faintspot.engine.streams.shared_streams import (
 )
 from faintspot.engine.streams.stream import Follower
 from faintspot.slopes.kernels.compilation.compiling import Direct
-from faintspot.slopes.kernels.driver.telemetry_rows import fill_telemetry_rows
+from faintspot.slopes.kernels.driver.products import fill_telemetry_rows
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 
 DETAILS = (

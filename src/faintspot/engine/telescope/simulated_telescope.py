@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import not_none, number_between, numbers_between
-from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
+from faintspot.base.files import Closing
 from faintspot.base.toml_files import check_keys
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.readout import CameraReport, Readout, RowTimes, StopEvent, readout_type
@@ -26,7 +26,7 @@ from faintspot.loop.simulation.configuration.configuration import LoopConfigurat
 from faintspot.loop.simulation.telescope.calibration import make_detector
 from faintspot.loop.simulation.telescope.model import TelescopeModel
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
-from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
+from faintspot.slopes.spots.speckled import R0_WAVELENGTH_M
 
 ORDERS = ("photons", "magnitude", "r0_m", "seeing_arcsec", "wind_factor")
 _FWHM = 0.976  # long-exposure FWHM in units of wavelength / r0, without outer scale (Roddier 1981)

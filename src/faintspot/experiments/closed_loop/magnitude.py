@@ -23,7 +23,7 @@ from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import MAGNITUDE_FILE
 from faintspot.loop.simulation.telescope.calibration import camera_calibration
 from faintspot.slopes.estimators.base import Need
-from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 from faintspot.slopes.estimators.built_in.smoothed import Smoothed
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.estimators.built_in.window import Window

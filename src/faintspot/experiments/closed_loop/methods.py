@@ -24,7 +24,7 @@ from faintspot.loop.simulation.methods import (
     Method,
 )
 from faintspot.slopes.estimators.base import Need
-from faintspot.slopes.estimators.built_in.maximum_a_posteriori import MaximumAPosteriori
+from faintspot.slopes.estimators.built_in.maximum_likelihood import MaximumAPosteriori
 from faintspot.slopes.estimators.built_in.window import Window
 from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.pipeline.settings import Settings

@@ -11,8 +11,13 @@ from faintspot.base.report.plots import Line, Panel
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import paired_mean
 from faintspot.experiments.closed_loop.results import MagnitudeResult, differences_by_flux
-from faintspot.experiments.closed_loop.tables import gain_table, settings_table, strehl_table
-from faintspot.experiments.closed_loop.verdict import loop_verdict, reference_methods
+from faintspot.experiments.closed_loop.verdict import (
+    gain_table,
+    loop_verdict,
+    reference_methods,
+    settings_table,
+    strehl_table,
+)
 from faintspot.loop.control.base import split_control
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.slopes.estimators.base import Style

@@ -9,7 +9,7 @@ from faintspot.base.report.texts import Texts, plain_number, with_error
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.methods import Knowledge
 from faintspot.experiments.planner.answer import Answer, MethodResult, settings_in_words
-from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 
 _TEXT = Texts("faintspot.experiments")

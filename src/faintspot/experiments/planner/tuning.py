@@ -29,7 +29,7 @@ from faintspot.experiments.planner.question import Question
 from faintspot.experiments.planner.simulated import SimulatedSpots, SpotFrames
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.estimators.base import Estimator
-from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 from faintspot.slopes.estimators.built_in.thresholded import Thresholded
 from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.pipeline.slopes import Slopes

@@ -1,1 +1,1 @@
-"""Page of a study: `page`, and `estimators` for one that compares estimators."""
+"""Page of a study."""

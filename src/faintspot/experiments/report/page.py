@@ -2,36 +2,231 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
 from faintspot.base.report.page import FigureWithData, Report, Section, configuration_section
+from faintspot.base.report.plots import Line, Panel
 from faintspot.base.report.texts import Texts
+from faintspot.experiments.methods import knows_the_spot, label_of, style_of
 from faintspot.experiments.night.blocks import NIGHT_STORE, Night, load_night
 from faintspot.experiments.night.page import night_sections
 from faintspot.experiments.paper.claims import guidance, verdicts
 from faintspot.experiments.paper.figures import (
+    axis_of_study,
     baselines_figure,
     kept_pixels_figure,
     sweep_figure,
     triple_picture,
 )
-from faintspot.experiments.paper.tables import baselines_section, gains_section
-from faintspot.experiments.paper.whole import paper_rows, paper_section
-from faintspot.experiments.report.estimators import (
-    compares_estimators,
-    estimator_figures,
-    findings,
+from faintspot.experiments.paper.tables import (
+    baselines_section,
+    gains_section,
+    grouped,
+    in_words,
+    parameter_in_words,
 )
-from faintspot.experiments.study.specification import StudySpecification
+from faintspot.experiments.paper.whole import paper_rows, paper_section
+from faintspot.experiments.study.curves import StudyConditions
+from faintspot.experiments.study.specification import BEST, CORRECTED, StudySpecification
 from faintspot.experiments.study.sweep import PARAMETERS
+from faintspot.slopes.estimators.built_in.maximum_likelihood import MaximumAPosteriori, MaximumLikelihood
+from faintspot.slopes.estimators.built_in.weighted import Weighted
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
 
 if TYPE_CHECKING:
     import xarray
+
+
+Floats = NDArray[np.float64]
+
+ENOUGH_PHOTONS = {0.1: 30.0, 3.0: 120.0, 16.0: 500.0}
+"""Fewest electrons, by read noise, at which an estimator that knows the spot is expected at the bound."""
+EXPECTED_EFFICIENCY = {MaximumLikelihood.name: 0.95, MaximumAPosteriori.name: 0.95, Weighted.name: 0.75}
+"""Least photon efficiency, by method, where there is flux enough."""
+NEAR_BEST = 1.04
+"""Gain-corrected rms over the smallest of all methods up to which a method counts as near the best."""
+_KINDS = ("error", "photon_efficiency", "gain")
+_ROW_HEIGHT = 4.4
+_FEWEST_POINTS = 3
+_BOUND: dict[str, Any] = {"color": "black", "lw": 3, "alpha": 0.35, "zorder": 1}
+_BEST_OF_CELL: dict[str, Any] = {"ls": "", "marker": "o", "ms": 15, "mfc": "none", "mec": "black", "mew": 1.4}
+_SCALES: dict[str, dict[str, Any]] = {
+    "error": {"y_ticks": (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2)},
+    "photon_efficiency": {"levels": {1.0: {**_BOUND, "label": "Cramer-Rao bound"}}, "y_range": (0, 1.35)},
+    "gain": {"levels": {1.0: _BOUND}},
+    "corrected_rms": {
+        "x_ticks": (0.3, 0.5, 1, 2, 3, 5, 10),
+        "y_ticks": (0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1, 2),
+    },
+}
+_STANDARD = {"elongation": 1.0, "size": 1.0, "pixels": 16, "position_range_px": 1.0}
+_STANDARD |= {"background_e": 0.0, "em_gain": 1.0, "d_over_r0": 0.0}
+
+
+def compares_estimators(dataset: xarray.Dataset) -> bool:
+    """Whether a study has methods that know the spot."""
+    return any(knows_the_spot(str(method)) for method in dataset["estimator"].values)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Panels of cells that have all but some parameters in common."""
+
+    common: Mapping[str, Any]
+    panels: Mapping[str, list[int]]
+    """Cells by increasing value of what varies, by the title of their panel."""
+
+    @property
+    def name(self) -> str:
+        """A short name, different for every group."""
+        changed = {key: value for key, value in self.common.items() if value != _STANDARD.get(key, value)}
+        words = [f"{key.partition('_')[0]}{value:g}" for key, value in changed.items()]
+        return "-".join([self.common["profile"], *words])
+
+    @property
+    def words(self) -> str:
+        """Parameters that the cells share."""
+        named = [parameter_in_words(key, value) for key, value in self.common.items()]
+        return ", ".join(text for text in named if not text.startswith("no "))
+
+
+def estimator_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
+    """Yield the figures of a study that compares estimators, as far as its cells are finished.
+
+    Cells that differ in flux (or, speckled ones, in d/r0) alone are a line, where there are at least three.
+    """
+    for group in _groups(dataset, "flux_e", ("read_noise_e",), speckled=False):
+        rows = [
+            [_panel(dataset.isel(cell=cells).sel(mode=BEST), kind, "flux_e", title) for kind in _KINDS]
+            for title, cells in group.panels.items()
+        ]
+        yield _figure("estimators", group, rows)
+    for group in _groups(dataset, "d_over_r0", ("read_noise_e", "flux_e"), speckled=True):
+        speckled = dataset.sel(mode=_corrected_mode(dataset))
+        panels = [
+            _panel(speckled.isel(cell=cells), "corrected_rms", "d_over_r0", title)
+            for title, cells in group.panels.items()
+        ]
+        yield _figure("speckled", group, [panels[first : first + 2] for first in range(0, len(panels), 2)])
+
+
+def _groups(dataset: xarray.Dataset, axis: str, by: Sequence[str], *, speckled: bool) -> Iterator[_Group]:
+    """Yield the groups of cells that differ in `axis`, within a panel, and in `by`, between panels."""
+    common = [name for name in PARAMETERS if name not in (axis, *by)]
+    done = dataset["done"].values & ((dataset["d_over_r0"].values > 0) == speckled)
+    for values, cells in grouped(dataset, np.flatnonzero(done).tolist(), common, axis).items():
+        parts = grouped(dataset, cells, by, axis)
+        panels = {in_words(by, key): part for key, part in parts.items() if len(part) >= _FEWEST_POINTS}
+        if panels:
+            yield _Group(dict(zip(common, values, strict=True)), panels)
+
+
+def _figure(kind: str, group: _Group, rows: list[list[Panel]]) -> FigureWithData:
+    title, caption = f"{_TEXT[f'{kind}.title']}: {group.words}", _TEXT(f"{kind}.caption")
+    height = _ROW_HEIGHT * len(rows) + 0.9
+    return FigureWithData.of(f"{kind}-{group.name}", title, caption, rows, height, heading=title)
+
+
+def _panel(cells: xarray.Dataset, kind: str, axis: str, title: str) -> Panel:
+    """Return a variable of every method along an axis."""
+    x, values = cells[axis].values, cells[kind]
+    errors, scale = cells.get(f"{kind}_se"), {**axis_of_study(axis), **_SCALES[kind]}
+    lines = []
+    for method in map(str, cells["estimator"].values):
+        error = None if errors is None else errors.sel(estimator=method).values
+        style, line = style_of(method), "-" if knows_the_spot(method) else "--"
+        drawn = {"color": style.colour, "marker": style.marker, "ms": 8 if style.marker == "*" else 5.5}
+        drawn |= {"lw": 1.8, "ls": line, "elinewidth": 1, "zorder": 3}
+        lines.append(Line(label_of(method), x, values.sel(estimator=method).values, error, drawn))
+    if kind == "error":
+        lines.append(Line("Cramer-Rao bound", x, cells["bound"].values, style=_BOUND))
+        scale["levels"] = {float(cells["position_range_px"][0]) / 2: {"ls": ":"}}
+    elif kind == "corrected_rms":
+        best = values.min("estimator").values
+        lines.append(Line("best", x, best, style={**_BEST_OF_CELL, "zorder": 4}, in_legend=False))
+        scale["y_range"] = (0.85 * best.min(), min(4.0, 1.2 * float(np.nanmax(values))))
+    return Panel(lines, y=_TEXT[f"estimator_axes.{kind}"], title=title, **scale)
+
+
+def enough_photons(read_noise_e: float, flux_e: float) -> bool:
+    """Whether there is flux enough for the bound to be within reach.
+
+    Between the read noises of `ENOUGH_PHOTONS`, logarithms are interpolated.
+    """
+    noises, fluxes = np.log(list(ENOUGH_PHOTONS)), np.log(list(ENOUGH_PHOTONS.values()))
+    needed = np.exp(np.interp(np.log(max(read_noise_e, 1e-3)), noises, fluxes))
+    return bool(flux_e >= needed * (1 - 1e-9))
+
+
+def findings(dataset: xarray.Dataset) -> list[str]:
+    """Return what a study says about the estimators, a sentence or two each."""
+    return [
+        *_efficient(_finished(dataset, speckled=False)),
+        *_near_the_best(_finished(dataset, speckled=True)),
+    ]
+
+
+def _finished(dataset: xarray.Dataset, *, speckled: bool) -> xarray.Dataset:
+    """Return the finished cells of a study, with or without speckles."""
+    done = dataset["done"].values & ((dataset["d_over_r0"].values > 0) == speckled)
+    return dataset.isel(cell=np.flatnonzero(done)).transpose("cell", "estimator", ...)
+
+
+def _methods(cells: xarray.Dataset) -> list[str]:
+    return [str(method) for method in cells["estimator"].values]
+
+
+def _cells_in_words(cells: xarray.Dataset) -> list[str]:
+    """Return each cell in one line."""
+    names = StudyConditions.__dataclass_fields__
+    columns = [cells[name].values.tolist() for name in names]
+    keys = [StudyConditions(**dict(zip(names, values, strict=True))) for values in zip(*columns, strict=True)]
+    fluxes = cells["flux_e"].values
+    return [f"{flux:g} e-, {key.in_words()}" for flux, key in zip(fluxes, keys, strict=True)]
+
+
+def _efficient(cells: xarray.Dataset) -> list[str]:
+    conditions = zip(cells["read_noise_e"].values, cells["flux_e"].values, strict=True)
+    enough = [enough_photons(float(noise), float(flux)) for noise, flux in conditions]
+    bright = cells.isel(cell=np.flatnonzero(enough))
+    sentences = []
+    for method, target in EXPECTED_EFFICIENCY.items():
+        if method in _methods(cells) and any(enough):
+            efficiency = bright["photon_efficiency"].sel(mode=BEST, estimator=method).values
+            lowest = int(np.argmin(efficiency))
+            values = {"lowest": efficiency[lowest], "where": _cells_in_words(bright)[lowest]}
+            counts = {"reached": np.sum(efficiency >= target), "cells": len(efficiency)}
+            sentences.append(_TEXT("findings.efficient", method=method, target=target, **counts, **values))
+    return sentences
+
+
+def _near_the_best(cells: xarray.Dataset) -> list[str]:
+    if not cells.sizes["cell"]:
+        return []
+    rms: Floats = cells["corrected_rms"].sel(mode=_corrected_mode(cells)).values
+    every, d_over_r0 = rms / np.nanmin(rms, axis=1, keepdims=True), cells["d_over_r0"].values
+    sentences = []
+    for words, part in (("d/r0 up to 1", d_over_r0 <= 1), ("above 1", d_over_r0 > 1)):
+        if part.any():
+            near, worst = (every[part] <= NEAR_BEST).sum(axis=0), 100 * (every[part].max(axis=0) - 1)
+            ranked = sorted(zip(-near, worst, _methods(cells), strict=True), key=lambda each: each[:2])[:5]
+            listed = ", ".join(f"{name} {-count} (worst {percent:.0f} %)" for count, percent, name in ranked)
+            counts = {"which": words, "cells": part.sum(), "near": 100 * (NEAR_BEST - 1)}
+            sentences.append(_TEXT("findings.near_best", **counts, ranked=listed))
+    return sentences
+
+
+def _corrected_mode(dataset: xarray.Dataset) -> str:
+    """Return the mode whose settings are chosen for the gain-corrected rms, where the study has it."""
+    return CORRECTED if CORRECTED in dataset["mode"].values else BEST
 
 
 _TEXT = Texts("faintspot.experiments")
@@ -104,7 +299,7 @@ def study_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
 
     A sweep is drawn by the first word of its name, so that several make one figure. The paper's pictures
     (figures 1 and 5) come with the paper's sweeps only. A study with methods that know the spot has the
-    figures of `faintspot.experiments.report.estimators` instead.
+    figures of `faintspot.experiments.report.page` instead.
     """
     if compares_estimators(dataset):
         yield from estimator_figures(dataset)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.files import Closing
 from faintspot.base.sizes import check_bytes
 from faintspot.io.locations import one_line
 

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from faintspot.base.errors import InputError
+from faintspot.base.extras import import_modules
 from faintspot.base.files import check_regular
-from faintspot.base.lazy import import_modules
 from faintspot.io.formats.file_format import FileFormat
 
 import_modules(__name__.rpartition(".")[0])

@@ -14,9 +14,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
-from faintspot.base.files import output_errors, replace_file
+from faintspot.base.files import Closing, output_errors, replace_file
 from faintspot.base.variables import VARIABLES
 from faintspot.io.optional_packages import load_filelock
 from faintspot.io.stored.slopes_format import RecordingHeader, StoredSlopes, checked_block

@@ -13,7 +13,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from faintspot.base.errors import InputError
-from faintspot.base.lazy import import_modules
+from faintspot.base.extras import import_modules
 
 if TYPE_CHECKING:
     from faintspot.slopes.estimators.base import Estimator
@@ -79,15 +79,15 @@ def _line_of(error: BaseException, file: str | None) -> str:
 ENTRY_POINTS = "faintspot.estimators"
 _PACKAGE = "faintspot.slopes.estimators.built_in"
 _MODULES = {
-    "brightest": "brightest",
+    "brightest": "gravity",
     "tv": "total_variation",
     "smoothed": "smoothed",
-    "centroid": "centroid",
+    "centroid": "gravity",
     "thresholded": "thresholded",
     "window": "window",
     "weighted": "weighted",
     "ml": "maximum_likelihood",
-    "map": "maximum_a_posteriori",
+    "map": "maximum_likelihood",
 }
 """Modules of `built_in` by the names of estimators, in the order of lists; one is imported on first use."""
 
@@ -181,11 +181,10 @@ def estimator_named(name: str) -> type[Estimator]:
 @cache
 def _load() -> None:
     """Import the built-in estimators and those of installed packages."""
-    first = [f"{_PACKAGE}.{module}" for module in _MODULES.values()]
-    modules = [*first, *(module for module in import_modules(_PACKAGE) if module not in first)]
+    import_modules(_PACKAGE)
     # User code that imported one of them directly has changed the order.
-    places = {module: place for place, module in enumerate(modules)}
-    kinds = sorted(_kinds.values(), key=lambda kind: places.get(kind.__module__, len(places)))
+    places = {name: place for place, name in enumerate(_MODULES)}
+    kinds = sorted(_kinds.values(), key=lambda kind: places.get(kind.name, len(places)))
     _kinds.clear()
     _kinds.update({kind.name: kind for kind in kinds})
     for point in entry_points(group=ENTRY_POINTS):

@@ -15,7 +15,7 @@ from faintspot.slopes.estimators import spot_tables
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan
 from faintspot.slopes.estimators.spot_tables import SpotModel
 from faintspot.slopes.kernels.driver.groups import RANGE
-from faintspot.slopes.kernels.gravity.pixel_noise import SMALLEST_VARIANCE
+from faintspot.slopes.kernels.gravity.smoothing import SMALLEST_VARIANCE
 from faintspot.slopes.kernels.spot_fits import fits as spot_fits
 
 _STEPS_IN_BRIGHT_FLUX = 12

@@ -28,7 +28,7 @@ from faintspot.slopes.sensor.detection.following import FollowedDrift
 from faintspot.slopes.sensor.detection.lattice import Lattice
 from faintspot.slopes.sensor.detection.nodes import find_spots, spot_width
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.neighbours import as_rows, neighbours_of
+from faintspot.slopes.sensor.region import as_rows, neighbours_of
 from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
 

@@ -21,7 +21,7 @@ from faintspot.slopes.kernels.driver.groups import Scratch, SlopeArrays, Source,
 from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.neighbours import (
+from faintspot.slopes.sensor.region import (
     LEAST_DIFFERENCE,
     LEAST_DIFFERENCE_PX,
     continued,

@@ -22,7 +22,7 @@ from faintspot.io.locations import split_location
 from faintspot.io.slopes import create_writer, read_reference
 from faintspot.io.stored.slopes_format import UNITS, pixels_in
 from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.camera.fitting_dark import with_fitting_dark
+from faintspot.slopes.camera.dark_frames import with_fitting_dark
 from faintspot.slopes.camera.frame_checks import are_repeated
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration

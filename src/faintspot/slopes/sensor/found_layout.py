@@ -16,8 +16,7 @@ from faintspot.slopes.kernels.driver.doubtful import Expected, flag_doubtful
 from faintspot.slopes.sensor.binning import magnified_layout, scaled_points
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.neighbours import LEAST_DIFFERENCE, lines_of, neighbours_of
-from faintspot.slopes.sensor.region import PupilRegion, Rectangle
+from faintspot.slopes.sensor.region import LEAST_DIFFERENCE, PupilRegion, Rectangle, lines_of, neighbours_of
 from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, SMALLEST_WINDOW, window_size
 from faintspot.slopes.sensor.windows import Windows, find_windows
 

@@ -1,4 +1,4 @@
-"""Regions of a frame given by the user: pupil and rectangle."""
+"""Regions of a frame given by the user, pupil and rectangle, and neighbours of sub-apertures."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from types import EllipsisType
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from faintspot.base.checks import numbers_between
 from faintspot.base.errors import InputError
@@ -70,3 +71,75 @@ class Rectangle:
     def slices(self) -> tuple[EllipsisType, slice, slice]:
         """Slices that cut the rectangle out of one or several frames."""
         return (..., slice(self.y0, self.y1), slice(self.x0, self.x1))
+
+
+LEAST_DIFFERENCE = 0.1
+"""Smaller differences between displacements of spots are treated as equal, in pitches."""
+LEAST_DIFFERENCE_PX = 0.3
+"""Likewise in px; the smaller one counts."""
+
+_BESIDE = ((0, 1), (0, -1), (1, 0), (-1, 0))
+_DIAGONAL = ((1, -1), (-1, 1), (1, 1), (-1, -1))
+
+
+def links_of(neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return pairs of neighbours (n, 2), each once, from the table that `neighbours_of` returns."""
+    count = len(neighbours)
+    pairs = np.column_stack([np.repeat(np.arange(count), neighbours.shape[1]), neighbours.ravel()])
+    return np.asarray(pairs[(pairs[:, 0] < pairs[:, 1]) & (pairs[:, 1] < count)])
+
+
+def neighbours_of(cells: NDArray[np.int64], geometry: str, *, diagonal: bool = False) -> NDArray[np.int64]:
+    """Return the (n, 4 or 6) indices of the neighbours of each cell, n where there is none.
+
+    With `diagonal` (n, 8), diagonal neighbours in square arrays are included.
+    """
+    steps = _BESIDE + _DIAGONAL[: 2 if geometry == "hexagonal" else 4 * diagonal]
+    shifted = cells - cells.min(axis=0) + 1
+    index = np.full(shifted.max(axis=0) + 2, len(cells), dtype=np.int64)
+    index[shifted[:, 0], shifted[:, 1]] = np.arange(len(cells))
+    return np.column_stack([index[shifted[:, 0] + row, shifted[:, 1] + column] for row, column in steps])
+
+
+def lines_of(neighbours: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return pairs of cells in line with each cell, from the table that `neighbours_of` returns.
+
+    They are opposite neighbours. Cells at the edge of the array, with fewer than two of these pairs, also
+    have each neighbour with the next one behind it.
+
+    Returns
+    -------
+    lines : (n, m, 2) array of int
+        n where there is none; those come last.
+    outside : (n, m) array of bool
+        Whether both are on the same side, the nearer one first.
+    """
+    n, count = neighbours.shape
+    opposite = neighbours.reshape(n, count // 2, 2)
+    few = (opposite < n).all(axis=2).sum(axis=1) < 2
+    same_side = continued(neighbours)
+    same_side[~few] = n
+    lines = np.concatenate([opposite, same_side], axis=1)
+    outside = np.broadcast_to(np.arange(lines.shape[1]) >= count // 2, lines.shape[:2])
+    complete = (lines < n).all(axis=2)
+    lines[~complete] = n
+    order = np.argsort(~complete, axis=1, kind="stable")[:, : max(complete.sum(axis=1).max(), 1)]
+    taken = np.take_along_axis(lines, order[:, :, None], axis=1)
+    return np.ascontiguousarray(taken), np.ascontiguousarray(np.take_along_axis(outside, order, axis=1))
+
+
+def continued(neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return each neighbour and the one behind it, (n, m, 2), from the table that `neighbours_of` returns."""
+    n, count = neighbours.shape
+    behind = np.vstack([neighbours, np.full(count, n)])[neighbours, np.arange(count)]
+    return np.ascontiguousarray(np.stack([neighbours, behind], axis=2))
+
+
+def as_rows(at: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Return complex positions as rows of x, y."""
+    return np.column_stack([at.real, at.imag])
+
+
+def as_tree(at: NDArray[np.complex128]) -> cKDTree:
+    """Return a tree of complex positions, in which near ones are found."""
+    return cKDTree(as_rows(at))

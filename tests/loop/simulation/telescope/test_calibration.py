@@ -1,9 +1,8 @@
 import pytest
 
 from faintspot.slopes.estimators.base import Estimator
-from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
-from faintspot.slopes.estimators.built_in.maximum_a_posteriori import MaximumAPosteriori
-from faintspot.slopes.estimators.built_in.maximum_likelihood import MaximumLikelihood
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
+from faintspot.slopes.estimators.built_in.maximum_likelihood import MaximumAPosteriori, MaximumLikelihood
 from faintspot.slopes.estimators.built_in.smoothed import Smoothed
 from faintspot.slopes.estimators.built_in.thresholded import Thresholded
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation

@@ -20,7 +20,7 @@ from faintspot.slopes.estimators.algorithms.automatic import (
     automatic_smoothing,
     automatic_strength,
 )
-from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 from faintspot.slopes.estimators.built_in.smoothed import Smoothed
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 

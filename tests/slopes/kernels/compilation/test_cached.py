@@ -9,14 +9,14 @@ import pytest
 from numba.core.caching import CacheImpl
 
 from faintspot.base.errors import CacheWarning
-from faintspot.slopes.kernels.compilation import cached
-from faintspot.slopes.kernels.compilation.cached import kernel_cache
+from faintspot.slopes.kernels.compilation import compiling
+from faintspot.slopes.kernels.compilation.compiling import kernel_cache
 
 
 @pytest.fixture(autouse=True)
 def _nothing_said_yet() -> None:
-    cached._warn_once.cache_clear()
-    cached._tell_once.cache_clear()
+    compiling._warn_once.cache_clear()
+    compiling._tell_once.cache_clear()
 
 
 def plus_one(number: Any) -> Any:
@@ -92,10 +92,10 @@ def test_damaged_files_are_compiled_anew(
 def test_says_once_that_it_compiles(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level("INFO", "faintspot.slopes.kernels.compilation.cached")
+    caplog.set_level("INFO", "faintspot.slopes.kernels.compilation.compiling")
     compiled = dispatcher(tmp_path, monkeypatch)
     assert (compiled(1), compiled(1.5)) == (2, 2.5)
     assert [record.getMessage().split()[0] for record in caplog.records] == ["compiling"]
-    cached._tell_once.cache_clear()
+    compiling._tell_once.cache_clear()
     assert dispatcher(tmp_path, monkeypatch)(1) == 2
     assert len(caplog.records) == 1

@@ -11,7 +11,7 @@ import pytest
 from tests.shared_data import ROOT
 
 from faintspot import Layout, Settings, SlopePipeline
-from faintspot.slopes.kernels.compilation.target import compile_target
+from faintspot.slopes.kernels.compilation.compiling import compile_target
 
 LAYOUT = Layout.grid((2, 2), pixels=8)
 SETTINGS = Settings("tv", noise_std=3.0, keep_brightest=20)
@@ -19,7 +19,7 @@ _MEASURE = """
 import json
 from tests.slopes.kernels.compilation import test_target as here
 from faintspot.slopes.kernels.compilation.host import lanes_for
-from faintspot.slopes.kernels.compilation.target import vector_registers
+from faintspot.slopes.kernels.compilation.compiling import vector_registers
 target, width = here.compile_target(), lanes_for("float32").width
 print(json.dumps([target.cpu, sorted(target.features), width, vector_registers(), here.slopes().tolist()]))
 """

@@ -16,7 +16,7 @@ from faintspot.loop.simulation.telescope.mirror import DeformableMirror
 from faintspot.loop.simulation.telescope.wavefront_sensor import ShackHartmann
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.detector import Detector
-from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 from faintspot.slopes.pipeline.light import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline

@@ -1,4 +1,4 @@
-"""Background subtraction and compiled kernel shared by the centre-of-gravity estimators."""
+"""Centres of gravity: plain, and of the brightest pixels; what they share."""
 
 from __future__ import annotations
 
@@ -14,8 +14,18 @@ from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.base.config.options import Value, is_auto, option
 from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.algorithms.automatic import automatic_kept_pixels
-from faintspot.slopes.estimators.algorithms.brightest import RULES, most_kept, threshold_rank
-from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, EstimatorPlan, Need, Step
+from faintspot.slopes.estimators.algorithms.centroid import RULES, most_kept, threshold_rank
+from faintspot.slopes.estimators.base import (
+    BACKGROUND,
+    CALIBRATED,
+    RAW,
+    Estimator,
+    EstimatorPlan,
+    Need,
+    Step,
+    Style,
+)
+from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.scene import PIXEL_BLUR_PX2, Scene
 from faintspot.slopes.estimators.sensor import Sensor
 from faintspot.slopes.kernels.gravity import gravity
@@ -190,3 +200,50 @@ def keep_all(table: NDArray[np.float32]) -> None:
     """Skip the background subtraction."""
     table[gravity.RANK] = table[gravity.SUBTRACT] = 0.0
     table[gravity.LEVEL] = -LARGEST_FLOAT32  # below every pixel
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BrightestPixels(KeepingBrightest):
+    """Centre of gravity of the brightest pixels (Basden, Myers & Gendron 2012), without denoising."""
+
+    name = "brightest"
+    label = "brightest pixels"
+    method = "brightest pixels, centre of gravity"
+    cost = 0.21
+    style = Style("#000000", "--", "o")
+    automatic_method = "none"
+
+    @classmethod
+    def like(cls, other: KeepingBrightest) -> BrightestPixels:
+        """Return an estimator with the background subtraction of `other` and no denoising."""
+        return cls(**{name: getattr(other, name) for name in cls.declared()})
+
+    def in_words(self, n_subapertures: int, pixels: int) -> str:
+        """See `Estimator`."""
+        return f"no denoising; {self.kept_in_words(n_subapertures, pixels)}"
+
+    def denoised(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See `KeepingBrightest`."""
+        return images
+
+    def prepared(self, sensor: Sensor) -> GravityPlan:
+        """See `Estimator`."""
+        return GravityPlan(self, sensor)
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CentreOfGravity(Centroid):
+    """Centre of gravity of the whole window, without background subtraction."""
+
+    name = "centroid"
+    label = "centre of gravity"
+    method = "centre of gravity of the whole window"
+    cost = 0.13
+    style = Style("#666666", ":", "x")
+    steps_shown = (RAW, CALIBRATED)
+
+    def prepared(self, sensor: Sensor) -> GravityPlan:
+        """See `Estimator`."""
+        return GravityPlan(self, sensor)

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from faintspot.base.config.options import Value, option
 from faintspot.slopes.estimators.algorithms.automatic import automatic_smoothing
 from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Step, Style
-from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
-from faintspot.slopes.estimators.built_in.gravity import GravityPlan, KeepingBrightest
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels, GravityPlan, KeepingBrightest
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.estimators.sensor import Sensor

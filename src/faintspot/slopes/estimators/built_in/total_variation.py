@@ -16,8 +16,12 @@ from faintspot.base.errors import InputError
 from faintspot.slopes.estimators.algorithms.automatic import automatic_strength
 from faintspot.slopes.estimators.algorithms.noise import ALGORITHMS, suggested_strength, tv_denoise
 from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Step, Style
-from faintspot.slopes.estimators.built_in.brightest import BrightestPixels
-from faintspot.slopes.estimators.built_in.gravity import Floats, GravityPlan, KeepingBrightest
+from faintspot.slopes.estimators.built_in.gravity import (
+    BrightestPixels,
+    Floats,
+    GravityPlan,
+    KeepingBrightest,
+)
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.estimators.sensor import Sensor

@@ -7,19 +7,96 @@ Python calls it, together with all that it calls; what other kernels call is onl
 
 from __future__ import annotations
 
+import hashlib
+import logging
+import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from numba import config, njit
 from numba.core import types as numba_types
+from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
 
 from faintspot.base import checks
-from faintspot.slopes.kernels.compilation.cached import kernel_cache
+from faintspot.base.errors import CacheWarning
+
+
+def kernel_cache(function: Callable[..., Any], stamp: Any) -> Any:
+    """Return the cache of a function's machine code, valid as long as `stamp` is the same.
+
+    Numba's own cache asks only whether the function's own file has changed, but kernels inline each other
+    across files.
+    """
+    try:
+        return _KernelCache(function, stamp)
+    except RuntimeError:  # neither in NUMBA_CACHE_DIR, nor beside the sources, nor in the user's folder
+        _warn_once("no folder for them can be written")
+        return NullCache()
+
+
+class _KernelCache(FunctionCache):
+    """Numba's cache, tolerant of a disk that is full, read-only or damaged."""
+
+    def __init__(self, function: Callable[..., Any], stamp: Any) -> None:
+        super().__init__(function)
+        self._cache_file = _KernelFiles(self._cache_path, self._impl.filename_base, stamp)
+
+    def load_overload(self, *arguments: Any) -> Any:
+        """Return the cached code, or discard it and return None if it cannot be read."""
+        kept = None
+        try:
+            kept = super().load_overload(*arguments)
+        except Exception:  # a damaged pickle raises anything
+            with suppress(OSError):
+                self._cache_file.flush()
+        if kept is None:
+            _tell_once()
+        return kept
+
+    def save_overload(self, *arguments: Any) -> None:
+        """Store machine code if possible."""
+        try:
+            super().save_overload(*arguments)
+        except OSError as error:
+            _warn_once(f"{self._cache_path}: {error.strerror or error}")
+
+
+class _KernelFiles(IndexDataCacheFile):
+    """The files of one function: an index, and one for each kind of arguments and processor.
+
+    Numba counts the latter from 1. Where two processes compile at once, both may then write the same file,
+    and the index name it as the code for one processor when it is that for another. Here names say what is
+    inside.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep machine code; of two processes that do so at once, one may have to compile again later."""
+        name = f"{self._index_name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}.nbc"
+        self._save_data(name, data)
+        self._save_index({**self._load_index(), key: name})
+
+
+@cache
+def _tell_once() -> None:
+    """Log that this run takes longer because kernels are compiled."""
+    logging.getLogger(__name__).info("compiling what this machine has not used yet; later runs start at once")
+
+
+@cache
+def _warn_once(reason: str) -> None:
+    warnings.warn(
+        f"compiled kernels cannot be kept ({reason}): every process compiles them anew, which takes "
+        "seconds each time; set NUMBA_CACHE_DIR to a folder that can be written",
+        CacheWarning,
+        stacklevel=2,
+    )
+
 
 _KERNELS = Path(__file__).parents[1]
 
@@ -168,3 +245,30 @@ def _writable(kind: Any) -> Any:
     if isinstance(kind, types.BaseTuple):
         return types.BaseTuple.from_types([_writable(each) for each in kind])
     return kind
+
+
+class Target(NamedTuple):
+    """Target of the machine code."""
+
+    triple: str
+    """Such as x86_64-unknown-linux-gnu."""
+    cpu: str
+    """LLVM's name of the processor; "generic" is the least of its kind."""
+    features: frozenset[str]
+    """LLVM's names of the features that may be used, beyond those that every processor of the kind has."""
+
+
+@cache
+def compile_target() -> Target:
+    """Return Numba's target, not the machine's: LLVM aborts if code uses a feature that the target lacks."""
+    from numba.core.registry import cpu_target
+
+    triple, cpu, features = cpu_target.target_context.codegen().magic_tuple()
+    names = (name.strip() for name in features.split(","))
+    return Target(triple, cpu, frozenset(name[1:] for name in names if name.startswith("+")))
+
+
+def vector_registers() -> int:
+    """Return the number of vector registers of the target: 32 with AVX-512 and on aarch64, else 16."""
+    target = compile_target()
+    return 32 if "avx512vl" in target.features or target.triple.startswith("aarch64") else 16

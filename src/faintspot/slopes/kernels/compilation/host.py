@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.slopes.kernels.compilation.compiling import compile_target
 from faintspot.slopes.kernels.compilation.simd import Lanes
-from faintspot.slopes.kernels.compilation.target import compile_target
 
 WIDTHS = (4, 8, 16)
 _ENVIRONMENT = "FAINTSPOT_SIMD_WIDTH"

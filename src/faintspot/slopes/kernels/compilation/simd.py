@@ -24,7 +24,7 @@ from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import NativeValue, unbox
 
-from faintspot.slopes.kernels.compilation.target import compile_target, vector_registers
+from faintspot.slopes.kernels.compilation.compiling import compile_target, vector_registers
 
 intrinsic: Any = extending.intrinsic  # to a type checker, what it returns has the signature of its typing
 

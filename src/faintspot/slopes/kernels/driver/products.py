@@ -1,4 +1,4 @@
-"""Products of a matrix with vectors, and with the slopes of a frame while its rows arrive."""
+"""Products of a matrix with vectors and with slopes while rows arrive, and rows of telemetry."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.base.flags import UNMEASURED
+from faintspot.base.flags import INVALID, UNMEASURED, SubapertureFlag
 from faintspot.slopes.kernels.compilation.compiling import compiled, inlined
 
 _UNMEASURED = int(UNMEASURED)
@@ -165,3 +165,36 @@ def finish_product(columns: Any, vector: Any, memory: Any) -> None:
             result[i] += outs[k, i]
     taken[:] = 0.0
     outs[:] = 0.0
+
+
+_INVALID, _NOT_CONVERGED = int(INVALID), int(SubapertureFlag.NOT_CONVERGED)
+
+
+@compiled
+def fill_telemetry_rows(
+    flux: Any,
+    flags: Any,
+    iterations: Any,
+    error_x: Any,
+    error_y: Any,
+    covariance_xy: Any,
+    counts: Any,
+    table: Any,
+) -> None:
+    """Fill a table (7, n), and count: invalid sub-apertures, those at the iteration limit, iterations.
+
+    Rows of the table: flux, valid, standard errors of x and y, iterations, flags, covariance of x and y.
+    """
+    counts[0] = counts[1] = counts[2] = 0
+    for s in range(flux.shape[0]):
+        invalid = flags[s] & _INVALID != 0
+        counts[0] += invalid
+        counts[1] += flags[s] & _NOT_CONVERGED != 0
+        counts[2] += iterations[s]
+        table[0, s] = flux[s]
+        table[1, s] = 0.0 if invalid else 1.0
+        table[2, s] = error_x[s]
+        table[3, s] = error_y[s]
+        table[4, s] = iterations[s]
+        table[5, s] = flags[s]
+        table[6, s] = covariance_xy[s]

@@ -20,9 +20,8 @@ import llvmlite.binding as llvm
 from llvmlite import ir
 from numba.core import types
 
-from faintspot.slopes.kernels.compilation.clock import now_ns, sleep_ns
 from faintspot.slopes.kernels.compilation.compiling import compiled
-from faintspot.slopes.kernels.compilation.ordered import look_at
+from faintspot.slopes.kernels.compilation.ordered import look_at, now_ns, sleep_ns
 from faintspot.slopes.kernels.compilation.simd import intrinsic, width_of
 from faintspot.slopes.kernels.driver.groups import copied
 from faintspot.slopes.kernels.driver.products import add_slopes

@@ -19,7 +19,7 @@ from faintspot.slopes.kernels.compilation.simd import (
     store,
     width_of,
 )
-from faintspot.slopes.kernels.gravity.pixel_noise import variance_of
+from faintspot.slopes.kernels.gravity.smoothing import variance_of
 
 # Rows of the table of per-lane numbers (n_rows, W).
 RANK = 0  # in: the threshold is the RANK-th largest pixel

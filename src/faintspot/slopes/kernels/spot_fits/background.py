@@ -21,7 +21,6 @@ from faintspot.slopes.kernels.compilation.simd import (
     store,
     width_of,
 )
-from faintspot.slopes.kernels.spot_fits.model import model_at, noise_of, weigh
 from faintspot.slopes.kernels.spot_fits.spot_rows import (
     FLUX,
     I_FF,
@@ -39,6 +38,9 @@ from faintspot.slopes.kernels.spot_fits.spot_rows import (
     SCORE_F,
     SCORE_X,
     SCORE_Y,
+    model_at,
+    noise_of,
+    weigh,
 )
 
 _LEAST_LEFT = 1e-5  # of the information on the flux: below it is round-off, and the spot resembles a constant

@@ -23,13 +23,17 @@ from faintspot.slopes.kernels.driver.groups import (
     ZERO_X,
     driver_of,
 )
-from faintspot.slopes.kernels.gravity.pixel_noise import SMALLEST_VARIANCE, variance_of, without_noisy_pixels
-from faintspot.slopes.kernels.gravity.smoothing import gather_taps
+from faintspot.slopes.kernels.gravity.smoothing import (
+    SMALLEST_VARIANCE,
+    gather_taps,
+    variance_of,
+    without_noisy_pixels,
+)
 from faintspot.slopes.kernels.spot_fits import spot_rows
 from faintspot.slopes.kernels.spot_fits.background import subtract_background
 from faintspot.slopes.kernels.spot_fits.likelihood import fit_group
 from faintspot.slopes.kernels.spot_fits.posterior import posterior_of_group
-from faintspot.slopes.kernels.spot_fits.start import LEAST_FLUX_E, find_start
+from faintspot.slopes.kernels.spot_fits.profiles import LEAST_FLUX_E, find_start
 from faintspot.slopes.kernels.spot_fits.weighted import weigh_group
 
 # Rows of the settings' table that follow the common ones: flux that is expected; weights of a fit; prior.

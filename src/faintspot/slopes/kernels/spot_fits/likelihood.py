@@ -25,7 +25,6 @@ from faintspot.slopes.kernels.compilation.simd import (
     width_of,
 )
 from faintspot.slopes.kernels.spot_fits.background import eliminate_background
-from faintspot.slopes.kernels.spot_fits.model import model_at, noise_of, weigh
 from faintspot.slopes.kernels.spot_fits.profiles import look_up
 from faintspot.slopes.kernels.spot_fits.spot_rows import (
     COVARIANCE,
@@ -61,6 +60,9 @@ from faintspot.slopes.kernels.spot_fits.spot_rows import (
     SEEN_ERROR,
     X,
     Y,
+    model_at,
+    noise_of,
+    weigh,
 )
 
 LARGEST_FACTOR = 2.0  # on the flux, in one step

@@ -11,8 +11,15 @@ import math
 from typing import Any
 
 from faintspot.slopes.kernels.compilation.compiling import compiled
-from faintspot.slopes.kernels.compilation.simd import load, multiply_add, splat, sum_of, width_of
-from faintspot.slopes.kernels.spot_fits.rows import rows_from_lanes
+from faintspot.slopes.kernels.compilation.simd import (
+    copy_transposed,
+    load,
+    multiply_add,
+    splat,
+    store,
+    sum_of,
+    width_of,
+)
 from faintspot.slopes.kernels.spot_fits.spot_rows import (
     HIGH_X,
     HIGH_Y,
@@ -28,6 +35,37 @@ from faintspot.slopes.kernels.spot_fits.spot_rows import (
     SPREAD_XY,
     SPREAD_Y,
 )
+
+
+@compiled
+def rows_from_lanes(lanes: Any, image: Any, ny: Any, nx: Any, starts: Any, rows: Any) -> None:
+    """Reorder a group's images.
+
+    Parameters
+    ----------
+    image : (>= ny * nx * W + W,)
+        All lanes of a pixel side by side.
+    starts : (W,) int64
+        Scratch.
+    rows : (ny, n_vectors, W, W)
+        Written: pixel `vector * W + i` of a row of sub-aperture `lane` is at [row, vector, lane, i].
+    """
+    width = width_of(lanes)
+    vectors = rows.shape[1]
+    nothing = ny * nx * width
+    store(image, nothing, splat(lanes, 0.0))
+    for vector in range(vectors):
+        first = vector * width
+        whole = first + width <= nx
+        for i in range(width):
+            starts[i] = (first + i) * width
+        for y in range(ny):
+            shift = y * nx * width
+            if not whole:
+                for i in range(nx - first, width):
+                    starts[i] = nothing - shift
+            copy_transposed(lanes, image, starts, shift, rows, (y * vectors + vector) * width * width)
+
 
 REACH = 4.0  # standard deviations of the prior beyond which no position is looked at
 _NEGLIGIBLE = 25.0  # differences of the logarithm that count as probability 0

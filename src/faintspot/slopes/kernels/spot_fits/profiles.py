@@ -16,11 +16,23 @@ from faintspot.slopes.kernels.compilation.simd import (
     maximum,
     minimum,
     multiply_add,
+    select,
     splat,
     store,
     width_of,
 )
-from faintspot.slopes.kernels.spot_fits.spot_rows import REST_X, X
+from faintspot.slopes.kernels.gravity.smoothing import smooth_pixel
+from faintspot.slopes.kernels.spot_fits.spot_rows import (
+    FLUX,
+    HIGH_X,
+    HIGH_Y,
+    LOW_X,
+    LOW_Y,
+    REST_X,
+    START_FLUX,
+    X,
+    Y,
+)
 
 PHASES = 16
 MARGIN = 2  # px that a table reaches beyond the window's side, on either end
@@ -75,3 +87,62 @@ def look_up(
                 derivative = load(lanes, profiles, (value + padded + i) * width)
                 here = (value + i) * width
                 store(profiles, here, multiply_add(rest, derivative, load(lanes, profiles, here)))
+
+
+LEAST_FLUX_E = 1.0  # an estimate of the flux below this says nothing
+
+
+@compiled
+def _pixel_range(lanes: Any, lane_values: Any, low: Any, high: Any, n: Any) -> Any:
+    """First and last pixel whose centre is within half a pixel of some lane's allowed positions."""
+    width = width_of(lanes)
+    first, last = n - 1, 0
+    for lane in range(width):
+        lowest, highest = lane_values[low * width + lane], lane_values[high * width + lane]
+        first = min(first, math.ceil(lowest - 0.5 + 0.5 * (n - 1)))
+        last = max(last, math.floor(highest + 0.5 + 0.5 * (n - 1)))
+    return max(first, 0), min(last, n - 1)
+
+
+@compiled
+def find_start(
+    lanes: Any, image: Any, ny: Any, nx: Any, reach: Any, taps: Any, smoothed: Any, lane_values: Any
+) -> None:
+    """Write X, Y and FLUX of every lane: its largest smoothed pixel within the allowed positions.
+
+    Of equal ones the first. FLUX follows from what such a pixel has of a spot's flux, START_FLUX.
+
+    Parameters
+    ----------
+    image : (ny * nx * W,)
+    reach, taps
+        See `smooth_pixel`.
+    smoothed : (>= ny * nx * W,), flat
+        Scratch.
+    """
+    width = width_of(lanes)
+    first_x, last_x = _pixel_range(lanes, lane_values, LOW_X, HIGH_X, nx)
+    first_y, last_y = _pixel_range(lanes, lane_values, LOW_Y, HIGH_Y, ny)
+    for y in range(max(first_y - reach, 0), min(last_y + reach + 1, ny)):
+        for x in range(first_x, last_x + 1):
+            at = (y * nx + x) * width
+            store(smoothed, at, smooth_pixel(lanes, image, at, width, x, nx, taps, 0, reach))
+    half, minus_half = splat(lanes, 0.5), splat(lanes, -0.5)
+    low_x, high_x = load(lanes, lane_values, LOW_X * width), load(lanes, lane_values, HIGH_X * width)
+    low_y, high_y = load(lanes, lane_values, LOW_Y * width), load(lanes, lane_values, HIGH_Y * width)
+    best = splat(lanes, -math.inf)
+    best_x, best_y = half * (low_x + high_x), half * (low_y + high_y)
+    for y in range(first_y, last_y + 1):
+        v = splat(lanes, y - 0.5 * (ny - 1))
+        for x in range(first_x, last_x + 1):
+            value = smooth_pixel(lanes, smoothed, (y * nx + x) * width, nx * width, y, ny, taps, 1, reach)
+            u = splat(lanes, x - 0.5 * (nx - 1))
+            inside = minimum(minimum(u - low_x, high_x - u), minimum(v - low_y, high_y - v)) >= minus_half
+            value = select(inside, value, splat(lanes, -math.inf))
+            larger = value > best
+            best = select(larger, value, best)
+            best_x, best_y = select(larger, u, best_x), select(larger, v, best_y)
+    flux = best / load(lanes, lane_values, START_FLUX * width)
+    store(lane_values, X * width, minimum(maximum(best_x, low_x), high_x))
+    store(lane_values, Y * width, minimum(maximum(best_y, low_y), high_y))
+    store(lane_values, FLUX * width, maximum(flux, splat(lanes, LEAST_FLUX_E)))

@@ -17,7 +17,7 @@ from faintspot.slopes.kernels.compilation.simd import (
     store,
     width_of,
 )
-from faintspot.slopes.kernels.gravity.pixel_noise import SMALLEST_VARIANCE, relative_variance, variance_of
+from faintspot.slopes.kernels.gravity.smoothing import SMALLEST_VARIANCE, relative_variance, variance_of
 from faintspot.slopes.kernels.spot_fits.profiles import look_up
 from faintspot.slopes.kernels.spot_fits.spot_rows import (
     COVARIANCE,

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from faintspot.slopes.kernels.compilation.compiling import compiled, inlined
+from faintspot.slopes.kernels.compilation.compiling import compiled, inlined, vector_registers
 from faintspot.slopes.kernels.compilation.simd import (
     align_stack,
     load,
@@ -28,7 +28,6 @@ from faintspot.slopes.kernels.compilation.simd import (
     twice_reciprocal_square_root,
     width_of,
 )
-from faintspot.slopes.kernels.compilation.target import vector_registers
 
 STATE_VECTORS = 5  # vectors per pixel: 2 px, 2 py of both versions, g
 IMAGE = 4  # place of g among them

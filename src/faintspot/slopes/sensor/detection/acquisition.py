@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from faintspot.slopes.sensor.detection.following import FollowedDrift, each_once, matched_spots
 from faintspot.slopes.sensor.detection.nodes import REACH, SpotFlux
-from faintspot.slopes.sensor.neighbours import as_rows, as_tree, links_of
+from faintspot.slopes.sensor.region import as_rows, as_tree, links_of
 
 # Pitches: steps of the tilts that are tried (twice that for defocus, at the edge of the pupil), sizes of
 # astigmatism, and largest distance of a spot from where one expects it.

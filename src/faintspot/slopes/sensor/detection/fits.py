@@ -22,8 +22,7 @@ from faintspot.slopes.sensor.detection.nodes import (
     no_drift,
     spot_width,
 )
-from faintspot.slopes.sensor.neighbours import as_rows, as_tree
-from faintspot.slopes.sensor.region import PupilRegion
+from faintspot.slopes.sensor.region import PupilRegion, as_rows, as_tree
 
 _FIT_PASSES = 10
 # A spot with this signal-to-noise ratio that is as bright as those of illuminated lenslets and this far

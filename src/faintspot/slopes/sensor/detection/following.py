@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from faintspot.slopes.sensor.detection.lattice import Lattice
 from faintspot.slopes.sensor.detection.nodes import REACH
-from faintspot.slopes.sensor.neighbours import as_rows, as_tree, links_of
+from faintspot.slopes.sensor.region import as_rows, as_tree, links_of
 
 # In pitches: largest distance of a spot from its node where the matching starts, largest difference between
 # neighbouring displacements there, and largest distance of a spot from the position extrapolated to it.

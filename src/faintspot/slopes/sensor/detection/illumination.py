@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, maxi
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.sensor.detection.lattice import Lattice
 from faintspot.slopes.sensor.detection.nodes import SEARCH, NodeFlux
-from faintspot.slopes.sensor.neighbours import links_of
+from faintspot.slopes.sensor.region import links_of
 
 # Signal-to-noise ratio at which a spot is as likely as not: the highest of the 10 to 20 independent noise
 # values within the search area exceeds 3.5 in one dark cell of 200.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.statistics import MAD_TO_STD
-from faintspot.slopes.sensor.neighbours import neighbours_of
+from faintspot.slopes.sensor.region import neighbours_of
 
 RATIOS = {"square": 1j, "hexagonal": complex(np.exp(1j * np.pi / 3))}
 SMALLEST_PITCH_PX = 5.0
