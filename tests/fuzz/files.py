@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 from tests.fuzz.refused import refused_in_one_line
+from tests.io import loop_layouts
 
 import faintspot as fs
 from faintspot.experiments.study.specification import StudySpecification
@@ -92,6 +93,15 @@ def _read_arrays(path: Path) -> None:
         read_array(f"{path}:{name}" if name else path)
 
 
+def _read_loop(path: Path) -> None:
+    from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
+
+    stated: dict[str, Any] = {"slope_unit": "px", "frame_rate_hz": 250.0}
+    if path.name == "milk":
+        stated |= {"slopes": "wfs", "commands": "dm"}
+    read_recorded_loop(path, stated=stated)
+
+
 _IMAGES = ("png", "bmp", "jpg", "lzw.tif")
 
 
@@ -113,6 +123,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "packed.sav": _read_arrays,
     "table.fits": _read_arrays,
     "poke.txt": _read_arrays,
+    **dict.fromkeys((*loop_layouts.WRITERS, "keck"), _read_loop),
     "psf.npz": PSF.load,
     "weights.npz": fs.FixedWeights.load,
     "faintspot.toml": _read_configuration,
@@ -154,6 +165,10 @@ def _originals() -> Path:
     for name in ("trs.sav", "packed.sav"):
         idl_file.write(folder / name, saved, compressed=name == "packed.sav")
     table(folder / "table.fits")
+    loop = loop_layouts.random_loop()
+    for name, write in {**loop_layouts.WRITERS, "keck": loop_layouts.keck}.items():
+        (folder / name).mkdir()
+        write(folder / name, loop)
     np.savetxt(folder / "poke.txt", np.eye(9), header="poke")
     psf = PSF.analytic(radius_px=5)
     weights = fs.FixedWeights(*np.random.default_rng(0).uniform(0.1, 1.0, (3, 8, 8)))

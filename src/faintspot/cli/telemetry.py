@@ -14,7 +14,7 @@ from faintspot.base.errors import InputError, errors_within
 from faintspot.base.extras import require, require_linux
 from faintspot.base.files import derived, write_atomically
 from faintspot.base.json_text import to_json
-from faintspot.cli.shared.commands import declared, option
+from faintspot.cli.shared.commands import SectionedCommand, declared, option
 from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.slopes.sensor.layout import OPTICS, Layout
@@ -24,10 +24,11 @@ if TYPE_CHECKING:
     from faintspot.loop.telemetry.page import Piece
 
 _SECONDS = 20.0
+_LACKS = "What FILE lacks"
 
 
 @needs("report", "matplotlib", "jinja2")
-@click.command()
+@click.command(cls=SectionedCommand)
 @click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[FILE]")
 @option("--engine", metavar="NAME", help="Record this running engine first; FILE keeps the recording.")
 @option(
@@ -59,7 +60,31 @@ _SECONDS = 20.0
 )
 @option("--one-loop", is_flag=True, help="Report the loop as a whole, although methods alternated.")
 @option("--every", type=float, metavar="SECONDS", help="Turbulence against time as well, in such pieces.")
-@option("--frame-rate-hz", type=float, metavar="HZ", help="Frame rate, of slopes from frames.")
+@option("--slopes", metavar="NAME", section=_LACKS, help="Array in FILE, or file, with the slopes.")
+@option("--commands", metavar="NAME", section=_LACKS, help="Array in FILE, or file, with the commands.")
+@option(
+    "--interaction-matrix",
+    metavar="NAME",
+    section=_LACKS,
+    help="Array in FILE, or file, with the slopes for a unit of each command.",
+)
+@option("--control-matrix", metavar="NAME", section=_LACKS, help="The matrix from slopes to commands.")
+@option(
+    "--cells",
+    metavar="NAME",
+    section=_LACKS,
+    help="Mask of the lenslet array, or row and column of each sub-aperture.",
+    show_default="a full square",
+)
+@option("--slope-unit", metavar="UNIT", section=_LACKS, help="Unit of the slopes: px, arcsec or rad.")
+@option(
+    "--slope-order",
+    metavar="ORDER",
+    section=_LACKS,
+    help="Order of slopes: pairs (x and y of each sub-aperture) or axes (all x, then all y).",
+    show_default="axes",
+)
+@option("--frame-rate-hz", type=float, metavar="HZ", section=_LACKS, help="Frame rate.")
 @declared(Layout, *OPTICS, sections="Telescope")
 @option("--controller", metavar="NPZ", help="Learn a predictive controller as well, and write it to a file.")
 @option("--output", "-o", metavar="HTML", help="Page to write.", show_default="FILE's or NAME's, with .html")
@@ -75,14 +100,15 @@ def command(
     every: float | None,
     controller: str | None,
     output: str | None,
-    **stated: float | None,
+    **stated: float | str | None,
 ) -> None:
     """Report noise, turbulence, vibrations and control of a recorded loop, of any system.
 
     FILE is a store of `faintspot realtime record`, slopes of `faintspot slopes` (without a loop), an AOT
-    file (FITS), a telemetry session of pyRTC, a TOML file that names arrays, or a NumPy or CSV file with
-    slopes. Writes a page and, beside it, the same numbers as JSON. Every value has a 95 % interval. Of a
-    loop it replays other gains and the predictive filter on the recorded turbulence. Takes a minute.
+    file, a SPARTA table of ESO with its matrices beside it, a .sav file of Keck, cubes of milk's logger, a
+    session of pyRTC, a folder of arrays, a file with slopes, or a TOML file that names arrays. Writes a page
+    and, beside it, the same numbers as JSON. Every value has a 95 % interval. Of a loop it replays other
+    gains and the predictive filter on the recorded turbulence. Takes a minute.
 
     Where methods alternated in a closed loop (realtime run --interleave), it compares them instead: Strehl
     ratio and residual phase, with hours of observing that would decide.
@@ -93,7 +119,9 @@ def command(
       faintspot telemetry night.zarr
       faintspot telemetry night.zarr --strehl times.csv
       faintspot telemetry slopes.zarr --frame-rate-hz 250 --every 60
-      faintspot telemetry night_aot.fits --system rate_and_unit.toml
+      faintspot telemetry night_aot.fits --slope-unit px
+      faintspot telemetry CIAO_LOOP_0001.fits --slope-unit px --cells mask.txt
+      faintspot telemetry n0088_LGS_trs.sav --slopes B.DTTCENTROIDS --slope-unit arcsec
       faintspot telemetry loop.toml -o loop.html
       faintspot telemetry loop.npz --controller controller.npz
     """

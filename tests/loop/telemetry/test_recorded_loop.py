@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.cli.cli_cases import Commands
+from tests.io import loop_layouts
 from tests.loop.telemetry.loop_cases import CELLS, recorded
 
 import faintspot as fs
@@ -67,7 +68,8 @@ def test_toml_that_names_arrays(tmp_path: Path) -> None:
     header = ",".join(f"s{number}" for number in range(50))
     np.savetxt(tmp_path / "slopes.csv", pairs, delimiter=",", header=header, comments="")
     np.save(tmp_path / "commands.npy", -found["commands"])
-    np.save(tmp_path / "matrix.npy", found["interaction_matrix"])
+    matrix = found["interaction_matrix"].reshape(2, 25, 36).swapaxes(0, 1).reshape(50, 36)
+    np.save(tmp_path / "matrix.npy", matrix)
     times = np.arange(len(pairs)) / 250
     times[100:] += 7 / 250
     np.save(tmp_path / "times.npy", times)
@@ -75,6 +77,7 @@ def test_toml_that_names_arrays(tmp_path: Path) -> None:
     (tmp_path / "night.toml").write_text(WORDS + names + 'time_s = "times.npy"\nslope_order = "pairs"\n')
     loop = read_recorded_loop(tmp_path / "night.toml")
     same(replace(loop, commands=-loop.commands))
+    np.testing.assert_array_equal(loop.interaction_matrix, found["interaction_matrix"])
     assert np.flatnonzero(np.diff(loop.frame) > 1).tolist() == [99]
     assert np.diff(loop.frame).max() == 8
 
@@ -119,7 +122,7 @@ def test_aot_file(tmp_path: Path) -> None:
         )
     ]
     system.write_to_file(tmp_path / "night.fits")
-    with pytest.raises(InputError, match="slope_unit: unknown; give it in a TOML file with --system"):
+    with pytest.raises(InputError, match="slope_unit: unknown; give it with --slope-unit"):
         read_recorded_loop(tmp_path / "night.fits")
     (tmp_path / "unit.toml").write_text('slope_unit = "px"')
     loop = read_recorded_loop(tmp_path / "night.fits", tmp_path / "unit.toml")
@@ -293,3 +296,67 @@ def test_slopes_of_frames_are_those_of_an_open_loop(tmp_path: Path) -> None:
         expected = np.hstack([y, -x]) / gain
         expected[3, [4, 13]] = np.nan
         assert np.allclose(loop.slopes, expected, atol=1e-6, equal_nan=True)
+
+
+OPTIONS: dict[str, Any] = {"subaperture_m": 0.6, "pixel_scale_arcsec": 0.2, "slope_unit": "px"}
+
+
+@pytest.mark.parametrize("writer", list(loop_layouts.WRITERS))
+def test_files_of_others_give_the_same_loop(tmp_path: Path, writer: str) -> None:
+    """With their matrices, frame rate and lost frames; what was taken from where is the first remark."""
+    pytest.importorskip("astropy")
+    known = recorded()
+    written = loop_layouts.Loop(known.slopes, known.commands, known.interaction_matrix, np.ones((5, 5)))
+    path, options = loop_layouts.WRITERS[writer](tmp_path, written), dict(OPTIONS)
+    if writer == "milk":
+        np.save(tmp_path / "im.npy", known.interaction_matrix)
+        options |= {"slopes": "wfs", "commands": "dm", "interaction_matrix": f"{tmp_path / 'im.npy'}"}
+    loop = read_recorded_loop(path, stated=options)
+    assert loop.frame_rate_hz == pytest.approx(250.0, rel=1e-3)  # times are rounded to microseconds
+    same(replace(loop, frame_rate_hz=250.0))
+    np.testing.assert_allclose(loop.interaction_matrix, known.interaction_matrix)
+    assert np.array_equal(np.diff(loop.frame), np.ones(len(known.slopes) - 1))
+    assert loop.remarks[0].startswith("read as ")
+    assert "slope_unit as given" in loop.remarks[0]
+    assert prepared(loop).sent_after_frames == 0
+
+
+def test_a_question_at_a_time(tmp_path: Path) -> None:
+    """Each error names the option that answers it; then what is still not known is a remark."""
+    slopes = np.random.default_rng(1).standard_normal((300, 42))
+    np.savez(tmp_path / "loop.npz", wfs=slopes, mask=np.pad(np.ones((3, 7)), 1))
+    answers: list[tuple[str, Any]] = [
+        ("slopes", "wfs"),
+        ("slope_unit", "px"),
+        ("frame_rate_hz", 100.0),
+        ("cells", "mask"),
+    ]
+    stated: dict[str, Any] = {}
+    for name, answer in answers:
+        with pytest.raises(InputError, match=name.replace("_", "[-_]")):
+            read_recorded_loop(tmp_path / "loop.npz", stated=stated)
+        stated[name] = answer
+    loop = read_recorded_loop(tmp_path / "loop.npz", stated=stated)
+    assert len(loop.cells) == 21
+    unknown = next(line for line in loop.remarks if line.startswith("not known: "))
+    for option in ("--commands", "--interaction-matrix", "--pixel-scale-arcsec", "--diameter-m", "law"):
+        assert option in unknown
+
+
+def test_tip_tilt_of_keck(tmp_path: Path) -> None:
+    """Commands are in the axes and the unit of the slopes; the loop is one aperture."""
+    rng = np.random.default_rng(2)
+    tilt = np.cumsum(rng.standard_normal((1500, 2)), axis=0)
+    slopes, commands = np.zeros((1500, 2)), np.zeros((1500, 2))
+    for frame in range(2, 1500):
+        slopes[frame] = tilt[frame] + commands[frame - 2] + 0.1 * rng.standard_normal(2)
+        commands[frame] = commands[frame - 1] - 0.3 * slopes[frame]
+    written = loop_layouts.Loop(slopes, commands, np.eye(2), np.ones((1, 1)))
+    path = loop_layouts.keck(tmp_path, written)
+    loop = read_recorded_loop(path, stated={"slope_unit": "arcsec"})
+    np.testing.assert_array_equal(loop.slopes, slopes)
+    np.testing.assert_array_equal(loop.interaction_matrix, np.eye(2))
+    assert loop.frame_rate_hz == pytest.approx(250.0, rel=1e-4)
+    ready = prepared(loop)
+    assert (ready.sign, ready.sent_after_frames) == (1.0, 0)
+    assert ready.loop_gain == pytest.approx(0.3, abs=0.01)

@@ -116,14 +116,15 @@ def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> Report:
     if pieces:
         missing = "; ".join(f"{piece.start_s:g} s: {piece.missing}" for piece in pieces if piece.missing)
         sections.append(_TEXT.section("time", _time_figure(pieces), missing=missing))
-    more = {
+    loop = report.loop
+    more: dict[str, Sequence[str] | Table | FigureWithData | None] = {
+        "frames": loop.remarks,
         "noise": _noise_figure(report),
         "spectra": _spectra_figure(report),
         "choices": _choices_table(report),
     }
     for name, part in report.parts.items():
         sections.append(_TEXT.section(name, _table(part), more.get(name), missing=part.missing))
-    loop = report.loop
     return Report(
         f"{'Loop' if loop.is_closed else 'Turbulence'} of {loop.name}",
         {"Sub-apertures": str(len(loop.cells)), "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"},

@@ -17,10 +17,13 @@ from faintspot.base.files import read_arrays
 from faintspot.base.flags import NO_FLAG, SubapertureFlag, leave_out
 from faintspot.base.toml_files import check_keys, parse_file
 from faintspot.io import StoredSlopes
+from faintspot.io.arrays.fits_units import is_aot
 from faintspot.io.arrays.zarr_store import holds_telemetry
 from faintspot.io.frames import read_array
+from faintspot.io.loops.layout_reading import read_layout
+from faintspot.io.loops.milk_streams import holds_streams, read_streams
+from faintspot.io.loops.pyrtc_session import holds_session, read_session
 from faintspot.io.slopes import holds_slopes
-from faintspot.io.telemetry.pyrtc_session import holds_session, read_session
 from faintspot.io.telemetry.recording import read_telemetry
 from faintspot.loop.control.configuration import load_control
 from faintspot.loop.control.identification.recording import NUMBERS, Recording, cells_of
@@ -43,18 +46,24 @@ _OF_SENSOR = (
 _SCALES = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
 """Scales of the telescope that a layout holds."""
 _WORDS = ("slope_unit", "slope_order", "loop")
-_PAIRS, _AXES = "pairs", "axes"
+_ASKED = {
+    "commands": "--commands",
+    "interaction_matrix": "--interaction-matrix or --control-matrix",
+    "pixel_scale_arcsec": "--pixel-scale-arcsec",
+    "subaperture_m": "--subaperture-m or --diameter-m",
+}
+"""Options for values without which a part of the report is missing."""
+_ORDERS = _PAIRS, _AXES = "pairs", "axes"
 _LEAST_RESPONSE = 0.3  # of the median, of slopes that are used
 _GAIN_ERROR, _NONLINEAR = 0.02, 0.1  # relative errors of the gain: of all, and of small responses
 _OF_LOST = 5.0  # relative error of the gain over the share of slopes at their limit
-_TABLES = (".npz", ".npy", ".csv", ".txt")
 
 
 def read_recorded_loop(
     path: str | Path,
     system: str | Path | None = None,
     configuration: str | Path | None = None,
-    stated: Mapping[str, float] | None = None,
+    stated: Mapping[str, float | str] | None = None,
 ) -> Recording:
     """Read a recording of a loop.
 
@@ -62,39 +71,50 @@ def read_recorded_loop(
     ----------
     path : path
         A store of `faintspot realtime record`, slopes of `faintspot slopes` without a loop, an AOT file, a
-        telemetry session of pyRTC, a TOML file that names arrays, or a NumPy or CSV file with slopes.
+        telemetry session of pyRTC, streams of milk's logger, a file or folder in one of the layouts of
+        `io.loops.layouts`, a TOML file that names arrays, or a file with slopes.
     system : path, optional
         TOML with values that the recording lacks, or that replace its own.
     configuration : path, optional
         faintspot.toml with [control], for a store of `faintspot realtime record`. Default: as recorded.
-    stated : dict of str to float, optional
-        Values that replace those of files, such as frame_rate_hz.
+    stated : dict, optional
+        Values that replace those of files, such as frame_rate_hz; of arrays the name in the file, or a file.
 
     Raises
     ------
     InputError
-        When a file cannot be read, shapes do not fit together, or rate, unit or geometry are missing.
+        When a file cannot be read, shapes do not fit together, or rate, unit or geometry are missing; the
+        message names the option.
     """
-    path, values = Path(path), {}
+    path, stated = Path(path), dict(stated or {})
     if not path.exists():
         raise InputError(f"{path}: no such file or directory")
-    if path.suffix == ".toml":
-        values = _system_values(path)
-    elif holds_session(path):
-        values = read_session(path)
-    elif path.is_dir() and holds_telemetry(path):
-        values = _of_store(path, configuration)
-    elif holds_slopes(path):
-        values = _of_slopes(path)
-    elif path.suffix in _TABLES:
-        values = _of_table(path)
-    else:
-        values = _of_aot(path)
-    if system is not None:
-        values |= _system_values(Path(system))
-    values |= stated or {}
+    named = {name: f"{stated.pop(name)}" for name in _ARRAYS if isinstance(stated.get(name), str)}
+    values = _values_of(path, configuration, named)
+    given = {**({} if system is None else _system_values(Path(system))), **stated}
     with errors_within(path):
-        return _loop(path.name, values)
+        return _loop(path.name, values | given, list(given))
+
+
+def _values_of(path: Path, configuration: str | Path | None, named: dict[str, str]) -> dict[str, Any]:
+    """Return the values of a recording of any kind, with arrays that options name."""
+    if holds_streams(path):
+        return read_streams(path, named)
+    if path.suffix == ".toml":
+        values = _system_values(path) | {"origin": "TOML file"}
+    elif holds_session(path):
+        values = read_session(path) | {"origin": "session of pyRTC"}
+    elif path.is_dir() and holds_telemetry(path):
+        values = _of_store(path, configuration) | {"origin": "recording of faintspot"}
+    elif holds_slopes(path):
+        values = _of_slopes(path) | {"origin": "slopes of faintspot"}
+    elif path.suffix == ".npz" and "slopes" not in named:
+        values = _of_table(path) | {"origin": "NumPy file"}
+    elif path.is_file() and is_aot(path):
+        values = _of_aot(path) | {"origin": "AOT file"}
+    else:
+        return read_layout(path, named)
+    return values | {name: read_array(text) for name, text in named.items()} | {"sources": named}
 
 
 def _system_values(path: Path) -> dict[str, Any]:
@@ -129,8 +149,6 @@ def _numbers(values: Mapping[str, object]) -> dict[str, float]:
 
 
 def _of_table(path: Path) -> dict[str, Any]:
-    if path.suffix != ".npz":
-        return {"slopes": read_array(path)}
     stored = read_arrays(path, "slopes of a loop")
     check_keys(f"{path}: ", stored, [*_ARRAYS, *NUMBERS, *_WORDS])
     return {name: array.item() if array.ndim == 0 else array for name, array in stored.items()}
@@ -157,6 +175,8 @@ def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
         values["commands"] = recording.commands[rows]
     if control is not None:
         values["interaction_matrix"] = control.interaction
+        law = ", ".join(f"{name} = {value}" for name, value in control.options.chosen().items())
+        values["control_law"] = law or "as by default"
         values["delay_frames"] = control.options.delay_frames
         if control.options.largest_command is not None:
             values["largest_command"] = control.options.largest_command
@@ -237,17 +257,18 @@ def _of_aot(path: Path) -> dict[str, Any]:
     return values | {name: value for name, value in optional.items() if value is not None and np.size(value)}
 
 
-def _loop(name: str, values: dict[str, Any]) -> Recording:
+def _loop(name: str, values: dict[str, Any], given: list[str]) -> Recording:
     """Return the loop of values from files, checked."""
     if "slopes" not in values:
-        raise InputError("slopes: expected an array, found none")
-    slopes, remarks = real_array("slopes", values["slopes"], minimum_dimensions=1).astype(np.float64), []
-    in_pairs = one_of("slope_order", values.get("slope_order", _AXES), (_AXES, _PAIRS)) == _PAIRS
+        raise InputError("slopes: expected an array, found none; name one with --slopes")
+    slopes = real_array("slopes", values["slopes"], minimum_dimensions=1).astype(np.float64)
+    remarks = [_taken(values, given), *values.get("remarks", ())]
+    in_pairs = one_of("slope_order", values.get("slope_order", _AXES), _ORDERS) == _PAIRS
     if in_pairs and slopes.ndim == 2:
         slopes = np.hstack([slopes[:, ::2], slopes[:, 1::2]])
     numbers = _numbers(values)
     if "slope_unit" not in values:
-        raise InputError(f"slope_unit: unknown; give it in a TOML file with --system ({', '.join(UNITS)})")
+        raise InputError(f"slope_unit: unknown; give it with --slope-unit ({', '.join(UNITS)})")
     unit = one_of("slope_unit", values["slope_unit"], list(UNITS))
     scale = UNITS[unit] or numbers.pop("pixel_scale_arcsec", None)
     frame, rate = _timing(values, len(slopes), numbers.get("frame_rate_hz"))
@@ -257,6 +278,14 @@ def _loop(name: str, values: dict[str, Any]) -> Recording:
         control = control.astype(np.float64)
         interaction = np.linalg.pinv(control.reshape(len(control), -1), rcond=0.03)
         remarks.append("interaction matrix: pseudo-inverse of the control matrix")
+    if in_pairs and interaction is not None:
+        matrix = finite_array("interaction_matrix", interaction, minimum_dimensions=2)
+        interaction = np.vstack([matrix[::2], matrix[1::2]])
+    n = slopes[0].size // 2
+    if values.get("cells") is None and math.isqrt(n) ** 2 != n:
+        raise InputError(
+            f"cells: unknown; give a mask, or row and column of each of the {n} sub-apertures, with --cells"
+        )
     diameter_m = numbers.pop("diameter_m", None)
     known: dict[str, Any] = {**numbers, "pixel_scale_arcsec": scale}
     known["frame_rate_hz"] = rate
@@ -264,7 +293,7 @@ def _loop(name: str, values: dict[str, Any]) -> Recording:
         slopes,
         values.get("commands"),
         interaction,
-        cells_of(values.get("cells"), math.prod(slopes.shape[1:]) // 2),
+        cells_of(values.get("cells"), n),
         **known,
         frame=frame,
         is_closed=one_of("loop", values.get("loop", "closed"), ("closed", "open")) == "closed",
@@ -274,7 +303,33 @@ def _loop(name: str, values: dict[str, Any]) -> Recording:
     slopes, left_out = _usable(loop.slopes, values.get("flags"))
     remarks += [f"slopes: {left_out}"] if left_out else []
     side = side_m(loop.cells, loop.subaperture_m, diameter_m, values.get("flags"))
-    return replace(loop, slopes=slopes, subaperture_m=side, remarks=tuple(remarks))
+    loop = replace(loop, slopes=slopes, subaperture_m=side)
+    return replace(loop, remarks=(*remarks, *_unknown(loop, values)))
+
+
+def _taken(values: Mapping[str, Any], given: list[str]) -> str:
+    """Return in one line what was taken from where."""
+    sources = values.get("sources", {})
+    names = [name for name in (*_ARRAYS, *NUMBERS) if name in values and name not in given]
+    parts = [f"{name} from {sources[name]}" if name in sources else name for name in names]
+    parts += [f"{name} as given" for name in given]
+    law = f"; control law: {values['control_law']}" if "control_law" in values else ""
+    return f"read as {values.get('origin', 'arrays')}: {', '.join(parts)}{law}"
+
+
+def _unknown(loop: Recording, values: Mapping[str, Any]) -> list[str]:
+    """Return in a line what could not be known, with the options that say it."""
+    of_loop = () if loop.is_closed else ("commands", "interaction_matrix")
+    unknown = [
+        f"{name} ({option})"
+        for name, option in _ASKED.items()
+        if getattr(loop, name) is None and name not in of_loop
+    ]
+    if values.get("frame") is None and values.get("time_s") is None:
+        unknown.append("lost frames")
+    if loop.is_closed and "control_law" not in values:
+        unknown.append("control law")
+    return [f"not known: {', '.join(unknown)}"] if unknown else []
 
 
 def _usable(slopes: Floats, flags: NDArray[np.uint8] | None) -> tuple[Floats, str]:

@@ -105,6 +105,7 @@ class LoopReport:
         return {
             "recording": self.loop.name,
             "slope_unit": self.loop.slope_unit,
+            "remarks": list(self.loop.remarks),
             "advice": self.advice,
             **values,
         }
@@ -162,7 +163,6 @@ def _frames(report: LoopReport) -> None:
         Measured("longest gap", "frames", float(lost.max(initial=0)), 0.0),
         Measured("slopes not measured", "", float(np.isnan(loop.slopes).mean()), 0.0, "share"),
     ]
-    part.missing = "; ".join(loop.remarks)
 
 
 def _loop(report: LoopReport) -> LoopDelay:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from faintspot.base.errors import InputError
-from faintspot.io.telemetry.pyrtc_session import holds_session, read_session
+from faintspot.io.loops.pyrtc_session import holds_session, read_session
 
 SLOPES = np.arange(60, dtype=np.float32).reshape(10, 6)
 COMMANDS = np.arange(40, dtype=np.float32).reshape(10, 4, 1)
