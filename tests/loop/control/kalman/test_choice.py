@@ -19,7 +19,7 @@ from faintspot.loop.control.kalman.guarded import (
 def driven(filters: float, integrators: float, frames: int, computed: float = math.inf) -> np.ndarray:
     """Return what was chosen; whatever drives, the residual of the integrator is computed as 3."""
     guard = np.zeros(GUARD_NUMBERS)
-    prepare(guard, False, computed, 60)
+    prepare(guard, False, computed, 60, 36)
     chosen = []
     for _ in range(frames):
         chosen.append(guard[CHOSEN])
@@ -52,7 +52,7 @@ def test_runaway_loses_the_mirror_at_once_and_for_good() -> None:
 
 def test_growing_residual_loses_the_mirror_before_it_is_ten_times_as_large() -> None:
     guard = np.zeros(GUARD_NUMBERS)
-    prepare(guard, False, math.inf, 60)
+    prepare(guard, False, math.inf, 60, 36)
     for _ in range(61):
         CHOOSE(guard, 0.5, 1.0)
     residual, frames = 0.5, 0
@@ -70,7 +70,7 @@ def test_a_filter_that_becomes_worse_is_replaced_within_30_frames_without_false_
     """Both residuals share the turbulence, and each has a scatter that is alike over five frames."""
     rng = np.random.default_rng(3)
     guard, chosen = np.zeros(GUARD_NUMBERS), []
-    prepare(guard, False, math.inf, 60)
+    prepare(guard, False, math.inf, 60, 36)
     scatter = [
         np.exp(0.15 * np.convolve(rng.standard_normal(10_004), np.full(5, 5**-0.5), "valid"))
         for _ in range(2)
@@ -100,7 +100,7 @@ def test_a_filter_is_replaced_though_it_leaves_little(
 ) -> None:
     """By commands at the limit, surprises, or slopes that are not used; not where the integrator has them."""
     guard = np.zeros(GUARD_NUMBERS)
-    prepare(guard, False, math.inf, 60)
+    prepare(guard, False, math.inf, 60, 36)
     chosen = []
     for number in range(400):
         driving = guard[CHOSEN] == 0

@@ -54,12 +54,16 @@ def learn_controller(
     """
     cells = np.rint(site.positions_m[:, ::-1] / site.subaperture_m).astype(np.int64)
     of_commands = phase_of_commands(plant.interaction, cells)
-    frames = max(_FEWEST_REPLAYED, _MOST_REPLAYED // len(site.positions_m) // 2)
-    part = telemetry.part(-frames, None)
+    part = replayed_part(telemetry, len(plant.interaction))
     gain, plain_residual = plant.best_gain(GAINS, part, of_commands @ plant.reconstructor.matrix)
     model = Kalman({}, gain, 1.0, (math.inf, plain_residual), of_commands)
     known = Identification(telemetry, site, rate_hz) if identification is None else identification
     return model.learnt(plant, part, _fits(known.among(AVERAGED[:1]), site, winds, start), progress)
+
+
+def replayed_part(telemetry: OpenLoopTelemetry, slopes: int) -> OpenLoopTelemetry:
+    """Return the frames by which controllers are compared."""
+    return telemetry.part(-max(_FEWEST_REPLAYED, _MOST_REPLAYED // slopes), None)
 
 
 def _fits(

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 _WINDOW, _WINDOW_S = 128, 0.52  # frames; a longer window if the frame rate is so high that these last longer
 _FEWEST_PIECES, _FEWEST_LONG_PIECES = 4, 12
-_MOST_DELAY, _USUAL_DELAY = 5, 3
+MOST_DELAY, _USUAL_DELAY = 5, 3
 _UNLIKE = 3.0  # misfit above which longer delays than the usual ones explain only what is not turbulence
 _STEP = 0.1  # of fractional delays
 GAINS = 0.1, 1.6
@@ -44,7 +44,7 @@ _LEAST_STRENGTH = 1e-6  # of the largest: weaker turbulence is none
 _LEAST_INFORMATION, _MOST_ERROR = 0.01, 1.0
 """Part of the information on the gain that unknown strengths leave at least; largest error of a gain."""
 _BATCH = 64  # pieces at a time
-_INDEPENDENT = 0.55  # part of half-overlapping pieces
+INDEPENDENT = 0.55  # part of half-overlapping pieces
 FEWEST_SUBAPERTURES = 3
 """Fewer show only tip and tilt, in which vibrations cannot be separated from turbulence."""
 
@@ -138,7 +138,7 @@ class DelayFits:
         window /= np.linalg.norm(window)
         basis = _modes(site, axis)
         slopes, sent = ((values - values.mean(axis=0))[:, columns] @ basis for values in (slopes_px, sent_px))
-        products, pieces = _products(slopes, sent, run, window)
+        products, pieces = cross_spectra(slopes, sent, run, window)
         self._fits = [
             _Fit(
                 products, _turbulence(replace(site, averaged=averaged), rate_hz, window, basis, axis), pieces
@@ -173,17 +173,17 @@ class DelayFits:
             fit.of(2.0)
         tried = {
             (fit, delay): fit.of(delay, _FEW_UPDATES)[-1]
-            for delay in range(1, _MOST_DELAY + 1)
+            for delay in range(1, MOST_DELAY + 1)
             for fit in self._fits
         }
-        for most in _MOST_DELAY, _USUAL_DELAY:
+        for most in MOST_DELAY, _USUAL_DELAY:
             fit, whole = min((key for key in tried if key[1] <= most), key=tried.__getitem__)
             fit.begin()
             fit.of(whole)
             misfit = fit.misfit(whole)
             if misfit < _UNLIKE:
                 break
-        delays = np.arange(max(whole - 1.0, 1.0), min(whole + 1.0, _MOST_DELAY) + 0.5 * _STEP, _STEP)
+        delays = np.arange(max(whole - 1.0, 1.0), min(whole + 1.0, MOST_DELAY) + 0.5 * _STEP, _STEP)
         values = np.array([fit.of(delay, _FEW_UPDATES) for delay in delays])
         weight = np.exp((values[:, 1].min() - values[:, 1]) / misfit**2)
         weight /= weight.sum()
@@ -207,7 +207,7 @@ class _Fit:
     def __init__(self, products: Floats, parts: Floats, pieces: int) -> None:
         self._products, self._parts = products, parts
         self._flat = parts.reshape(len(parts), -1)
-        self._independent = _INDEPENDENT * pieces
+        self._independent = INDEPENDENT * pieces
         self.begin()
 
     def begin(self) -> None:
@@ -261,7 +261,7 @@ class _Fit:
 
     def _of_delay(self, delay: float) -> tuple[Floats, Floats]:
         """Return products of slopes with the commands of a delay, and of these with themselves."""
-        first, part = min(int(delay), _MOST_DELAY), delay - min(int(delay), _MOST_DELAY)
+        first, part = min(int(delay), MOST_DELAY), delay - min(int(delay), MOST_DELAY)
         share = {first: 1 - part, first + 1: part}
         lags, weights = list(share), np.array(list(share.values()))
         crossed = np.tensordot(self._products[:, 0, lags], weights, (1, 0))
@@ -331,9 +331,9 @@ def _window_length(run: NDArray[np.int64], rate_hz: float) -> int:
     return length
 
 
-def _products(slopes: Floats, sent: Floats, run: NDArray[np.int64], window: Floats) -> tuple[Floats, int]:
+def cross_spectra(slopes: Floats, sent: Floats, run: NDArray[np.int64], window: Floats) -> tuple[Floats, int]:
     """Return cross-spectra (frequencies, 1 + lags, 1 + lags, m, m) of slopes and earlier commands."""
-    lags, length, m = _MOST_DELAY + 1, len(window), slopes.shape[1]
+    lags, length, m = MOST_DELAY + 1, len(window), slopes.shape[1]
     starts = [
         start
         for start in range(lags, len(slopes) - length + 1, length // 2)
@@ -349,7 +349,7 @@ def _products(slopes: Floats, sent: Floats, run: NDArray[np.int64], window: Floa
         for start in starts[first : first + _BATCH]:
             parts = [slopes[start : start + length]]
             parts += [sent[start - lag : start - lag + length] for lag in range(1, lags + 1)]
-            transformed = np.fft.rfft(np.array(parts) * window[:, None], axis=1)[:, _bins(length)]
+            transformed = np.fft.rfft(np.array(parts) * window[:, None], axis=1)[:, bins_of(length)]
             flat = transformed.transpose(1, 2, 0).reshape(transformed.shape[1], -1)
             pieces += [flat.real, flat.imag]
         batch = np.array(pieces).transpose(1, 2, 0)
@@ -360,7 +360,7 @@ def _products(slopes: Floats, sent: Floats, run: NDArray[np.int64], window: Floa
     ), len(starts)
 
 
-def _bins(length: int) -> NDArray[np.int64]:
+def bins_of(length: int) -> NDArray[np.int64]:
     """Return every second frequency, as neighbours are alike under the window."""
     return np.arange(1, length // 2, 2)
 
@@ -373,7 +373,7 @@ def _turbulence(
     The turbulence is from anywhere; of one axis, it comes from each direction, as winds along x change slopes
     along x more than those along y.
     """
-    bins = _bins(len(window))
+    bins = bins_of(len(window))
     spectra = SlopeSpectra(site, 1 / rate_hz, window, bins, max(_SPEEDS_M_PER_S) * len(window) / rate_hz)
     tables, _ = spectra.tables(site.outer_scale_m)
     angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS

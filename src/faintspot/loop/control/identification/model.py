@@ -22,7 +22,6 @@ from faintspot.loop.control.base import (
     KALMAN,
     CommandDelayLine,
     OpenLoopTelemetry,
-    Predictor,
     usual_noise,
 )
 from faintspot.loop.control.integrator import LoopPlant, settled
@@ -31,6 +30,8 @@ from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_model import STEPS, slopes_ahead, state_of_state, state_of_surprise
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter, local_shapes
+from faintspot.loop.control.kalman.modal_predictor import ARRAYS as MODAL
+from faintspot.loop.control.kalman.modal_predictor import ModalPredictor
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor, steady_covariance
 from faintspot.loop.control.replay import mean_residual
 
@@ -43,8 +44,8 @@ _MOST_SLOPES = 300  # whose filter lets each correct all others
 _LAYERS = "first", "second", "driving_px2"
 _NOISE = "variance_px2", "covariance_xy_px2"
 _LOCAL = "near", "around", "weights", "corrections", "variance_px2", "predicted_px2", "share"
-_DENSE_FORM, _LOCAL_FORM = KALMAN, f"local {KALMAN}"
-_FORMS = {_DENSE_FORM: (*_LAYERS, *_NOISE), _LOCAL_FORM: _LOCAL}
+_DENSE_FORM, _LOCAL_FORM, _MODAL_FORM = KALMAN, f"local {KALMAN}", f"modal {KALMAN}"
+_FORMS = {_DENSE_FORM: (*_LAYERS, *_NOISE), _LOCAL_FORM: _LOCAL, _MODAL_FORM: MODAL}
 """Names in files, and the arrays of each."""
 _NUMBERS, _GAIN = ("plain_gain", "noise_factor", "left", "phase_of_commands"), "centroid_gain"
 _ANY, _COVARIANCE_PX2 = (-1e6, 1e6), (-1e8, 1e8)
@@ -52,7 +53,7 @@ _RANGES = {
     "plain_gain": (0.0, 2.0),
     "noise_factor": (1e-6, 1e6),
     _GAIN: (1e-3, 1e3),
-    **dict.fromkeys(("first", "second", "weights", "corrections"), _ANY),
+    **dict.fromkeys(("first", "second", "weights", "corrections", *MODAL[:2]), _ANY),
     **dict.fromkeys(("driving_px2", "covariance_xy_px2"), _COVARIANCE_PX2),  # those of slopes of 1e4 px
     "variance_px2": (1e-12, 1e8),
     "predicted_px2": (0.0, 1e8),
@@ -67,7 +68,7 @@ class Kalman:
 
     Its arrays are layers first, second, driving_px2 (layers, m, m), and the noise of slopes: variance_px2
     (m,) and covariance_xy_px2 (m / 2,). For large sensors, in which only near sub-apertures interact, they
-    are those of `local_filter`.
+    are those of `local_filter`, and for modes, in place of slopes, those of `modal_filter`.
     """
 
     arrays: Mapping[str, Floats]
@@ -141,7 +142,7 @@ class Kalman:
             "prefers_plain": self.left[1] < self.left[0],
             "plain_residual": self.left[1],
         }
-        if not self.is_local:
+        if self._is_dense:
             return self._compiled(plant, line, self.phase(plant), **options)
         return LargeGuarded(line, plant, self.phase_of_commands, self.arrays, self.plain_gain, **options)
 
@@ -152,7 +153,7 @@ class Kalman:
 
     def replayed(self, plant: LoopPlant, telemetry: OpenLoopTelemetry, phase: Floats) -> Floats:
         """Return the squared residual that the filter would have left; see `replayed_frames`."""
-        if self.is_local:
+        if not self._is_dense:
             return plant.replayed(partial(self.controller, plant), telemetry.scaled(self.noise_factor), phase)
         line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames)
         return self._compiled(plant, line, phase, noise_factor=self.noise_factor).replayed(telemetry)
@@ -165,7 +166,7 @@ class Kalman:
         """Return the filter with its residual on telemetry, and with the covariance that this needed."""
         squares = self.replayed(plant, telemetry, self.phase(plant))
         residual = mean_residual(squares, telemetry, settled(telemetry))
-        covariance = self.covariance if self.is_local else self._covariance
+        covariance = self._covariance if self._is_dense else self.covariance
         return replace(self, left=(residual, self.left[1]), covariance=covariance)
 
     @property
@@ -174,12 +175,23 @@ class Kalman:
         return "around" in self.arrays
 
     @property
+    def is_modal(self) -> bool:
+        """Whether it is a filter of modes that are independent of each other."""
+        return MODAL[0] in self.arrays
+
+    @property
+    def _is_dense(self) -> bool:
+        return not (self.is_local or self.is_modal)
+
+    @property
     def expected_std_px(self) -> Floats:
         """(m,): standard deviations of the predicted slopes."""
         return self.predictor().std_px
 
-    def predictor(self) -> Predictor:
+    def predictor(self) -> LocalPredictor | ModalPredictor | SlopePredictor:
         """Return the filter itself."""
+        if self.is_modal:
+            return ModalPredictor(self.arrays)
         return LocalPredictor(self.arrays) if self.is_local else self.slope_predictor
 
     @property
@@ -192,7 +204,7 @@ class Kalman:
         if scale == 1.0:
             return self
         arrays = self.arrays
-        if not self.is_local:  # which has gains for several variances
+        if self._is_dense:  # others have gains for several variances, or one
             arrays = {**arrays, **{name: scale * arrays[name] for name in _NOISE}}
         text, factor = f"{self.description}, and {scale:g} of that", scale * self.noise_factor
         return replace(self, arrays=arrays, noise_factor=factor, description=text, covariance=None)
@@ -222,7 +234,7 @@ class Kalman:
             When it cannot be written.
         """
         numbers = {name: np.asarray(getattr(self, name), np.float64) for name in (*_NUMBERS, _GAIN)}
-        form = _LOCAL_FORM if self.is_local else _DENSE_FORM
+        form = _LOCAL_FORM if self.is_local else _MODAL_FORM if self.is_modal else _DENSE_FORM
         save_arrays(path, {"kind": np.array(form), **numbers, **self.arrays, **others})
 
     @classmethod
@@ -268,6 +280,9 @@ def _checked(arrays: Mapping[str, object], plant: LoopPlant) -> dict[str, Floats
     shapes = {"left": (2,), "phase_of_commands": (commands, commands), "variance_px2": (slopes,)}
     if "around" in numbers:
         shapes |= local_shapes(numbers, slopes)
+    elif MODAL[0] in numbers:
+        shapes |= dict.fromkeys(MODAL[:2], (len(np.atleast_1d(numbers[MODAL[0]])), slopes))
+        shapes["predicted_px2"] = (slopes,)
     else:
         layers = len(numbers["first"]) if numbers["first"].ndim == 3 else 1
         shapes |= {**dict.fromkeys(_LAYERS, (layers, slopes, slopes)), "covariance_xy_px2": (slopes // 2,)}
@@ -300,21 +315,22 @@ def state_space(model: Kalman, plant: LoopPlant, scale: Floats | float, sign: fl
     ----------
     model : Kalman
     plant : LoopPlant
-    scale : float or (2 n,) array
-        The model's slopes in a unit of s.
+    scale : float, (2 n,) or (modes, m) array
+        The model's slopes in a unit of s; or the matrix from s to modes.
     sign : float
         -1 where commands are subtracted from the turbulence.
     """
-    if model.is_local:
+    predictor = model.predictor()
+    if isinstance(predictor, LocalPredictor):
         return _sparse(model.arrays, plant, scale, sign)
-    predictor = model.slope_predictor
-    gain = np.linalg.solve(predictor.usual_px2, predictor.with_slopes.T).T
-    rest = np.eye(predictor.model.states) - gain @ predictor.model.observation
-    command = -sign * plant.reconstructor.clean @ predictor.model.ahead(plant.delay_frames)
+    transition, gain, observation, ahead = predictor.matrices(plant.delay_frames)
+    rest = np.eye(len(transition)) - gain @ observation
+    command = -sign * plant.reconstructor.clean @ ahead
     matrices = {}
-    for name, onward in (("command", command), ("state", predictor.model.onward)):
+    for name, onward in (("command", command), ("state", transition)):
+        answer = onward @ gain
         matrices[f"{name}_of_state"] = onward @ rest
-        matrices[f"{name}_of_slopes"] = onward @ gain * scale
+        matrices[f"{name}_of_slopes"] = answer @ scale if np.ndim(scale) == 2 else answer * scale
         matrices[f"{name}_of_mirror"] = -sign * onward @ gain @ plant.interaction
     return matrices
 

@@ -20,6 +20,8 @@ from faintspot.loop.control.identification.loop_delay import (
     LoopDelay,
     with_axes,
 )
+from faintspot.loop.control.identification.modal_delay import ModalFits
+from faintspot.loop.control.identification.modal_loop import plateau
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.turbulence.strength import OUTER_SCALE_M, TurbulenceStrength
@@ -85,7 +87,7 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
         )
     if not np.ptp(loop.commands, axis=0).any():
         raise InputError("commands: expected those of a closed loop, got constant ones")
-    fits = DelayFits(*_of_fit(loop))
+    fits = ModalFits(*of_modes(loop)) if loop.cells is None else DelayFits(*_of_fit(loop))
     fit = used = fits.best() if loop.delay_frames is None else fits.of(loop.delay_frames)
     nearest = float(round(fit.delay_frames))
     if loop.delay_frames is None and abs(fit.delay_frames - nearest) < max(
@@ -127,6 +129,12 @@ def _of_fit(loop: Recording) -> tuple[Floats, Floats, NDArray[np.int64], SlopeTu
     return slopes, mirror, runs_of(loop.frame[rows]), site, loop.frame_rate_hz
 
 
+def of_modes(loop: Recording) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Return what delay, gain and law of a recording in modes are fitted to."""
+    rows = np.isfinite(loop.slopes).all(axis=1)
+    return loop.slopes[rows], loop.commands[rows] @ loop.interaction_matrix.T, runs_of(loop.frame[rows])
+
+
 def known_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay, str]:
     """Return delay and gain as measured and as used, and why they could not be measured, if so.
 
@@ -158,7 +166,8 @@ def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:
         rows = rows[runs == np.bincount(runs).argmax()]
     if len(rows) < FEWEST_FRAMES:
         raise InputError(f"{len(rows)} frames with known commands, expected {FEWEST_FRAMES}")
-    frame, gains = loop.frame[rows] - loop.frame[rows[0]], delay.gains(loop.slopes.shape[1] // 2)
+    frame = loop.frame[rows] - loop.frame[rows[0]]
+    gains = delay.gain if loop.cells is None else delay.gains(len(loop.cells))
     grid = np.full((2, int(frame[-1]) + 1, loop.slopes.shape[1]), np.nan)
     grid[:, frame] = loop.slopes[rows] / gains
     grid[1, frame] -= mirror[rows]
@@ -166,7 +175,7 @@ def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:
         grid -= np.nansum(grid, axis=1, keepdims=True) / np.isfinite(grid).sum(axis=1, keepdims=True)
     residual, atmosphere = grid
     measured = np.isfinite(atmosphere)
-    variance, count = noise_variance(atmosphere)
+    variance, count = noise_variance(atmosphere) if loop.cells is not None else plateau(atmosphere)
     if count.any():
         variance = np.where(count > 0, variance, variance[count > 0].mean())
     least = _LEAST_SIGNAL * float(np.nanvar(atmosphere))

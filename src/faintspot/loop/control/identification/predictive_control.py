@@ -16,6 +16,7 @@ from faintspot.base.checks import one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.files import read_arrays, save_arrays
 from faintspot.loop.control.base import SETTLE_FRAMES, CommandDelayLine
+from faintspot.loop.control.identification.controlled_loop import LoopInModes, LoopOfControl
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.learning import (
     JUDGED_PART,
@@ -23,7 +24,9 @@ from faintspot.loop.control.identification.learning import (
     error_of_mean,
     learn_controller,
 )
-from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
+from faintspot.loop.control.identification.modal_loop import LEAST_MEASURED, modes_of
+from faintspot.loop.control.identification.modal_model import learn_modes, share_of_modes
 from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
 from faintspot.loop.control.identification.open_loop import (
     Measured,
@@ -46,18 +49,17 @@ from faintspot.loop.control.identification.relearning import (
     stored,
 )
 from faintspot.loop.control.integrator import LoopPlant
-from faintspot.loop.control.reconstructor import make_reconstructor
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-_LEAK = 0.01
 _MEASURED_FRAMES = 60  # that the integrator drives the mirror first, so that its residual is measured
 _MOST_SIGMAS = 5.0  # of the commands that the turbulence asks for
 _MOST_OFF = 1.5  # ratio of the recorded gain and the advised one, above which the fallback has the latter
 _EASED_FRAMES = 100  # in which it gets there
 _MARGIN = 0.55  # of the largest stable loop gain, for the largest centroid gain that is likely
 _ABSURD = 1e3  # of the rms of recorded slopes: no such slope is measured
+_CLEARLY = 0.99  # part of what winds leave, below which modes alone replace them
 _CONTENTS = "a predictive controller"
 _RELEARNT_FROM = 750  # frames since the integrator took over, from which is learnt in the background
 _PLAIN_AT_FIRST = 200  # frames in which it may drive because the filter has just begun
@@ -67,56 +69,6 @@ _LEARN_BESIDE = (
     "learn_beside(sys.argv[1])"
 )
 _CONTROL, _TASK, _BETTER, _RESULT = "control.npz", "frames.npz", "better.npz", "result.txt"
-
-
-@dataclass(frozen=True, eq=False)
-class LoopOfControl:
-    """Loop of a controller, with conversions from the user's unit and sign."""
-
-    interaction: Floats
-    """(2 n, commands): in slopes divided by the rms of the recording's and by their centroid gain."""
-    standard_error: Floats
-    """(2 n,): of such slopes; infinite where the recording has none, which are left out."""
-    scale: Floats
-    """(2 n,): such slopes in a unit of the user's."""
-    sign: float
-    """-1 where the user's commands are subtracted from the turbulence."""
-    delay: Floats
-    """(6,): delay in frames, centroid gain, and that of x relative to y, each with its standard error."""
-    winds: Floats
-    """(layers, 6): speed, direction and share, each with its standard error."""
-    largest_command: float
-    integrator_gain: float
-    sent_after_frames: int
-    recorded_gain: float = math.nan
-    """Gain of the recorded integrator on the controller's slopes, if the fallback has another one."""
-    length_unit: str = "m"
-    """Unit of length of the winds."""
-    recorded: Recording | None = None
-    """A frame of the recorded loop, in the user's units: what learning again must know."""
-
-    @property
-    def slopes_of_commands(self) -> Floats:
-        """(m, commands): the user's matrix in such slopes.
-
-        Raises
-        ------
-        InputError
-            When the file of the controller has no recorded loop.
-        """
-        if self.recorded is None:
-            raise InputError("controller: expected the recorded loop in its file; learn from a recording")
-        scale = float(np.exp(np.log(np.abs(self.scale)).mean())) * float(self.delay[2])
-        return np.asarray(scale * self.recorded.interaction_matrix)
-
-    def plant(self) -> LoopPlant:
-        """Return the loop for which controllers are made."""
-        frames = max(1, round(float(self.delay[0])))
-        reconstructor = make_reconstructor(self.interaction, measured=np.isfinite(self.standard_error))
-        # The integrator is that of the recording, whatever gain of x relative to y was found.
-        gains = np.exp(np.log(np.abs(self.scale)).mean()) / np.abs(self.scale)
-        reconstructor = replace(reconstructor, matrix=reconstructor.matrix * gains)
-        return LoopPlant(self.interaction, reconstructor, frames, _LEAK)
 
 
 class PredictiveControl:
@@ -181,7 +133,12 @@ class PredictiveControl:
 
     @property
     def left_out(self) -> NDArray[np.int64]:
-        """Numbers of sub-apertures not in use: without slopes in the recording, or measuring nothing now."""
+        """Numbers of sub-apertures not in use: without slopes in the recording, or measuring nothing now.
+
+        Without cells, numbers of slopes that the recording has none of.
+        """
+        if self._loop.analysis.size:
+            return np.flatnonzero(np.isinf(self._loop.standard_error))
         learnt = np.isinf(self._loop.standard_error).reshape(2, -1).any(axis=0)
         return np.flatnonzero(learnt | self._controller.is_stuck)
 
@@ -240,10 +197,22 @@ class PredictiveControl:
             self._eased += 1
             part, plain = self._eased / _EASED_FRAMES, self.model.plain_gain
             self._controller.set_plain_gain(loop.recorded_gain ** (1 - part) * plain**part)
-        self._controller.update(scaled, errors)
+        self._controller.update(*self._controlled(scaled, errors))
         command = loop.sign * self._line.latest
         self._recent.add(np.where(np.isfinite(errors), scaled, np.nan) / loop.scale, command)
         return command
+
+    def _controlled(self, slopes: Floats, errors: Floats) -> tuple[Floats, Floats]:
+        """Return the slopes, or modes, of the controller, and their standard errors.
+
+        Those of modes are infinite in a frame with too few slopes.
+        """
+        loop = self._loop
+        if not loop.analysis.size:
+            return slopes, errors
+        noise, used = np.sqrt(self.model.arrays["variance_px2"]), np.isfinite(loop.standard_error)
+        is_known = np.isfinite(errors).sum() >= LEAST_MEASURED * used.sum()
+        return loop.analysis @ slopes, noise if is_known else np.full_like(noise, np.inf)
 
     def _learn_beside(self) -> None:
         """Begin to learn in another process when it is time to, and take what was learnt when it ends."""
@@ -417,21 +386,24 @@ class PredictiveControl:
         InputError
             When the file cannot be written.
         """
-        plant = self._plant
-        matrices = state_space(self.model, plant, self._loop.scale, self._loop.sign)
+        plant, loop = self._plant, self._loop
+        scale = loop.analysis * loop.scale if loop.analysis.size else loop.scale
+        matrices = state_space(self.model, plant, scale, loop.sign)
         matrices["delay_frames"] = np.array(plant.delay_frames)
-        write_matrices(path, {**matrices, "largest_command": np.array(self._loop.largest_command)})
+        write_matrices(path, {**matrices, "largest_command": np.array(loop.largest_command)})
 
     def summary(self) -> str:
         """Return a summary of one line."""
         gain, delay = self.centroid_gain, self.delay_frames
         left, plain = self.model.left
+        kind = "slopes" if self._loop.analysis.size else "sub-apertures"
         parts = [
             f"delay {delay.value:.2f} +- {delay.error:.2f} frames, centroid gain {gain.value:.3f} +- "
             f"{gain.error:.3f}",
             self.model.description,  # not in files
             f"residual, noise included, {left / plain:.2f} of an integrator's",
-            f"sub-apertures {', '.join(map(str, self.left_out))} left out" if len(self.left_out) else "",
+            f"{self._loop.law} ran" if self._loop.law else "",
+            f"{kind} {', '.join(map(str, self.left_out))} left out" if len(self.left_out) else "",
         ]
         return "; ".join(part for part in parts if part)
 
@@ -504,13 +476,14 @@ def learn(recording: Recording, start: Identified | None = None) -> PredictiveCo
     >>> control(slopes[0]).shape
     (16,)
     """
-    if recording.cells is None:
-        raise InputError("cells: expected row and column of each sub-aperture, got none")
     if recording.commands is None or recording.interaction_matrix is None:
         absent = "commands" if recording.commands is None else "interaction_matrix"
         raise InputError(f"{absent}: expected an array, got none")
     ready = prepared(recording)
     loop = ready.recording
+    if loop.cells is None or len(loop.cells) < FEWEST_SUBAPERTURES:
+        measured, used = measured_delay(modes_of(loop).recording)
+        return _in_modes(ready, LoopInModes.of(ready, replace(used, delay_error=measured.delay_error)))
     measured, used = measured_delay(loop)
     delay = with_axes_of(loop, replace(used, delay_error=measured.delay_error))
     return learn_observed(ObservedLoop(ready, delay, open_loop_of(loop, delay)), start)
@@ -531,7 +504,7 @@ class ObservedLoop:
 def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> PredictiveControl:
     """Learn as `learn` from a recording whose delay and open-loop slopes are known."""
     ready, delay, seen = observed.ready, observed.delay, observed.seen
-    loop, gain, site = ready.recording, delay.gain, site_of_loop(ready.recording)
+    loop, site = ready.recording, site_of_loop(ready.recording)
     described = LoopOfControl(
         loop.interaction_matrix,
         np.where(np.isfinite(loop.slopes).any(axis=0), np.sqrt(seen.variance), np.inf),
@@ -554,7 +527,31 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> P
         start=start,
         identification=observed.identification,
     )
-    advised = _advised_gain(learnt.plain_gain, delay, plant.delay_frames)
+    modes = LoopInModes.of(ready, delay)
+    if not learnt.is_local:
+        share = share_of_modes(modes, learnt, plant, seen)
+        if share < _CLEARLY:
+            return _in_modes(ready, modes)
+        description = f"{learnt.description}, modes alone leave {share:.2f} of what winds leave"
+        learnt = replace(learnt, description=description)
+    described, identified = replace(described, law=modes.described.law), learnt.identified
+    if identified is not None and identified.is_layered:
+        described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
+    return _controlling(described, ready, seen, learnt)
+
+
+def _in_modes(ready: Prepared, modes: LoopInModes) -> PredictiveControl:
+    """Learn from modes alone."""
+    learnt = learn_modes(modes.described.plant(), modes.seen.telemetry)
+    return _controlling(modes.described, ready, modes.seen, learnt)
+
+
+def _controlling(
+    described: LoopOfControl, ready: Prepared, seen: OpenLoop, learnt: Kalman
+) -> PredictiveControl:
+    """Return the control of a learnt filter, with its fallback and stroke limit."""
+    loop, plant, gain = ready.recording, described.plant(), float(described.delay[2])
+    advised = _advised_gain(learnt.plain_gain, gain, float(described.delay[3]), plant.delay_frames)
     recorded, remarks = ready.loop_gain, list(loop.remarks)
     plain = recorded if math.isfinite(recorded) else advised
     if abs(math.log(max(plain, 1e-9) / advised)) > math.log(_MOST_OFF):
@@ -564,27 +561,24 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> P
     described = replace(
         described, largest_command=_largest_command(loop, seen, plant), integrator_gain=advised
     )
-    identified = learnt.identified
-    if identified is not None and identified.is_layered:
-        described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
     description = "; ".join([learnt.description, *remarks])
     return PredictiveControl(described, replace(learnt, plain_gain=plain * gain, description=description))
 
 
-def _advised_gain(best: float, delay: LoopDelay, delay_frames: int) -> float:
+def _advised_gain(best: float, gain: float, gain_error: float, delay_frames: int) -> float:
     """Return the loop gain on slopes as measured: the best by replay, or less, as it must be stable.
 
     Parameters
     ----------
     best : float
         Of slopes divided by the centroid gain.
-    delay : LoopDelay
+    gain, gain_error : float
+        Centroid gain.
     delay_frames : int
         Whole frames; an integrator is stable up to 2 sin(pi / (4 delay - 2)).
     """
     most = _MARGIN * 2 * math.sin(math.pi / (4 * delay_frames - 2))
-    error = delay.gain_error if math.isfinite(delay.gain_error) else 0.0
-    return min(best / delay.gain, most / (delay.gain + error))
+    return min(best / gain, most / (gain + (gain_error if math.isfinite(gain_error) else 0.0)))
 
 
 def _largest_command(loop: Recording, seen: OpenLoop, plant: LoopPlant) -> float:

@@ -30,18 +30,19 @@ _LATE, _RUNAWAY = 10, 2.0
 """Frames, and their mean residual in those of the integrator, with which a filter fails for good."""
 _ASSUMED = 4.0  # residual of an integrator that was computed, by which it may be too small
 _FIRST_WAIT, _LONGEST_WAIT = 500, 20_000  # frames that the integrator drives the mirror after that
+_MANY_COMMANDS = 12  # with which numbers of frames are those above
 _PROVEN = 2000  # frames after which the wait is the first one again
 
 # Numbers of the guard: 1 where the plain one's commands go out; the same of the frame before, or another
 # number; frames of late, mean difference, its mean square, evidence for the other controller; frames of the
 # handover that are left; frames since the last change, and what was chosen before it; frames of the
 # integrator that were measured; residual of the filter of late; the integrator's computed residual; frames to
-# wait, now and the next time. Then measures of this frame, the integrator's means, and sums of the filter's
-# excess.
+# wait, now and the next time; how many times more frames it needs than with many commands. Then measures of
+# this frame, the integrator's means, and sums of the filter's excess.
 CHOSEN, SENT, FRAMES, _MEAN, _SQUARE, _EVIDENCE, BLENDED, _SINCE, _BEFORE = range(9)
-_PLAIN_FRAMES, _OF_LATE, _COMPUTED, _WAIT, _NEXT_WAIT = range(9, 14)
-_RESIDUAL, SURPRISE, LEFT_OUT, AT_LIMIT = range(14, 18)
-_PLAIN, EXCESS, GUARD_NUMBERS = 18, 22, 26
+_PLAIN_FRAMES, _OF_LATE, _COMPUTED, _WAIT, _NEXT_WAIT, _PATIENCE = range(9, 15)
+_RESIDUAL, SURPRISE, LEFT_OUT, AT_LIMIT = range(15, 19)
+_PLAIN, EXCESS, GUARD_NUMBERS = 19, 23, 27
 
 
 @partial(compiled_with, source=__file__)
@@ -73,7 +74,8 @@ def choose(guard: Any, learnt: object, plain: Any) -> None:
             guard[_PLAIN_FRAMES] += 1.0
             for measure in range(_MEASURES):
                 change = guard[_RESIDUAL + measure] - guard[_PLAIN + measure]
-                guard[_PLAIN + measure] += change / min(guard[_PLAIN_FRAMES], _MEASURED_MEMORY)
+                memory = _MEASURED_MEMORY * guard[_PATIENCE]
+                guard[_PLAIN + measure] += change / min(guard[_PLAIN_FRAMES], memory)
     else:
         is_measured = guard[_PLAIN_FRAMES] >= _MEASURED
         for measure in range(_MEASURES):
@@ -85,8 +87,9 @@ def choose(guard: Any, learnt: object, plain: Any) -> None:
                 usual = math.inf if measure == LEFT_OUT - _RESIDUAL else _ASSUMED * computed
             ratio = min(value / max(usual, _LEAST[measure]), _IN_ONE_FRAME[measure])
             if measure == 0:
-                guard[_OF_LATE] += (ratio - guard[_OF_LATE]) / min(guard[_SINCE], _LATE)
-            excess = max(0.0, guard[EXCESS + measure] + ratio - _ALLOWED[measure])
+                guard[_OF_LATE] += (ratio - guard[_OF_LATE]) / min(guard[_SINCE], _LATE * guard[_PATIENCE])
+            more = (ratio - _ALLOWED[measure]) / guard[_PATIENCE]
+            excess = max(0.0, guard[EXCESS + measure] + more)
             guard[EXCESS + measure] = excess
             if excess > MOST_EXCESS:
                 guard[EXCESS] = max(guard[EXCESS], excess)
@@ -102,7 +105,8 @@ def choose(guard: Any, learnt: object, plain: Any) -> None:
         variance = guard[_SQUARE] - guard[_MEAN] * guard[_MEAN]
         for_plain = difference / max(math.sqrt(max(0.0, variance)), _LEAST_DEVIATION)
         for_other = -for_plain if guard[CHOSEN] > 0.0 else for_plain
-        guard[_EVIDENCE] = max(0.0, guard[_EVIDENCE] + min(for_other, _MOST_DEVIATIONS))
+        evidence = min(for_other, _MOST_DEVIATIONS) / guard[_PATIENCE]
+        guard[_EVIDENCE] = max(0.0, guard[_EVIDENCE] + evidence)
     if guard[_WAIT] > 0.0:
         guard[_WAIT] -= 1.0
     elif guard[_EVIDENCE] > _ENOUGH:
@@ -112,7 +116,7 @@ def choose(guard: Any, learnt: object, plain: Any) -> None:
 CHOOSE = Direct(choose)
 
 
-def prepare(guard: Any, prefers_plain: bool, plain_residual: float, plain_frames: int) -> None:
+def prepare(guard: Any, prefers_plain: bool, plain_residual: float, plain_frames: int, commands: int) -> None:
     """Set the numbers of a guard before its first frame.
 
     Parameters
@@ -125,9 +129,12 @@ def prepare(guard: Any, prefers_plain: bool, plain_residual: float, plain_frames
         Computed residual of the plain controller, as from a replay; infinite if unknown.
     plain_frames : int
         Frames that the plain controller drives the mirror first, so that its residual is measured.
+    commands : int
+        Number of commands: residuals of few scatter more, so that more frames are needed to judge them.
     """
+    guard[_PATIENCE] = patience = max(1.0, _MANY_COMMANDS / commands)
     guard[CHOSEN] = guard[SENT] = guard[_BEFORE] = float(prefers_plain or plain_frames > 0)
-    guard[_COMPUTED], guard[_WAIT], guard[_NEXT_WAIT] = plain_residual, plain_frames, _FIRST_WAIT
+    guard[_COMPUTED], guard[_WAIT], guard[_NEXT_WAIT] = plain_residual, plain_frames * patience, _FIRST_WAIT
 
 
 def restart(guard: Any) -> None:
@@ -181,7 +188,11 @@ class GuardedController(Controller):
         self._guard, self._offset = np.zeros(GUARD_NUMBERS), np.zeros(interaction.shape[1])
         self._watch = StuckWatch(len(interaction))
         prepare(
-            self._guard, prefers_plain=prefers_plain, plain_residual=plain_residual, plain_frames=plain_frames
+            self._guard,
+            prefers_plain=prefers_plain,
+            plain_residual=plain_residual,
+            plain_frames=plain_frames,
+            commands=interaction.shape[1],
         )
 
     @property

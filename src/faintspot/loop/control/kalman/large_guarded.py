@@ -1,4 +1,4 @@
-"""Guarded predictive control of large sensors: little is left to do when a frame's slopes arrive."""
+"""Guarded predictive control of large sensors and of modes: one product is left when slopes arrive."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from faintspot.loop.control.base import CommandDelayLine, ExpectedSlopes, without_prior
 from faintspot.loop.control.integrator import LoopPlant, SlopeProduct
 from faintspot.loop.control.kalman.guarded import SURPRISE, GuardedController
-from faintspot.loop.control.kalman.local_model import replies
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor
+from faintspot.loop.control.kalman.modal_predictor import ModalPredictor
 from faintspot.slopes.kernels.driver.products import ProductPart
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ class _Frame(NamedTuple):
 
 
 class LargeGuarded(GuardedController):
-    """Guard of `Predictive` and the integrator, for large sensors.
+    """Guard of `Predictive` and the integrator, for large sensors and for modes.
 
     Reading matrices takes most of the time of a frame. They are kept in float32. The predictive command is
     linear in what the slopes differ from their prediction; the matrix of that is computed beforehand, and so
@@ -59,7 +59,7 @@ class LargeGuarded(GuardedController):
     phase_of_commands : (commands, commands) array
         From commands to the compared amplitudes, see `phase.phase_of_commands`.
     arrays : mapping
-        Of the filter, as from `local_filter`.
+        Of the filter, as from `local_filter` or `modal_filter`.
     plain_gain : float
         Of the integrator.
     options
@@ -73,17 +73,17 @@ class LargeGuarded(GuardedController):
         line: CommandDelayLine,
         plant: LoopPlant,
         phase_of_commands: Floats,
-        arrays: Mapping[str, object],
+        arrays: Mapping[str, Any],
         plain_gain: float,
         **options: Any,
     ) -> None:
         interaction, reconstructor = plant.interaction, plant.reconstructor
         super().__init__(line, interaction, **options)
-        self._predictor = LocalPredictor(arrays)
+        self._predictor = LocalPredictor(arrays) if "around" in arrays else ModalPredictor(arrays)
         self._integrator = plant.integrator(plain_gain, self._lines[_PLAIN])
         self._product, self._reconstruct = SlopeProduct(interaction), SlopeProduct(reconstructor.matrix)
         self._clean, self._compare = SlopeProduct(reconstructor.clean), SlopeProduct(phase_of_commands)
-        matrices = replies(arrays, line.delay_frames)
+        matrices = self._predictor.replies(line.delay_frames)
         self._replies = [SlopeProduct((matrix.T @ reconstructor.clean.T).T) for matrix in matrices]
         self._caused = np.zeros((2, len(line.rows), len(interaction)))
         """Slopes that the commands of both lines cause, row by row."""

@@ -19,6 +19,7 @@ from faintspot.loop.control.kalman.local_model import (
     local_gains,
     neighbours_within,
     of_slopes,
+    replies,
     steady_covariance,
 )
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
@@ -52,6 +53,7 @@ class LocalPredictor:
     """
 
     def __init__(self, arrays: Mapping[str, Any]) -> None:
+        self._arrays = arrays
         self._near, self._around = (
             np.ascontiguousarray(arrays[name], np.int32) for name in ("near", "around")
         )
@@ -101,6 +103,10 @@ class LocalPredictor:
         more = np.log(variance_px2[measured] / self._usual_px2[measured]).mean() / math.log(NOISE_STEP)
         level = round(float(more)) + len(self._gains) // 2
         return np.where(measured, difference_px, 0.0), int(np.clip(level, 0, len(self._gains) - 1))
+
+    def replies(self, frames: int) -> Iterable[Any]:
+        """Return how predicted slopes answer to surprises, (m, m), for every set of gains."""
+        return replies(self._arrays, frames)
 
     def failure(self, difference_px: Floats, variance_px2: Floats) -> float:
         """Return the mean square of what slopes differ from the prediction, in its expected deviation."""

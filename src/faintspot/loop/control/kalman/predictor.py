@@ -191,6 +191,14 @@ class SlopePredictor:
             self._ahead[frames] = self.model.ahead(frames)
         return np.asarray(self._ahead[frames] @ self.state)
 
+    def matrices(self, frames: int) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return transition, correction by the usual noise, observation and slopes so many frames ahead.
+
+        Shapes: (states, states), (states, m) and twice (m, states).
+        """
+        model = self.model
+        return model.onward, np.asarray(self._gain), model.observation, model.ahead(frames)
+
     def begin(self, slopes_px: Floats) -> None:
         """Restart from constant open-loop slopes."""
         self._of_layers[:] = shares(self.model)[:, None, None] * slopes_px

@@ -1,0 +1,179 @@
+"""Delay and gain of a closed loop of any sensor, and the law by which it ran, from modes and commands.
+
+With the right delay and gain, the open-loop spectrum of every mode is white noise and turbulence, which falls
+with frequency. With wrong ones it has bumps that no such sum has. So delay and gain are those for which the
+spectra are closest to such sums in the sense of Itakura & Saito, the contrast of Whittle's likelihood: it
+does not depend on scale, so all delays and gains are compared by the shapes of their spectra alone.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, median_filter
+
+from faintspot.loop.control.identification.loop_delay import (
+    GAINS,
+    INDEPENDENT,
+    MOST_DELAY,
+    LoopDelay,
+    bins_of,
+    cross_spectra,
+)
+from faintspot.loop.control.identification.vibrations import Vibration
+
+Floats = NDArray[np.float64]
+
+_WINDOW, _LONG_WINDOW, _FOR_LONG = 128, 256, 3200  # frames, and consecutive ones for the long window
+_MOST_MODES = 8
+_KNEES, _POWER = (1e-3, 3e-3, 1e-2, 3e-2), 2.5
+"""Turbulence is a sum of (1 + (f / knee)^2)^-power, the knees in parts of the frame rate: between the powers
+of Zernike tilt, 11 / 6, and of the mean gradient, 17 / 6, of the pupil."""
+_STEP, _GAIN_STEPS, _UPDATES = 0.1, 36, 60
+_EXPECTED_GAIN = 0.4  # standard deviation of the gain's logarithm about 0, before anything is measured
+_MOST_PEAKS, _DAMPING = 4, 0.01  # bins of lines of a mode with wings, and these
+_LINE, _BACKGROUND = 4.0, 9  # height of a line in standard deviations, and bins of the median around it
+_DELAY_ERROR, _GAIN_ERROR = 0.06, 0.15  # frames, and relative: spectra differ from such sums
+_FREQUENCIES = 2**14
+_EXACT = 0.05  # part of a command's steps that a law leaves unexplained
+_LEAST_MOVED = 0.01  # of the mode that is moved most: others tell little of the law
+_LEAST_KEPT = 0.7  # of its command, by an integrator
+INTEGRATOR, FILTERED, OTHER = "an integrator", "an integrator with a filter", "another law"
+
+
+class ModalFits:
+    """Delay and gain of a loop by the shapes of its modes' spectra.
+
+    Parameters
+    ----------
+    modes : (frames, m) array
+        Residual modes.
+    sent : (frames, m) array
+        Modes of the command computed from each frame, by the interaction matrix.
+    run : (frames,) array of int
+        Frames with the same number are consecutive.
+
+    Raises
+    ------
+    InputError
+        When there are fewer than 8 pieces of 128 consecutive frames, half overlapping.
+    """
+
+    def __init__(self, modes: Floats, sent: Floats, run: NDArray[np.int64]) -> None:
+        longest = int(np.bincount(run - run.min()).max())
+        window = np.hanning((_LONG_WINDOW if longest >= _FOR_LONG else _WINDOW) + 2)[1:-1]
+        window /= np.linalg.norm(window)
+        used = np.unique(np.geomspace(1, modes.shape[1], _MOST_MODES).astype(int)) - 1
+        pairs = [(values[:, used] - values[:, used].mean(axis=0)).T for values in (modes, sent)]
+        products = []
+        for mode, command in zip(*pairs, strict=True):
+            spectra, pieces = cross_spectra(mode[:, None], command[:, None], run, window)
+            products.append(spectra[..., 0, 0])
+        self._products = np.array(products)
+        """(modes, frequencies, 1 + lags, 1 + lags)"""
+        self._independent = INDEPENDENT * pieces
+        lines = _lines(self._products[..., 0, 0], self._independent)
+        self._counts, self._shapes = ~lines, _shapes(window, self._products[..., 0, 0] * lines)
+        self._gains = np.geomspace(GAINS[0], GAINS[1], _GAIN_STEPS)[1:-1]
+        self._strength: Floats | None = None
+
+    def of(self, delay_frames: float) -> LoopDelay:
+        """Return the gain for a delay that is known."""
+        return self._likely(np.array([delay_frames]))
+
+    def best(self) -> LoopDelay:
+        """Return delay and gain, averaged over those that are likely."""
+        return self._likely(np.arange(1.0, MOST_DELAY + 0.5 * _STEP, _STEP))
+
+    def _likely(self, delays: Floats) -> LoopDelay:
+        misfit = np.array([self._misfit(delay) for delay in delays])
+        weight = np.exp(misfit.min() - misfit)
+        weight /= weight.sum()
+        later = float(weight.sum(axis=1) @ (delays - delays[0]))
+        delay, gain = float(delays[0]) + later, float(weight.sum(axis=0) @ self._gains)
+        of_delay = math.sqrt(float(weight.sum(axis=1) @ np.square(delays - delay)))
+        of_gain = math.sqrt(float(weight.sum(axis=0) @ np.square(self._gains - gain)))
+        error = 0.0 if len(delays) == 1 else math.hypot(of_delay, _DELAY_ERROR)
+        return LoopDelay(delay, error, gain, math.hypot(of_gain, _GAIN_ERROR * gain))
+
+    def _misfit(self, delay: float) -> Floats:
+        """Return minus the logarithm of the likelihood of a delay, for all gains."""
+        lag, part = int(delay), delay % 1
+        lags, shares = ([lag, lag + 1], np.array([1 - part, part])) if part else ([lag], np.ones(1))
+        crossed = self._products[:, :, 0, lags] @ shares
+        squared = np.einsum("mfij,i,j->mf", self._products[:, :, lags][..., lags], shares, shares)
+        gains, plain = self._gains[:, None, None], self._products[:, :, 0, 0]
+        power = np.maximum(plain - 2 * gains * crossed + gains**2 * squared, 1e-12 * plain.max())
+        shapes, strength = self._shapes, self._strength
+        if strength is None:
+            strength = np.einsum("gmf,ms->gms", power, 1 / shapes.sum(axis=2)) / shapes.shape[1]
+        for _ in range(_UPDATES):
+            inverse = self._counts / np.einsum("gms,msf->gmf", strength, shapes, optimize=True)
+            explained, expected = (
+                np.einsum("gmf,msf->gms", values, shapes, optimize=True)
+                for values in (power * inverse**2, inverse)
+            )
+            strength = strength * np.maximum(explained / np.maximum(expected, 1e-300), 1e-9)
+        self._strength = np.maximum(strength, 1e-9 * np.max(strength, axis=-1, keepdims=True))
+        ratio = power / np.einsum("gms,msf->gmf", strength, shapes)
+        contrast = (self._counts * (ratio - np.log(ratio) - 1)).sum(axis=(1, 2))
+        misfit: Floats = self._independent * contrast + 0.5 * (np.log(self._gains) / _EXPECTED_GAIN) ** 2
+        return misfit
+
+
+def _shapes(window: Floats, lines: Floats) -> Floats:
+    """Return windowed spectra of noise, turbulence and lines of each mode, (modes, parts, frequencies).
+
+    Parameters
+    ----------
+    window : (frames,) array
+    lines : (modes, frequencies) array
+        Power in the lines of each mode, 0 elsewhere; the wings of the highest ones are parts.
+    """
+    frames, frequency = len(window), np.fft.fftfreq(_FREQUENCIES)
+    seen = np.correlate(window, window, "full")[frames - 1 :]
+    seen[1:] *= 2
+    bins = bins_of(frames)
+    cosines = np.cos(2 * np.pi / frames * np.outer(bins, np.arange(frames)))
+    moments = [np.fft.ifft((1 + (frequency / knee) ** 2) ** -_POWER).real[:frames] for knee in _KNEES]
+    common = [np.ones(len(bins)), *(cosines @ (seen * moment / moment[0]) for moment in moments)]
+    parts = []
+    for line in lines:
+        peaks = [k for k in np.argsort(-line)[:_MOST_PEAKS] if line[k] > 0]
+        wings = [Vibration("", bins[k] / frames, _DAMPING, 1.0, 0.0, 0.0) for k in peaks]
+        of_wings = [cosines @ (seen * wing.correlation(1.0, frames)) for wing in wings]
+        parts.append([*common, *of_wings, *([common[0]] * (_MOST_PEAKS - len(peaks)))])
+    return np.maximum(np.array(parts), 1e-12)
+
+
+def _lines(power: Floats, independent: float) -> NDArray[np.bool_]:
+    """Return where narrow lines are in spectra, (modes, frequencies): vibrations, which do not count."""
+    background = median_filter(power, (1, _BACKGROUND), mode="nearest")
+    high = power > (1 + _LINE / math.sqrt(independent)) * background
+    return np.asarray(binary_dilation(high, np.ones((1, 3))))
+
+
+def law_of(modes: Floats, sent: Floats, run: NDArray[np.int64]) -> str:
+    """Return the name of the law that made the commands, with its gain, by regression of each mode.
+
+    Parameters as for `ModalFits`.
+    """
+    moved = np.flatnonzero(sent.std(axis=0) > _LEAST_MOVED * sent.std(axis=0).max())
+    for name, before in ((INTEGRATOR, 1), (FILTERED, 4)):
+        rows = np.flatnonzero(run[before:] == run[:-before]) + before
+        left = total = 0.0
+        gains, kept = [], []
+        for mode, command in zip(modes.T[moved], sent.T[moved], strict=True):
+            past = [command[rows - k] for k in range(1, before + 1)]
+            now = [mode[rows - k] for k in range(before)]
+            terms, steps = np.array([*now, *past]).T, command[rows] - command[rows - 1]
+            weights = np.linalg.lstsq(terms, command[rows], rcond=None)[0]
+            left += float(np.square(command[rows] - terms @ weights).sum())
+            total += float(np.square(steps - steps.mean()).sum())
+            gains.append(-float(weights[:before].sum()))
+            kept.append(float(weights[before:].sum()))
+        if left <= _EXACT**2 * total and min(kept) > _LEAST_KEPT:
+            return f"{name} of gain {np.median(np.abs(gains)):.2g}"
+    return OTHER

@@ -1,0 +1,51 @@
+"""Delay, gain and law of loops without geometry."""
+
+import numpy as np
+import pytest
+from tests.loop.control.modal_cases import integrated, wandering
+
+from faintspot.base.errors import InputError
+from faintspot.loop.control.identification.modal_delay import (
+    FILTERED,
+    INTEGRATOR,
+    OTHER,
+    ModalFits,
+    law_of,
+)
+
+FRAMES = 4000
+RUN = np.zeros(FRAMES, np.int64)
+
+
+@pytest.mark.parametrize(
+    ("delay", "loop_gain"), [(1.0, 0.6), (1.5, 0.4), (2.0, 0.2), (2.0, 0.6), (3.0, 0.2), (3.0, 0.4)]
+)
+def test_delay_of_tip_and_tilt_is_measured(delay: float, loop_gain: float) -> None:
+    """Within 0.2 frames and 3 errors, with a vibration; the gain within 3 errors."""
+    rng = np.random.default_rng([int(2 * delay), int(10 * loop_gain)])
+    slopes, commands = integrated(wandering(rng, FRAMES), rng, delay=delay, loop_gain=loop_gain)
+    found = ModalFits(slopes, commands, RUN).best()
+    assert found.delay_frames == pytest.approx(delay, abs=min(0.2, 3 * found.delay_error))
+    assert found.gain == pytest.approx(0.8, abs=3 * found.gain_error)
+
+
+def test_gain_of_a_known_delay() -> None:
+    rng = np.random.default_rng(4)
+    slopes, commands = integrated(wandering(rng, FRAMES), rng, gain=0.5, loop_gain=0.6)
+    found = ModalFits(slopes, commands, RUN).of(2.0)
+    assert (found.delay_frames, found.delay_error) == (2.0, 0.0)
+    assert found.gain == pytest.approx(0.5, rel=0.2)
+
+
+def test_the_law_is_named() -> None:
+    rng = np.random.default_rng(5)
+    open_loop = wandering(rng, FRAMES)
+    plain, filtered = (integrated(open_loop, rng, filtered=part) for part in (0.0, 0.4))
+    assert law_of(*plain, RUN) == f"{INTEGRATOR} of gain 0.4"
+    assert law_of(*filtered, RUN).startswith(FILTERED)
+    assert law_of(plain[0], rng.standard_normal(plain[1].shape), RUN) == OTHER
+
+
+def test_too_few_frames() -> None:
+    with pytest.raises(InputError, match="expected 326 consecutive frames, got 300"):
+        ModalFits(np.zeros((300, 2)), np.zeros((300, 2)), RUN[:300])
