@@ -23,6 +23,8 @@ from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.psf import PSF
 
+Floats = NDArray[np.float64]
+
 _ROUNDS = 2  # of looking along each axis in turn
 
 Choice = Mapping[str, Any]
@@ -155,8 +157,6 @@ def corrected_badness(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> float:
     corrected = statistics.corrected_rms.value
     return corrected if math.isfinite(corrected) else 1e6 + statistics.rms.value
 
-
-Floats = NDArray[np.float64]
 
 _SAME = 1e-9  # difference of a level from the end of a curve that rounding makes
 _HALVINGS = 50  # of the interval in which a curve crosses the level

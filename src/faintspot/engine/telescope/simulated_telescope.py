@@ -26,7 +26,7 @@ from faintspot.loop.simulation.configuration.configuration import LoopConfigurat
 from faintspot.loop.simulation.telescope.calibration import make_detector
 from faintspot.loop.simulation.telescope.model import TelescopeModel
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
-from faintspot.slopes.spots.speckled import R0_WAVELENGTH_M
+from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 
 ORDERS = ("photons", "magnitude", "r0_m", "seeing_arcsec", "wind_factor")
 _FWHM = 0.976  # long-exposure FWHM in units of wavelength / r0, without outer scale (Roddier 1981)

@@ -20,6 +20,8 @@ from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX, spots
 from faintspot.slopes.spots.speckled import LARGEST_D_OVER_R0, speckled_spots
 
+Floats = NDArray[np.float64]
+
 PROFILES = tuple(FWHM_OF_SIZE_1_PX)
 SPECKLED_ABOVE = 0.7
 """Side of a sub-aperture in r0 above which spots count as speckled."""
@@ -132,9 +134,6 @@ class StatedOptics(Options):
             expected = f"expected 'diffraction', as spots are speckled (d / r0 = {ratio:.2g})"
             raise InputError(expected, name="profile", value=profile)
         return ratio
-
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,7 @@ from faintspot.loop.telemetry.spectra import ModalSpectra, modal_spectra, record
 from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.turbulence.strength import differential_image_motion, turbulence_strength
 from faintspot.slopes.sensor.pupil import subapertures_across
-from faintspot.slopes.spots.speckled import R0_WAVELENGTH_M
+from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.predictive_control import ObservedLoop

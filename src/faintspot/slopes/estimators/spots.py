@@ -18,6 +18,8 @@ from faintspot.slopes.kernels.driver.groups import RANGE
 from faintspot.slopes.kernels.gravity.smoothing import SMALLEST_VARIANCE
 from faintspot.slopes.kernels.spot_fits import fits as spot_fits
 
+Floats = NDArray[np.float64]
+
 _STEPS_IN_BRIGHT_FLUX = 12
 
 
@@ -45,8 +47,6 @@ class Stepping(Estimator):
         parts = [f"{name} {self._span(name, n_subapertures, pixels)}" for name in own]
         return f"{self.method or self.label} ({', '.join([*parts, f'{self.step_count} steps'])})"
 
-
-Floats = NDArray[np.float64]
 
 _LEVEL = 0.05  # step of the logarithm of variances for which the flux of likely outliers is computed
 _LARGEST_MOVE = 0.25  # in a step, in units of the FWHM; 1 px for narrow spots

@@ -23,6 +23,8 @@ from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
 
+Floats = NDArray[np.float64]
+
 _LOOKS, _FRAMES = 20, 50  # stretches of frames over the whole recording
 _FRAMES_FOR_SATURATION = 200
 _FRAMES_APART = 8
@@ -179,8 +181,6 @@ def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str
     words = ["faintspot", "layout", str(frames), "--grid", f"{rows}x{columns}", *roi, "-o", str(path)]
     return shlex.join(words)
 
-
-Floats = NDArray[np.float64]
 
 _STEP_PX = 0.25
 

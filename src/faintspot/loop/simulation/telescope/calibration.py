@@ -23,6 +23,8 @@ from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF, spot_psf
 
+Floats = NDArray[np.float64]
+
 
 def make_detector(configuration: LoopConfiguration) -> Detector:
     """Return the sensor's camera."""
@@ -57,8 +59,6 @@ _DITHER_PX = 0.25
 _DITHER_WAVEFRONTS = 60
 _DITHER_STEP_S = 0.1  # between wavefronts, so that they differ
 _SMALLEST_GAIN = 0.05  # less is noise, and dividing by it would make the loop unstable
-
-Floats = NDArray[np.float64]
 
 
 def method_layout(layout: Layout, method: Method) -> Layout:

@@ -24,6 +24,8 @@ from faintspot.slopes.spots.sodium import SodiumProfile
 from faintspot.slopes.training.known_sodium import KnownSodium
 from faintspot.slopes.training.sodium import MeanImages
 
+Floats = NDArray[np.float64]
+
 Images = NDArray[np.float32]
 
 _NODES = 3  # per pixel: a point's image has no structure that wide beams would not blur
@@ -177,8 +179,6 @@ def _terms(
     y, x = (term.astype(np.float32) for term in terms)  # (n, rank, pixels, nodes)
     return np.ascontiguousarray(y.swapaxes(1, 2)), np.ascontiguousarray(x.swapaxes(2, 3))
 
-
-Floats = NDArray[np.float64]
 
 _OF_NOISE = 6  # of a frame's random numbers
 

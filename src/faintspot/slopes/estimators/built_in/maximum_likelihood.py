@@ -24,6 +24,8 @@ from faintspot.slopes.estimators.spots import SpotPlan, Stepping
 from faintspot.slopes.kernels.driver.groups import RANGE, flux_above_edges
 from faintspot.slopes.kernels.spot_fits import fits as spot_fits
 
+Floats = NDArray[np.float64]
+
 _BLURS = (0.4, 0.0, 0.8, 1.2)  # of the PSF of a speckled spot, in units of lambda / d
 _MODEL_ERRORS = (0.3, 0.0, 1.0)  # for speckled spots
 _LEARNT_WEIGHT_FLOOR = 1e-3
@@ -137,8 +139,6 @@ def _rounding_variance(noise_e: float) -> float:
     """Return the variance after rounding: one electron more or less where the noise exceeds one half."""
     return math.erfc(0.5 / (noise_e * math.sqrt(2.0))) if noise_e > 0 else 0.0
 
-
-Floats = NDArray[np.float64]
 
 # Levels of measured flux, a tenth apart, for which memory must suffice: a factor of two. Fluxes beyond the
 # levels that fit use the tables of the nearest one.
